@@ -1,0 +1,61 @@
+"""hesim_render: a physically-rendered scene-to-sensor simulator for hybrid event-frame cameras.
+
+>>> import hesim_render as hr
+>>> sensor = hr.load_sensor("eiger").crop(512, 384)
+>>> scene = hr.load_scene("colorchecker")
+>>> rec = hr.simulate(scene, sensor, duration_s=0.1, seed=7)  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+from hesim_render import backend as _backend
+
+# Dr.Jit takes the first LLVM it finds when it is imported, and some abort the process: choose before.
+_backend.prepare()
+
+try:
+    __version__ = version("hesim_render")
+except PackageNotFoundError:  # run from a source tree that was never installed
+    __version__ = "0+unknown"
+
+# Imported on first use: the command line must answer --help without loading a renderer.
+_HOMES = {
+    "Recording": "hesim_render.recording",
+    "Scene": "hesim_render.scene",
+    "Sensor": "hesim_render.sensor",
+    "load_scene": "hesim_render.scene",
+    "load_sensor": "hesim_render.sensor",
+    "photocurrent": "hesim_render.radiometry",
+    "simulate": "hesim_render.simulation",
+}
+
+__all__ = [
+    "Recording",
+    "Scene",
+    "Sensor",
+    "__version__",
+    "load_scene",
+    "load_sensor",
+    "photocurrent",
+    "simulate",
+]
+
+if TYPE_CHECKING:
+    from hesim_render.radiometry import photocurrent
+    from hesim_render.recording import Recording
+    from hesim_render.scene import Scene, load_scene
+    from hesim_render.sensor import Sensor, load_sensor
+    from hesim_render.simulation import simulate
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'hesim_render' has no attribute {name!r}")
+    value = getattr(importlib.import_module(home), name)
+    globals()[name] = value
+    return value

@@ -1,0 +1,51 @@
+"""The hinge of the house: who can say how many photo-electrons per second each pixel gets.
+
+The renderer and the video path implement `FluxSource`; nothing downstream knows which one it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class FluxSource(Protocol):
+    """Noise-free photo-electron rate Φ of physical pixels, each through its own filter."""
+
+    #: True where Φ does not depend on time: one call then serves all times.
+    is_static: bool
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly between `begin_us` and `end_us` at which the source moves to its next state.
+
+        Between two edges the source may be frozen where it cannot do better (object poses); callers
+        must not let one `mean_flux` call straddle an edge.
+        """
+        ...
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly between `begin_us` and `end_us` close enough together to follow the motion.
+
+        For sensors without a tick of their own: the image moves about half a pixel, or less, from
+        one time to the next. Empty for a static source.
+        """
+        ...
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """Mean Φ of each listed pixel over its own interval, e⁻/s.
+
+        Parameters
+        ----------
+        pixel : [n] mosaic indices (row · cols + col of the read-out region), any order.
+        begin_us, end_us : [n] or scalar, µs, inside one slice.
+
+        Returns
+        -------
+        half_a, half_b : Dr.Jit Float [n]. Two independent estimates: their mean is the flux, half
+            their difference its standard error. Both use the same random numbers at every call, so
+            a static pixel is exactly static; therefore accumulate each half over time and compare
+            the sums, never add the errors of slices. Exact sources return the same array twice.
+        """
+        ...

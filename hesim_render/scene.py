@@ -1,0 +1,100 @@
+"""A scene ready to render: its validated file, or a Mitsuba scene given directly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from hesim_render.errors import SpecError
+from hesim_render.specs.scene import CameraSpec, SceneSpec, TrackSpec, read_scene
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is seen, how it is lit, from where, and how it moves.
+
+    Parameters
+    ----------
+    spec : the validated scene file.
+    """
+
+    spec: SceneSpec
+
+    @property
+    def name(self) -> str:
+        return self.spec.name
+
+    @property
+    def file(self) -> str:
+        """The file it was read from, empty where it was given directly."""
+        return str(self.spec.file) if self.spec.file else ""
+
+    @classmethod
+    def from_mitsuba(
+        cls,
+        scene: Mapping[str, Any] | str | Path,
+        *,
+        camera: CameraSpec | Mapping[str, Any] | None = None,
+        motion: Sequence[TrackSpec | Mapping[str, Any]] = (),
+        max_depth: int | None = None,
+        radiance_scale: float = 1.0,
+        name: str = "mitsuba",
+    ) -> Scene:
+        """A scene that Mitsuba itself can load.
+
+        Parameters
+        ----------
+        scene : a dictionary as for ``mitsuba.load_dict`` (such as ``mitsuba.cornell_box()``), or the
+            path of an XML file.
+        camera : keys of `CameraSpec`; default the scene's first sensor, whose whole picture then just
+            fits into the read-out region.
+        motion : tracks (keys of `TrackSpec`) of shapes, by their id, and of ``camera``.
+        max_depth : path length; default the scene's own path tracer with its depth, else 8.
+        radiance_scale : multiplies all radiance, which is taken as W m⁻² sr⁻¹ nm⁻¹.
+
+        Raises
+        ------
+        SpecError
+            If the camera or the motion is not valid, or the file is missing.
+        """
+        source: dict[str, Any] = {"radiance_scale": radiance_scale}
+        if isinstance(scene, Mapping):
+            source["inline"] = dict(scene)
+        else:
+            if not Path(scene).is_file():
+                raise SpecError("no such file", file=scene)
+            source["file"] = str(Path(scene).resolve())
+        content = {
+            "schema_version": 1,
+            "name": name,
+            "description": "a Mitsuba scene",
+            "mitsuba": source,
+            "camera": camera,
+            "motion": list(motion),
+            "max_depth": max_depth,
+        }
+        try:
+            return cls(SceneSpec.model_validate(content))
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            key = ".".join(str(part) for part in problem["loc"])
+            raise SpecError(problem["msg"].removeprefix("Value error, "), key=key or None) from None
+
+
+def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """A scene by shipped name (``hesim-render list scenes``) or path of a YAML file.
+
+    Parameters
+    ----------
+    overrides : dotted keys and their values, applied before validation (``camera.f_number``).
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of what is wrong.
+    """
+    return Scene(read_scene(name_or_path, overrides))

@@ -1,0 +1,243 @@
+"""``calibration.yaml``: reading it, and a sensor file that points at one (``noise: calibration.yaml``)."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from hesim_render.errors import SpecError
+from hesim_render.specs.files import Strict, load_yaml
+from hesim_render.units import S_PER_US
+
+SCHEMA_VERSION = 1
+
+
+def read_calibration(file: str | Path) -> dict[str, Any]:
+    """A ``calibration.yaml`` as plain dictionaries, lists and numbers.
+
+    Raises
+    ------
+    SpecError
+        If it cannot be read or is of another schema.
+    """
+    path = Path(file)
+    try:
+        data = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, YAMLError):
+        data = load_yaml(path)  # slower, but its errors carry the line
+    if not isinstance(data, dict):
+        raise SpecError("expected a mapping of keys to values at the top level", file=path)
+    if data.get("schema_version") != SCHEMA_VERSION:
+        raise SpecError(f"expected {SCHEMA_VERSION}, a calibration of this version", file=path, key="schema_version")
+    return data
+
+
+def read_maps(
+    file: str | Path, section: str, data: Mapping[str, Any] | None = None, names: Iterable[str] | None = None
+) -> dict[str, NDArray]:
+    """The maps of a section, ``aps`` or ``evs``, of a calibration.
+
+    Parameters
+    ----------
+    data : what `read_calibration` gave, where it was called before.
+    names : which maps, of those that are there; default all.
+
+    Raises
+    ------
+    SpecError
+        If the section or its map file is missing or cannot be read.
+    """
+    path = Path(file)
+    data = read_calibration(path) if data is None else data
+    if section not in data:
+        raise SpecError(f"holds no section {section!r}; run 'calibrate {section}'", file=path)
+    maps = path.parent / data[section]["maps"]["file"]
+    try:
+        with np.load(maps, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files if names is None or name in names}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise SpecError(f"cannot be read ({error}); it belongs to {path.name}", file=maps) from None
+
+
+class NoiseFile(Strict):
+    """The calibration a sensor file points at. A dump holds the SHA-256 of it and its maps, not its place."""
+
+    file: str
+    sha256: str | None = Field(None, description="of the calibration and its maps; they are refused if they differ")
+    folder: Path = Field(Path(), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shorthand(cls, data: Any) -> Any:
+        return {"file": data} if isinstance(data, str) else data
+
+    @model_serializer(mode="wrap")
+    def _with_hash(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {**handler(self), "sha256": self.sha256 or self.digest()}
+
+    @property
+    def path(self) -> Path:
+        return self.folder / self.file
+
+    def digest(self) -> str:
+        data = read_calibration(self.path)
+        files = [self.path, *(self.path.parent / data[s]["maps"]["file"] for s in ("aps", "evs") if s in data)]
+        digest = hashlib.sha256()
+        for file in files:
+            try:
+                with file.open("rb") as stream:
+                    digest.update(hashlib.file_digest(stream, "sha256").digest())
+            except OSError as error:
+                raise SpecError(f"cannot be read ({error.strerror})", file=file) from None
+        return digest.hexdigest()
+
+    def read(self) -> dict[str, Any]:
+        """The calibration.
+
+        Raises
+        ------
+        SpecError
+            If it cannot be read, or is not the one that `sha256` names.
+        """
+        data = read_calibration(self.path)
+        if not any(section in data for section in ("aps", "evs")):
+            raise SpecError("holds neither a section 'aps' nor 'evs'", file=self.path)
+        if self.sha256 is not None and self.sha256 != self.digest():
+            raise SpecError("it, or a map of it, is not the one this sensor was written with", file=self.path)
+        return data
+
+
+def apply_calibration(sensor: dict[str, Any], noise: NoiseFile) -> None:
+    """Replace a sensor file's own noise by the calibrated one, in place; the file itself is valid.
+
+    Frames take K, the black level and the variance polynomial (0 where a term is not identified), and what
+    is known of read noise, dark current, DSNU, PRNU and full well; their fixed maps stay in the calibration's
+    map file. Events take the coefficients of each position, thresholds, mismatch, leak and signal reference.
+
+    Raises
+    ------
+    SpecError
+        If the calibration cannot be read, does not fit the sensor, or lacks a parameter that a simulation needs.
+    """
+    try:
+        _apply(sensor, noise, noise.read())
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise SpecError(f"is not as 'calibrate' writes it; it lacks {error}", file=noise.path) from None
+
+
+def _apply(sensor: dict[str, Any], noise: NoiseFile, data: Mapping[str, Any]) -> None:
+    changed: dict[str, Any] = {}
+    tile = ["".join(line.split()) for line in sensor["tile"].strip().splitlines()]
+    shape = len(tile), len(tile[0])
+    capture = data["capture"]
+    if shape != (capture["tile_rows"], capture["tile_cols"]):
+        raise SpecError(
+            f"is of a sensor with a tile of {capture['tile_rows']}×{capture['tile_cols']}, not {shape[0]}×{shape[1]}",
+            file=noise.path,
+        )
+    for section, values in (("aps", _aps_values), ("evs", _evs_values)):
+        if section not in data:
+            continue
+        if not isinstance(sensor.get(section), dict):
+            raise SpecError(f"holds a section {section!r}, but the sensor has none", file=noise.path)
+        for key, value in values(sensor, data, noise.path).items():
+            sensor[section][key] = value
+            changed[f"{section}.{key}"] = value
+    for key in changed:
+        for group in ("sources", "assumptions"):
+            if isinstance(sensor.get(group), dict):
+                sensor[group].pop(key, None)
+        sensor.setdefault("sources", {})[key] = f"measured: {noise.file}"
+
+
+def _aps_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) -> dict[str, Any]:
+    aps, capture = data["aps"], data["capture"]
+    if sensor["aps"].get("bit_depth") != capture["bit_depth"]:
+        raise SpecError(
+            f"is of frames of {capture['bit_depth']} bits, the sensor has {sensor['aps'].get('bit_depth')}", file=file
+        )
+    values = {
+        "system_gain_dn_per_e": _needed(aps["K"], "aps.K", file),
+        "black_level_dn": aps["black_dn"],
+        "row_offset_std_dn": aps["n_row_std_dn"],
+        "beta": [[[b or 0.0 for b in cell] for cell in row] for row in aps["beta"]],
+    }
+    if aps["full_well_e"].get("limited_by") == "full well":
+        values["full_well_e"] = aps["full_well_e"]["value"]
+    for key, name, scale in (
+        ("read_noise_e", "read_noise_e", 1.0),
+        ("dark_current_e_per_s", "dark_current_e_per_s", 1.0),
+        ("dsnu_e", "dsnu_e", 1.0),
+        ("prnu_rel", "prnu_percent", 0.01),
+    ):
+        if aps[name]["value"] is not None:
+            values[key] = max(0.0, scale * aps[name]["value"])
+    return values
+
+
+def _evs_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) -> dict[str, Any]:
+    """In the gauge of the calibration, β2 = 1 V; θ is the file's own where the calibration could not tell it."""
+    evs, own, capture = data["evs"], sensor["evs"], data["capture"]
+    if own.get("reference") != "previous_sample":
+        raise SpecError("its events are of fixed comparisons; the sensor needs reference 'previous_sample'", file=file)
+    theta_v = evs["theta_hardware_v"]
+    theta_v = 1.0 if isinstance(theta_v, Mapping) else float(theta_v)
+    measured = evs["theta"]["value"] is not None
+    theta = evs["theta"]["value"] if measured else (own["contrast_threshold_on"] + own["contrast_threshold_off"]) / 2
+    rho = _asymmetry(evs)
+    grid = sensor.get("evs_grid") or {}
+    if len(evs["positions"]) != grid.get("rows_per_tile", 0) * grid.get("cols_per_tile", 0):
+        raise SpecError(f"has {len(evs['positions'])} event positions, not as many as the sensor", file=file)
+    pooled = [_needed(evs[name], f"evs.{name}", file) for name in "AB"] + [evs[name]["value"] or 0.0 for name in "CD"]
+    coefficients = []
+    for position in evs["positions"]:
+        found = [position[name]["value"] for name in "ABCD"]
+        a, b, c, d = pooled if any(value is None for value in found) else found
+        beta4 = theta / theta_v / b
+        coefficients.append({"beta1": a / b, "beta2": 1.0, "beta3": c * beta4, "beta4": beta4, "beta5": d})
+    values = {
+        "contrast_threshold_on": theta * (1 - rho),
+        "contrast_threshold_off": theta * (1 + rho),
+        "threshold_mismatch_std": evs["threshold_mismatch"]["value"] or 0.0,
+        "coefficients": coefficients,
+        "shot_law": evs["shot_law"],
+        "leak_rate_hz": -math.log1p(-max(0.0, evs["leak_per_trial"]["value"] or 0.0)) / (own["tick_us"] * S_PER_US),
+    }
+    if not isinstance(evs["theta_hardware_v"], Mapping):
+        values["threshold_hardware_v"] = theta_v
+    if "signal_reference" in capture:
+        reference = capture["signal_reference"]
+        values["signal_reference"] = {
+            "k_dn_per_e": reference["k"], "t_ref_us": reference["t_ref_us"], "filter": reference["filter"]
+        }  # fmt: skip
+    return values
+
+
+def _asymmetry(evs: Mapping[str, Any]) -> float:
+    """(θ₋ − θ₊)/(θ₋ + θ₊), from the static counts or from the steps, whichever is better known."""
+    static, on, off = evs["asymmetry"], evs["theta_on"], evs["theta_off"]
+    if on["value"] is None or off["value"] is None:
+        return float(static["value"] or 0.0)
+    total = on["value"] + off["value"]
+    error = 2 * math.hypot(on["value"] * off["standard_error"], off["value"] * on["standard_error"]) / total**2
+    if static["value"] is not None and static.get("standard_error", math.inf) < error:
+        return float(static["value"])
+    return (off["value"] - on["value"]) / total
+
+
+def _needed(item: Mapping[str, Any], key: str, file: Path) -> float:
+    if item["value"] is None:
+        raise SpecError(
+            f"not identifiable, so that nothing can be simulated with it: {item['reason']}", file=file, key=key
+        )
+    return float(item["value"])

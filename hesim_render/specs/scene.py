@@ -1,0 +1,272 @@
+"""The scene file: what is seen, how it is lit, from where, and how it moves.
+
+Lengths are in metres, y is up. A target lies in the plane z = 0, its centre at the origin, its
+face towards +z; the camera looks at it along −z with +x to the right of the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    ValidationInfo,
+    field_serializer,
+    model_validator,
+)
+
+from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.specs.target import ReflectanceSpec, TargetSpec
+
+Vector = tuple[float, float, float]
+
+
+def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:
+    if spec.load().values.min() < 0:
+        raise ValueError("a light's spectrum must not be negative")
+    return spec
+
+
+def _not_zero(vector: Vector) -> Vector:
+    if sum(c * c for c in vector) < 1e-18:
+        raise ValueError("a direction must not be the zero vector")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_not_zero)]
+
+
+class LightSpec(Strict):
+    """Where the light comes from, its spectrum, and how much of it reaches a named plane.
+
+    Exactly one of `illuminance_lux` and `irradiance_w_m2` gives the level on the plane through
+    `plane_point_m` with normal `plane_normal` (default: the target's own), unshadowed and from
+    this light alone.
+    """
+
+    type: Literal["uniform", "point", "area", "directional", "none"]
+    illuminant: Annotated[SpectrumSpec, AfterValidator(_not_negative)] = SpectrumSpec(illuminant="D65")
+    illuminance_lux: float | None = Field(None, ge=0)
+    irradiance_w_m2: float | None = Field(None, ge=0, description="integrated over the illuminant's table")
+    position_m: Vector | None = Field(None, description="point and area lights")
+    size_m: tuple[PositiveFloat, PositiveFloat] | None = Field(None, description="area light: width, height")
+    direction: Direction | None = Field(None, description="directional light: the way the light travels")
+    plane_point_m: Vector = (0.0, 0.0, 0.0)
+    plane_normal: Direction = (0.0, 0.0, 1.0)
+
+    @model_validator(mode="after")
+    def _check(self) -> LightSpec:
+        levels = [v for v in (self.illuminance_lux, self.irradiance_w_m2) if v is not None]
+        if len(levels) != (self.type != "none"):
+            raise ValueError(
+                "a light of type 'none' has no level"
+                if self.type == "none"
+                else "a light needs exactly one of illuminance_lux and irradiance_w_m2"
+            )
+        needs = {"point": ["position_m"], "area": ["position_m", "size_m"], "directional": ["direction"]}
+        for name in ("position_m", "size_m", "direction"):
+            needed = name in needs.get(self.type, [])
+            if needed != (getattr(self, name) is not None):
+                raise ValueError(f"a light of type '{self.type}' {'needs' if needed else 'has no'} {name}")
+        return self
+
+
+class ObjectSpec(Strict):
+    """A diffuse solid beside or in front of the target."""
+
+    name: str = Field(min_length=1)
+    shape: Literal["sphere", "box", "rectangle", "mesh"]
+    size_m: Vector = Field((0.1, 0.1, 0.1), description="extent along x, y, z before rotation")
+    position_m: Vector = (0.0, 0.0, 0.0)
+    rotation_axis: Direction = (0.0, 1.0, 0.0)
+    rotation_deg: float = 0.0
+    reflectance: ReflectanceSpec = SpectrumSpec(flat=0.5)
+    pattern: ReflectanceSpec | None = Field(None, description="second reflectance: checks over the shape's own u, v")
+    pattern_count: tuple[PositiveInt, PositiveInt] = (8, 8)
+    mesh: str | None = Field(None, description="OBJ or PLY file, relative to this file")
+
+    @model_validator(mode="after")
+    def _check(self) -> ObjectSpec:
+        if (self.shape == "mesh") != (self.mesh is not None):
+            raise ValueError("shape 'mesh' and the key 'mesh' go together")
+        if min(self.size_m) < 0 or (min(self.size_m) == 0 and self.shape not in ("rectangle", "mesh")):
+            raise ValueError("size_m must be above 0")
+        if self.shape == "sphere" and len(set(self.size_m)) != 1:
+            raise ValueError("a sphere's size_m is three times its diameter; use a mesh for an ellipsoid")
+        return self
+
+
+class CameraSpec(Strict):
+    """Where the camera stands. `fit: target` ignores `origin_m` and backs off along +z until the target fills the view.
+
+    Focal length, f-number and focus default to the sensor file's lens; a value here replaces them.
+    """
+
+    fit: Literal["target"] | None = None
+    fit_margin: float = Field(1.0, gt=0, description="target size over view size; below 1 leaves a border")
+    origin_m: Vector = (0.0, 0.0, 1.0)
+    target_m: Vector = (0.0, 0.0, 0.0)
+    up: Vector = (0.0, 1.0, 0.0)
+    focal_length_mm: PositiveFloat | None = None
+    f_number: PositiveFloat | None = None
+    horizontal_fov_deg: float | None = Field(
+        None, gt=0, lt=170, description="view across the read-out region; replaces the focal length"
+    )
+    focus_distance_m: PositiveFloat | None = Field(None, description="default: distance from origin to target")
+
+    @model_validator(mode="after")
+    def _check(self) -> CameraSpec:
+        if self.focal_length_mm is not None and self.horizontal_fov_deg is not None:
+            raise ValueError("give focal_length_mm or horizontal_fov_deg, not both")
+        if self.fit is None and all(a == b for a, b in zip(self.origin_m, self.target_m, strict=True)):
+            raise ValueError("origin_m and target_m are the same point")
+        return self
+
+
+class KeyframeSpec(Strict):
+    """A rigid pose at one time: rotate about the track's pivot, then translate."""
+
+    t_us: int = Field(description="time, µs from the start")
+    translation_m: Vector = (0.0, 0.0, 0.0)
+    rotation_axis: Direction = (0.0, 0.0, 1.0)
+    rotation_deg: float = 0.0
+
+
+class TrackSpec(Strict):
+    """Motion of one object (``target``, an object's name, a shape id of a Mitsuba scene) or of ``camera``.
+
+    Between keyframes the translation is linear and the rotation runs at constant angular speed:
+    about the shared axis, any number of turns, where both keyframes name the same axis (a rotation
+    of 0 shares every axis); along the shortest arc otherwise. Before the first and after the last
+    keyframe the pose is held, or the track repeats. Objects stand still within slices of time that
+    are short against their speed; the camera's motion is rendered ray by ray.
+    """
+
+    object: str = Field(min_length=1)
+    pivot_m: Vector = (0.0, 0.0, 0.0)
+    repeat: bool = False
+    keyframes: list[KeyframeSpec] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _check(self) -> TrackSpec:
+        times = [frame.t_us for frame in self.keyframes]
+        for earlier, later in zip(times[:-1], times[1:], strict=True):
+            if later <= earlier:
+                raise ValueError(f"keyframes must be in order of time: {later} µs follows {earlier} µs")
+        return self
+
+
+class MitsubaSpec(Strict):
+    """A scene of Mitsuba's own: exactly one of an XML file, a built-in, or an inline dictionary.
+
+    In an inline dictionary a 4×4 list of rows stands for a transform. Radiance is taken as
+    W m⁻² sr⁻¹ nm⁻¹ times `radiance_scale`. The first sensor is the camera unless the scene file
+    has a `camera` section.
+    """
+
+    file: str | None = None
+    builtin: Literal["cornell_box"] | None = None
+    inline: Mapping[str, Any] | None = None
+    radiance_scale: PositiveFloat = 1.0
+
+    @model_validator(mode="after")
+    def _check(self) -> MitsubaSpec:
+        if sum(value is not None for value in (self.file, self.builtin, self.inline)) != 1:
+            raise ValueError("give exactly one of file, builtin and inline")
+        return self
+
+    @field_serializer("inline", when_used="json")
+    def _inline_as_text(self, inline: Mapping[str, Any] | None) -> Any:
+        return None if inline is None else _plain(inline)
+
+
+def _plain(node: Any) -> Any:
+    """An inline scene as JSON can hold it: matrices as lists, objects of Mitsuba as their own text."""
+    if isinstance(node, Mapping):
+        return {str(key): _plain(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return [_plain(value) for value in node]
+    if node is None or isinstance(node, bool | int | float | str):
+        return node
+    if hasattr(node, "matrix"):
+        return np.array(node.matrix, dtype=np.float64).round(9).tolist()
+    return node.tolist() if isinstance(node, np.ndarray) else str(node)
+
+
+class SceneSpec(Strict):
+    """A whole scene file."""
+
+    schema_version: Literal[1]
+    name: str = Field(min_length=1)
+    description: str
+    target: TargetSpec | None = None
+    objects: list[ObjectSpec] = []
+    mitsuba: MitsubaSpec | None = None
+    light: LightSpec | None = None
+    camera: CameraSpec | None = None
+    motion: list[TrackSpec] = []
+    max_depth: int | None = Field(
+        None,
+        ge=2,
+        le=64,
+        description="path length: 2 is direct light, more adds interreflection; default 2, or a Mitsuba scene's own",
+    )
+    folder: Path = Field(Path(), exclude=True)
+    file: Path | None = Field(None, exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
+        if isinstance(data, dict) and info.context:
+            for key in ("folder", "file"):
+                if key in data:
+                    raise ValueError(f"unknown key '{key}'")
+        return data
+
+    @model_validator(mode="after")
+    def _check(self) -> SceneSpec:
+        tracks = [track.object for track in self.motion]
+        if len(set(tracks)) != len(tracks):
+            raise ValueError("motion: one track for each object; put all its keyframes into that")
+        if self.mitsuba is not None:
+            if self.target is not None or self.objects or self.light is not None:
+                raise ValueError("a Mitsuba scene brings its own shapes and lights: drop target, objects and light")
+            if self.camera is not None and self.camera.fit is not None:
+                raise ValueError("camera.fit is 'target' but the scene has no target")
+            return self
+        if self.target is None and not self.objects:
+            raise ValueError("a scene needs a target, objects or a Mitsuba scene")
+        if self.light is None:
+            raise ValueError("light is required (type 'none' is darkness)")
+        if self.camera is None:
+            raise ValueError("camera is required")
+        if self.camera.fit == "target" and self.target is None:
+            raise ValueError("camera.fit is 'target' but the scene has no target")
+        names = [item.name for item in self.objects]
+        if len(set(names)) != len(names) or "target" in names or "camera" in names:
+            raise ValueError("objects: names must be unique and not 'target' or 'camera'")
+        known = [*(["target"] if self.target else []), "camera", *names]
+        for track in self.motion:
+            if track.object not in known:
+                raise ValueError(f"motion: no object {track.object!r} in the scene; there are {', '.join(known)}")
+        return self
+
+
+def read_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SceneSpec:
+    """A scene file, by shipped name or path, with dotted `overrides` applied before validation.
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of the first thing wrong.
+    """
+    file = locate(name_or_path, "scenes")
+    spec = validate(SceneSpec, load_yaml(file), file, overrides or {})
+    return spec.model_copy(update={"folder": file.parent, "file": file})

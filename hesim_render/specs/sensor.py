@@ -1,0 +1,395 @@
+"""The sensor file: geometry, tile, filters, lens, APS and EVS parameters.
+
+Units are in the key names. ``sources`` and ``assumptions`` say, for every figure, where it comes
+from or why it was assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt, field_validator, model_validator
+
+from hesim_render.errors import SpecError
+from hesim_render.specs.calibration import NoiseFile, apply_calibration
+from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.spectra import Spectrum
+
+Role = Literal["aps", "evs"]
+NonNegative = Field(ge=0)
+
+
+class GeometrySpec(Strict):
+    rows: PositiveInt
+    cols: PositiveInt
+    pitch_um: PositiveFloat
+    fill_factor: float = Field(1.0, gt=0, le=1)
+    crosstalk: float = Field(0.0, ge=0, le=0.5, description="part of a pixel's electrons its 4 neighbours collect")
+
+
+class PixelSpec(Strict):
+    """One letter of the tile."""
+
+    filter: str
+    roles: list[Role] = Field(min_length=1)
+
+
+class EvsGridSpec(Strict):
+    """How event pixels are numbered: each tile holds rows × cols of them, taken in reading order.
+
+    The k-th event pixel of tile (i, j) has event coordinates y = i·rows_per_tile + k // cols_per_tile
+    and x = j·cols_per_tile + k % cols_per_tile.
+    """
+
+    rows_per_tile: PositiveInt
+    cols_per_tile: PositiveInt
+
+
+class IlluminationTable(Strict):
+    """Relative illumination against image height, linear between points, constant beyond the last."""
+
+    image_height_mm: list[float] = Field(min_length=2)
+    relative: list[float] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _check(self) -> IlluminationTable:
+        heights = self.image_height_mm
+        if len(heights) != len(self.relative):
+            raise ValueError(f"{len(heights)} heights but {len(self.relative)} values; they must be equally many")
+        if any(b <= a for a, b in zip(heights[:-1], heights[1:], strict=True)) or heights[0] < 0:
+            raise ValueError("image_height_mm must start at 0 or above and increase strictly")
+        if any(not 0 <= value <= 1 for value in self.relative):
+            raise ValueError("relative illumination must lie in [0, 1]")
+        return self
+
+
+class LensSpec(Strict):
+    """Solid angle of the cone at the sensor: G = π / (1 + 4 N² (1 + |m|)²) sr."""
+
+    f_number: float = Field(gt=0)
+    focal_length_mm: PositiveFloat
+    transmittance: SpectrumSpec = SpectrumSpec(flat=1.0)
+    magnification: float | Literal["focus"] = Field(
+        "focus", description="m; 'focus' derives it from focal length and the scene's focus distance"
+    )
+    relative_illumination: Literal["cos4", "none"] | IlluminationTable = "cos4"
+    psf_fwhm_um: float = Field(0.0, ge=0, description="Gaussian point-spread function on the sensor")
+
+
+class ApsSpec(Strict):
+    """Frames: N_e = min(Poisson((1 + PRNU) I_e + D Δt), full well) + N(0, σ_r²); DN = clip(round(K N_e + N_FP))."""
+
+    full_well_e: PositiveFloat
+    system_gain_dn_per_e: PositiveFloat
+    bit_depth: int = Field(ge=1, le=16)
+    black_level_dn: float = Field(ge=0)
+    read_noise_e: float = Field(ge=0)
+    dark_current_e_per_s: float = Field(ge=0)
+    dark_current_nonuniformity_rel: float = Field(0.0, ge=0, description="std / mean of a gamma law over pixels")
+    dark_current_doubling_c: float | None = Field(None, ge=2, description="warming that doubles the dark current")
+    dark_current_reference_c: float | None = Field(
+        None, ge=-100, le=125, description="temperature dark_current_e_per_s holds at; default temperature_c"
+    )
+    temperature_c: float | None = Field(None, ge=-100, le=125, description="of the sensor; default the reference's")
+    prnu_rel: float = Field(0.0, ge=0, lt=0.3)
+    dsnu_e: float = Field(0.0, ge=0, description="std over pixels of the fixed offset N_BLC, in electrons")
+    row_offset_std_dn: float = Field(0.0, ge=0, description="std over rows of the fixed offset N_row")
+    residual_noise_dn: float = Field(0.0, ge=0, description="N_res: extra Gaussian temporal noise")
+    law: Literal["poisson", "gaussian"] = "poisson"
+    exposure_us: PositiveInt
+    frame_rate_hz: PositiveFloat
+    shutter: Literal["rolling", "global"]
+    line_time_us: float = Field(0.0, ge=0)
+    beta: list[list[list[float]]] | None = Field(
+        None,
+        description="[tile_row][tile_col][6] variance polynomial in 1, I, t, I², I·t, t² (DN, s), ADC variance "
+        "excluded; replaces read, shot and dark noise of the physical form",
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> ApsSpec:
+        if self.shutter == "rolling" and self.line_time_us == 0:
+            raise ValueError("a rolling shutter needs line_time_us above 0")
+        if self.black_level_dn >= 2**self.bit_depth - 1:
+            raise ValueError(f"black_level_dn {self.black_level_dn:g} does not fit into {self.bit_depth} bits")
+        if self.exposure_us > 1e6 / self.frame_rate_hz:
+            raise ValueError(
+                f"exposure_us {self.exposure_us} is longer than a frame period of {1e6 / self.frame_rate_hz:.0f} µs"
+            )
+        if self.excess_temperature_c != 0:
+            if self.dark_current_doubling_c is None:
+                raise ValueError(
+                    f"temperature_c {self.temperature_c:g} is not dark_current_reference_c "
+                    f"{self.dark_current_reference_c:g}: dark_current_doubling_c is needed"
+                )
+            if self.beta is not None:
+                raise ValueError("beta holds at the temperature it was measured at: leave temperature_c out")
+        return self
+
+    @property
+    def excess_temperature_c(self) -> float:
+        """Temperature above that of the dark-current figure."""
+        if self.temperature_c is None or self.dark_current_reference_c is None:
+            return 0.0
+        return self.temperature_c - self.dark_current_reference_c
+
+    @property
+    def dark_current_growth(self) -> float:
+        """Dark current at `temperature_c` over that of the reference: 2^((T − T_ref)/doubling)."""
+        if self.dark_current_doubling_c is None:
+            return 1.0
+        return 2.0 ** (self.excess_temperature_c / self.dark_current_doubling_c)
+
+    @property
+    def dark_current_now_e_per_s(self) -> float:
+        """Mean dark current at `temperature_c`."""
+        return self.dark_current_e_per_s * self.dark_current_growth
+
+
+class SignalReferenceSpec(Strict):
+    """Unit of the EVS signal: I = k · Φ · t_ref, in DN of this exposure seen through `filter`."""
+
+    k_dn_per_e: PositiveFloat
+    t_ref_us: PositiveFloat
+    filter: str = Field(
+        "own",
+        description="'own', or a filter: Φ is then scaled by the ratio of responses to an equal-energy light",
+    )
+
+
+class EvsCoefficients(Strict):
+    """Noise of one event position: x = β1 I + β2, s² from β3 (shot), β4 (dark), β5 (their correlation)."""
+
+    beta1: float = Field(ge=0, description="V/DN, slope of the voltage map")
+    beta2: float = Field(gt=0, description="V, V_PD: the photodiode's baseline voltage")
+    beta3: float = Field(ge=0, description="shot noise: V/DN for the linear law, V/√DN for the sqrt law")
+    beta4: float = Field(ge=0, description="V, dark-current shot noise")
+    beta5: float = Field(0.0, ge=-1, le=1, description="correlation of the two")
+
+
+class PhotoreceptorSpec(Strict):
+    """Second-order low-pass of ln x before it is compared: two equal poles, −3 dB together at the corner."""
+
+    cutoff_hz: PositiveFloat = Field(description="corner at signal_dn and above, where the bias current limits it")
+    follows_light: bool = Field(True, description="below signal_dn the corner is proportional to the signal")
+    signal_dn: PositiveFloat | None = Field(None, description="signal of which the corner is cutoff_hz")
+    min_cutoff_hz: PositiveFloat | None = Field(None, description="corner in the dark")
+
+    @model_validator(mode="after")
+    def _check(self) -> PhotoreceptorSpec:
+        if self.follows_light:
+            if self.signal_dn is None or self.min_cutoff_hz is None:
+                raise ValueError("a corner that follows the light needs signal_dn and min_cutoff_hz")
+            if self.min_cutoff_hz > self.cutoff_hz:
+                raise ValueError(f"min_cutoff_hz {self.min_cutoff_hz:g} is above cutoff_hz {self.cutoff_hz:g}")
+        elif self.signal_dn is not None or self.min_cutoff_hz is not None:
+            raise ValueError("without follows_light the corner is cutoff_hz: leave signal_dn and min_cutoff_hz out")
+        return self
+
+
+class EvsSpec(Strict):
+    """Events: compare ΔV = ln x₁/x₀ + noise with θ₊ and θ₋ (ln units)."""
+
+    reference: Literal["previous_sample", "last_event"]
+    tick_us: PositiveInt | None = Field(None, description="period of the fixed comparisons (previous_sample)")
+    window_us: PositiveInt = Field(description="integration window that ends at each sample")
+    contrast_threshold_on: PositiveFloat
+    contrast_threshold_off: PositiveFloat
+    threshold_mismatch_std: float = Field(0.0, ge=0, lt=0.5, description="std over pixels of θ, relative")
+    threshold_hardware_v: PositiveFloat | None = Field(None, description="Θ; β0 = θ/Θ where it is known")
+    signal_reference: SignalReferenceSpec
+    coefficients: list[EvsCoefficients] = Field(min_length=1, description="one for all, or one per event position")
+    shot_law: Literal["linear", "sqrt"]
+    noise_mode: Literal["per_instant", "independent"] = "per_instant"
+    leak_rate_hz: float = Field(0.0, ge=0, description="Poisson process of ON events, per pixel")
+    photoreceptor_cutoff_hz: PositiveFloat | None = Field(None, description="noise bandwidth (last_event)")
+    photoreceptor: PhotoreceptorSpec | None = Field(None, description="bandwidth of the signal; default unlimited")
+    refractory_period_us: PositiveInt | None = Field(None, description="no event so long after a pixel's last one")
+    readout_max_events_per_s: PositiveFloat | None = Field(None, description="events beyond are lost; default no limit")
+    readout_buffer_events: PositiveInt | None = Field(
+        None, description="events that can wait for the read-out; default what it takes in tick_us, or in 1 ms"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> EvsSpec:
+        if self.reference == "previous_sample":
+            if self.tick_us is None:
+                raise ValueError("reference 'previous_sample' needs tick_us")
+            if self.window_us > self.tick_us:
+                raise ValueError(f"window_us {self.window_us} is longer than tick_us {self.tick_us}")
+        elif self.photoreceptor_cutoff_hz is None:
+            raise ValueError("reference 'last_event' needs photoreceptor_cutoff_hz, the bandwidth of its noise")
+        if self.refractory_period_us is not None and self.reference != "last_event":
+            raise ValueError("refractory_period_us belongs to reference 'last_event'; a fixed tick has none")
+        if self.readout_buffer_events is not None and self.readout_max_events_per_s is None:
+            raise ValueError("readout_buffer_events needs readout_max_events_per_s")
+        follows_light = self.photoreceptor is not None and self.photoreceptor.follows_light
+        if follows_light and any(entry.beta1 == 0 for entry in self.coefficients):
+            raise ValueError("photoreceptor.follows_light needs beta1 above 0: without it there is no signal")
+        return self
+
+
+class SensorSpec(Strict):
+    """A whole sensor file."""
+
+    schema_version: Literal[1]
+    name: str = Field(min_length=1)
+    description: str
+    device_seed: int = Field(ge=0)
+    geometry: GeometrySpec
+    tile: str
+    pixels: dict[str, PixelSpec] = Field(min_length=1)
+    evs_grid: EvsGridSpec | None = None
+    filters: dict[str, SpectrumSpec] = Field(min_length=1, description="C_f(λ), transmittance")
+    quantum_efficiency: SpectrumSpec = Field(description="η(λ), electrons per photon")
+    lens: LensSpec
+    aps: ApsSpec | None = None
+    evs: EvsSpec | None = None
+    noise: NoiseFile | None = Field(None, description="a calibration.yaml whose values replace the file's own")
+    sources: dict[str, str] = {}
+    assumptions: dict[str, str] = {}
+
+    @field_validator("tile", mode="before")
+    @classmethod
+    def _tile_text(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            raise ValueError("the tile is drawn as text, one letter a pixel, one line a row")
+        return value
+
+    @field_validator("tile")
+    @classmethod
+    def _tile_shape(cls, value: str) -> str:
+        rows = ["".join(line.split()) for line in value.strip().splitlines()]
+        if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
+            raise ValueError("every line of the tile must hold the same number of letters")
+        return "\n".join(rows)
+
+    @property
+    def tile_rows(self) -> list[str]:
+        """The tile, one string of letters per row."""
+        return self.tile.split("\n")
+
+    def positions(self, role: Role) -> list[tuple[int, int]]:
+        """Tile positions that have `role`, in reading order."""
+        return [
+            (i, j)
+            for i, row in enumerate(self.tile_rows)
+            for j, letter in enumerate(row)
+            if role in self.pixels[letter].roles
+        ]
+
+    def filter_response(self, name: str) -> Spectrum:
+        """τ_lens · C_f · η of a filter: electrons per photon that reaches the lens."""
+        from hesim_render.spectra import product
+
+        return product(self.filters[name].load(), self.quantum_efficiency.load(), self.lens.transmittance.load())
+
+    @model_validator(mode="after")
+    def _check(self) -> SensorSpec:
+        rows = self.tile_rows
+        for letter in dict.fromkeys("".join(rows)):
+            if letter not in self.pixels:
+                raise ValueError(f"tile: the letter {letter!r} is not defined under 'pixels'")
+        for letter, pixel in self.pixels.items():
+            if len(letter) != 1:
+                raise ValueError(f"pixels: {letter!r} must be a single letter")
+            if pixel.filter not in self.filters:
+                known = ", ".join(self.filters)
+                raise ValueError(f"pixels.{letter}.filter: no filter {pixel.filter!r}; defined are {known}")
+        if self.geometry.rows % len(rows) or self.geometry.cols % len(rows[0]):
+            raise ValueError(
+                f"geometry: {self.geometry.rows}×{self.geometry.cols} pixels are not a whole number of "
+                f"{len(rows)}×{len(rows[0])} tiles"
+            )
+        self._check_roles()
+        self._check_spectra()
+        for group in ("sources", "assumptions"):
+            for key in getattr(self, group):
+                self._require_key(group, key)
+        return self
+
+    def _check_roles(self) -> None:
+        aps, evs = self.positions("aps"), self.positions("evs")
+        for role, positions, section in (("aps", aps, self.aps), ("evs", evs, self.evs)):
+            if bool(positions) != (section is not None):
+                raise ValueError(f"the tile has {len(positions)} {role} positions, so '{role}' must "
+                                 f"{'be given' if positions else 'be absent'}")  # fmt: skip
+        if self.aps is not None and self.aps.beta is not None:
+            shape = [[len(cell) for cell in row] for row in self.aps.beta]
+            if shape != [[6] * len(self.tile_rows[0])] * len(self.tile_rows):
+                raise ValueError("aps.beta: expected 6 coefficients for every position of the tile")
+        if self.evs is None:
+            return
+        if self.evs_grid is None:
+            raise ValueError("evs_grid is required where the tile has event pixels")
+        if self.evs_grid.rows_per_tile * self.evs_grid.cols_per_tile != len(evs):
+            raise ValueError(f"evs_grid: {self.evs_grid.rows_per_tile}×{self.evs_grid.cols_per_tile} does not hold "
+                             f"the tile's {len(evs)} event pixels")  # fmt: skip
+        if len(self.evs.coefficients) not in (1, len(evs)):
+            raise ValueError(f"evs.coefficients: expected 1 entry or {len(evs)}, one per event position")
+        reference = self.evs.signal_reference.filter
+        if reference != "own" and reference not in self.filters:
+            raise ValueError(f"evs.signal_reference.filter: no filter {reference!r}")
+
+    def _check_spectra(self) -> None:
+        from hesim_render.spectra import RENDERABLE_NM, constant, coverage
+
+        quantum_efficiency = self.quantum_efficiency.load()
+        if quantum_efficiency.values.min() < 0 or quantum_efficiency.values.max() > 1:
+            raise ValueError("quantum_efficiency must lie in [0, 1] electrons per photon")
+        for name, spec in self.filters.items():
+            values = spec.load().values
+            if values.min() < 0 or values.max() > 1.0 + 1e-9:
+                raise ValueError(f"filters.{name}: transmittance must lie in [0, 1]")
+            try:
+                response = self.filter_response(name)
+            except SpecError as error:
+                raise ValueError(f"filters.{name}: with quantum efficiency and lens, {error}") from None
+            if response.values.max() <= 0:
+                raise ValueError(f"filters.{name}: filter, quantum efficiency and lens share no wavelength")
+            if coverage(constant(1.0, *RENDERABLE_NM), response) < 0.999:
+                raise ValueError(
+                    f"filters.{name}: more than 0.1 % of the response lies outside "
+                    f"{RENDERABLE_NM[0]:g}-{RENDERABLE_NM[1]:g} nm, which cannot be rendered; add an infrared cut"
+                )
+
+    def _require_key(self, group: str, dotted: str) -> None:
+        node: Any = self
+        for key in dotted.split("."):
+            if isinstance(node, Strict):
+                node = getattr(node, key) if key in type(node).model_fields else None
+            elif isinstance(node, dict):
+                node = node.get(key)
+            else:
+                node = None
+            if node is None:
+                raise ValueError(f"{group}.{dotted}: there is no such key in this file")
+
+
+def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SensorSpec:
+    """A sensor file, by shipped name or path, with dotted `overrides` applied before validation.
+
+    The calibration that ``noise`` names, relative to the file (to the working directory where it is an
+    override), replaces the file's own values first: overrides have the last word.
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of the first thing wrong.
+    """
+    file = locate(name_or_path, "sensors")
+    data, changes = load_yaml(file), dict(overrides or {})
+    folder = Path.cwd() if "noise" in changes else file.parent
+    given = changes.pop("noise", data.get("noise"))
+    if given is not None or any(key.startswith("noise.") for key in changes):
+        given = {"file": given} if isinstance(given, str) else given
+        if not isinstance(given, Mapping) or not isinstance(given.get("file"), str):
+            raise SpecError("expected the path of a calibration.yaml", file=file, key="noise")
+        data.pop("noise", None)
+        validate(SensorSpec, data, file, changes)
+        apply_calibration(data, NoiseFile(file=given["file"], sha256=given.get("sha256"), folder=folder))
+        data["noise"] = {**given, "folder": folder}
+    return validate(SensorSpec, data, file, changes)

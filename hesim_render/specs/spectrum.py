@@ -1,0 +1,138 @@
+"""How a spectrum is written in a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, model_serializer, model_validator
+
+from hesim_render import spectra
+from hesim_render.errors import SpecError
+from hesim_render.specs.files import Strict
+from hesim_render.spectra import Spectrum
+
+
+class SpectrumSpec(Strict):
+    """One spectrum, from exactly one of the sources below, times `scale`.
+
+    A bare number in a file means ``{flat: number}``; a bare string means ``{illuminant: name}``,
+    or ``{csv: file}`` where it ends in ``.csv``.
+    """
+
+    flat: float | None = Field(None, description="the same value everywhere")
+    band_nm: tuple[float, float] | None = Field(None, description="limits of `flat`, nm; zero outside")
+    csv: str | None = Field(None, description="CSV file, relative to this file")
+    column: str | int | None = Field(None, description="column of `csv`: header or 1-based number")
+    illuminant: str | None = Field(None, description="relative spectral power by name, as D65 or LED-B3")
+    colorchecker: str | None = Field(None, description="data set of measured ColorChecker reflectances")
+    patch: str | int | None = Field(None, description="patch of `colorchecker`: name or 1-24")
+    camera: str | None = Field(None, description="measured camera sensitivity by name")
+    channel: str | None = Field(None, description="channel of `camera`")
+    basis: Literal["energy", "quantum"] = Field(
+        "quantum",
+        description="'energy': the table is a response per watt; it is divided by λ and normalised to its peak",
+    )
+    wavelength_nm: list[float] | None = Field(None, description="grid of `value`, nm, increasing")
+    value: list[float] | None = Field(None, description="values on `wavelength_nm`")
+    blackbody_k: float | None = Field(None, gt=0, description="Planck radiator of this temperature")
+    peak_nm: float | None = Field(None, description="centre of a Gaussian")
+    fwhm_nm: float | None = Field(None, gt=0, description="full width at half maximum of that Gaussian")
+    scale: float = Field(1.0, description="multiplies all values")
+    folder: Path = Field(Path(), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shorthand(cls, data: Any, info: ValidationInfo) -> Any:
+        if isinstance(data, bool):
+            return data
+        if isinstance(data, int | float):
+            data = {"flat": float(data)}
+        elif isinstance(data, str):
+            data = {"csv": data} if data.endswith(".csv") else {"illuminant": data}
+        if isinstance(data, dict) and info.context:
+            if "folder" in data:
+                raise ValueError("unknown key 'folder'")
+            data = {**data, "folder": info.context["folder"]}
+        return data
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SpectrumSpec:
+        sources = {
+            "flat": self.flat,
+            "csv": self.csv,
+            "illuminant": self.illuminant,
+            "colorchecker": self.colorchecker,
+            "camera": self.camera,
+            "wavelength_nm": self.wavelength_nm,
+            "blackbody_k": self.blackbody_k,
+            "peak_nm": self.peak_nm,
+        }
+        given = [name for name, value in sources.items() if value is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"a spectrum needs exactly one of {', '.join(sources)}; found {', '.join(given) or 'none'}"
+            )
+        needs = {"colorchecker": "patch", "camera": "channel", "wavelength_nm": "value", "peak_nm": "fwhm_nm"}
+        partner = needs.get(given[0])
+        if partner and getattr(self, partner) is None:
+            raise ValueError(f"'{given[0]}' needs '{partner}' beside it")
+        try:
+            self.load()
+        except SpecError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @model_serializer(mode="wrap")
+    def _self_contained(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A dump (and so a hash) holds the numbers of a CSV file, not its name."""
+        data = handler(self)
+        if self.csv is not None:
+            table = self._source()
+            data |= {"csv": None, "column": None}
+            data |= {"wavelength_nm": table.wavelength_nm.tolist(), "value": table.values.tolist()}
+        return data
+
+    def load(self) -> Spectrum:
+        """The spectrum itself.
+
+        Raises
+        ------
+        SpecError
+            If a name or file is unknown or a table is malformed.
+        """
+        spectrum = self._source()
+        if self.basis == "energy":
+            quantum = spectrum.values / spectrum.wavelength_nm
+            spectrum = Spectrum(spectrum.wavelength_nm, quantum / quantum.max())
+        return spectrum.scaled(self.scale) if self.scale != 1.0 else spectrum
+
+    def _source(self) -> Spectrum:
+        if self.flat is not None:
+            return spectra.constant(self.flat, *(self.band_nm or (300.0, 1100.0)))
+        if self.csv is not None:
+            return spectra.read_csv(self.folder / self.csv, self.column)
+        if self.illuminant is not None:
+            return spectra.illuminant(self.illuminant)
+        if self.colorchecker is not None:
+            chart = spectra.colorchecker(self.colorchecker)
+            if isinstance(self.patch, int):
+                if not 1 <= self.patch <= len(chart):
+                    raise SpecError(f"patch {self.patch} does not exist; patches are 1 to {len(chart)}")
+                return list(chart.values())[self.patch - 1]
+            if self.patch not in chart:
+                raise SpecError(f"no patch {self.patch!r}; patches are {', '.join(chart)}")
+            return chart[str(self.patch)]
+        if self.camera is not None:
+            return spectra.camera_sensitivity(self.camera, str(self.channel))
+        if self.wavelength_nm is not None:
+            return Spectrum(np.array(self.wavelength_nm), np.array(self.value))
+        grid = np.arange(300.0, 1101.0, 1.0)
+        if self.blackbody_k is not None:
+            # Planck's law in relative units; c2 = h c / k_B = 1.438777e7 nm K (CODATA 2018)
+            power = grid**-5 / np.expm1(1.438776877e7 / (grid * self.blackbody_k))
+            return Spectrum(grid, power / power.max())
+        assert self.peak_nm is not None and self.fwhm_nm is not None
+        sigma = self.fwhm_nm / 2.354820045
+        return Spectrum(grid, np.exp(-0.5 * ((grid - self.peak_nm) / sigma) ** 2))
