@@ -1,0 +1,1 @@
+"""The statistical model of both pixel types: formulas, device maps and samplers."""
