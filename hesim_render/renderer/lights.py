@@ -1,0 +1,157 @@
+"""Absolute emitters: a light's level on a named plane becomes radiance, intensity or irradiance."""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.errors import SpecError
+from hesim_render.renderer._mitsuba import spectrum_dict, transform
+from hesim_render.specs.scene import LightSpec
+from hesim_render.spectra import Spectrum, scale_to_irradiance, scale_to_lux
+
+#: Dimmest light, relative to facing the plane squarely, that can still set a level on it.
+_GRAZING = 1e-6
+
+
+def irradiance(light: LightSpec) -> Spectrum | None:
+    """E(λ) on the light's plane, W m⁻² nm⁻¹; None in darkness (type 'none' or a level of zero)."""
+    if light.type == "none" or not (light.illuminance_lux or light.irradiance_w_m2):
+        return None
+    shape = light.illuminant.load()
+    if light.illuminance_lux is not None:
+        return scale_to_lux(shape, light.illuminance_lux)
+    assert light.irradiance_w_m2 is not None
+    return scale_to_irradiance(shape, light.irradiance_w_m2)
+
+
+def form_factor_integral(
+    corners: NDArray[np.float64], point: NDArray[np.float64], normal: NDArray[np.float64]
+) -> float:
+    """∫ cos θ dω over a polygon as seen from `point` on a plane with unit `normal`, in sr: E = L × this.
+
+    Lambert's formula, ½ Σ γ_i (Γ_i · n) with γ_i the angle that edge i subtends and Γ_i the unit
+    normal of the plane through `point` and that edge; the part below the plane's horizon is cut off.
+
+    Parameters
+    ----------
+    corners : polygon's corners in order, [n, 3].
+    """
+    rays = _clip_to_horizon(corners - point, normal)
+    if len(rays) < 3:
+        return 0.0
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    following = np.roll(rays, -1, axis=0)
+    cross = np.cross(rays, following)
+    sine = np.linalg.norm(cross, axis=1)
+    angle = np.arctan2(sine, np.sum(rays * following, axis=1))
+    weight = np.divide(angle, sine, out=np.zeros_like(angle), where=sine > 0)
+    return abs(float(0.5 * np.sum(weight * (cross @ normal))))
+
+
+def _clip_to_horizon(rays: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a polygon on the side of the plane through the origin that `normal` points to."""
+    height = rays @ normal
+    kept: list[NDArray[np.float64]] = []
+    for i in range(len(rays)):
+        j = (i + 1) % len(rays)
+        if height[i] >= 0:
+            kept.append(rays[i])
+        if (height[i] >= 0) != (height[j] >= 0):
+            kept.append(rays[i] + (rays[j] - rays[i]) * (height[i] / (height[i] - height[j])))
+    return np.array(kept)
+
+
+def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
+    """Placement [4, 4] of an area light: columns are half its width, half its height, its unit normal, its centre.
+
+    The normal points at the plane point; the width runs horizontally (along x where the light
+    shines straight up or down).
+    """
+    assert light.position_m is not None and light.size_m is not None
+    centre = np.array(light.position_m, dtype=np.float64)
+    normal = _unit(np.array(light.plane_point_m) - centre, light)
+    width = np.cross([0.0, 1.0, 0.0], normal)
+    width = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(width) < 1e-9 else width / np.linalg.norm(width)
+    height = np.cross(normal, width)
+    frame = np.eye(4)
+    frame[:3, 0], frame[:3, 1] = width * light.size_m[0] / 2, height * light.size_m[1] / 2
+    frame[:3, 2], frame[:3, 3] = normal, centre
+    return frame
+
+
+def emitters(mi: Any, light: LightSpec) -> dict[str, Any]:
+    """Entries of the Mitsuba scene for a light; empty in darkness.
+
+    ``uniform``: L = E/π from everywhere, as of a plane under an even sky, visible behind the scene.
+    ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``: a one-sided Lambertian
+    rectangle, L = E / ∫ cos θ dω exactly.
+
+    Raises
+    ------
+    SpecError
+        If the light cannot reach its plane from the front.
+    """
+    level = irradiance(light)
+    if level is None:
+        return {}
+    plane = np.array(light.plane_point_m, dtype=np.float64)
+    normal = _unit(np.array(light.plane_normal, dtype=np.float64), light, "light.plane_normal")
+    if light.type == "uniform":
+        # Sampling directions by the BSDF alone has no variance under an even sky, sampling the sky
+        # has: its weight is 0, and a black point light takes the share that Mitsuba insists on.
+        return {
+            "light": {
+                "type": "constant",
+                "radiance": spectrum_dict(level.scaled(1 / pi)),
+                "sampling_weight": 0.0,
+            },
+            "light_unlit": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "uniform", "value": 0.0}},
+        }
+    if light.type == "directional":
+        travel = _unit(np.array(light.direction, dtype=np.float64), light, "light.direction")
+        across = level.scaled(1 / _facing(float(-travel @ normal)))
+        return {
+            "light": {"type": "directional", "direction": travel.tolist(), "irradiance": spectrum_dict(across)},
+        }
+    if light.type == "point":
+        away = np.array(light.position_m, dtype=np.float64) - plane
+        distance2 = float(away @ away)
+        cosine = _facing(float(_unit(away, light, "light.position_m") @ normal))
+        return {
+            "light": {
+                "type": "point",
+                "position": list(light.position_m or ()),
+                "intensity": spectrum_dict(level.scaled(distance2 / cosine)),
+            }
+        }
+    frame = area_light_frame(light)
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = frame[:3, 3] + signs @ frame[:3, :2].T
+    radiance = level.scaled(1 / _facing(form_factor_integral(corners, plane, normal)))
+    return {
+        "light": {
+            "type": "rectangle",
+            "to_world": transform(mi, frame),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
+            "emitter": {"type": "area", "radiance": spectrum_dict(radiance)},
+        }
+    }
+
+
+def _facing(cosine: float) -> float:
+    if cosine < _GRAZING:
+        raise SpecError(
+            "the light does not reach its plane from the front (see plane_point_m, plane_normal)", key="light"
+        )
+    return cosine
+
+
+def _unit(vector: NDArray[np.float64], light: LightSpec, key: str = "light") -> NDArray[np.float64]:
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        raise SpecError(f"a light of type '{light.type}' is given a direction of length zero", key=key)
+    return vector / length

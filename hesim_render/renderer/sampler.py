@@ -1,0 +1,110 @@
+"""Random numbers of a rendered sample: a pure function of (seed, pixel, half, sample, dimension).
+
+Every dimension pair of every pixel and half is a (0, 2)-sequence of its own: sample j of n takes
+point π(j) of the sequence, π a random permutation, and both coordinates are shifted digitally (XOR)
+by random bits. Permutation and shifts come from Philox4x32 with the counters (pixel on the full
+sensor, half, dimension). Each sample is uniform, so estimates are unbiased; the n samples of a half
+are stratified in every single dimension and in each pair, unlike pairs are independent, and so are
+the halves. (Owen scrambling in place of the shift was measured: 1.6 times the error at 16 samples,
+for the spectra are smooth.)
+
+Padding of low-dimensional sequences: Kollig and Keller 2002, "Efficient multidimensional sampling";
+permutation: Kensler 2013, "Correlated multi-jittered sampling".
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+
+def permute(index: Any, mask: int, key: Any) -> Any:
+    """Kensler's hashed permutation of 0 … mask, mask + 1 a power of two; UInt32 in and out."""
+    i = index ^ key
+    i = i * 0xE170893D
+    i = i ^ (key >> 16)
+    i = i ^ ((i & mask) >> 4)
+    i = i ^ (key >> 8)
+    i = i * 0x0929EB3F
+    i = i ^ (key >> 23)
+    i = i ^ ((i & mask) >> 1)
+    i = i * (1 | (key >> 27))
+    i = i * 0x6935FA69
+    i = i ^ ((i & mask) >> 11)
+    i = i * 0x74DCB303
+    i = i ^ ((i & mask) >> 2)
+    i = i * 0x9E501CC3
+    i = i ^ ((i & mask) >> 2)
+    i = i * 0xC860A3DF
+    i = i & mask
+    i = i ^ (i >> 5)
+    return (i + key) & mask
+
+
+def zero_two_point(index: Any, bits: int) -> tuple[Any, Any]:
+    """Point of the (0, 2)-sequence of van der Corput and Sobol', as two UInt32 binary fractions."""
+    import drjit as dr
+
+    x = dr.brev(index)
+    y = index & 0
+    direction = 1 << 31
+    for bit in range(bits):
+        y = y ^ (((index >> bit) & 1) * direction)
+        direction ^= direction >> 1
+    return x, y
+
+
+@functools.cache
+def sampler_class(variant: str) -> Any:
+    """`CounterSampler` for one Mitsuba variant (its base class differs between variants)."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    assert mi.variant() == variant
+
+    class CounterSampler(mi.Sampler):
+        """See the module. Its state is plain Dr.Jit arrays: only those take part in symbolic loops."""
+
+        def __init__(self, props: Any = None) -> None:
+            super().__init__(props if props is not None else mi.Properties())
+
+        def setup(self, key: Any, pixel: Any, half: Any, sample: Any, samples_per_half: int) -> None:
+            """Start one wavefront.
+
+            Parameters
+            ----------
+            key : UInt64, opaque.
+            pixel, half, sample : UInt32 per lane; `sample` counts within its half.
+            samples_per_half : n.
+            """
+            self.key, self.pixel, self.half, self.sample = key, pixel, half, sample
+            self.dimension = dr.zeros(mi.UInt32, dr.width(pixel))
+            self._bits = max(0, (samples_per_half - 1).bit_length())
+
+        def _pair(self) -> tuple[Any, Any]:
+            self.dimension = self.dimension + 1
+            bits = mi.Philox4x32(self.key, self.pixel, self.half, self.dimension).next_uint32x4()
+            point = permute(self.sample, (1 << self._bits) - 1, bits[0]) if self._bits else self.sample
+            x, y = zero_two_point(point, self._bits)
+            return mi.Float((x ^ bits[1]) >> 8) * 2.0**-24, mi.Float((y ^ bits[2]) >> 8) * 2.0**-24
+
+        def next_1d(self, active: Any = True) -> Any:
+            return self._pair()[0]
+
+        def next_2d(self, active: Any = True) -> Any:
+            return mi.Point2f(*self._pair())
+
+        def fork(self) -> CounterSampler:
+            return self
+
+        def clone(self) -> CounterSampler:
+            return self
+
+        def seed(self, *_: Any) -> None:
+            """The counters are the seed; integrators that call this change nothing."""
+
+        def schedule_state(self) -> None:
+            dr.schedule(self.dimension)
+
+    return CounterSampler

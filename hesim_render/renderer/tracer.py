@@ -1,0 +1,210 @@
+"""Paths from mosaic pixels into the scene, in blocks of fixed size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.backend import jit
+from hesim_render.errors import RangeError
+from hesim_render.renderer._mitsuba import mitsuba
+from hesim_render.renderer.builder import build
+from hesim_render.renderer.camera import RayFactory, place_camera
+from hesim_render.renderer.sampler import sampler_class
+from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.rng import Stream, stream_key
+from hesim_render.scene import Scene
+from hesim_render.sensor import Sensor
+from hesim_render.spectra import Spectrum
+
+#: Work goes in blocks of these many rays: each new length compiles a kernel, and memory stays bounded.
+BLOCK_RAYS = (1 << 20, 1 << 17, 1 << 14)
+
+#: (mosaic index, u in [0, 1)) → the four wavelengths of a ray, nm.
+Wavelengths = Callable[[Any, Any], list[Any]]
+#: (mosaic index, radiance at those four) → the quantities to average.
+Values = Callable[[Any, Any], list[Any]]
+
+
+class PixelTracer:
+    """A scene, a placed camera and their random numbers; averages over each pixel's rays.
+
+    Parameters
+    ----------
+    scene, sensor : what and through what.
+    samples : rays per pixel, even; a half of them for each of two independent estimates.
+    seed : of the run.
+    responses : spectra that the scene must cover.
+    progress : called with the number of rays traced so far, after each block.
+    block_rays : sizes of the work blocks, largest first.
+
+    Raises
+    ------
+    SpecError
+        If the scene cannot be loaded or does not cover a response.
+    RangeError
+        If `samples` is odd, below 2 or larger than a block.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        samples: int,
+        seed: int,
+        responses: Mapping[str, Spectrum],
+        progress: Callable[[int], None] | None = None,
+        block_rays: tuple[int, ...] = BLOCK_RAYS,
+    ) -> None:
+        import drjit as dr
+
+        if samples < 2 or samples % 2:
+            raise RangeError("samples", samples, "an even number of rays per pixel, 2 or more")
+        if samples > block_rays[0]:
+            raise RangeError("samples", samples, f"at most {block_rays[0]} rays per pixel")
+        mi, types = mitsuba(), jit()
+        self.samples, self.progress = samples, progress
+        self._block_rays = tuple(size for size in block_rays if size >= samples)
+        self._rays_done = 0
+        self.built = build(mi, scene.spec, responses)
+        self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
+        moving = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
+        self.camera = next((trajectory for trajectory in moving if trajectory.moves), None)
+        mitsuba_scene = scene.spec.mitsuba
+        #: Factor from the scene's own radiance to W m⁻² sr⁻¹ nm⁻¹.
+        self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
+        self._posed_us: float | None = None
+        self._rays = RayFactory(self.view)
+        layout = self.view.sensor.layout
+        self._cols = dr.opaque(types.UInt32, layout.cols)
+        self._first_index = dr.opaque(types.UInt32, int(layout.full_index[0, 0]))
+        self._full_cols = dr.opaque(types.UInt32, layout.spec.geometry.cols)
+        self._key = dr.opaque(types.UInt64, stream_key(seed, Stream.RENDER))
+        self._sampler = sampler_class(mi.variant())()
+
+    @property
+    def pixel_count(self) -> int:
+        return self.view.sensor.rows * self.view.sensor.cols
+
+    def pose(self, t_us: float) -> None:
+        """Put moving objects at their place of `t_us`."""
+        if self.built.trajectories and t_us != self._posed_us:
+            self.built.pose(t_us)
+            self._posed_us = t_us
+
+    def trace(
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: ArrayLike,
+        end_us: ArrayLike,
+        wavelengths: Wavelengths,
+        values: Values,
+    ) -> list[tuple[Any, Any]]:
+        """Averages over the rays of each listed pixel, the camera moving through the pixel's own interval.
+
+        Returns
+        -------
+        For each of `values`: half_a, half_b, Dr.Jit Float [n] each.
+
+        Raises
+        ------
+        RangeError
+            If a pixel lies outside the region or an interval ends before it begins.
+        """
+        import drjit as dr
+
+        mitsuba()  # the variant may have been changed by other code
+        begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
+        if pixel.size and int(pixel.max()) >= self.pixel_count:
+            raise RangeError("pixel", int(pixel.max()), f"0 to {self.pixel_count - 1}, inside the region")
+        if not np.all(end >= begin):
+            raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
+        times = None
+        if self.camera is not None:
+            # wrapped on the host in double precision, pixel by pixel: no rounding depends on the others
+            local = self.camera.local_us(begin) if self.camera.repeat else begin - self.camera.knots_us[0]
+            times = [np.broadcast_to(v, pixel.shape).astype(np.float32) for v in (local, end - begin)]
+        parts: list[list[tuple[Any, Any]]] = []
+        for first, last, size in self._blocks(pixel.size):
+            spread = None if times is None else [values[first:last] for values in times]
+            parts.append(self._block(pixel[first:last], spread, size // self.samples, wavelengths, values))
+            self._rays_done += (last - first) * self.samples
+            if self.progress is not None:
+                self.progress(self._rays_done)
+        if len(parts) == 1:
+            return parts[0]
+        channels = range(len(parts[0]))
+        return [(dr.concat([p[k][0] for p in parts]), dr.concat([p[k][1] for p in parts])) for k in channels]
+
+    def _blocks(self, count: int) -> Iterator[tuple[int, int, int]]:
+        """First and last pixel and the ray count of each block; the last one is padded."""
+        first = 0
+        while first < count:
+            rays = (count - first) * self.samples
+            # the largest block that is filled at least by half, else the smallest
+            size = next((s for s in self._block_rays if 2 * rays > s), self._block_rays[-1])
+            last = min(count, first + size // self.samples)
+            yield first, last, size
+            first = last
+
+    def _block(
+        self,
+        pixels: NDArray[np.uint32],
+        times: list[NDArray[np.float32]] | None,
+        room: int,
+        wavelengths: Wavelengths,
+        values: Values,
+    ) -> list[tuple[Any, Any]]:
+        """Both halves of a few pixels; `room` pixels are traced, those beyond the list are masked."""
+        import drjit as dr
+
+        types = jit()
+        count, per_half = pixels.size, self.samples // 2
+
+        def by_lane(table: NDArray, kind: Any) -> Any:
+            return dr.gather(kind, kind(np.pad(table, (0, room - count))), lane)
+
+        ray = dr.arange(types.UInt32, room * self.samples)
+        lane = ray // self.samples
+        place = ray - lane * self.samples
+        half = dr.select(place >= per_half, types.UInt32(1), types.UInt32(0))
+        active = lane < dr.opaque(types.UInt32, count)
+        pixel = by_lane(pixels, types.UInt32)
+        spread = None if times is None else [by_lane(table, types.Float) for table in times]
+        quantities = self._rays_of(pixel, half, place - half * per_half, spread, active, wavelengths, values)
+        sums = [dr.block_sum(dr.select(active, quantity, 0.0), per_half) * (1 / per_half) for quantity in quantities]
+        dr.eval(*sums)
+        index = dr.arange(types.UInt32, count) * 2
+        halves = [(dr.gather(types.Float, s, index), dr.gather(types.Float, s, index + 1)) for s in sums]
+        dr.eval(halves)
+        return halves
+
+    def _rays_of(
+        self,
+        pixel: Any,
+        half: Any,
+        sample: Any,
+        spread: list[Any] | None,
+        active: Any,
+        wavelengths: Wavelengths,
+        values: Values,
+    ) -> list[Any]:
+        """The wanted quantities of one ray per lane."""
+        mi, types = self.built.mi, jit()
+        row = pixel // self._cols
+        col = pixel - row * self._cols
+        sampler = self._sampler
+        sampler.setup(self._key, self._first_index + row * self._full_cols + col, half, sample, self.samples // 2)
+        aperture, choice = sampler.next_2d(), sampler.next_2d()
+        blur = sampler.next_2d() if self._rays.has_psf else None
+        origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
+        if spread is not None:
+            assert self.camera is not None
+            origin, direction = self.camera.move(spread[0] + choice[1] * spread[1], origin, direction)
+        bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice[0]))
+        primary = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
+        radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary, active=active)
+        return values(pixel, radiance)

@@ -1,0 +1,183 @@
+"""Keyframed rigid poses: where an object or the camera is at any time."""
+
+from __future__ import annotations
+
+from math import degrees, radians
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.backend import jit
+from hesim_render.specs.scene import KeyframeSpec, TrackSpec
+
+Quaternion = NDArray[np.float64]  # w, x, y, z
+_EPSILON = 1e-12
+
+
+def _axis_angle(axis: NDArray[np.float64], angle_rad: NDArray[np.float64]) -> Quaternion:
+    """Quaternions [..., 4] of rotations about unit axes [..., 3]."""
+    half = np.asarray(angle_rad, dtype=np.float64)[..., None] / 2
+    return np.concatenate([np.cos(half), np.sin(half) * axis], axis=-1)
+
+
+def _multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """p · q: rotate by q, then by p."""
+    w = p[..., :1] * q[..., :1] - np.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)
+    v = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
+    return np.concatenate([w, v], axis=-1)
+
+
+def rotation_matrix(q: Quaternion) -> NDArray[np.float64]:
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_about(axis: ArrayLike, angle_deg: float) -> NDArray[np.float64]:
+    """Matrix [3, 3] of a right-handed turn by `angle_deg` about `axis` (any length but zero)."""
+    direction = np.asarray(axis, dtype=np.float64)
+    return rotation_matrix(_axis_angle(direction / np.linalg.norm(direction), np.array(radians(angle_deg))))
+
+
+def _unit(axis: ArrayLike) -> NDArray[np.float64]:
+    vector = np.asarray(axis, dtype=np.float64)
+    return vector / np.linalg.norm(vector)
+
+
+def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], float]:
+    """Axis and angle (rad, any number of turns) of the rotation that leads from one keyframe to the next."""
+    if start.rotation_deg == 0:
+        return _unit(end.rotation_axis), radians(end.rotation_deg)
+    if end.rotation_deg == 0:
+        return _unit(start.rotation_axis), -radians(start.rotation_deg)
+    a, b = _unit(start.rotation_axis), _unit(end.rotation_axis)
+    if abs(abs(a @ b) - 1) < 1e-9:
+        return a, radians(end.rotation_deg * np.sign(a @ b) - start.rotation_deg)
+    first = _axis_angle(a, np.array(radians(start.rotation_deg)))
+    second = _axis_angle(b, np.array(radians(end.rotation_deg)))
+    step = _multiply(second, first * np.array([1, -1, -1, -1]))
+    step = -step if step[0] < 0 else step  # the shorter of the two arcs
+    sine = float(np.linalg.norm(step[1:]))
+    if sine < _EPSILON:
+        return a, 0.0
+    return step[1:] / sine, 2 * float(np.arctan2(sine, step[0]))
+
+
+class Trajectory:
+    """A track evaluated: pose(t) = translate(T(t)) · pivot + R(t) · (x − pivot).
+
+    Between keyframes T is linear and R turns at constant angular speed: about the shared axis, any
+    number of turns, where both keyframes name the same axis (a rotation of 0 shares every axis);
+    along the shortest arc otherwise. Outside the keyframes the pose is held, or the track repeats
+    with the period from its first to its last keyframe.
+
+    Parameters
+    ----------
+    track : keyframes as written in the scene file, angles in degrees, lengths in metres.
+    """
+
+    def __init__(self, track: TrackSpec) -> None:
+        frames = track.keyframes
+        self.repeat = track.repeat
+        self.pivot_m = np.array(track.pivot_m, dtype=np.float64)
+        self.knots_us = np.array([frame.t_us for frame in frames], dtype=np.float64)
+        self.translation_m = np.array([frame.translation_m for frame in frames], dtype=np.float64)
+        arcs = [_arc(start, end) for start, end in zip(frames[:-1], frames[1:], strict=True)]
+        self.arc_axis = np.array([axis for axis, _ in arcs])
+        self.arc_rad = np.array([angle for _, angle in arcs])
+        self.start_rotation = np.array(
+            [_axis_angle(_unit(f.rotation_axis), np.array(radians(f.rotation_deg))) for f in frames[:-1]]
+        )
+        self._device: tuple[Any, ...] | None = None
+
+    @property
+    def period_us(self) -> float:
+        """From the first keyframe to the last."""
+        return float(self.knots_us[-1] - self.knots_us[0])
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose changes at all."""
+        return bool(np.any(np.ptp(self.translation_m, axis=0) > 0) or np.any(np.abs(self.arc_rad) > 0))
+
+    def local_us(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Time since the first keyframe, wrapped where the track repeats, else held to its ends."""
+        local = np.asarray(t_us, dtype=np.float64) - self.knots_us[0]
+        return np.mod(local, self.period_us) if self.repeat else np.clip(local, 0.0, self.period_us)
+
+    def matrix(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Pose at one or many times: 4×4 rigid matrices, shape [..., 4, 4] for times of shape [...]."""
+        local = self.local_us(t_us)
+        knots = self.knots_us - self.knots_us[0]
+        segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
+        share = (local - knots[segment]) / (knots[segment + 1] - knots[segment])
+        turn = _axis_angle(self.arc_axis[segment], share * self.arc_rad[segment])
+        rotation = rotation_matrix(_multiply(turn, self.start_rotation[segment]))
+        start = self.translation_m[segment]
+        translation = start + share[..., None] * (self.translation_m[segment + 1] - start)
+        pose = np.zeros((*local.shape, 4, 4))
+        pose[..., :3, :3] = rotation
+        pose[..., :3, 3] = translation + self.pivot_m - rotation @ self.pivot_m
+        pose[..., 3, 3] = 1.0
+        return pose
+
+    def move(self, local_us: Any, point: Any, direction: Any) -> tuple[Any, Any]:
+        """Pose applied per lane in Dr.Jit: a point and a direction at each lane's own time.
+
+        Parameters
+        ----------
+        local_us : Dr.Jit Float, time since the first keyframe as from `local_us`; it may run past the
+            end of the track by less than a period.
+        point, direction : Dr.Jit 3-vectors (any Array3f type), metres and unit length.
+        """
+        import drjit as dr
+
+        types = jit()
+        floats, integers = types.Float, types.UInt32
+        if self._device is None:
+            knots = self.knots_us - self.knots_us[0]
+            tables = (knots, self.arc_axis, self.arc_rad, self.start_rotation, self.translation_m)
+            self._device = tuple(floats(np.ascontiguousarray(table, dtype=np.float32).ravel()) for table in tables)
+            dr.eval(*self._device)
+            dr.make_opaque(*self._device)
+        knots, axis, angle, start, translation = self._device
+        count = self.knots_us.size
+        period = dr.gather(floats, knots, count - 1)
+        if self.repeat:
+            local_us = dr.select(local_us >= period, local_us - period * dr.floor(local_us / period), local_us)
+        local_us = dr.clip(local_us, 0, period)
+        after = dr.binary_search(1, count - 1, lambda i: dr.gather(floats, knots, integers(i)) <= local_us)
+        segment = integers(after) - 1
+        begin = dr.gather(floats, knots, segment)
+        share = (local_us - begin) / (dr.gather(floats, knots, segment + 1) - begin)
+        vector = type(point)
+
+        def three(table: Any, index: Any) -> Any:
+            return vector(*(dr.gather(floats, table, index * 3 + k) for k in range(3)))
+
+        sine, cosine = dr.sincos(share * dr.gather(floats, angle, segment) * 0.5)
+        turn_v = three(axis, segment) * sine
+        base_w = dr.gather(floats, start, segment * 4)
+        base_v = vector(*(dr.gather(floats, start, segment * 4 + k) for k in (1, 2, 3)))
+        w = cosine * base_w - dr.dot(turn_v, base_v)
+        v = cosine * base_v + base_w * turn_v + dr.cross(turn_v, base_v)
+
+        def turned(x: Any) -> Any:
+            x = vector(x)
+            twice = 2 * dr.cross(v, x)
+            return x + w * twice + dr.cross(v, twice)
+
+        first = three(translation, segment)
+        shift = first + share * (three(translation, segment + 1) - first)
+        pivot = vector(*(float(c) for c in self.pivot_m))
+        return turned(vector(point) - pivot) + pivot + shift, turned(direction)
+
+    def __repr__(self) -> str:
+        turns = degrees(float(np.sum(np.abs(self.arc_rad))))
+        return f"Trajectory({self.knots_us.size} keyframes, {self.period_us:g} µs, {turns:g}° in all)"
