@@ -1,0 +1,284 @@
+"""A capture set on disk: ``capture.yaml`` and the ``.npz`` files beside it, read as streams.
+
+Frames are decompressed one at a time, so a capture set larger than memory can be calibrated.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+
+from hesim_render.errors import SpecError
+from hesim_render.specs.files import Strict, load_yaml, validate
+from hesim_render.specs.sensor import SensorSpec, read_sensor
+
+_BROKEN = (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error)
+
+
+class SignalReference(Strict):
+    """Unit of the EVS signal: I = k · Φ · t_ref, in DN of this exposure seen through `filter`."""
+
+    k: PositiveFloat
+    t_ref_us: PositiveFloat
+    filter: str = "own"
+
+
+class Region(Strict):
+    """What part of the sensor was read out, in frame pixels; maps belong to it."""
+
+    x: NonNegativeInt
+    y: NonNegativeInt
+    width_px: PositiveInt
+    height_px: PositiveInt
+
+
+class CaptureSpec(Strict):
+    """``capture.yaml``."""
+
+    bit_depth: int = Field(ge=1, le=16)
+    tile_rows: PositiveInt
+    tile_cols: PositiveInt
+    notes: str = ""
+    sensor: str | None = None
+    roi: Region | None = Field(None, description="the whole sensor where it is left out")
+    theta_hardware_v: PositiveFloat | None = None
+    signal_reference: SignalReference | None = None
+    contrast_of: Literal["signal", "voltage"] = "signal"
+    evs_tile_rows: PositiveInt | None = Field(
+        None, description="event pixels of a tile, where they are not one a pixel"
+    )
+    evs_tile_cols: PositiveInt | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> CaptureSpec:
+        if (self.evs_tile_rows is None) != (self.evs_tile_cols is None):
+            raise ValueError("evs_tile_rows and evs_tile_cols are given together or not at all")
+        return self
+
+    @property
+    def full_scale_dn(self) -> int:
+        return 2**self.bit_depth - 1
+
+
+@dataclass(frozen=True)
+class CaptureSet:
+    """A folder of captures and what ``capture.yaml`` says of it."""
+
+    folder: Path
+    spec: CaptureSpec
+    sensor: SensorSpec | None
+
+    def frames(self, name: Literal["aps_dark", "aps_lit"]) -> FrameStack:
+        """The stack of frames in ``<name>.npz``, not yet read.
+
+        Raises
+        ------
+        SpecError
+            If it is missing, is not a stack of whole-number frames, or does not fit the tile.
+        """
+        return FrameStack(self._file(name), self.spec)
+
+    def arrays(self, name: str, required: tuple[str, ...]) -> dict[str, NDArray]:
+        """All arrays of a small ``.npz`` file.
+
+        Raises
+        ------
+        SpecError
+            If the file or one of the `required` arrays is missing, or cannot be read.
+        """
+        file = self._file(name)
+        try:
+            with np.load(file, allow_pickle=False) as data:
+                found = {key: data[key] for key in data.files}
+        except _BROKEN as error:
+            raise _unreadable(file, error) from None
+        _require(file, required, list(found))
+        return found
+
+    def has(self, name: str) -> bool:
+        return (self.folder / f"{name}.npz").is_file()
+
+    def _file(self, name: str) -> Path:
+        file = self.folder / f"{name}.npz"
+        if not file.is_file():
+            what = {
+                "aps_dark": "frames with the lens covered, at several exposures",
+                "aps_lit": "frames of a static scene of many brightnesses, at several exposures",
+                "evs_static": "counts of events of a static scene of many brightnesses and in the dark",
+            }.get(name, "this capture")
+            raise SpecError(f"no such file; capture {what}", file=file)
+        return file
+
+
+def read_captures(folder: str | Path) -> CaptureSet:
+    """The capture set in `folder`.
+
+    Raises
+    ------
+    SpecError
+        If the folder or ``capture.yaml`` is missing or wrong, or the named sensor has another tile.
+    """
+    path = Path(folder)
+    if not path.is_dir():
+        raise SpecError("no such folder of captures", file=path)
+    file = path / "capture.yaml"
+    if not file.is_file():
+        raise SpecError("no such file; it states bit_depth, tile_rows and tile_cols", file=file)
+    spec = validate(CaptureSpec, load_yaml(file), file, {})
+    sensor = None
+    if spec.sensor is not None:
+        beside = path / spec.sensor
+        sensor = read_sensor(beside if beside.is_file() else spec.sensor)
+        tile = len(sensor.tile_rows), len(sensor.tile_rows[0])
+        if tile != (spec.tile_rows, spec.tile_cols):
+            raise SpecError(
+                f"the tile is {spec.tile_rows}×{spec.tile_cols}, but that of sensor {sensor.name} is "
+                f"{tile[0]}×{tile[1]}",
+                file=file,
+                key="tile_rows",
+            )
+    return CaptureSet(path, spec, sensor)
+
+
+class FrameStack:
+    """``frames[exposure, frame, row, col]`` of a ``.npz`` file, read one frame at a time.
+
+    Attributes
+    ----------
+    exposures_us : int64 [exposure], as in the file.
+    shape : (exposures, frames, rows, cols).
+    """
+
+    def __init__(self, file: Path, spec: CaptureSpec) -> None:
+        self.file, self._full = file, spec.full_scale_dn
+        try:
+            with zipfile.ZipFile(file) as archive:
+                _require(file, ("frames", "exposures_us"), [Path(name).stem for name in archive.namelist()])
+                with archive.open("exposures_us.npy") as stream:
+                    exposures = np.lib.format.read_array(stream, allow_pickle=False)
+                with archive.open("frames.npy") as stream:
+                    self.shape, self._dtype = self._header(stream)
+        except SpecError:
+            raise
+        except _BROKEN as error:
+            raise _unreadable(file, error) from None
+        self.exposures_us = self._check(np.asarray(exposures), spec)
+
+    def _header(self, stream: IO[bytes]) -> tuple[tuple[int, int, int, int], np.dtype]:
+        shape, dtype = _read_header(stream, self.file)
+        if dtype.kind == "O":
+            raise SpecError(
+                "frames is an array of objects, as NumPy makes of frames of different sizes; all frames must be "
+                "[exposure, frame, row, col] of one size",
+                file=self.file,
+            )
+        if dtype.kind not in "ui":
+            raise SpecError(
+                f"frames holds {dtype.name}, not whole DN; save the RAW values as uint16, not scaled, averaged or "
+                "dark-subtracted ones",
+                file=self.file,
+            )
+        if len(shape) != 4 or 0 in shape:
+            raise SpecError(f"frames has shape {shape}; expected [exposure, frame, row, col]", file=self.file)
+        return shape, dtype
+
+    def _check(self, exposures: NDArray, spec: CaptureSpec) -> NDArray[np.int64]:
+        count, frames, rows, cols = self.shape
+        if exposures.shape != (count,):
+            raise SpecError(f"{exposures.size} exposures_us for {count} exposures in frames", file=self.file)
+        if exposures.dtype.kind not in "uif" or not np.all(exposures > 0):
+            raise SpecError("exposures_us must be numbers above 0, in microseconds", file=self.file)
+        if np.unique(exposures).size != count:
+            raise SpecError("exposures_us holds one exposure twice; put its frames together", file=self.file)
+        if count < 2:
+            raise SpecError(
+                "holds one exposure only, which cannot tell dark current from the fixed offset nor light from time; "
+                "capture at least 2 exposures, better 5 over a factor of 20",
+                file=self.file,
+            )
+        if frames < 8:
+            raise SpecError(
+                f"holds {frames} frames per exposure; a variance needs 8 at least, better 64", file=self.file
+            )
+        if rows % spec.tile_rows or cols % spec.tile_cols:
+            raise SpecError(
+                f"frames of {rows}×{cols} pixels are not whole tiles of {spec.tile_rows}×{spec.tile_cols}",
+                file=self.file,
+            )
+        return exposures.astype(np.int64)
+
+    def __iter__(self) -> Iterator[NDArray]:
+        """Frames [row, col] of all exposures in order; each is valid until the next is asked for."""
+        shape = self.shape[2:]
+        for frame in _stream(self.file, "frames", int(np.prod(self.shape[:2])), shape):
+            if int(frame.max()) > self._full or (self._dtype.kind == "i" and int(frame.min()) < 0):
+                raise SpecError(
+                    f"holds values outside 0 to {self._full}, the range of bit_depth in capture.yaml", file=self.file
+                )
+            yield frame
+
+
+def count_maps(captures: CaptureSet, name: str, member: str) -> Iterator[NDArray]:
+    """Maps [row, col] of a member [k, row, col], one at a time."""
+    file = captures.folder / f"{name}.npz"
+    try:
+        with zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
+            shape, _ = _read_header(stream, file)
+    except (KeyError, *_BROKEN) as error:
+        raise _unreadable(file, error) from None
+    if len(shape) != 3:
+        raise SpecError(f"{member} has shape {shape}; expected [contrast, row, col]", file=file)
+    yield from _stream(file, member, shape[0], shape[1:])
+
+
+def _stream(file: Path, member: str, count: int, shape: tuple[int, ...]) -> Iterator[NDArray]:
+    """`count` consecutive arrays of `shape` from a member, through one buffer."""
+    try:
+        with zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
+            _, dtype = _read_header(stream, file)
+            buffer = bytearray(int(np.prod(shape)) * dtype.itemsize)
+            for _ in range(count):
+                _fill(stream, memoryview(buffer))
+                yield np.frombuffer(buffer, dtype=dtype).reshape(shape)
+    except SpecError:
+        raise
+    except _BROKEN as error:
+        raise _unreadable(file, error) from None
+
+
+def _fill(stream: IO[bytes], view: memoryview, piece: int = 1 << 18) -> None:
+    filled = 0
+    while filled < len(view):
+        data = stream.read(min(piece, len(view) - filled))
+        if not data:
+            raise EOFError("the file ends early")
+        view[filled : filled + len(data)] = data
+        filled += len(data)
+
+
+def _read_header(stream: IO[bytes], file: Path) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran_order, dtype = read(stream)
+    if fortran_order and len(shape) > 1:
+        raise SpecError("arrays must be in C order (use numpy.ascontiguousarray before saving)", file=file)
+    return shape, dtype
+
+
+def _require(file: Path, required: tuple[str, ...], found: list[str]) -> None:
+    for name in required:
+        if name not in found:
+            raise SpecError(f"holds no array {name!r} (found: {', '.join(found) or 'none'})", file=file)
+
+
+def _unreadable(file: Path, error: BaseException) -> SpecError:
+    reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
+    return SpecError(f"cannot be read as an .npz file of plain arrays ({reason})", file=file)

@@ -1,0 +1,190 @@
+"""Event counts of a static scene: bad pixels, pooling by brightness, over-dispersion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+from scipy.stats import binom
+
+from hesim_render.calibrate.captures import CaptureSet
+from hesim_render.errors import SpecError
+
+_CHANCE = 1e-7
+
+
+@dataclass(frozen=True)
+class StaticCapture:
+    """``evs_static.npz``; maps [row, col] on the event grid.
+
+    Attributes
+    ----------
+    signal_dn : clean signal. n_on, n_off : counts of the lit scene. dark_n_on, dark_n_off : in the dark, or None.
+    position : number of each pixel's tile position. tile : event pixels of a tile, (rows, cols).
+    """
+
+    signal_dn: NDArray[np.float64]
+    n_on: NDArray[np.int64]
+    n_off: NDArray[np.int64]
+    dark_n_on: NDArray[np.int64] | None
+    dark_n_off: NDArray[np.int64] | None
+    trials: int
+    tile: tuple[int, int]
+
+    @property
+    def position(self) -> NDArray[np.int64]:
+        height, width = self.signal_dn.shape
+        rows, cols = np.ogrid[:height, :width]
+        return (rows % self.tile[0]) * self.tile[1] + cols % self.tile[1]
+
+    @property
+    def sessions(self) -> list[tuple[NDArray, NDArray, NDArray]]:
+        """(signal, ON, OFF) of the lit scene and, where there is one, of the dark."""
+        lit = [(self.signal_dn, self.n_on, self.n_off)]
+        if self.dark_n_on is None or self.dark_n_off is None:
+            return lit
+        return [*lit, (np.zeros_like(self.signal_dn), self.dark_n_on, self.dark_n_off)]
+
+
+def read_static(captures: CaptureSet) -> StaticCapture:
+    """Read and check ``evs_static.npz``.
+
+    Raises
+    ------
+    SpecError
+        If arrays are missing or do not fit each other, or the counts hold nothing to fit.
+    """
+    file = captures.folder / "evs_static.npz"
+    data = captures.arrays("evs_static", ("signal_dn", "n_on", "n_off", "n_trials"))
+    signal = np.asarray(data["signal_dn"])
+    if signal.ndim != 2 or signal.dtype.kind not in "uif":
+        raise SpecError(f"signal_dn has shape {signal.shape}; expected numbers [row, col]", file=file)
+    trials = _trials(data["n_trials"], file)
+    names = [name for name in ("n_on", "n_off", "dark_n_on", "dark_n_off") if name in data]
+    if len(names) == 3:
+        raise SpecError("dark_n_on and dark_n_off are given together or not at all", file=file)
+    for name in names:
+        counts = data[name]
+        if counts.shape != signal.shape:
+            raise SpecError(f"{name} is of size {counts.shape}, signal_dn of {signal.shape}", file=file)
+        if counts.dtype.kind not in "ui":
+            raise SpecError(f"{name} holds {counts.dtype.name}; save whole numbers of events", file=file)
+        if counts.min() < 0 or counts.max() > trials:
+            raise SpecError(f"{name} holds counts outside 0 to n_trials = {trials}", file=file)
+    maps = {name: data[name].astype(np.int64) for name in names}
+    total = sum(int(counts.sum()) for counts in maps.values())
+    if total == 0:
+        raise SpecError("holds no event at all; capture more trials, or lower the threshold", file=file)
+    if total > 0.98 * trials * signal.size * len(names) / 2:
+        raise SpecError(
+            "there is an event in nearly every trial, which tells nothing of the noise; raise the threshold", file=file
+        )
+    signal = signal.astype(np.float64)
+    if np.any(signal[np.isfinite(signal)] < 0) or not np.any(np.isfinite(signal)):
+        raise SpecError("signal_dn must be 0 or above (the clean light signal, black subtracted)", file=file)
+    return StaticCapture(
+        signal,
+        maps["n_on"],
+        maps["n_off"],
+        maps.get("dark_n_on"),
+        maps.get("dark_n_off"),
+        trials,
+        event_tile(captures, signal.shape),
+    )
+
+
+def _trials(value: NDArray, file: object) -> int:
+    if value.size != 1 or value.dtype.kind not in "uif" or value.item() < 1 or value.item() != int(value.item()):
+        raise SpecError("n_trials must be one whole number above 0", file=str(file))
+    return int(value.item())
+
+
+def event_tile(captures: CaptureSet, shape: tuple[int, ...]) -> tuple[int, int]:
+    """Event pixels of a tile: as the sensor or capture.yaml says, else from the sizes of the two grids.
+
+    Raises
+    ------
+    SpecError
+        If the event maps are not whole tiles.
+    """
+    spec = captures.spec
+    tile = spec.tile_rows, spec.tile_cols
+    if captures.sensor is not None and captures.sensor.evs_grid is not None:
+        tile = captures.sensor.evs_grid.rows_per_tile, captures.sensor.evs_grid.cols_per_tile
+    elif spec.evs_tile_rows is not None and spec.evs_tile_cols is not None:
+        tile = spec.evs_tile_rows, spec.evs_tile_cols
+    elif captures.has("aps_dark"):
+        frame = captures.frames("aps_dark").shape[2:]
+        if frame[0] * shape[1] == frame[1] * shape[0] and shape[0] * tile[0] % frame[0] == 0:
+            tile = tile[0] * shape[0] // frame[0], tile[1] * shape[1] // frame[1]
+    if 0 in tile or shape[0] % tile[0] or shape[1] % tile[1]:
+        raise SpecError(
+            f"event maps of {shape[0]}×{shape[1]} pixels are not whole tiles; state evs_tile_rows and evs_tile_cols in "
+            "capture.yaml",
+            file=captures.folder,
+        )
+    return tile
+
+
+def bad_event_pixels(static: StaticCapture) -> NDArray[np.bool_]:
+    """Pixels [row, col] whose counts no threshold within the spread of the others could give.
+
+    Pixels are compared with the mean of those of like brightness; the spread of thresholds is taken from
+    the middle of their distribution, so that the bad ones do not widen it. A pixel is bad where a
+    threshold 5 spreads (6 % at least) away would give its count with a chance below 1e-7.
+    """
+    bad = ~np.isfinite(static.signal_dn)
+    for signal, *both in static.sessions:
+        filled = np.where(bad, 0.0, signal)
+        edges = np.unique(np.quantile(filled.ravel()[:: _stride(filled)], np.linspace(0, 1, 25)))
+        group = np.searchsorted(edges[1:-1], filled, side="right")
+        for counts in both:
+            bad |= _outliers(counts, group, bad, static.trials)
+    return bad
+
+
+def _outliers(counts: NDArray, group: NDArray, bad: NDArray, trials: int) -> NDArray[np.bool_]:
+    outlying = bad.copy()
+    size = int(group.max()) + 1
+    for _ in range(6):
+        number = np.bincount(group[~outlying], minlength=size)
+        total = np.bincount(group[~outlying], weights=counts[~outlying], minlength=size)
+        rate = (total + 0.5) / (np.maximum(number, 1) * trials + 1)
+        u = np.maximum(-ndtri(np.minimum(rate, 0.5)), 0.05)
+        reach = max(0.06, 5 * _robust_spread(counts, group, outlying, trials, rate, u))
+        high, low = ndtr(-u * max(1 - reach, 0.0)), ndtr(-u * (1 + reach))
+        found = bad.copy()
+        # Only counts far off need the exact tail.
+        margin = 4.0
+        n, h, w = counts, (trials * high)[group], (trials * low)[group]
+        over, under = n > h + margin * np.sqrt(h), n < w - margin * np.sqrt(w)
+        found[over] |= binom.sf(n[over] - 1, trials, high[group[over]]) < _CHANCE
+        found[under] |= binom.cdf(n[under], trials, low[group[under]]) < _CHANCE
+        if np.array_equal(found, outlying):
+            break
+        outlying = found
+    return outlying
+
+
+def _stride(array: NDArray) -> int:
+    """Step through an array that leaves some 100,000 values: medians need no more. Odd, to visit all positions."""
+    return 2 * (array.size // 200_000) + 1
+
+
+def _robust_spread(counts: NDArray, group: NDArray, outlying: NDArray, trials: int, rate: NDArray, u: NDArray) -> float:
+    """Relative spread of thresholds beyond counting noise, from medians; groups of few events are left out."""
+    step = _stride(counts)
+    counts, group, outlying = counts.ravel()[::step], group.ravel()[::step], outlying.ravel()[::step]
+    spreads = []
+    for g in np.flatnonzero(trials * rate > 5):
+        values = counts[(group == g) & ~outlying]
+        if values.size < 50:
+            continue
+        threshold = -ndtri((values + 0.5) / (trials + 1))
+        middle = np.median(threshold)
+        robust = 1.4826 * np.median(np.abs(threshold - middle))
+        slope = np.exp(-0.5 * u[g] ** 2) / np.sqrt(2 * np.pi)
+        spreads.append((robust**2 - rate[g] / trials / slope**2) / u[g] ** 2)
+    return float(np.sqrt(max(np.median(spreads), 0.0))) if spreads else 0.0

@@ -1,0 +1,49 @@
+"""The main parameters of a calibration in a few lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_APS = {
+    "K": "K, system gain",
+    "read_noise_e": "read noise",
+    "dark_current_e_per_s": "dark current",
+    "full_well_e": "saturation capacity",
+    "dsnu_e": "DSNU",
+    "prnu_percent": "PRNU",
+    "linearity_error": "linearity error",
+}
+_EVS = {
+    **{name: name for name in "ABCD"},
+    "theta_on": "θ₊",
+    "theta_off": "θ₋",
+    "threshold_mismatch": "threshold mismatch",
+    "leak_per_trial": "leak per trial",
+}
+
+
+def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
+    """One line a parameter, with its 95 % interval or the reason why it is not known.
+
+    Parameters
+    ----------
+    calibration : from `read_calibration`.
+    section : ``aps`` or ``evs``.
+    """
+    content = calibration[section]
+    lines = [_line(text, content[key]) for key, text in (_APS if section == "aps" else _EVS).items()]
+    if section == "aps":
+        values = [c for row in content["goodness"]["chi2_per_dof"] for c in row if c is not None]
+        lines.append(f"{'β, χ²/dof':<20} {min(values):.3f} to {max(values):.3f} over {len(values)} tile positions")
+    else:
+        lines.append(f"{'shot law':<20} {content['shot_law']}; χ²/dof {content['goodness']['chi2_per_dof']:.3f}")
+    return [*lines, f"{'bad pixels':<20} {content['bad_pixels']}"]
+
+
+def _line(text: str, item: Mapping[str, Any]) -> str:
+    if item["value"] is None:
+        return f"{text:<20} not identifiable: {item['reason']}"
+    interval = item.get("interval_95")
+    between = f" ({interval[0]:.5g} to {interval[1]:.5g})" if interval else ""
+    return " ".join([f"{text:<20} {item['value']:.5g}{between}", item.get("unit", ""), item.get("note", "")]).rstrip()
