@@ -1,0 +1,126 @@
+"""Colour correction: a matrix from the camera's channels to linear sRGB, fitted from a chart and judged in ΔE2000."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.errors import RangeError
+from hesim_render.isp.bands import in_bands
+
+
+@dataclass(frozen=True)
+class ColourFit:
+    """A matrix and how well it does on the patches it was fitted from.
+
+    Parameters
+    ----------
+    matrix : [3][channel], balanced channels to linear sRGB; rows sum to 1.
+    exposure : factor of the channels that goes with the references' scale.
+    delta_e_2000 : [patch].
+    """
+
+    matrix: list[list[float]]
+    exposure: float
+    delta_e_2000: list[float]
+
+    @property
+    def mean_delta_e(self) -> float:
+        return float(np.mean(self.delta_e_2000))
+
+    @property
+    def max_delta_e(self) -> float:
+        return float(np.max(self.delta_e_2000))
+
+
+def colour_matrix(image: NDArray[np.float32], matrix: ArrayLike) -> NDArray[np.float32]:
+    """Linear RGB [row, col, 3] (a view of planes) of balanced channels [row, col, channel]."""
+    weights = np.asarray(matrix, dtype=np.float32)
+    if weights.shape != (3, image.shape[2]):
+        raise RangeError("shape of the colour matrix", weights.shape, f"(3, {image.shape[2]})")
+    out = np.empty((3, *image.shape[:2]), dtype=np.float32)
+
+    def work(rows: slice) -> None:
+        scratch = np.empty((rows.stop - rows.start, image.shape[1]), dtype=np.float32)
+        for channel in range(3):
+            np.multiply(image[rows, :, 0], weights[channel, 0], out=out[channel, rows])
+            for other in range(1, image.shape[2]):
+                np.multiply(image[rows, :, other], weights[channel, other], out=scratch)
+                out[channel, rows] += scratch
+
+    in_bands(image.shape[0], work)
+    return np.moveaxis(out, 0, -1)
+
+
+def fit_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
+    """The matrix, with rows that sum to 1 so that white stays white, of least mean ΔE2000.
+
+    Starts from least squares in linear light (Cheung et al. 2004, with the white constraint) and minimises
+    the mean ΔE2000 from there; where that does not help the least squares stay.
+
+    Parameters
+    ----------
+    patches : [patch, channel], linear, black at 0, white-balanced, any exposure.
+    reference : [patch, 3], linear sRGB.
+
+    Raises
+    ------
+    RangeError
+        If there are fewer patches than channels, or the shapes do not fit.
+    """
+    from scipy.optimize import minimize
+
+    camera, target = np.asarray(patches, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    if camera.ndim != 2 or target.shape != (len(camera), 3) or len(camera) < max(3, camera.shape[1]):
+        raise RangeError("shape of patches and reference", (camera.shape, target.shape), "(n, channels) and (n, 3)")
+    # the exposure that goes with the reference: what a single factor for all would be, on the sum of the channels
+    exposure = float((camera.mean(axis=1) @ target.mean(axis=1)) / (camera.mean(axis=1) @ camera.mean(axis=1)))
+    free = _constrained_least_squares(exposure * camera, target)
+    start = np.append(free.ravel(), 1.0)
+
+    def unpack(values: NDArray) -> tuple[NDArray, float]:
+        return _with_unit_rows(values[:-1].reshape(3, -1)), exposure * values[-1]
+
+    def loss(values: NDArray) -> float:
+        matrix, scale = unpack(values)
+        return float(delta_e_2000(scale * camera @ matrix.T, target).mean())
+
+    best = start
+    if camera.shape[1] > 1:
+        found = minimize(loss, start, method="Powell", options={"maxiter": 20, "xtol": 1e-4, "ftol": 1e-5})
+        best = found.x if found.fun < loss(start) else start
+    matrix, scale = unpack(best)
+    return ColourFit(matrix.tolist(), scale, delta_e_2000(scale * camera @ matrix.T, target).tolist())
+
+
+def _constrained_least_squares(camera: NDArray, target: NDArray) -> NDArray[np.float64]:
+    """Columns but the first of the matrix [3, channel] whose rows sum to 1, by least squares."""
+    found, *_ = np.linalg.lstsq(camera[:, 1:] - camera[:, :1], target - camera[:, :1], rcond=None)
+    return found.T
+
+
+def _with_unit_rows(free: NDArray) -> NDArray[np.float64]:
+    return np.concatenate([1 - free.sum(axis=1, keepdims=True), free], axis=1)
+
+
+def delta_e_2000(linear_a: ArrayLike, linear_b: ArrayLike) -> NDArray[np.float64]:
+    """ΔE2000 (CIE 142-2001) between linear sRGB values [..., 3], under sRGB's own white."""
+    return _colour().delta_E(_lab(linear_a), _lab(linear_b), method="CIE 2000")
+
+
+def _lab(linear: ArrayLike) -> NDArray[np.float64]:
+    colour = _colour()
+    space = colour.RGB_COLOURSPACES["sRGB"]
+    xyz = np.asarray(linear, dtype=np.float64) @ space.matrix_RGB_to_XYZ.T
+    return colour.XYZ_to_Lab(xyz, space.whitepoint)
+
+
+def _colour():
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it tells which optional packages are not installed
+        import colour
+    return colour

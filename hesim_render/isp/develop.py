@@ -1,0 +1,118 @@
+"""Pictures of all frames of a recording, in a folder that appears whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render import manifest as manifests
+from hesim_render.errors import RangeError, SpecError
+from hesim_render.isp.camera import Camera
+from hesim_render.isp.pipeline import PICTURE, Pipeline, develop
+from hesim_render.layout import Layout
+from hesim_render.optics import Lens, relative_illumination
+from hesim_render.output import OutputFolder, output_errors
+from hesim_render.recording import Recording
+from hesim_render.specs.sensor import SensorSpec
+
+#: File that tells a folder of pictures.
+MARKER = "isp.json"
+
+
+def develop_recording(
+    folder: str | Path,
+    out: str | Path | None = None,
+    pipeline: Pipeline | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a picture of every frame of a recording, and ``isp.json`` with how they were made.
+
+    Depth 8 gives PNG; depth 16, and float32 where there is no encode step or it says ``float``, give TIFF. An
+    automatic exposure is measured on the middle frame and kept for all, so that a sequence does not flicker.
+
+    Parameters
+    ----------
+    out : folder to write; default beside the recording, its name with ``-pictures``.
+    pipeline : default `PICTURE`.
+    progress : called with (done, total, what).
+    overwrite : replace an earlier folder of pictures.
+
+    Returns
+    -------
+    Path : the folder of pictures.
+
+    Raises
+    ------
+    SpecError
+        If it is no recording, or has no frames.
+    OutputError
+        If the pictures cannot be written.
+    """
+    recording = Recording.load(folder)
+    if recording.path is None or len(recording.frames) == 0:
+        raise SpecError("the recording has no frames", file=str(folder))
+    chain = pipeline or PICTURE
+    camera = Camera.of(recording.mosaic)
+    target = OutputFolder(out or recording.path.with_name(f"{recording.path.name}-pictures"), MARKER, overwrite)
+    illumination = _illumination(recording) if any(item.step == "lens_shading" for item in chain.steps) else None
+    total = len(recording.frames)
+    try:
+        gain, entries = None, []
+        if any(item.step == "exposure" and item.auto for item in chain.steps):
+            gain = develop(recording.frames[total // 2], camera, chain, illumination=illumination).exposure_gain
+        for number, frame in enumerate(recording.frames):
+            done = develop(frame, camera, chain, illumination=illumination, exposure_gain=gain)
+            name = f"{number:06d}.png" if done.image.dtype == np.uint8 else f"{number:06d}.tif"
+            with output_errors(target.target):
+                write_picture(target.path / name, done.image)
+            entries.append({"file": name, "t_us": frame.t_us, **(done.report or {})})
+            if progress is not None:
+                progress(number + 1, total, "pictures")
+        about = {
+            "schema_version": 1,
+            "recording": recording.path.name,
+            "pipeline": chain.model_dump(mode="json", exclude_none=True),
+            "camera": camera.model_dump(mode="json"),
+            "software": manifests.software_versions(),
+            "pictures": entries,
+        }
+        with output_errors(target.target):
+            (target.path / MARKER).write_text(manifests.to_text(about) + "\n", encoding="utf-8")
+        return target.commit()
+    except BaseException:
+        target.discard()
+        raise
+
+
+def write_picture(path: Path, picture: NDArray) -> None:
+    """Write [row, col, 3]: uint8 as PNG or TIFF, uint16 and float32 as TIFF.
+
+    Raises
+    ------
+    RangeError
+        If the file name's ending does not go with the depth.
+    """
+    if path.suffix == ".png":
+        from PIL import Image
+
+        if picture.dtype != np.uint8:
+            raise RangeError("picture file", path.name, "a .tif file for 16 bit and float")
+        Image.fromarray(np.ascontiguousarray(picture)).save(path, compress_level=3)
+        return
+    if path.suffix not in (".tif", ".tiff"):
+        raise RangeError("picture file", path.name, "a name ending in .png or .tif")
+    import tifffile
+
+    tifffile.imwrite(path, np.ascontiguousarray(picture), photometric="rgb", metadata=None)
+
+
+def _illumination(recording: Recording) -> NDArray[np.float32]:
+    """Relative illumination of the recording's own lens over its region, as the manifest describes them."""
+    spec = SensorSpec.model_validate(recording.manifest["sensor"]["spec"])
+    roi, used = recording.manifest["roi"], recording.manifest["lens"]
+    layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
+    return relative_illumination(layout, Lens(used["f_number"], used["focal_length_mm"], used["magnification"]))

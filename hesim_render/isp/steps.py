@@ -1,0 +1,281 @@
+"""The steps of a pipeline as a file has them: one model per step, which calls the step's function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator
+
+from hesim_render.errors import SpecError
+from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
+from hesim_render.isp.camera import Camera
+from hesim_render.isp.demosaicing import demosaic
+from hesim_render.isp.transfer import Depth, Transfer, encode
+from hesim_render.specs.files import Strict
+
+Corners = Annotated[list[tuple[float, float]], Field(min_length=4, max_length=4)]
+
+
+@dataclass
+class Development:
+    """An image on its way through a pipeline.
+
+    Parameters
+    ----------
+    image : [row, col] before the demosaic, [row, col, channel] after it.
+    camera : the camera that took it; steps without figures of their own take the camera's.
+    tile : channel numbers of the mosaic as it is now (holes get filled).
+    illumination : relative illumination of the lens [row, col], where it is known.
+    exposure_gain : gain of an automatic exposure, kept so that all frames of a recording get the same.
+    report : what steps found out (gains, ΔE2000).
+    """
+
+    image: NDArray
+    camera: Camera
+    tile: NDArray[np.int64]
+    illumination: NDArray[np.float32] | None = None
+    exposure_gain: float | None = None
+    report: dict[str, Any] | None = None
+
+    def note(self, **found: Any) -> None:
+        self.report = {**(self.report or {}), **found}
+
+
+class MapFile(Strict):
+    """A map in an NPY file, or a named array of an NPZ file, relative to the pipeline's file."""
+
+    file: Path
+    name: str | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _beside_the_pipeline(cls, given: Path, info: ValidationInfo) -> Path:
+        return Path((info.context or {}).get("folder", Path())) / given
+
+    def load(self) -> NDArray:
+        """The array.
+
+        Raises
+        ------
+        SpecError
+            If it cannot be read.
+        """
+        try:
+            found = np.load(self.file, allow_pickle=False)
+            if isinstance(found, np.ndarray):
+                return found
+            with found:
+                if self.name not in found.files:
+                    raise SpecError(f"no array {self.name!r}; it has {', '.join(found.files)}", file=self.file)
+                return found[self.name]
+        except (OSError, ValueError, EOFError) as error:
+            if isinstance(error, SpecError):
+                raise
+            raise SpecError(f"cannot be read ({error})", file=self.file) from None
+
+
+class BlackLevel(Strict):
+    """`levels.black_level`; without figures those of the camera."""
+
+    step: Literal["black_level"]
+    black_level_dn: float | None = None
+    white_level_dn: float | None = None
+    row_map: MapFile | None = None
+    pixel_map: MapFile | None = None
+
+    def run(self, state: Development) -> None:
+        black = state.camera.black_level_dn if self.black_level_dn is None else self.black_level_dn
+        white = state.camera.white_level_dn if self.white_level_dn is None else self.white_level_dn
+        rows, pixels = (None if m is None else m.load() for m in (self.row_map, self.pixel_map))
+        state.image = levels.black_level(state.image, black, white, rows, pixels)
+
+
+class Fill(Strict):
+    """`fill`: bad pixels, and positions without a value unless the demosaic is to bridge them."""
+
+    step: Literal["fill"]
+    event_pixels: bool = False
+    bad_pixels: MapFile | None = None
+
+    def run(self, state: Development) -> None:
+        if self.bad_pixels is not None:
+            state.image = fill.fill_pixels(state.image, state.tile, self.bad_pixels.load().astype(bool))
+        filled = state.camera.filled_tile
+        if self.event_pixels and not np.array_equal(filled, state.tile):
+            state.image = fill.fill_positions(state.image, state.tile, filled)
+            state.tile = filled
+
+
+class LensShading(Strict):
+    """`levels.lens_shading` by the recording's own lens, a map, or cos⁴ of a focal length."""
+
+    step: Literal["lens_shading"]
+    map: MapFile | None = None
+    focal_length_px: float | None = Field(None, gt=0)
+    centre_px: tuple[float, float] | None = None
+
+    def run(self, state: Development) -> None:
+        if self.map is not None:
+            illumination = self.map.load()
+        elif self.focal_length_px is not None:
+            illumination = levels.cos4_illumination(state.image.shape, self.focal_length_px, self.centre_px)
+        elif state.illumination is not None:
+            illumination = state.illumination
+        else:
+            raise SpecError("no lens is known here; give map or focal_length_px", key="lens_shading")
+        state.image = levels.lens_shading(state.image, illumination)
+
+
+class WhiteBalance(Strict):
+    """`balance.white_balance` with the camera's gains, given ones, grey world, or a ColorChecker's grey patches."""
+
+    step: Literal["white_balance"]
+    method: Literal["camera", "given", "grey_world", "chart"] = "camera"
+    gains: list[float] | None = None
+    corners: Corners | None = None
+    clip: bool = True
+
+    def run(self, state: Development) -> None:
+        gains = self._gains(state)
+        state.note(white_balance=[float(gain) for gain in gains])
+        state.image = balance.white_balance(state.image, state.tile, gains, self.clip)
+
+    def _gains(self, state: Development) -> list[float]:
+        if self.method == "camera":
+            return state.camera.white_balance
+        if self.method == "grey_world":
+            return balance.grey_world(state.image, state.tile)
+        if self.method == "given":
+            if self.gains is None:
+                raise SpecError("is required by method given", key="white_balance.gains")
+            return self.gains
+        if self.corners is None:
+            raise SpecError("is required by method chart", key="white_balance.corners")
+        return balance.from_neutral(chart.patch_means(_by_channel(state), self.corners)[chart.NEUTRAL])
+
+
+def _by_channel(state: Development) -> NDArray[np.float32]:
+    """A mosaic as [row, col, channel] with NaN where a channel has no sample."""
+    periods = zip(state.image.shape, state.tile.shape, strict=True)
+    channel = state.tile[np.ix_(*(np.arange(size) % period for size, period in periods))]
+    count = len(state.camera.channels)
+    return np.where(channel[..., None] == np.arange(count), state.image[..., None], np.float32(np.nan))
+
+
+class Demosaic(Strict):
+    """`demosaicing.demosaic`."""
+
+    step: Literal["demosaic"]
+    method: Literal["guided", "linear"] = "guided"
+
+    def run(self, state: Development) -> None:
+        state.image = demosaic(state.image, state.tile, self.method)
+
+
+class NoiseReduction(Strict):
+    """`smooth.reduce_noise`."""
+
+    step: Literal["noise_reduction"]
+    luma: float = Field(0.005, ge=0)
+    chroma: float = Field(0.02, ge=0)
+    radius_px: int = Field(3, ge=1, le=50)
+
+    def run(self, state: Development) -> None:
+        state.image = smooth.reduce_noise(state.image, self.luma, self.chroma, self.radius_px)
+
+
+class ColourMatrix(Strict):
+    """`colour.colour_matrix` with the camera's matrix, a given one, or one fitted from a ColorChecker in the image."""
+
+    step: Literal["colour_matrix"]
+    method: Literal["camera", "given", "chart"] = "camera"
+    matrix: list[list[float]] | None = None
+    corners: Corners | None = None
+    illuminant: str = "D65"
+
+    def run(self, state: Development) -> None:
+        matrix = state.camera.matrix
+        if self.method == "given":
+            if self.matrix is None:
+                raise SpecError("is required by method given", key="colour_matrix.matrix")
+            matrix = self.matrix
+        elif self.method == "chart":
+            if self.corners is None:
+                raise SpecError("is required by method chart", key="colour_matrix.corners")
+            from hesim_render import spectra
+
+            reference = chart.reference_linear_srgb(spectra.illuminant(self.illuminant))
+            found = colour.fit_matrix(chart.patch_means(state.image, self.corners), reference)
+            matrix = found.matrix
+            state.note(matrix=matrix, mean_delta_e_2000=found.mean_delta_e, max_delta_e_2000=found.max_delta_e)
+        state.image = colour.colour_matrix(state.image, matrix)
+
+
+class Exposure(Strict):
+    """`tone.exposure`: a given gain, or (``auto``) the one that brings the brightest half percent to white."""
+
+    step: Literal["exposure"]
+    gain: float = Field(1.0, gt=0)
+    auto: bool = False
+    percentile: float = Field(99.5, gt=0, le=100)
+    level: float = Field(0.95, gt=0)
+
+    def run(self, state: Development) -> None:
+        gain = self.gain
+        if self.auto:
+            if state.exposure_gain is None:
+                state.exposure_gain = tone.auto_gain(state.image, self.percentile, self.level)
+            gain *= state.exposure_gain
+        state.note(exposure_gain=gain)
+        state.image = tone.exposure(state.image, gain)
+
+
+class Tone(Strict):
+    """`tone.tone_global` or `tone.tone_local`."""
+
+    step: Literal["tone"]
+    method: Literal["global", "local"] = "global"
+    white: float = Field(4.0, gt=0)
+    compression: float = Field(0.6, gt=0, le=1)
+    detail: float = Field(1.0, ge=0, le=4)
+    radius_px: int = Field(16, ge=1, le=500)
+
+    def run(self, state: Development) -> None:
+        if self.method == "global":
+            state.image = tone.tone_global(state.image, self.white)
+        else:
+            state.image = tone.tone_local(state.image, self.compression, self.detail, self.radius_px)
+
+
+class Encode(Strict):
+    """`transfer.encode`; without a transfer the camera's."""
+
+    step: Literal["encode"]
+    transfer: Transfer | None = None
+    gamma: float | None = Field(None, gt=0)
+    depth: Depth = 8
+
+    def run(self, state: Development) -> None:
+        curve = self.transfer or state.camera.transfer
+        state.image = encode(state.image, curve, self.gamma or state.camera.gamma, self.depth)
+
+
+Step = Annotated[
+    BlackLevel
+    | Fill
+    | LensShading
+    | WhiteBalance
+    | Demosaic
+    | NoiseReduction
+    | ColourMatrix
+    | Exposure
+    | Tone
+    | Encode,
+    Field(discriminator="step"),
+]
+#: Where a step may stand: on the mosaic (before the demosaic) or on the picture (after it).
+ON_MOSAIC = (BlackLevel, Fill, LensShading, WhiteBalance)
