@@ -1,0 +1,300 @@
+"""One run: a source of flux, a sensor, a stretch of time; out come frames, events and their truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.backend import jit
+from hesim_render.crosstalk import with_crosstalk
+from hesim_render.errors import RangeError
+from hesim_render.evs import EvsStage
+from hesim_render.flux import FluxSource
+from hesim_render.frame import Frame
+from hesim_render.noise.aps import APS_TERMS, ApsNoise
+from hesim_render.noise.evs import EVS_TERMS, EvsNoise
+from hesim_render.schedule import Exposure, exposures, ticks_us
+from hesim_render.sensor import Sensor
+from hesim_render.units import S_PER_US
+
+#: Called with (done, total, what): µs of simulated time, or rays while a static scene renders.
+Progress = Callable[[float, float, str], None]
+
+
+def noise_models(
+    sensor: Sensor, clean: bool = False, without: Sequence[str] = ()
+) -> tuple[ApsNoise | None, EvsNoise | None]:
+    """Both noise models with terms switched off.
+
+    Parameters
+    ----------
+    clean : all terms off.
+    without : names such as ``aps.read`` or ``evs.leak``; see `APS_TERMS` and `EVS_TERMS`.
+
+    Raises
+    ------
+    RangeError
+        For a name that is not a term.
+    """
+    known = [f"aps.{term}" for term in APS_TERMS] + [f"evs.{term}" for term in EVS_TERMS]
+    for name in without:
+        if name not in known:
+            raise RangeError("noise term", name, f"one of {', '.join(known)}")
+    aps = sensor.aps if sensor.spec.aps is not None else None
+    evs = sensor.evs if sensor.spec.evs is not None else None
+    if aps is not None:
+        aps = aps.clean() if clean else aps.without(*[n[4:] for n in without if n.startswith("aps.")])
+    if evs is not None:
+        evs = evs.clean() if clean else evs.without(*[n[4:] for n in without if n.startswith("evs.")])
+    return aps, evs
+
+
+@dataclass
+class _OpenFrame:
+    """A frame being exposed: both halves of its electrons, one entry per frame pixel."""
+
+    exposure: Exposure
+    half_a: Any
+    half_b: Any
+
+
+class Capture:
+    """Drives the stages over time, holding one slice of flux and the frames in exposure.
+
+    Parameters
+    ----------
+    flux : where Φ comes from.
+    sensor : region and lens as `flux` uses them.
+    aps, evs : noise models, from `noise_models`.
+    duration_us : length of the run.
+    seed : of all temporal noise.
+    """
+
+    def __init__(
+        self,
+        flux: FluxSource,
+        sensor: Sensor,
+        aps: ApsNoise | None,
+        evs: EvsNoise | None,
+        duration_us: int,
+        seed: int,
+    ) -> None:
+        self._flux, self._sensor, self._aps, self._seed = flux, sensor, aps, seed
+        self._duration_us = duration_us
+        layout = sensor.layout
+        # the source as frame and as event pixels see it: one, but where crosstalk is off for one of them
+        sources = {n.crosstalk: with_crosstalk(flux, layout.shape, n.crosstalk) for n in (aps, evs) if n is not None}
+        self._frame_source, self._event_source = (
+            sources[noise.crosstalk] if noise is not None else next(iter(sources.values()), flux)
+            for noise in (aps, evs)
+        )
+        none = np.empty(0, np.uint32)
+        self._aps_pixel = np.flatnonzero(layout.aps_mask).astype(np.uint32) if aps is not None else none
+        self._aps_row = self._aps_pixel // layout.cols
+        self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else none
+        self._exposures = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
+        self._stage = EvsStage(evs, seed) if evs is not None else None
+        self._samples = self._evs_samples() if evs is not None else np.empty(0, np.int64)
+        self._event_flux = EventFlux(self._evs_pixel.size)
+
+    @property
+    def event_flux(self) -> EventFlux:
+        """Mean noise-free flux of the event pixels over all samples taken so far."""
+        return self._event_flux
+
+    @property
+    def events_dropped(self) -> int:
+        """Events lost in the sensor's read-out so far."""
+        return self._stage.dropped if self._stage is not None else 0
+
+    def _evs_samples(self) -> NDArray[np.int64]:
+        """Times at which the event pixels are sampled: the sensor's ticks, or the source's own pace."""
+        assert self._stage is not None
+        spec = self._stage.noise.spec
+        if spec.reference == "previous_sample":
+            return ticks_us(spec, self._duration_us)
+        inner = np.rint(self._flux.sample_times_us(0, self._duration_us)).astype(np.int64)
+        first = np.array([spec.window_us], dtype=np.int64)
+        times = np.unique(np.concatenate([first, inner, [self._duration_us]]))
+        return times[(times >= spec.window_us) & (times <= self._duration_us)]
+
+    def run(self, progress: Progress | None = None) -> Iterator[Frame | NDArray]:
+        """Frames and blocks of events (`EVENT_DTYPE`), each kind in order of time."""
+        if self._flux.is_static:
+            yield from self._run_static(progress)
+            return
+        edges = self._flux.slice_edges_us(0, self._duration_us)
+        bounds = np.concatenate([[0.0], edges, [float(self._duration_us)]])
+        waiting, open_frames = list(self._exposures), []
+        window = _Window()
+        for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
+            while waiting and waiting[0].start_us < end:
+                open_frames.append(self._open(waiting.pop(0)))
+            for frame in open_frames:
+                self._expose(frame, begin, end)
+            while open_frames and open_frames[0].exposure.end_us <= end:
+                yield self._read_out(open_frames.pop(0))
+            yield from self._sample_events(window, begin, end)
+            if progress is not None:
+                progress(end, self._duration_us, "simulated µs")
+
+    def _run_static(self, progress: Progress | None) -> Iterator[Frame | NDArray]:
+        """A scene that stands still: its flux is rendered once and serves all times."""
+        frame_pixel = self._aps_pixel if self._exposures else np.empty(0, np.uint32)
+        if self._frame_source is self._event_source:
+            (frame_a, frame_b), (event_a, event_b) = self._static_flux(self._frame_source, frame_pixel, self._evs_pixel)
+        else:
+            ((frame_a, frame_b),) = self._static_flux(self._frame_source, frame_pixel)
+            ((event_a, event_b),) = self._static_flux(self._event_source, self._evs_pixel)
+        for exposure in self._exposures:
+            seconds = exposure.exposure_us * S_PER_US
+            yield self._read_out(_OpenFrame(exposure, frame_a * seconds, frame_b * seconds))
+        if self._stage is None:
+            return
+        self._event_flux.add(event_a, event_b)
+        for t_us in self._samples:
+            yield self._step(event_a, event_b, int(t_us))
+            if progress is not None:
+                progress(float(t_us), self._duration_us, "simulated µs")
+
+    def _static_flux(self, source: FluxSource, *lists: NDArray[np.uint32]) -> Iterator[tuple[Any, Any]]:
+        """Both halves of the flux of each list of pixels, from one render of all of them."""
+        wanted = np.zeros(self._sensor.rows * self._sensor.cols, dtype=bool)
+        for pixels in lists:
+            wanted[pixels] = True
+        place = np.cumsum(wanted) - 1  # of each mosaic pixel among the wanted
+        halves = source.mean_flux(np.flatnonzero(wanted).astype(np.uint32), 0.0, float(self._duration_us))
+        for pixels in lists:
+            yield _take(halves[0], place[pixels]), _take(halves[1], place[pixels])
+
+    def _open(self, exposure: Exposure) -> _OpenFrame:
+        import drjit as dr
+
+        types = jit()
+        count = self._aps_pixel.size
+        return _OpenFrame(exposure, dr.zeros(types.Float, count), dr.zeros(types.Float, count))
+
+    def _expose(self, frame: _OpenFrame, begin_us: float, end_us: float) -> None:
+        """Add the part of each row's exposure that lies in one slice."""
+        import drjit as dr
+
+        starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
+        first = np.maximum(starts, begin_us)
+        last = np.minimum(starts + frame.exposure.exposure_us, end_us)
+        where = np.flatnonzero((last > first)[self._aps_row])
+        if where.size == 0:
+            return
+        rows = self._aps_row[where]
+        half_a, half_b = self._frame_source.mean_flux(self._aps_pixel[where], first[rows], last[rows])
+        types = jit()
+        seconds = types.Float(((last - first)[rows] * S_PER_US).astype(np.float32))
+        index = types.UInt32(where.astype(np.uint32))
+        for total, half in ((frame.half_a, half_a), (frame.half_b, half_b)):
+            # every index occurs once, so this is no race and the sum's order is that of time
+            dr.scatter(total, dr.gather(types.Float, total, index) + half * seconds, index)
+        dr.eval(frame.half_a, frame.half_b)
+
+    def _sample_events(self, window: _Window, begin_us: float, end_us: float) -> Iterator[NDArray]:
+        """Event samples whose windows meet one slice; a window may straddle several slices."""
+        if self._stage is None:
+            return
+        length = self._stage.noise.spec.window_us
+        while window.next < len(self._samples):
+            t_us = int(self._samples[window.next])
+            first, last = max(t_us - length, begin_us), min(t_us, end_us)
+            if t_us - length >= end_us:
+                return
+            if last > first:
+                half_a, half_b = self._event_source.mean_flux(self._evs_pixel, first, last)
+                window.add(half_a, half_b, (last - first) / length)
+            if t_us > end_us:
+                return
+            self._event_flux.add(window.half_a, window.half_b)
+            yield self._step(window.half_a, window.half_b, t_us)
+            window.reset()
+
+    def _step(self, half_a: Any, half_b: Any, t_us: int) -> NDArray:
+        assert self._stage is not None
+        seconds = self._stage.noise.spec.window_us * S_PER_US
+        return self._stage.step((half_a + half_b) * (0.5 * seconds), t_us)
+
+    def _read_out(self, frame: _OpenFrame) -> Frame:
+        """Noise once per frame, then everything back on the mosaic."""
+        import drjit as dr
+
+        assert self._aps is not None
+        types = jit()
+        layout = self._sensor.layout
+        exposure = frame.exposure
+        count = layout.rows * layout.cols
+        index = types.UInt32(self._aps_pixel)
+        mean = 0.5 * (frame.half_a + frame.half_b)
+        signal = dr.zeros(types.Float, count)
+        dr.scatter(signal, mean, index)
+        raw = self._aps.sample_dn(signal, exposure.exposure_us, self._seed, exposure.index).numpy()
+        electrons = np.full(count, np.nan, dtype=np.float32)
+        stderr = np.full(count, np.nan, dtype=np.float32)
+        electrons[self._aps_pixel] = np.array(mean)
+        stderr[self._aps_pixel] = np.array(dr.abs(frame.half_a - frame.half_b) * 0.5)
+        valid = layout.aps_mask
+        return Frame(
+            raw=np.where(valid, raw.reshape(layout.shape), 0).astype(np.uint16),
+            valid=valid,
+            electrons_mean=electrons.reshape(layout.shape),
+            electrons_stderr=stderr.reshape(layout.shape),
+            t_us=exposure.t_us,
+            exposure_start_us=exposure.start_us,
+            exposure_us=exposure.exposure_us,
+            line_time_us=exposure.line_time_us,
+            index=exposure.index,
+        )
+
+
+class EventFlux:
+    """Truth of the event pixels: mean flux over all samples, with both halves kept apart."""
+
+    def __init__(self, count: int) -> None:
+        self._half_a, self._half_b = np.zeros(count), np.zeros(count)
+        self.samples = 0
+
+    def add(self, half_a: Any, half_b: Any) -> None:
+        self._half_a += np.array(half_a)
+        self._half_b += np.array(half_b)
+        self.samples += 1
+
+    def mean_e_per_s(self) -> NDArray[np.float32]:
+        """[event pixel], e⁻/s."""
+        return ((self._half_a + self._half_b) / (2 * max(1, self.samples))).astype(np.float32)
+
+    def stderr_e_per_s(self) -> NDArray[np.float32]:
+        """[event pixel], standard error of that mean from its two halves, e⁻/s."""
+        return (np.abs(self._half_a - self._half_b) / (2 * max(1, self.samples))).astype(np.float32)
+
+
+class _Window:
+    """Mean flux of the event window being filled, and which sample it belongs to."""
+
+    def __init__(self) -> None:
+        self.next = 0
+        self.half_a: Any = 0.0
+        self.half_b: Any = 0.0
+
+    def add(self, half_a: Any, half_b: Any, share: float) -> None:
+        self.half_a, self.half_b = self.half_a + half_a * share, self.half_b + half_b * share
+
+    def reset(self) -> None:
+        self.next += 1
+        self.half_a = self.half_b = 0.0
+
+
+def _take(array: Any, index: NDArray) -> Any:
+    import drjit as dr
+
+    types = jit()
+    taken = dr.gather(types.Float, array, types.UInt32(index.astype(np.uint32)))
+    dr.eval(taken)
+    return taken

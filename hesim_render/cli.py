@@ -1,0 +1,394 @@
+"""The command line. Heavy modules are imported inside the commands, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hesim_render import __version__
+from hesim_render.errors import HesimError, RangeError
+from hesim_render.output import check_target, discard_unfinished, output_errors
+
+if TYPE_CHECKING:
+    from hesim_render.recording import Recording
+
+app = typer.Typer(
+    name="hesim-render",
+    help="Render a scene into RAW frames and events of a hybrid event-frame sensor.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+# typer carries its own copy of click in newer versions; this is the base of its usage errors in all
+_ClickError: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+
+
+_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+_DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
+
+
+class Kind(StrEnum):
+    """What can be listed."""
+
+    scenes = "scenes"
+    sensors = "sensors"
+    illuminants = "illuminants"
+
+
+class Part(StrEnum):
+    """What of a sensor is calibrated."""
+
+    aps = "aps"
+    evs = "evs"
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"hesim-render {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _app(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def doctor() -> None:
+    """Say what this machine can run, and what to install where it can run nothing."""
+    from hesim_render import backend
+    from hesim_render.manifest import software_versions
+
+    for name, version in software_versions().items():
+        typer.echo(f"{name:<14}{version}")
+    found = [backend.probe(candidate) for candidate in backend.candidates()]
+    for candidate in found:
+        verdict = "works" if candidate.works else f"does not work: {candidate.reason}"
+        typer.echo(f"{'candidate':<14}{candidate.describe()} - {verdict}")
+    chosen = next((candidate for candidate in found if candidate.works), None)
+    if chosen is None:
+        typer.echo(f"{'backend':<14}none")
+        typer.echo(f"no Dr.Jit backend works on this machine: {backend.INSTALL_HINT}", err=True)
+        raise typer.Exit(2)
+    typer.echo(f"{'backend':<14}{chosen.describe()}, Mitsuba variant {chosen.backend}_ad_spectral")
+
+
+@app.command("list")
+def list_(kind: Annotated[Kind, typer.Argument(help="scenes, sensors or illuminants")]) -> None:
+    """List the names that can be used."""
+    if kind is Kind.illuminants:
+        from hesim_render.spectra import illuminant_names
+
+        typer.echo("\n".join(illuminant_names()))
+        return
+    from hesim_render.specs.files import data_folder, list_names, load_yaml
+
+    names = list_names(kind.value)
+    width = max((len(name) for name in names), default=0)
+    for name in names:
+        description = load_yaml(data_folder(kind.value) / f"{name}.yaml").get("description", "")
+        typer.echo(f"{name:<{width}}  {description}")
+
+
+@app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(help="a name (see 'list scenes') or the path of a scene file")],
+    sensor: Annotated[str, typer.Option(help="a name (see 'list sensors') or the path of a sensor file")],
+    out: Annotated[Path, typer.Option(help="folder to write the recording to")],
+    duration: Annotated[float, typer.Option(help="simulated time, s")] = 0.1,
+    roi: Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")] = None,
+    seed: Annotated[int, typer.Option(help="of all noise and of the render")] = 7,
+    samples: Annotated[int | None, typer.Option(help="rays per pixel and slice of time")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="change a key of the scene file, or with sensor. of the sensor file"
+        ),
+    ] = None,
+    clean: Annotated[bool, typer.Option("--clean", help="no noise at all")] = False,
+    without: Annotated[
+        list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing recording")] = False,
+) -> None:
+    """Render a scene and record it: RAW frames, events and their ground truth."""
+    _check_duration(duration)
+    scene_changes, sensor_changes = split_overrides(set_ or [])
+    recording = _simulate(
+        scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
+        overwrite=overwrite, duration_s=duration, seed=seed, samples=samples, clean=clean, without=without or (),
+    )  # fmt: skip
+    typer.echo(summary(recording))
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
+) -> None:
+    """Two small recordings with pictures: a ColorChecker, and a moving scene."""
+    runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
+    for target in runs:
+        _check_output(target, overwrite=True)
+    for target, (scene, sensor) in runs.items():
+        recording = _simulate(scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        typer.echo(summary(recording) + "\n")
+    still, moving = runs
+    typer.echo(f"Look at {still / 'preview.png'} (24 measured patches)")
+    typer.echo(f"    and {moving / 'preview.gif'} (events of a moving scene).")
+
+
+@app.command()
+def lab(
+    sensor: Annotated[str, typer.Argument(help="a name (see 'list sensors') or the path of a sensor file")],
+    out: Annotated[Path, typer.Option(help="folder to write the capture set to")],
+    roi: Annotated[
+        str, typer.Option(help="WIDTHxHEIGHT or ...+X+Y, px, or 'full' (gigabytes of frames for a large sensor)")
+    ] = "256x256",
+    frames: Annotated[int, typer.Option(help="frames per exposure, dark and lit")] = 64,
+    ticks: Annotated[int, typer.Option(help="event comparisons on the static target, and in the dark")] = 20000,
+    dark_ms: Annotated[str, typer.Option(help="dark exposures, ms")] = "1,5,20,50,80",
+    lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
+    illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
+    seed: Annotated[int, typer.Option(help="of all temporal noise")] = 7,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
+    ] = None,
+    without: Annotated[
+        list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing capture set")] = False,
+) -> None:
+    """A virtual calibration session: dark and lit captures to calibrate from."""
+
+    scene_changes, changes = split_overrides(set_ or [])
+    for key in scene_changes:
+        raise RangeError("--set", key, "a key of the sensor file, as sensor.aps.read_noise_e")
+    exposures = {"dark_exposures_us": parse_exposures(dark_ms), "lit_exposures_us": parse_exposures(lit_ms)}
+    check_target(out, "capture.yaml", overwrite)
+    from hesim_render.lab import write_captures
+    from hesim_render.sensor import load_sensor
+
+    loaded = load_sensor(sensor, changes)
+    if roi != "full":
+        loaded = loaded.crop(*parse_roi(roi))
+    if loaded.spec.evs is not None and loaded.spec.evs.reference == "last_event":
+        typer.echo(
+            "frames only: events of reference 'last_event' have no fixed comparisons to count, and their "
+            "calibration is not covered"
+        )
+    with progress_bar(f"lab {sensor}") as progress:
+        folder = write_captures(
+            loaded, out, frames=frames, ticks=ticks, seed=seed, without=without or (), illuminant=illuminant,
+            overwrite=overwrite, progress=progress, **exposures,
+        )  # fmt: skip
+    for file in sorted(folder.iterdir()):
+        typer.echo(f"{file.stat().st_size / 1e6:10.1f} MB  {out / file.name}")
+
+
+@app.command()
+def calibrate(
+    part: Annotated[Part, typer.Argument(help="aps (frames) or evs (events)")],
+    captures: Annotated[Path, typer.Argument(help="folder of a capture set")],
+    out: Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")],
+    report: Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")] = None,
+) -> None:
+    """Noise parameters from captures, into a file that a sensor file can point at."""
+    from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
+    from hesim_render.calibrate.summary import summary_lines
+
+    run = calibrate_aps if part is Part.aps else calibrate_evs
+    with progress_bar(f"calibrate {part.value}") as move:
+        tell = None if move is None else lambda what, fraction: move(fraction, 1.0, what)
+        run(captures, out, report, tell)
+    lines = summary_lines(read_calibration(out), part.value)
+    where = [f"in {out}"] if report is None else [f"in {out}", f"report: {report}"]
+    typer.echo("\n".join([*lines, *where]))
+
+
+@app.command()
+def isp(
+    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
+    out: Annotated[Path | None, typer.Option(help="folder of the pictures; default NAME-pictures beside it")] = None,
+    pipeline: Annotated[Path | None, typer.Option(help="YAML file that changes the steps (docs/isp.md)")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace existing pictures")] = False,
+) -> None:
+    """Develop the RAW frames of a recording into pictures."""
+    from hesim_render.isp import develop_recording, load_pipeline
+
+    steps = None if pipeline is None else load_pipeline(pipeline)
+    with progress_bar(f"developing {recording}") as progress:
+        folder = develop_recording(recording, out, steps, progress, overwrite)
+    typer.echo(f"pictures in {folder}")
+
+
+@app.command()
+def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:
+    """Summarise a recording and write its previews anew."""
+    from hesim_render.recording import Recording
+    from hesim_render.showcase import write_previews
+
+    loaded = Recording.load(recording)
+    assert loaded.path is not None
+    with output_errors(loaded.path):
+        write_previews(loaded, loaded.path)
+    typer.echo(summary(loaded))
+
+
+def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """``--set`` items for the scene file and for the sensor file (those that begin with ``sensor.``)."""
+    from hesim_render.specs.files import parse_override
+
+    scene: dict[str, Any] = {}
+    sensor: dict[str, Any] = {}
+    for key, value in map(parse_override, texts):
+        if key.startswith("sensor."):
+            sensor[key.removeprefix("sensor.")] = value
+        else:
+            scene[key] = value
+    return scene, sensor
+
+
+def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
+    """Width, height and optional first column and row of ``512x384`` or ``512x384+100+200``."""
+    size, *offset = text.lower().split("+")
+    try:
+        width, height = (int(part) for part in size.split("x"))
+        x, y = (int(part) for part in offset) if offset else (None, None)
+    except ValueError:
+        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384") from None
+    return width, height, x, y
+
+
+def parse_exposures(text: str) -> list[int]:
+    """Exposures in µs of ``1,5,20``, in ms."""
+    try:
+        return [round(1000 * float(part)) for part in text.split(",")]
+    except (ValueError, OverflowError):
+        raise RangeError("exposures", text, "times in ms, such as 1,5,20") from None
+
+
+def _check_duration(duration_s: float) -> None:
+    if not 0 < duration_s < float("inf"):
+        raise RangeError("--duration", duration_s, "a time above 0, in seconds")
+
+
+def _check_output(out: Path, overwrite: bool) -> None:
+    """Refuse a bad output folder before anything is rendered."""
+    from hesim_render.manifest import MANIFEST_NAME
+
+    check_target(out, MANIFEST_NAME, overwrite)
+
+
+def _simulate(
+    scene: str,
+    sensor: str,
+    out: Path,
+    *,
+    scene_changes: dict[str, Any] | None = None,
+    sensor_changes: dict[str, Any] | None = None,
+    roi: str | None = None,
+    overwrite: bool = False,
+    **options: Any,
+) -> Recording:
+    _check_output(out, overwrite)
+    import hesim_render as hr
+
+    loaded_sensor = hr.load_sensor(sensor, sensor_changes)
+    if roi is not None:
+        loaded_sensor = loaded_sensor.crop(*parse_roi(roi))
+    loaded_scene = hr.load_scene(scene, scene_changes)
+    with progress_bar(f"{scene} → {sensor}") as progress:
+        return hr.simulate(loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress, **options)
+
+
+@contextlib.contextmanager
+def progress_bar(title: str) -> Iterator[Any]:
+    """A callback (done, total, what) that moves a bar on a terminal; silent elsewhere."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None)
+
+        def move(done: float, total: float, what: str) -> None:
+            bar.update(task, completed=done, total=total, description=f"{title}: {what}")
+
+        yield move
+
+
+def summary(recording: Recording) -> str:
+    """What a recording holds and where, in a few lines."""
+    manifest = recording.manifest
+    counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
+    scene = (manifest.get("scene") or {}).get("name", "no scene file")
+    size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
+    lines = [
+        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}",
+        f"  RAW frames: {counts['frames']} of {size}, {bits}",
+    ]
+    if counts["frames"] == 0:
+        lines[1] += " (no frame's last row is fully exposed in this time)"
+    if grid["width"]:
+        lines.append(
+            f"  events: {counts['events']} ({counts['events_on']} ON, {counts['events_off']} OFF) "
+            f"on {grid['width']}x{grid['height']} px"
+        )
+    if counts.get("events_dropped"):
+        lines.append(f"  {counts['events_dropped']} more events were lost in the sensor's read-out")
+    if recording.path is not None:
+        pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
+        lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
+    return "\n".join(lines)
+
+
+def _interrupted(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point. Exit status 0; 2 with one line on stderr where the user can help it; 130 when interrupted."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    # a terminated run cleans up like an interrupted one
+    previous = signal.signal(signal.SIGTERM, _interrupted)
+    try:
+        status = app(args=given or ["--help"], standalone_mode=False)
+    except HesimError as error:
+        _fail(str(error))
+    except _ClickError as error:
+        _fail(error.format_message().replace("Value error, ", ""))
+    except (KeyboardInterrupt, typer.Abort):
+        status = _INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(0)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    if status == _INTERRUPTED:  # newer typer turns the exception into this status itself
+        discard_unfinished()
+        sys.stderr.write("hesim-render: interrupted\n")
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _fail(message: str) -> None:
+    sys.stderr.write(f"hesim-render: {' '.join(message.split())}\n")
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

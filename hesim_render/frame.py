@@ -1,0 +1,48 @@
+"""One RAW frame and the truth behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One RAW frame and its truth.
+
+    Parameters
+    ----------
+    raw : uint16 [row, col], DN; 0 where `valid` is False.
+    valid : bool [row, col], which pixels give frame values.
+    electrons_mean : float32 [row, col], e⁻: noise-free signal of this exposure; NaN where not valid.
+    electrons_stderr : float32 [row, col], e⁻: its standard error.
+    t_us : end of row 0's exposure, µs.
+    exposure_start_us : begin of row 0's exposure, µs.
+    exposure_us : every row's exposure, µs.
+    line_time_us : from one row to the next, µs; 0 for a global shutter.
+    index : number of the frame, 0 first.
+    """
+
+    raw: NDArray[np.uint16]
+    valid: NDArray[np.bool_]
+    electrons_mean: NDArray[np.float32]
+    electrons_stderr: NDArray[np.float32]
+    t_us: int
+    exposure_start_us: int
+    exposure_us: int
+    line_time_us: float
+    index: int
+
+    @property
+    def times(self) -> dict[str, Any]:
+        """Everything but the images, as the manifest has it."""
+        return {
+            "index": self.index,
+            "t_us": self.t_us,
+            "exposure_start_us": self.exposure_start_us,
+            "exposure_us": self.exposure_us,
+            "line_time_us": self.line_time_us,
+        }
