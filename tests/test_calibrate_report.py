@@ -1,0 +1,135 @@
+"""calibration.yaml, its maps and the report: whole, readable, without anything from outside."""
+
+import os
+import re
+from html.parser import HTMLParser
+
+import capture_sets
+import numpy as np
+import pytest
+
+from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
+from hesim_render.calibrate.result import plain
+from hesim_render.calibrate.svg import number, ticks
+from hesim_render.errors import OutputError, SpecError
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    capture_sets.write_frames(folder / "set", frames=16)
+    capture_sets.write_events(folder / "set", size=64, trials=20000)
+    told = []
+    calibrate_aps(folder / "set", folder / "c.yaml", folder / "aps.html", lambda what, done: told.append((what, done)))
+    calibrate_evs(folder / "set", folder / "c.yaml", folder / "both.html", lambda what, done: told.append((what, done)))
+    return folder, told
+
+
+def test_sections_stand_side_by_side(both):
+    folder, told = both
+    data = read_calibration(folder / "c.yaml")
+    assert set(data) == {"schema_version", "capture", "aps", "evs"}
+    assert np.array(data["aps"]["beta"]).shape == (2, 2, 6)
+    assert np.array(data["evs"]["beta"]).shape == (4, 6)
+    for section in ("aps", "evs"):
+        maps = read_maps(folder / "c.yaml", section)
+        for name, key in data[section]["maps"].items():
+            assert name == "file" or key in maps
+    assert read_maps(folder / "c.yaml", "aps")["n_dp"].shape == (64, 64)
+    assert {what for what, _ in told} >= {"reading aps_dark.npz", "reading aps_lit.npz", "fitting", "done"}
+    assert all(0 <= done <= 1 for _, done in told)
+    calibrate_aps(folder / "set", folder / "c.yaml")
+    assert "evs" in read_calibration(folder / "c.yaml")
+    left = sorted(p.name for p in folder.iterdir())
+    assert left == ["aps.html", "both.html", "c.yaml", "c_aps_maps.npz", "c_evs_maps.npz", "set"]
+
+
+class _Checker(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.open, self.links, self.images = [], [], 0
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.images += tag == "svg"
+        self.links += [v for k, v in given.items() if k in ("src", "href", "xlink:href")]
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.links += [v for k, v in attributes if k in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize(
+    ("name", "headings"), [("aps.html", ["Frames (APS)"]), ("both.html", ["Frames (APS)", "Events (EVS)"])]
+)
+def test_the_report_is_one_whole_file(both, name, headings):
+    page = (both[0] / name).read_text(encoding="utf-8")
+    checker = _Checker()
+    checker.feed(page)
+    assert checker.open == []
+    assert all(link.startswith("data:image/png;base64,") for link in checker.links)
+    assert "<script" not in page and "nan" not in re.sub(r"base64,[^\"]*", "", page).lower().replace("nance", "")
+    for heading in headings:
+        assert f"<h2>{heading}</h2>" in page
+    wanted = [
+        "Row bias",
+        "Temporal variance per pixel",
+        "Noise of single values, dark",
+        "residual, %",
+        "PRNU",
+        "β5 (t^2)",
+    ]
+    if "Events (EVS)" in headings:
+        wanted += ["Event probability per trial", "Event probability against brightness", "Counts per pixel, lit",
+                   "Counts per pixel, dark", "200 starts", "threshold mismatch"]  # fmt: skip
+    else:
+        assert "Events (EVS)" not in page
+    for text in wanted:
+        assert text in page
+    assert checker.images >= 5 + 2 * 4
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", page)
+
+
+def test_notes_cannot_break_the_page(tmp_path):
+    capture_sets.write_events(tmp_path / "set", size=32, notes="'<script>alert(1)</script>'")
+    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "r.html")
+    assert "<script>" not in (tmp_path / "r.html").read_text()
+
+
+def test_what_cannot_be_written_or_read(both, tmp_path):
+    folder, _ = both
+    if os.geteuid() != 0:
+        tmp_path.chmod(0o500)
+        with pytest.raises(OutputError):
+            write_report(folder / "c.yaml", tmp_path / "r.html")
+        tmp_path.chmod(0o700)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        write_report(folder / "c.yaml", tmp_path / "file" / "r.html")
+    with pytest.raises(SpecError):
+        read_calibration(tmp_path / "missing.yaml")
+    (tmp_path / "old.yaml").write_text("schema_version: 7\n")
+    with pytest.raises(SpecError, match="schema_version"):
+        read_calibration(tmp_path / "old.yaml")
+    (tmp_path / "lone.yaml").write_text((folder / "c.yaml").read_text())
+    with pytest.raises(SpecError, match=r"c_aps_maps\.npz"):
+        read_maps(tmp_path / "lone.yaml", "aps")
+    (tmp_path / "none.yaml").write_text("schema_version: 1\ncapture: {}\n")
+    with pytest.raises(SpecError, match="no section 'evs'"):
+        read_maps(tmp_path / "none.yaml", "evs")
+
+
+def test_numbers_that_are_none_become_null():
+    assert plain({"a": np.float32(0.1), "b": np.nan, "c": np.array([1, 2]), 5: np.bool_(True), "d": 1 / 3}) == {
+        "a": 0.100000001, "b": None, "c": [1, 2], 5: True, "d": 0.333333333,
+    }  # fmt: skip
+
+
+def test_axis_ticks_are_round():
+    assert ticks(0, 1, 5) == [0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    assert ticks(-0.011, 0.011) == [-0.01, -0.005, 0.0, 0.005, 0.01]
+    assert [number(v) for v in (0, 1234567, 0.25, 2e-4)] == ["0", "1.2e6", "0.25", "2.0e-4"]

@@ -1,0 +1,329 @@
+"""The command line: exit codes, one clear line for every mistake, nothing left behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import recordings
+
+import hesim_render as hr
+from hesim_render import backend, cli
+from hesim_render.backend import Candidate
+from hesim_render.errors import RangeError
+from hesim_render.specs.files import list_names
+
+
+def call(capsys, *arguments):
+    """(exit status, stdout, stderr) of one command, in this process."""
+    with pytest.raises(SystemExit) as caught:
+        cli.main([str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return caught.value.code, out, err
+
+
+def fails(capsys, *arguments):
+    """The one line a mistake gives."""
+    status, out, err = call(capsys, *arguments)
+    assert status == 2 and out == ""
+    assert err.startswith("hesim-render: ") and err.count("\n") == 1 and "Traceback" not in err
+    return err
+
+
+def test_help_lists_the_commands():
+    done = subprocess.run([sys.executable, "-m", "hesim_render.cli", "--help"], capture_output=True, text=True)
+    assert done.returncode == 0
+    for command in ("doctor", "list", "simulate", "demo", "view", "lab", "calibrate", "isp"):
+        assert command in done.stdout
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from hesim_render.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+        "print([m for m in ('drjit', 'mitsuba', 'numpy', 'scipy', 'colour', 'pydantic') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_no_arguments_show_the_help(capsys):
+    status, out, _ = call(capsys)
+    assert status == 0 and "Usage" in out
+    assert call(capsys, "--version")[1] == f"hesim-render {hr.__version__}\n"
+
+
+@pytest.mark.parametrize("kind", ["sensors", "scenes"])
+def test_list_names_what_ships(kind, capsys):
+    status, out, _ = call(capsys, "list", kind)
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()] == list_names(kind)
+    assert all(len(line.split()) > 3 for line in out.splitlines())
+
+
+def test_list_illuminants(capsys):
+    names = call(capsys, "list", "illuminants")[1].splitlines()
+    assert {"D65", "A", "FL11", "LED-B3"} <= set(names)
+
+
+def test_doctor_says_what_runs(capsys):
+    status, out, _ = call(capsys, "doctor")
+    assert status == 0
+    last = out.splitlines()[-1]
+    assert last.startswith("backend") and last.endswith("_ad_spectral")
+    assert any(line.startswith("candidate") and line.endswith("works") for line in out.splitlines())
+    assert any(line.split() == ["numpy", np.__version__] for line in out.splitlines())
+
+
+def test_doctor_says_what_to_install_where_nothing_runs(capsys, monkeypatch):
+    broken = Candidate("llvm", "system", "/nowhere/libLLVM-20.so")
+    monkeypatch.setattr(backend, "candidates", lambda: [broken])
+    status, out, err = call(capsys, "doctor")
+    assert status == 2 and "does not work: no such file" in out
+    assert err.count("\n") == 1 and "libllvm19" in err and "hesim_render[llvm]" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["nonsense"], "No such command 'nonsense'"),
+        (["list", "cameras"], "'cameras' is not one of"),
+        (["simulate"], "Missing argument"),
+        (["simulate", "colorchecker"], "Missing option '--sensor'"),
+        (["simulate", "colorchecker", "--sensor", "eiger"], "Missing option '--out'"),
+        (["simulate", "colorchecker", "--sensor", "eiger", "--out", "o", "--colour"], "No such option"),
+        (["view"], "Missing argument"),
+    ],
+)
+def test_wrong_usage_is_one_line(arguments, text, capsys):
+    assert text in fails(capsys, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--duration", "0"], "--duration is 0.0; expected a time above 0"),
+        (["--duration", "-1"], "--duration is -1.0"),
+        (["--duration", "nan"], "--duration is nan"),
+        (["--duration", "soon"], "--duration"),
+        (["--roi", "512"], "--roi is '512'; expected WIDTHxHEIGHT"),
+        (["--roi", "axb"], "expected WIDTHxHEIGHT"),
+        (["--roi", "512x384+1"], "expected WIDTHxHEIGHT"),
+        (["--roi", "4000x384"], "roi width_px is 4000; expected 1 to 3264"),
+        (["--roi", "510x384"], "a multiple of the tile's 4 pixels"),
+        (["--roi", "512x384+3200+0"], "inside the sensor"),
+        (["--seed", "-1"], "seed is -1"),
+        (["--set", "camera"], "expected KEY=VALUE"),
+        (["--set", "camera.f_numbr=4"], "colorchecker.yaml: camera.f_numbr: unknown key"),
+        (["--set", "light.illuminance_lux=-4"], "light.illuminance_lux"),
+        (["--set", "sensor.aps.exposure_us=-4"], "eiger.yaml: aps.exposure_us: Input should be greater than 0"),
+        (["--set", "sensor.aps.reed_noise=1"], "eiger.yaml: aps.reed_noise: unknown key"),
+        (["--set", "light.illuminant={flat: 1, band_nm: [400, 600]}"], "of the response of"),
+        (["--without", "aps.nothing"], "noise term is 'aps.nothing'; expected one of aps."),
+        (["--sensor", "eigr"], "no sensor named 'eigr'; shipped are"),
+        (["--sensor", "./my.yaml"], "my.yaml: no such file"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(options, text, capsys, tmp_path):
+    out = tmp_path / "o"
+    base = ["simulate", "colorchecker", "--sensor", "eiger", "--out", out, "--duration", "0.02", "--roi", "16x16"]
+    assert text in fails(capsys, *base, *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_and_unreadable_scenes_are_one_line(capsys, tmp_path):
+    base = ["--sensor", "eiger", "--roi", "16x16", "--out", tmp_path / "o"]
+    assert "no scene named 'colourchecker'; shipped are" in fails(capsys, "simulate", "colourchecker", *base)
+    (tmp_path / "broken.xml").write_text("<scene version='3.0.0'><shape></scene>")
+    (tmp_path / "xml.yaml").write_text(
+        "schema_version: 1\nname: x\ndescription: x\nmitsuba: {file: broken.xml}\n"
+        "camera: {origin_m: [0, 0, 4], target_m: [0, 0, 0]}\n"
+    )
+    assert "broken.xml" in fails(capsys, "simulate", tmp_path / "xml.yaml", *base)
+    assert not (tmp_path / "o").exists()
+
+
+def test_existing_output_is_refused_before_anything_is_rendered(capsys, tmp_path, monkeypatch):
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "thesis.txt").write_text("x")
+    monkeypatch.setitem(hr.__dict__, "simulate", lambda *a, **k: pytest.fail("rendered"))
+    line = fails(capsys, "simulate", "colorchecker", "--sensor", "eiger", "--out", tmp_path / "o", "--overwrite")
+    assert "holds other things" in line
+    assert "is not a folder" in fails(
+        capsys, "simulate", "colorchecker", "--sensor", "eiger", "--out", tmp_path / "o" / "thesis.txt" / "r"
+    )
+
+
+def test_options_reach_simulate(capsys, tmp_path, monkeypatch):
+    seen = {}
+
+    def simulate(scene, sensor, **options):
+        seen.update(options, scene=scene, sensor=sensor)
+        return recordings.make("eiger", options["out"])
+
+    monkeypatch.setitem(hr.__dict__, "simulate", simulate)
+    monkeypatch.setitem(hr.__dict__, "load_scene", lambda name, changes: (name, changes))
+    monkeypatch.setitem(hr.__dict__, "load_sensor", lambda name, changes: Cropped(name, changes))
+    status, out, _ = call(
+        capsys, "simulate", "dark", "--sensor", "gen2", "--out", tmp_path / "o", "--duration", "0.25", "--roi",
+        "64x32+4+8", "--seed", "9", "--samples", "32", "--set", "camera.f_number=4", "--set",
+        "sensor.aps.law=gaussian", "--clean", "--without", "aps.read", "--without", "evs.leak",
+    )  # fmt: skip
+    assert status == 0 and "RAW frames: 2 of 128x96 px" in out and str(tmp_path / "o") in out
+    assert seen["scene"] == ("dark", {"camera.f_number": 4})
+    assert (seen["sensor"].name, seen["sensor"].changes) == ("gen2", {"aps.law": "gaussian"})
+    assert seen["sensor"].region == (64, 32, 4, 8)
+    assert {k: seen[k] for k in ("duration_s", "seed", "samples", "clean", "without", "overwrite")} == {
+        "duration_s": 0.25, "seed": 9, "samples": 32, "clean": True, "without": ["aps.read", "evs.leak"],
+        "overwrite": False,
+    }  # fmt: skip
+
+
+class Cropped:
+    def __init__(self, name, changes):
+        self.name, self.changes, self.region = name, changes, None
+
+    def crop(self, *region):
+        self.region = region
+        return self
+
+
+def test_view_writes_the_previews_anew(capsys, tmp_path):
+    recordings.make("eiger", tmp_path / "r")
+    (tmp_path / "r" / "preview.png").unlink()
+    status, out, _ = call(capsys, "view", tmp_path / "r")
+    assert status == 0 and (tmp_path / "r" / "preview.png").is_file()
+    assert "events: 20000" in out and "preview.png" in out
+    assert "not a recording" in fails(capsys, "view", tmp_path)
+    assert "no such folder" in fails(capsys, "view", tmp_path / "nowhere")
+
+
+def test_parse_roi():
+    assert cli.parse_roi("512x384") == (512, 384, None, None)
+    assert cli.parse_roi("512X384+100+200") == (512, 384, 100, 200)
+    with pytest.raises(RangeError):
+        cli.parse_roi("512x384x2")
+
+
+def test_interrupt_exits_130_and_leaves_nothing(tmp_path):
+    out = tmp_path / "o"
+    command = [sys.executable, "-m", "hesim_render.cli", "simulate", "rotating-star", "--sensor", "gen2", "--roi"]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        child = subprocess.Popen(
+            [*command, "512x384", "--duration", "5", "--out", out],
+            stderr=subprocess.PIPE,
+            text=True,
+            # a test run in the background of a shell ignores SIGINT, and its children would too
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.glob(".o.*.partial")) and time.monotonic() < deadline and child.poll() is None:
+            time.sleep(0.05)
+        os.kill(child.pid, number)
+        _, err = child.communicate(timeout=60)
+        assert child.returncode == 130, err
+        assert "interrupted" in err and "Traceback" not in err
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_the_main_job_end_to_end(capsys, tmp_path):
+    status, out, err = call(
+        capsys, "simulate", "colorchecker", "--sensor", "eiger", "--roi", "64x48", "--duration", "0.02",
+        "--out", tmp_path / "o", "--samples", "16", "--seed", "3",
+    )  # fmt: skip
+    assert status == 0 and err == "" and "RAW frames: 1 of 64x48 px" in out
+    recording = hr.Recording.load(tmp_path / "o")
+    frame = recording.frames[0]
+    assert frame.raw.shape == (48, 64) and frame.raw.dtype == np.uint16
+    assert 0.74 < frame.valid.mean() < 0.76 and (frame.raw[~frame.valid] == 0).all()
+    assert np.isfinite(frame.electrons_mean[frame.valid]).all() and np.isnan(frame.electrons_mean[~frame.valid]).all()
+    assert (frame.electrons_mean[frame.valid] > 0).all() and (frame.electrons_stderr[frame.valid] >= 0).all()
+    assert recording.manifest["settings"]["samples"] == 16 and recording.manifest["seed"] == 3
+    assert recording.event_truth.flux_mean_e_per_s.shape == recording.event_shape == (24, 32)
+    assert json.loads((tmp_path / "o" / "recording.json").read_text())["scene"]["name"] == "colorchecker"
+    assert (tmp_path / "o" / "preview.png").is_file()
+    assert "exists; give another name" in fails(
+        capsys, "simulate", "colorchecker", "--sensor", "eiger", "--out", tmp_path / "o"
+    )
+
+
+def test_lab_calibrate_and_simulate_end_to_end(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = call(
+        capsys, "lab", "eiger", "--out", "lab", "--roi", "64x64", "--frames", "16", "--ticks", "3000", "--seed", "4",
+        "--dark-ms", "1,20,80", "--lit-ms", "1,10,20,80", "--set", "sensor.evs.contrast_threshold_on=0.15",
+        "--set", "sensor.evs.contrast_threshold_off=0.15",
+    )  # fmt: skip
+    assert status == 0 and err == "" and "lab/aps_dark.npz" in out and "lab/evs_steps.npz" in out
+    for part, text in (("aps", "K, system gain"), ("evs", "threshold mismatch")):
+        status, out, err = call(
+            capsys, "calibrate", part, "lab", "--out", "calibration.yaml", "--report", "report.html"
+        )
+        assert status == 0 and err == "" and text in out and " to " in out
+        assert out.endswith("in calibration.yaml\nreport: report.html\n")
+    assert "Frames (APS)" in (tmp_path / "report.html").read_text()
+    line = fails(
+        capsys, "simulate", "dark", "--sensor", "eiger", "--set", "sensor.noise=calibration.yaml", "--out", "r",
+        "--roi", "128x64", "--duration", "0.02",
+    )  # fmt: skip
+    assert "--roi 64x64+1600+1192" in line and not (tmp_path / "r").exists()
+    status, out, err = call(
+        capsys, "simulate", "dark", "--sensor", "eiger", "--set", "sensor.noise=calibration.yaml", "--out", "r",
+        "--roi", "64x64", "--duration", "0.02", "--samples", "2",
+    )  # fmt: skip
+    assert status == 0 and err == ""
+    frame = hr.Recording.load(tmp_path / "r").frames[0]
+    with np.load(tmp_path / "lab" / "aps_dark.npz") as data:
+        captured = data["frames"][0].mean(axis=0)
+    # the rows of this device (1.5 DN) above read noise (0.8 DN): 1/sqrt(1 + (0.8² + 2·0.32²)/1.5²) = 0.86
+    assert np.corrcoef(frame.raw[frame.valid], captured[frame.valid])[0, 1] > 0.75
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["lab"], "Missing argument"),
+        (["lab", "eiger"], "Missing option '--out'"),
+        (["lab", "eigr", "--out", "o"], "no sensor named 'eigr'"),
+        (["lab", "eiger", "--out", "o", "--frames", "3"], "frames is 3; expected 8 or more"),
+        (["lab", "eiger", "--out", "o", "--ticks", "0"], "ticks is 0"),
+        (["lab", "eiger", "--out", "o", "--dark-ms", "short"], "exposures is 'short'; expected times in ms"),
+        (["lab", "eiger", "--out", "o", "--dark-ms", "5"], "dark exposures"),
+        (["lab", "eiger", "--out", "o", "--set", "camera.f_number=4"], "expected a key of the sensor file"),
+        (["lab", "eiger", "--out", "o", "--illuminant", "D66"], "D66"),
+        (["lab", "eiger", "--out", "o", "--without", "aps.reed"], "noise term is 'aps.reed'"),
+        (["calibrate", "isp", "x", "--out", "c.yaml"], "'isp' is not one of"),
+        (["calibrate", "aps", "nowhere", "--out", "c.yaml"], "nowhere: no such folder of captures"),
+        (["calibrate", "aps", ".", "--out", "c.yaml"], "capture.yaml: no such file"),
+    ],
+)
+def test_bad_input_of_lab_and_calibrate_is_one_line_and_writes_nothing(arguments, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert text in fails(capsys, *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lab_says_what_it_leaves_out_and_keeps_what_is_there(capsys, tmp_path):
+    command = ["lab", "davis346", "--out", tmp_path / "o", "--roi", "16x16", "--frames", "8"]
+    status, out, _ = call(capsys, *command)
+    assert status == 0 and out.startswith("frames only: events of reference 'last_event'")
+    assert out.count("\n") == 4 and "evs_" not in out
+    assert "exists; give another name" in fails(capsys, *command)
+    assert call(capsys, *command, "--overwrite")[0] == 0
+
+
+def test_isp_develops_a_recording(capsys, tmp_path):
+    from PIL import Image
+
+    recording = tmp_path / "rec"
+    status, _, _ = call(capsys, "simulate", "colorchecker", "--sensor", "eiger", "--roi", "96x64", "--out", recording)
+    assert status == 0
+    status, out, _ = call(capsys, "isp", recording)
+    assert status == 0 and "rec-pictures" in out
+    pictures = sorted((tmp_path / "rec-pictures").glob("*.png"))
+    assert len(pictures) == 1 and Image.open(pictures[0]).size == (96, 64)
+    assert "exists" in fails(capsys, "isp", recording)
+    assert "not a recording" in fails(capsys, "isp", tmp_path)

@@ -1,0 +1,54 @@
+"""Colours of a rendered ColorChecker after the ISP, against its measured reflectances."""
+
+import colour as colour_science
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render import spectra
+from hesim_render.isp import Camera, Pipeline, chart, colour, develop
+
+ROWS, COLS = 192, 288
+
+
+@pytest.mark.filterwarnings("ignore:Aligning")
+@pytest.mark.parametrize("light", ["D65", "A"])
+def test_rendered_chart_comes_out_within_two_delta_e(light):
+    sensor = hr.load_sensor("reference-bayer").crop(COLS, ROWS)
+    scene = hr.load_scene("colorchecker", {"light.illuminant": light})
+    recording = hr.simulate(scene, sensor, duration_s=0.011, seed=7)
+    # centres of dark skin, bluish green, black and white as seen in the picture (camera: fit target, margin 0.96)
+    corners = [(34.5, 28.5), (34.5, 259.0), (157.0, 259.0), (157.0, 28.5)]
+    balanced = Pipeline.of("black_level", "white_balance", "demosaic")
+    patches = chart.patch_means(develop(recording.frames[0], recording.mosaic, balanced).image, corners)
+
+    # reference by colour-science alone: XYZ under the light, Bradford to D65, Lab
+    table = colour_science.SDS_ILLUMINANTS[light]
+    cmfs = colour_science.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    shape = colour_science.SpectralShape(380, 780, 5)
+    surfaces = colour_science.SDS_COLOURCHECKERS["ISO 17321-1"].values()
+    xyz = np.array(
+        [colour_science.sd_to_XYZ(sd.copy().align(shape), cmfs, table, method="Integration") / 100 for sd in surfaces]
+    )
+    white = colour_science.sd_to_XYZ(table, cmfs, method="Integration")
+    white_d65 = colour_science.xy_to_XYZ(colour_science.RGB_COLOURSPACES["sRGB"].whitepoint)
+    adapted = colour_science.chromatic_adaptation(
+        xyz, white / white[1], white_d65, method="Von Kries", transform="Bradford"
+    )
+    lab = colour_science.XYZ_to_Lab(adapted, colour_science.RGB_COLOURSPACES["sRGB"].whitepoint)
+
+    def difference(linear):
+        found = np.asarray(linear) @ colour_science.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
+        found = colour_science.XYZ_to_Lab(found, colour_science.RGB_COLOURSPACES["sRGB"].whitepoint)
+        return colour_science.delta_E(found, lab, method="CIE 2000")
+
+    # the recording's own matrix, one factor of exposure; and a matrix fitted from this picture
+    reference = chart.reference_linear_srgb(spectra.illuminant(light))
+    own = patches @ np.array(Camera.of(recording.mosaic).matrix).T
+    own *= (own * reference).sum() / (own * own).sum()
+    assert difference(own).mean() < 2
+    fit = colour.fit_matrix(patches, reference)
+    fitted = difference(fit.exposure * patches @ np.array(fit.matrix).T)
+    assert fitted.mean() < 1.5
+    np.testing.assert_allclose(fit.delta_e_2000, fitted, atol=0.1)
+    assert fit.mean_delta_e <= colour.delta_e_2000(own, reference).mean()

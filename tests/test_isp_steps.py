@@ -1,0 +1,257 @@
+"""Each step against its formula, written out again."""
+
+import numpy as np
+import pytest
+from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
+
+from hesim_render.errors import RangeError
+from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone, transfer
+
+RNG = np.random.default_rng(11)
+
+
+# -- levels ------------------------------------------------------------------------------------------------------
+
+
+def test_black_level_with_maps():
+    raw = RNG.integers(0, 1023, (150, 20)).astype(np.uint16)
+    rows, pixels = RNG.normal(0, 2, 150), RNG.normal(0, 1, (150, 20))
+    found = levels.black_level(raw, 64, 1000, rows, pixels)
+    np.testing.assert_allclose(found, (raw - 64.0 - rows[:, None] - pixels) / 936, atol=1e-6)
+    assert found.dtype == np.float32
+    with pytest.raises(RangeError, match="row_map_dn"):
+        levels.black_level(raw, 64, 1000, rows[:-1])
+    with pytest.raises(RangeError, match="white_level_dn"):
+        levels.black_level(raw, 64, 64)
+
+
+def test_lens_shading_undoes_cos4():
+    y, x = np.mgrid[0:60, 0:80] - np.array([29.5, 39.5])[:, None, None]
+    angle = np.arctan(np.hypot(x, y) / 100.0)
+    np.testing.assert_allclose(levels.cos4_illumination((60, 80), 100.0), np.cos(angle) ** 4, rtol=1e-5)
+    flat = np.full((60, 80), 0.6, dtype=np.float32)
+    shaded = (flat * np.cos(angle) ** 4).astype(np.float32)
+    np.testing.assert_allclose(levels.lens_shading(shaded, levels.cos4_illumination((60, 80), 100.0)), flat, rtol=1e-5)
+    with pytest.raises(RangeError, match="more than 0 everywhere"):
+        levels.lens_shading(flat, np.zeros((60, 80)))
+
+
+# -- fill --------------------------------------------------------------------------------------------------------
+
+
+def test_event_pixels_are_filled_from_their_own_colour():
+    y, x = np.mgrid[0:48, 0:64]
+    planes = np.stack([0.1 + 0.01 * x, 0.6 - 0.01 * y, 0.3 + 0.005 * x + 0.002 * y], -1)
+    whole = mosaic_of(planes, QUAD).astype(np.float32)
+    holed = mosaic_of(planes, MIPI).astype(np.float32)
+    filled = fill.fill_positions(holed, MIPI, QUAD)
+    np.testing.assert_allclose(filled[8:-8, 8:-8], whole[8:-8, 8:-8], atol=1e-6)
+    known = np.tile(np.array(MIPI) >= 0, (12, 16))
+    np.testing.assert_array_equal(filled[known], holed[known])
+
+
+def test_fill_does_not_reach_across_an_edge():
+    """A vertical edge between the cell and its right neighbour of the same colour."""
+    picture = np.full((32, 32, 3), 0.1)
+    picture[:, 18:] = 0.9
+    filled = fill.fill_positions(mosaic_of(picture, MIPI).astype(np.float32), MIPI, QUAD)
+    np.testing.assert_allclose(filled, mosaic_of(picture, QUAD), atol=0.01)
+
+
+def test_bad_pixels_and_their_clusters_are_filled():
+    y, x = np.mgrid[0:40, 0:40]
+    truth = mosaic_of(np.stack([0.2 + 0.01 * x, 0.5 - 0.005 * y, 0.4 + 0.003 * x], -1), QUAD).astype(np.float32)
+    bad = RNG.random((40, 40)) < 0.02
+    bad[10:13, 10:13] = True
+    broken = np.where(bad, 1.0, truth).astype(np.float32)
+    filled = fill.fill_pixels(broken, QUAD, bad)
+    np.testing.assert_array_equal(filled[~bad], truth[~bad])
+    inside = np.zeros_like(bad)
+    inside[4:-4, 4:-4] = True
+    # a pixel with good neighbours to one side only takes a neighbour's value, off by a slope over up to 4 px
+    assert np.abs(filled - truth)[bad & inside].max() < 0.045
+    assert np.median(np.abs(filled - truth)[bad & inside]) < 1e-3
+    with pytest.raises(RangeError, match="bad pixels"):
+        fill.fill_pixels(truth, QUAD, np.ones((40, 40), dtype=bool))
+    with pytest.raises(RangeError, match="mask"):
+        fill.fill_pixels(truth, QUAD, bad[1:])
+
+
+# -- white balance -----------------------------------------------------------------------------------------------
+
+
+def test_balance_multiplies_and_holds_highlights():
+    raw = RNG.uniform(0, 0.35, (150, 36)).astype(np.float32)
+    gains = np.array([2.643, 1.0, 1.764])
+    expected = raw * gains[np.tile(QUAD, (38, 9))[:150]]
+    np.testing.assert_allclose(balance.white_balance(raw, QUAD, gains), expected, rtol=1e-6)
+    np.testing.assert_allclose(balance.white_balance(raw, QUAD, 2 * gains), expected, rtol=1e-6)
+    bright = np.ones((8, 8), dtype=np.float32)
+    np.testing.assert_array_equal(balance.white_balance(bright, QUAD, gains), 1)
+    assert balance.white_balance(bright, QUAD, gains, clip=False).max() == pytest.approx(2.643)
+    for wrong in ([1, 0, 1], [1, 2], [1, np.nan, 1]):
+        with pytest.raises(RangeError, match="white balance"):
+            balance.white_balance(raw, QUAD, wrong)
+
+
+@pytest.mark.parametrize("tile", [QUAD, MIPI])
+def test_grey_world_finds_the_light(tile):
+    grey = RNG.uniform(0.1, 0.9, (20, 30))[:, :, None].repeat(4, 0).repeat(4, 1)
+    raw = mosaic_of(grey / [2.643, 1.0, 1.764], tile).astype(np.float32)
+    np.testing.assert_allclose(balance.grey_world(raw, tile), [2.643, 1.0, 1.764], rtol=1e-4)
+    with pytest.raises(RangeError, match="grey-world"):
+        balance.grey_world(np.zeros((8, 8), dtype=np.float32), tile)
+
+
+def test_balance_from_grey_patches_leaves_saturated_ones_out():
+    greys = np.array([1.0, 0.5, 0.25, 0.1])[:, None] / [2.643, 1.0, 1.764]
+    greys[0] = [0.5, 1.0, 1.0]
+    np.testing.assert_allclose(balance.from_neutral(greys), [2.643, 1.0, 1.764], rtol=1e-9)
+    with pytest.raises(RangeError, match="grey patches"):
+        balance.from_neutral(np.ones((2, 3)))
+
+
+# -- chart and colour --------------------------------------------------------------------------------------------
+
+
+def test_patches_are_found_on_the_chart():
+    picture = images()["checker"]
+    means = chart.patch_means(picture, [(64, 64), (64, 704), (448, 704), (448, 64)])
+    expected = picture[64::128, 64::128].reshape(24, 3)
+    np.testing.assert_allclose(means, expected, atol=1e-12)
+    turned = chart.patch_means(picture[::-1, ::-1], [(447, 703), (447, 63), (63, 63), (63, 703)])
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+    with pytest.raises(RangeError, match="inside the image"):
+        chart.patch_means(picture, [(64, 64), (64, 764), (448, 764), (448, 64)])
+
+
+def test_patch_centres_follow_perspective():
+    """Lines stay lines: the diagonals of the chart meet in the centre of any of its views."""
+    corners = np.array([(10, 20), (30, 200), (150, 180), (120, 40)], dtype=float)
+    centres = chart.patch_centres(corners, 3, 3).reshape(3, 3, 2)
+    a, b = corners[2] - corners[0], corners[3] - corners[1]
+    t = np.linalg.solve(np.stack([a, -b], 1), corners[1] - corners[0])[0]
+    np.testing.assert_allclose(centres[1, 1], corners[0] + t * a, atol=1e-9)
+    np.testing.assert_allclose(centres[[0, 0, 2, 2], [0, 2, 2, 0]], corners, atol=1e-9)
+
+
+def test_fit_finds_the_matrix_that_made_the_patches():
+    matrix = np.array([[1.7, -0.6, -0.1], [-0.2, 1.6, -0.4], [0.05, -0.5, 1.45]])
+    reference = chart.reference_linear_srgb()
+    patches = 0.4 * reference @ np.linalg.inv(matrix).T
+    fit = colour.fit_matrix(patches, reference)
+    np.testing.assert_allclose(fit.matrix, matrix, atol=1e-3)
+    assert fit.exposure == pytest.approx(2.5, rel=1e-3)
+    assert fit.max_delta_e < 0.05
+    np.testing.assert_allclose(np.sum(fit.matrix, axis=1), 1, atol=1e-12)
+    with pytest.raises(RangeError, match="patches and reference"):
+        colour.fit_matrix(patches[:2], reference[:2])
+
+
+def test_delta_e_of_a_known_pair():
+    """Sharma, Wu and Dalal (2005), data pair 7: Lab (50, 0, 0) against (50, -1, 2) is 2.3669."""
+
+    def to_linear_srgb(lab):
+        f = np.array([(lab[0] + 16) / 116 + lab[1] / 500, (lab[0] + 16) / 116, (lab[0] + 16) / 116 - lab[2] / 200])
+        x, y = 0.3127, 0.3290
+        xyz = np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29)) * [x / y, 1, (1 - x - y) / y]
+        primaries = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+        return np.linalg.solve(primaries, xyz)
+
+    found = colour.delta_e_2000(to_linear_srgb((50, 0, 0)), to_linear_srgb((50, -1, 2)))
+    assert found == pytest.approx(2.3669, abs=2e-3)
+
+
+def test_colour_matrix_is_a_product():
+    image, matrix = RNG.random((70, 9, 4)).astype(np.float32), RNG.normal(size=(3, 4))
+    np.testing.assert_allclose(colour.colour_matrix(image, matrix), image @ matrix.T, atol=1e-5)
+    with pytest.raises(RangeError, match="colour matrix"):
+        colour.colour_matrix(image, np.eye(3))
+
+
+# -- tone, noise, transfer ---------------------------------------------------------------------------------------
+
+
+def test_global_tone_follows_the_formula_and_keeps_hue():
+    image = RNG.uniform(0, 4, (70, 8, 3)).astype(np.float32)
+    found = tone.tone_global(image, white=4.0)
+    y = image @ [0.2126, 0.7152, 0.0722]
+    np.testing.assert_allclose(found @ [0.2126, 0.7152, 0.0722], y * (1 + y / 16) / (1 + y), rtol=1e-4)
+    np.testing.assert_allclose(found / found.sum(-1, keepdims=True), image / image.sum(-1, keepdims=True), atol=1e-5)
+    white = tone.tone_global(np.full((2, 2, 3), 4, dtype=np.float32), white=4.0)
+    np.testing.assert_allclose(white, 1, rtol=1e-4)
+
+
+def test_local_tone_lowers_large_contrast_and_keeps_detail():
+    image = np.full((128, 256, 3), 0.02, dtype=np.float32)
+    image[:, 128:] = 0.8
+    texture = 1 + 0.1 * (np.indices((128, 256)).sum(0) % 2 - 0.5)
+    image *= texture[..., None].astype(np.float32)
+    found = tone.tone_local(image, compression=0.5, radius_px=8)[..., 1]
+    left, right = found[32:96, 32:96], found[32:96, 160:224]
+    assert np.log2(right.mean() / left.mean()) == pytest.approx(0.5 * np.log2(0.8 / 0.02), rel=0.02)
+    for part in (left, right):
+        assert part.std() / part.mean() == pytest.approx(0.05, rel=0.05)
+    np.testing.assert_allclose(tone.tone_local(image, compression=1.0), image, rtol=1e-5)
+
+
+def test_automatic_exposure_brings_highlights_to_the_level():
+    image = RNG.uniform(0, 0.1, (200, 200, 3)).astype(np.float32)
+    gain = tone.auto_gain(image, 99, 0.9)
+    assert np.percentile((gain * image)[::2, ::2].max(-1), 99) == pytest.approx(0.9, rel=1e-4)
+    assert tone.auto_gain(np.zeros((8, 8, 3), dtype=np.float32)) == pytest.approx(50)
+
+
+def test_noise_reduction_lowers_noise_and_keeps_edges():
+    clean = np.full((128, 128, 3), 0.1, dtype=np.float32)
+    clean[:, 64:] = [0.6, 0.4, 0.5]
+    noisy = clean + RNG.normal(0, 0.01, clean.shape).astype(np.float32)
+    found = smooth.reduce_noise(noisy, luma=0.02, chroma=0.05)
+    assert found[20:108, 20:44].std(axis=(0, 1)).max() < 0.5 * 0.01
+    assert found[20:108, 84:108].std(axis=(0, 1)).max() < 0.5 * 0.01
+    np.testing.assert_allclose(found.mean((0, 1)), noisy.mean((0, 1)), rtol=0.01)
+    step = found[:, 66].mean(0) - found[:, 61].mean(0)
+    np.testing.assert_allclose(step, [0.5, 0.3, 0.4], rtol=0.06)
+    np.testing.assert_allclose(smooth.reduce_noise(noisy, 0, 0), noisy, atol=1e-6)
+    assert psnr(found, clean) > psnr(noisy, clean) + 4
+
+
+def test_guided_filter_against_its_definition():
+    """One pixel by hand: mean of the linear models of all windows that cover it."""
+    image, guide = RNG.random((2, 15, 15)).astype(np.float32)
+    found = smooth.guided_filter(image, guide, 1, 0.01)[7, 7]
+    models = []
+    for y in range(6, 9):
+        for x in range(6, 9):
+            p, g = image[y - 1 : y + 2, x - 1 : x + 2].astype(float), guide[y - 1 : y + 2, x - 1 : x + 2].astype(float)
+            a = ((g * p).mean() - g.mean() * p.mean()) / (g.var() + 0.01)
+            models.append((a, p.mean() - a * g.mean()))
+    a, b = np.mean(models, axis=0)
+    assert found == pytest.approx(a * guide[7, 7] + b, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["srgb", "bt709", "gamma", "linear"])
+def test_transfer_functions_are_inverses(name):
+    x = np.linspace(0, 1, 100_001)
+    atol = 1e-6 if name == "srgb" else 1e-12  # the published constants of sRGB leave a step where its branches meet
+    np.testing.assert_allclose(transfer.decode(transfer.encode_exactly(x, name), name), x, atol=atol)
+    np.testing.assert_allclose(transfer.encode_exactly(transfer.decode(x, name), name), x, atol=atol)
+    assert transfer.decode([0.0, 1.0], name) == pytest.approx([0, 1])
+
+
+def test_srgb_against_the_standard():
+    x = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(transfer.decode(x), linear(x), atol=1e-12)
+    with pytest.raises(RangeError, match="transfer"):
+        transfer.decode(x, "rec2020")
+
+
+@pytest.mark.parametrize("depth", [8, 16])
+def test_integer_depths_round_the_curve(depth):
+    image = np.linspace(-0.1, 1.1, 3 * 200_000).reshape(200, 1000, 3).astype(np.float32)
+    found = transfer.encode(image, depth=depth)
+    top = 2**depth - 1
+    exact = top * transfer.encode_exactly(np.clip(image, 0, 1).astype(np.float64))
+    assert found.dtype == (np.uint8 if depth == 8 else np.uint16)
+    # 8 bit: a table of 65536 levels, at most 0.03 of a code off half a code; 16 bit: float32 input rounds once
+    assert np.abs(found - exact).max() < 0.55

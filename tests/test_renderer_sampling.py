@@ -1,0 +1,90 @@
+"""The sampler's and the wavelengths' laws: permutation, strata, uniformity, distribution."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy import stats
+
+from hesim_render.backend import jit
+from hesim_render.renderer._mitsuba import mitsuba
+from hesim_render.renderer.sampler import permute, sampler_class, zero_two_point
+from hesim_render.renderer.wavelengths import WavelengthSampler
+from hesim_render.spectra import Spectrum
+
+
+def draws(pixels, per_half, dimensions, seed=11):
+    """Pairs [pixel, half, sample, dimension, 2]."""
+    mi = mitsuba()
+    index = np.indices((pixels, 2, per_half)).reshape(3, -1).astype(np.uint32)
+    sampler = sampler_class(mi.variant())()
+    sampler.setup(mi.UInt64(seed), *(mi.UInt32(i) for i in index), per_half)
+    pairs = [np.array(sampler.next_2d()).T for _ in range(dimensions)]
+    return np.stack(pairs, axis=1).reshape(pixels, 2, per_half, dimensions, 2)
+
+
+@pytest.mark.parametrize("bits", [1, 3, 6, 10])
+def test_permute_is_a_bijection(bits):
+    types = jit()
+    size = 1 << bits
+    for key in (0, 1, 0xDEADBEEF, 0xFFFFFFFF):
+        result = np.array(permute(dr.arange(types.UInt32, size), size - 1, dr.full(types.UInt32, key, size)))
+        np.testing.assert_array_equal(np.sort(result), np.arange(size))
+
+
+def test_points_fill_every_elementary_interval():
+    types = jit()
+    x, y = (np.array(v, dtype=np.float64) / 2**32 for v in zero_two_point(dr.arange(types.UInt32, 16), 4))
+    for split in range(5):
+        cells = np.floor(x * 2**split) * 2 ** (4 - split) + np.floor(y * 2 ** (4 - split))
+        np.testing.assert_array_equal(np.sort(cells), np.arange(16))
+
+
+def test_samples_of_a_half_are_stratified_and_uniform():
+    pairs = draws(400, 8, 6)
+    assert pairs.min() >= 0 and pairs.max() < 1
+    cells = np.sort(np.floor(pairs * 8), axis=2)
+    np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(8)[None, None, :, None, None], cells.shape))
+    # one sample of each pixel and half: independent and uniform (χ², 16 × 16 cells, false alarm 1e-4)
+    one = pairs[:, :, 3].reshape(-1, 2)
+    counts = np.histogram2d(one[:, 0], one[:, 1], bins=16, range=[[0, 1], [0, 1]])[0]
+    assert stats.chisquare(counts.ravel()).pvalue > 1e-4
+
+
+def test_dimensions_pixels_and_halves_are_uncorrelated():
+    pairs = draws(4000, 4, 3)
+    columns = pairs.transpose(0, 1, 2, 3, 4).reshape(4000, -1)
+    matrix = np.corrcoef(columns, rowvar=False)
+    # within one dimension strata make samples of a half anticorrelated; everything else must be 0 on average
+    same = np.kron(np.eye(2), np.kron(np.ones((4, 4)), np.eye(6))).astype(bool)
+    off = matrix[~same]
+    # 1e-4 over all entries by Bonferroni
+    assert np.abs(off).max() < stats.norm.isf(1e-4 / off.size / 2) / np.sqrt(4000)
+    assert matrix[same & ~np.eye(matrix.shape[0], dtype=bool)].mean() < -0.2
+
+
+@pytest.mark.parametrize("per_half", [1, 3, 5])
+def test_any_number_of_samples_is_unbiased(per_half):
+    pairs = draws(20_000, per_half, 1)
+    mean = pairs.mean(axis=(0, 1, 2, 3))
+    assert np.all(np.abs(mean - 0.5) < 4.4 / np.sqrt(12 * 40_000))
+
+
+def test_wavelengths_follow_the_response_exactly():
+    types = jit()
+    spiky = Spectrum(
+        np.array([400.0, 450.0, 450.5, 452.0, 500.0, 600.0, 601.0, 700.0]),
+        np.array([0.0, 0.0, 5.0, 0.1, 0.0, 0.0, 1.0, 0.2]),
+    )
+    flat = Spectrum(np.array([380.0, 780.0]), np.array([2.0, 2.0]))
+    sampler = WavelengthSampler({"flat": flat, "spiky": spiky})
+    count = 1 << 16
+    u = types.Float(((np.arange(count) + 0.5) / count).astype(np.float32))
+    for number, response in enumerate((flat, spiky)):
+        which = dr.full(types.UInt32, number, count)
+        np.testing.assert_allclose(np.array(sampler.total(which))[0], response.integral(), rtol=1e-6)
+        wavelengths = np.sort(np.concatenate([np.array(w, dtype=float) for w in sampler.sample(which, u)]))
+        grid = np.linspace(*response.support_nm, 200_001)
+        values = response.at(grid)
+        area = np.concatenate([[0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(grid))])
+        expected = np.interp(wavelengths, grid, area / area[-1])
+        np.testing.assert_allclose(expected, (np.arange(4 * count) + 0.5) / (4 * count), atol=2e-5)

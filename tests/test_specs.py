@@ -1,0 +1,252 @@
+"""Sensor and scene files: what ships is complete, and every mistake names file, line and key."""
+
+import re
+import typing
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from hesim_render.errors import RangeError, SpecError
+from hesim_render.layout import Layout
+from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene, read_sensor
+from hesim_render.specs.files import content_hash, data_folder, list_names, parse_override
+
+SENSOR = (data_folder("sensors") / "eiger.yaml").read_text()
+SCENE = """schema_version: 1
+name: mine
+description: a grey field
+target:
+  type: flat
+  width_m: 0.3
+  reflectance: 0.18
+light:
+  type: uniform
+  illuminance_lux: 1000
+camera:
+  fit: target
+motion:
+  - object: target
+    keyframes:
+      - {t_us: 0}
+      - {t_us: 1000, rotation_deg: 5}
+"""
+
+
+def line_with(text, part):
+    return next(number for number, line in enumerate(text.splitlines(), 1) if part in line)
+
+
+def error_of(tmp_path, text, reader):
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    with pytest.raises(SpecError) as caught:
+        reader(file)
+    error = caught.value
+    assert "\n" not in str(error)
+    assert str(error).startswith(f"{file}:{error.line}: ")
+    assert error.key is None or error.key in str(error)
+    return error
+
+
+# what is replaced, by what; the key and the text that the message must hold
+MISTAKES = [
+    ("read_noise_e: 5.0", "reed_noise_e: 5.0", "aps.reed_noise_e", "unknown key"),
+    ("device_seed: 3003", "device_sed: 3003", "device_sed", "unknown key"),
+    ("bit_depth: 10", "bit_depth: ten", "aps.bit_depth", "integer"),
+    ("bit_depth: 10", "bit_depth: 17", "aps.bit_depth", "16"),
+    ("exposure_us: 10000", "exposure_us: -5", "aps.exposure_us", "greater than 0"),
+    ("exposure_us: 10000", "exposure_us: 10.5", "aps.exposure_us", "integer"),
+    ("exposure_us: 10000", "exposure_us: 200000", "aps.exposure_us", "longer than a frame period"),
+    ("read_noise_e: 5.0", "read_noise_e: .nan", "aps.read_noise_e", "finite"),
+    ("line_time_us: 14.2", "line_time_us: 0", "aps.line_time_us", "rolling shutter"),
+    ("black_level_dn: 64", "black_level_dn: 1023", "aps.black_level_dn", "10 bits"),
+    ("  R r G g", "  R r G X", "tile", "'X' is not defined"),
+    ("  R r G g", "  R r G", "tile", "same number of letters"),
+    ("rows: 2448", "rows: 2447", "geometry", "whole number"),
+    ("b: {filter: blue,", "b: {filter: bleu,", "pixels.b.filter", "no filter 'bleu'"),
+    ("R: {filter: red, roles: [aps]}", "R: {filter: red, roles: [apps]}", "pixels.R.roles.0", "'aps' or 'evs'"),
+    ("rows_per_tile: 2", "rows_per_tile: 3", "evs_grid", "4 event pixels"),
+    ("channel: green", "channel: gren", "filters.green.camera", "no channel 'gren'"),
+    ("quantum_efficiency: 0.7", "quantum_efficiency: 1.7", "quantum_efficiency", "[0, 1]"),
+    ("quantum_efficiency: 0.7", "quantum_efficiency: nowhere.csv", "quantum_efficiency", "nowhere.csv"),
+    ("quantum_efficiency: 0.7", "quantum_efficiency: D66", "quantum_efficiency", "unknown illuminant 'D66'"),
+    ("quantum_efficiency: 0.7", "quantum_efficiency: {flat: 1, colour: 2}", "quantum_efficiency.colour", "unknown key"),
+    ("quantum_efficiency: 0.7", "quantum_efficiency: {wavelength_nm: [500, 400], value: [1, 1]}", "quantum_efficiency",
+     "increase strictly"),
+    ("quantum_efficiency: 0.7", "quantum_efficiency: {flat: 0.5, band_nm: [900, 1000]}", "filters.red",
+     "do not overlap"),
+    ("f_number: 2.0", "f_number: 0", "lens.f_number", "greater than 0"),
+    ("relative_illumination: cos4", "relative_illumination: {image_height_mm: [0, 1], relative: [1, 2]}",
+     "lens.relative_illumination", "[0, 1]"),
+    ("window_us: 1000", "window_us: 2000", "evs.window_us", "longer than tick_us"),
+    ("beta2: 5.0e-3", "beta2: 0", "evs.coefficients.0.beta2", "greater than 0"),
+    ("filter: own", "filter: ultraviolet", "evs.signal_reference.filter", "no filter 'ultraviolet'"),
+    ("  evs.shot_law:", "  evs.shoot_law:", "sources.evs.shoot_law", "no such key"),
+    ("schema_version: 1", "schema_version: 2", "schema_version", "should be 1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "key", "text"), MISTAKES)
+def test_a_wrong_sensor_file_names_file_line_and_key(old, new, key, text, tmp_path):
+    assert SENSOR.count(old) >= 1
+    error = error_of(tmp_path, SENSOR.replace(old, new, 1), read_sensor)
+    assert error.key is not None and (error.key == key or error.key.startswith(f"{key}."))
+    assert text in str(error)
+    # checks of a whole section report its first line, all others the very line
+    section = {"tile": "tile:", "filters.red": "  red:"}.get(key, old)
+    assert error.line == line_with(SENSOR, section)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "line_of", "text"),
+    [
+        ("type: flat", "type: flatt", "target.type", "type:", "flatt"),
+        ("width_m: 0.3", "width: 0.3", "target.width", "width_m", "unknown key"),
+        ("width_m: 0.3", "width_m: -1", "target.width_m", "width_m", "greater than 0"),
+        ("  illuminance_lux: 1000\n", "", "light", "light:", "exactly one of"),
+        ("illuminance_lux: 1000", "illuminance_lux: -1", "light.illuminance_lux", "illuminance_lux", "or equal to 0"),
+        ("fit: target", "fit: all", "camera.fit", "fit:", "should be 'target'"),
+        ("object: target", "object: ball", "motion", "motion:", "no object 'ball'"),
+        ("t_us: 1000", "t_us: 0", "motion.0.keyframes", "keyframes:", "in order of time"),
+        ("reflectance: 0.18", "reflectance: {colorchecker: Babel, patch: 1}", "target.reflectance", "reflectance",
+         "Babel"),
+    ],
+)  # fmt: skip
+def test_a_wrong_scene_file_names_file_line_and_key(old, new, key, line_of, text, tmp_path):
+    assert old in SCENE
+    error = error_of(tmp_path, SCENE.replace(old, new, 1), read_scene)
+    assert error.key is not None and error.key.startswith(key) and text in str(error)
+    assert error.line == line_with(SCENE, line_of)
+
+
+def test_missing_keys_and_sections(tmp_path):
+    assert error_of(tmp_path, SENSOR.replace("  full_well_e: 6000\n", ""), read_sensor).key == "aps.full_well_e"
+    assert error_of(tmp_path, SENSOR.replace("name: eiger\n", ""), read_sensor).key == "name"
+    error = error_of(tmp_path, SENSOR.replace("evs_grid: {rows_per_tile: 2, cols_per_tile: 2}\n", ""), read_sensor)
+    assert error.key == "evs_grid" and "required" in str(error)
+    error = error_of(tmp_path, SCENE.replace("camera:\n  fit: target\n", ""), read_scene)
+    assert error.key == "camera"
+
+
+def test_broken_yaml_names_the_line(tmp_path):
+    error = error_of(tmp_path, SENSOR.replace("name: eiger", "name: [eiger"), read_sensor)
+    assert "not valid YAML" in str(error)
+    error = error_of(tmp_path, SENSOR.replace("name: eiger", "name: eiger\nname: again"), read_sensor)
+    assert error.line == line_with(SENSOR, "name: eiger") + 1 and "duplicate" in str(error)
+    assert "mapping" in str(error_of(tmp_path, "- 1\n", read_sensor))
+
+
+def test_missing_and_unreadable_files(tmp_path):
+    with pytest.raises(SpecError, match=r"nowhere\.yaml: no such file"):
+        read_sensor(tmp_path / "nowhere.yaml")
+    with pytest.raises(SpecError, match=r"no sensor named 'eigr'; shipped are .*eiger"):
+        read_sensor("eigr")
+    with pytest.raises(SpecError, match="no scene named 'x'"):
+        read_scene("x")
+    (tmp_path / "b.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SpecError, match="not a UTF-8 text file"):
+        read_sensor(tmp_path / "b.yaml")
+
+
+@pytest.mark.parametrize("size", [(3268, 2448), (0, 4), (6, 4), (-4, 4)])
+def test_roi_that_does_not_fit(size):
+    with pytest.raises(RangeError, match="roi"):
+        Layout.full(read_sensor("eiger")).crop(*size)
+
+
+def test_overrides_are_validated_and_named():
+    assert read_sensor("eiger", {"aps.read_noise_e": 1.5}).aps.read_noise_e == 1.5
+    assert read_sensor("eiger", {"evs.coefficients.0.beta4": 0.5}).evs.coefficients[0].beta4 == 0.5
+    for key, value in (("aps.read_noise_e", -1), ("aps.nothing", 1), ("nothing.at.all", 1), ("filters.red", "D66")):
+        with pytest.raises(SpecError) as caught:
+            read_sensor("eiger", {key: value})
+        assert caught.value.key.split(".")[0] == key.split(".")[0] and "set by an override" in str(caught.value)
+    with pytest.raises(SpecError, match="items 0 to 0"):
+        read_sensor("eiger", {"evs.coefficients.7.beta4": 1})
+
+
+def test_parse_override_reads_yaml_values():
+    assert parse_override("a.b=4") == ("a.b", 4)
+    assert parse_override("a=[1, 2.5]") == ("a", [1, 2.5])
+    assert parse_override("a=x=y") == ("a", "x=y")
+    for text in ("a", "=3", "a=[1"):
+        with pytest.raises(SpecError, match="--set"):
+            parse_override(text)
+
+
+def test_hash_is_of_the_content_only(tmp_path):
+    original = content_hash(read_sensor("eiger"))
+    (tmp_path / "copy.yaml").write_text("# another comment\n" + SENSOR)
+    assert content_hash(read_sensor(tmp_path / "copy.yaml")) == original
+    assert content_hash(read_sensor("eiger", {"aps.read_noise_e": 5.1})) != original
+
+
+@pytest.mark.parametrize("name", list_names("sensors"))
+def test_shipped_sensor_files_say_where_every_number_is_from(name):
+    spec = read_sensor(name)
+    assert spec.name == name and spec.description
+    data = files.load_yaml(data_folder("sensors") / f"{name}.yaml")
+    told = {*spec.sources, *spec.assumptions}
+    untold = [
+        key
+        for section in ("geometry", "lens", "aps", "evs")
+        for key in numbers(data.get(section), section)
+        if not any(key == prefix or key.startswith(f"{prefix}.") for prefix in told)
+    ]
+    # a term that is switched off with 0 claims nothing
+    untold = [key for key in untold if value_at(data, key) != 0]
+    assert not untold
+    for section in ("filters", "quantum_efficiency"):
+        assert section in told
+
+
+def numbers(node, prefix):
+    if isinstance(node, dict):
+        return [key for name, value in node.items() for key in numbers(value, f"{prefix}.{name}")]
+    if isinstance(node, list):
+        return [key for number, value in enumerate(node) for key in numbers(value, f"{prefix}.{number}")]
+    return [prefix] if isinstance(node, int | float) and not isinstance(node, bool) else []
+
+
+def value_at(node, key):
+    for part in key.split("."):
+        node = node[int(part)] if isinstance(node, list) else node[part]
+    return node
+
+
+def test_the_six_sensors_ship():
+    names = {"eiger", "gen2", "mipi-hybridevs", "davis346", "reference-mono", "reference-bayer"}
+    assert names <= set(list_names("sensors"))
+
+
+@pytest.mark.parametrize("name", list_names("scenes"))
+def test_shipped_scene_files_load(name):
+    spec = read_scene(name)
+    assert spec.name == name and spec.description
+
+
+def keys_of(model):
+    """Every key that a file can hold, through lists, alternatives and dictionaries."""
+    found = set()
+    for name, field in model.model_fields.items():
+        if not field.exclude:
+            found.add(name)
+            for inner in models_in(field.annotation):
+                found |= keys_of(inner)
+    return found
+
+
+def models_in(annotation):
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in typing.get_args(annotation) for model in models_in(part)]
+
+
+@pytest.mark.parametrize(("model", "document"), [(SensorSpec, "sensors.md"), (SceneSpec, "scenes.md")])
+def test_the_documentation_names_every_key(model, document):
+    docs = Path(__file__).parent.parent / "docs"
+    # how a spectrum is written is told once, in sensors.md
+    text = (docs / document).read_text() + (docs / "sensors.md").read_text()
+    untold = [key for key in keys_of(model) if not re.search(rf"(?<![\w]){key}(?![\w])", text)]
+    assert untold == []

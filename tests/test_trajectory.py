@@ -1,0 +1,110 @@
+"""Keyframed poses against SciPy's rotations, and the Dr.Jit evaluation against the NumPy one."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from hesim_render.backend import jit
+from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.specs.scene import TrackSpec
+
+
+def track(*keyframes, **options):
+    return Trajectory(TrackSpec.model_validate({"object": "x", "keyframes": list(keyframes), **options}))
+
+
+def test_translation_is_linear_and_held_outside_the_keyframes():
+    moving = track({"t_us": 1000, "translation_m": (1, 2, 3)}, {"t_us": 3000, "translation_m": (3, 2, -1)})
+    times = [0, 1000, 1500, 2000, 3000, 9000]
+    expected = [(1, 2, 3), (1, 2, 3), (1.5, 2, 2), (2, 2, 1), (3, 2, -1), (3, 2, -1)]
+    poses = moving.matrix(times)
+    np.testing.assert_allclose(poses[:, :3, 3], expected, atol=1e-12)
+    np.testing.assert_allclose(poses[:, :3, :3], np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-12)
+
+
+def test_shared_axis_turns_at_constant_speed_through_any_number_of_turns():
+    axis = np.array([1.0, -2.0, 0.5])
+    unit = axis / np.linalg.norm(axis)
+    turning = track(
+        {"t_us": 0, "rotation_axis": tuple(axis), "rotation_deg": 30},
+        {"t_us": 10_000, "rotation_axis": tuple(axis), "rotation_deg": 30 + 3.25 * 360},
+    )
+    times = np.linspace(0, 10_000, 41)
+    angle = np.radians(30 + 3.25 * 360 * times / 10_000)
+    expected = Rotation.from_rotvec(angle[:, None] * unit).as_matrix()
+    np.testing.assert_allclose(turning.matrix(times)[:, :3, :3], expected, atol=1e-12)
+
+
+def test_zero_rotation_shares_every_axis():
+    turning = track({"t_us": 0}, {"t_us": 1000, "rotation_axis": (0, 1, 0), "rotation_deg": 720})
+    quarter = turning.matrix(125.0)[:3, :3]
+    np.testing.assert_allclose(quarter, Rotation.from_euler("y", 90, degrees=True).as_matrix(), atol=1e-12)
+    back = track({"t_us": 0, "rotation_axis": (0, 1, 0), "rotation_deg": 720}, {"t_us": 1000})
+    np.testing.assert_allclose(back.matrix(875.0)[:3, :3], quarter, atol=1e-12)
+
+
+def test_opposite_axes_are_the_same_axis_with_the_angle_negated():
+    turning = track(
+        {"t_us": 0, "rotation_axis": (0, 0, 1), "rotation_deg": 10},
+        {"t_us": 100, "rotation_axis": (0, 0, -2), "rotation_deg": -50},
+    )
+    expected = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    np.testing.assert_allclose(turning.matrix(50.0)[:3, :3], expected, atol=1e-12)
+
+
+def test_different_axes_follow_the_shortest_arc():
+    turning = track(
+        {"t_us": 0, "rotation_axis": (1, 0, 0), "rotation_deg": 80},
+        {"t_us": 1000, "rotation_axis": (0, 1, 1), "rotation_deg": 110},
+        {"t_us": 3000, "rotation_axis": (1, 1, 0), "rotation_deg": 200},
+    )
+    keys = Rotation.from_rotvec(
+        [
+            np.radians(80) * np.array([1, 0, 0]),
+            np.radians(110) * np.array([0, 1, 1]) / np.sqrt(2),
+            np.radians(200) * np.array([1, 1, 0]) / np.sqrt(2),
+        ]
+    )
+    times = np.linspace(0, 3000, 31)
+    expected = Slerp([0, 1000, 3000], keys)(times).as_matrix()
+    np.testing.assert_allclose(turning.matrix(times)[:, :3, :3], expected, atol=1e-12)
+
+
+def test_pivot_stays_where_it_is_and_repeat_wraps():
+    turning = track(
+        {"t_us": 100, "rotation_deg": 0},
+        {"t_us": 1100, "rotation_deg": 90},
+        pivot_m=(0.3, -0.2, 1.0),
+        repeat=True,
+    )
+    for time in (100.0, 650.0, 1099.0):
+        pose = turning.matrix(time)
+        np.testing.assert_allclose(pose @ [0.3, -0.2, 1.0, 1], [0.3, -0.2, 1.0, 1], atol=1e-12)
+        for periods in (-3, 2):
+            np.testing.assert_allclose(turning.matrix(time + 1000 * periods), pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_drjit_evaluation_equals_numpy(repeat):
+    moving = track(
+        {"t_us": 500, "translation_m": (0.1, 0, 0), "rotation_axis": (0, 1, 0), "rotation_deg": 400},
+        {"t_us": 700, "translation_m": (0.4, 1, 0), "rotation_axis": (0, 1, 0), "rotation_deg": -20},
+        {"t_us": 2500, "translation_m": (-0.3, 0.5, 2), "rotation_axis": (1, 0, 1), "rotation_deg": 75},
+        pivot_m=(0.2, 0.1, -0.4),
+        repeat=repeat,
+    )
+    types = jit()
+    times = np.linspace(-800, 4400, 521)
+    local = moving.local_us(times) if repeat else times - 500
+    point, direction = np.array([0.7, -0.3, 0.9]), np.array([0.6, 0.0, -0.8])
+    vectors = (types.Array3f(*map(float, vector)) for vector in (point, direction))
+    moved, turned = moving.move(types.Float(local.astype(np.float32)), *vectors)
+    poses = moving.matrix(times)
+    np.testing.assert_allclose(np.array(moved).T, poses[:, :3, :3] @ point + poses[:, :3, 3], atol=3e-6)
+    np.testing.assert_allclose(np.array(turned).T, poses[:, :3, :3] @ direction, atol=3e-6)
+
+
+def test_a_track_without_motion_does_not_move():
+    still = {"translation_m": (1, 0, 0), "rotation_deg": 90}
+    assert not track({"t_us": 0, **still}, {"t_us": 10, **still}).moves
+    assert track({"t_us": 0, **still}, {"t_us": 10, "translation_m": (1, 0, 0), "rotation_deg": 450}).moves
