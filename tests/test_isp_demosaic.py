@@ -18,8 +18,9 @@ from isp_images import (
     srgb,
 )
 
+from hesim_render import bands
 from hesim_render.errors import RangeError
-from hesim_render.isp import Camera, Pipeline, bands, demosaic, kriging, process, remosaic
+from hesim_render.isp import Camera, Pipeline, demosaic, kriging, process, remosaic
 
 EIGER = ((0, 0, 1, 1), (0, -1, 1, -1), (1, 1, 2, 2), (1, -1, 2, -1))
 RGBW = ((3, 0, 3, 1), (0, 3, 1, 3), (3, 1, 3, 2), (1, 3, 2, 3))

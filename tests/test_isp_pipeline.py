@@ -9,6 +9,7 @@ import tifffile
 from isp_images import PAPER_BALANCE, PAPER_MATRIX, QUAD, captured, images, mosaic_of, psnr
 from PIL import Image
 
+from hesim_render import transfer
 from hesim_render.errors import OutputError, RangeError, SpecError
 from hesim_render.isp import (
     DEFAULT,
@@ -25,7 +26,6 @@ from hesim_render.isp import (
     load_pipeline,
     process,
     tone,
-    transfer,
 )
 from hesim_render.recording import Recording
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
+from hesim_render import transfer
 from hesim_render.errors import RangeError
-from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone, transfer
+from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
 
 RNG = np.random.default_rng(11)
 

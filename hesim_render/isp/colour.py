@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError
-from hesim_render.isp.bands import in_bands
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError
 from hesim_render.isp import kriging
-from hesim_render.isp.bands import in_bands
-from hesim_render.isp.transfer import ROOT_TOE
+from hesim_render.transfer import ROOT_TOE
 
 #: Contrast of activity along rows and columns, |H - V| / (H + V), where direction begins to count and is sure.
 _UNSURE, _SURE = 0.2, 0.5

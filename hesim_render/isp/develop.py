@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render import manifest as manifests
+from hesim_render.camera import Camera
 from hesim_render.errors import RangeError, SpecError
-from hesim_render.isp.camera import Camera
 from hesim_render.isp.pipeline import PICTURE, Pipeline, develop
 from hesim_render.layout import Layout
 from hesim_render.optics import Lens, relative_illumination

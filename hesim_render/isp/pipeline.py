@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from hesim_render.camera import Camera
 from hesim_render.errors import RangeError
 from hesim_render.frame import Frame
-from hesim_render.isp.camera import Camera
 from hesim_render.isp.steps import ON_MOSAIC, Demosaic, Development, Encode, Step
 from hesim_render.mosaic import Mosaic
 from hesim_render.specs.files import Strict, load_yaml, validate

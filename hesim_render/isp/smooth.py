@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.errors import RangeError
-from hesim_render.isp.transfer import ROOT_TOE
+from hesim_render.transfer import ROOT_TOE
 
 
 def guided_filter(

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
+from hesim_render.camera import Camera
 from hesim_render.errors import SpecError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
-from hesim_render.isp.camera import Camera
 from hesim_render.isp.demosaicing import demosaic
-from hesim_render.isp.transfer import Depth, Transfer, encode
 from hesim_render.specs.files import Strict
+from hesim_render.transfer import Depth, Transfer, encode
 
 Corners = Annotated[list[tuple[float, float]], Field(min_length=4, max_length=4)]
 

@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import functools
-from typing import Literal
+import math
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError
-from hesim_render.isp.bands import in_bands
 
 Transfer = Literal["srgb", "bt709", "gamma", "linear"]
+#: The transfers of pictures that come in: also those of high dynamic range.
+InputTransfer = Literal["srgb", "bt709", "gamma", "linear", "pq", "hlg"]
 #: Steps that work on square roots add this first, in units of white: shot noise becomes even, and read noise
 #: around black is not bent.
 ROOT_TOE = 0.01
 #: Constants of BT.709 to the digits of ITU-T H.273, with which the two branches of the curve meet.
 _BT709_ALPHA, _BT709_BETA = 1.099296826809442, 0.018053968510807
+#: Constants of SMPTE ST 2084 (PQ) and of the HLG curve, ITU-R BT.2100-2 tables 4 and 5.
+_PQ_M1, _PQ_M2, _PQ_C1, _PQ_C2, _PQ_C3 = 2610 / 16384, 2523 / 32, 3424 / 4096, 2413 / 128, 2392 / 128
+_HLG_A, _HLG_B, _HLG_C = 0.17883277, 0.28466892, 0.55991073
+#: What counts as white, 1, in high dynamic range: 203 cd/m² and 75 % HLG signal (ITU-R BT.2408).
+_PQ_WHITE = 203 / 10000
+_HLG_WHITE = (math.exp((0.75 - _HLG_C) / _HLG_A) + _HLG_B) / 12
 Depth = Literal["float", 8, 16]
 
 
-def decode(values: ArrayLike, transfer: Transfer = "srgb", gamma: float = 2.2) -> NDArray[np.float64]:
+def decode(values: ArrayLike, transfer: InputTransfer = "srgb", gamma: float = 2.2) -> NDArray[np.float64]:
     """Linear light of picture values in [0, 1]; float64, any shape.
 
     Parameters
     ----------
-    transfer : ``srgb`` (IEC 61966-2-1), ``bt709`` (ITU-R BT.709, the camera's curve), ``gamma``, ``linear``.
+    transfer : ``srgb`` (IEC 61966-2-1), ``bt709`` (ITU-R BT.709, the camera's curve), ``gamma``, ``linear``,
+        ``pq`` and ``hlg`` (ITU-R BT.2100; the display's light and the scene's, 1 being 203 cd/m² and 75 % signal).
     gamma : exponent of ``gamma``.
     """
     x = np.asarray(values, dtype=np.float64)
@@ -38,7 +48,13 @@ def decode(values: ArrayLike, transfer: Transfer = "srgb", gamma: float = 2.2) -
         return np.maximum(x, 0) ** gamma
     if transfer == "linear":
         return x
-    raise RangeError("transfer", transfer, "srgb, bt709, gamma or linear")
+    if transfer == "pq":
+        root = np.maximum(x, 0) ** (1 / _PQ_M2)
+        return (np.maximum(root - _PQ_C1, 0) / (_PQ_C2 - _PQ_C3 * root)) ** (1 / _PQ_M1) / _PQ_WHITE
+    if transfer == "hlg":
+        x = np.maximum(x, 0)
+        return np.where(x <= 0.5, x**2 / 3, (np.exp((x - _HLG_C) / _HLG_A) + _HLG_B) / 12) / _HLG_WHITE
+    raise RangeError("transfer", transfer, f"one of {', '.join(get_args(InputTransfer))}")
 
 
 def encode_exactly(linear: ArrayLike, transfer: Transfer = "srgb", gamma: float = 2.2) -> NDArray[np.float64]:

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
+from hesim_render import transfer as curves
 from hesim_render.errors import RangeError
-from hesim_render.isp import transfer as curves
-from hesim_render.isp.transfer import Transfer
 from hesim_render.mosaic import Mosaic
 from hesim_render.specs.files import Strict, load_yaml, validate
+from hesim_render.transfer import Transfer
 
 #: Stands in a tile where a position gives no frame value.
 NO_VALUE = "."
