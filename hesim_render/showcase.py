@@ -44,7 +44,9 @@ def write_previews(recording: Recording, folder: Path) -> list[Path]:
 
 
 def moves(recording: Recording) -> bool:
-    """Whether the scene of a recording has motion."""
+    """Whether the scene of a recording has motion; a video counts as such."""
+    if "video" in recording.manifest["settings"]:
+        return True
     scene = recording.manifest.get("scene") or {}
     return bool(scene.get("spec", {}).get("motion"))
 

@@ -1,0 +1,112 @@
+"""What commands read from and write to a terminal: texts into values, a progress bar, a summary."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hesim_render.errors import RangeError
+
+if TYPE_CHECKING:
+    from hesim_render.recording import Recording
+
+
+def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """``--set`` items for the scene file and for the sensor file (those that begin with ``sensor.``)."""
+    from hesim_render.specs.files import parse_override
+
+    scene: dict[str, Any] = {}
+    sensor: dict[str, Any] = {}
+    for key, value in map(parse_override, texts):
+        if key.startswith("sensor."):
+            sensor[key.removeprefix("sensor.")] = value
+        else:
+            scene[key] = value
+    return scene, sensor
+
+
+def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
+    """Width, height and optional first column and row of ``512x384`` or ``512x384+100+200``."""
+    size, *offset = text.lower().split("+")
+    try:
+        width, height = (int(part) for part in size.split("x"))
+        x, y = (int(part) for part in offset) if offset else (None, None)
+    except ValueError:
+        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384") from None
+    return width, height, x, y
+
+
+def parse_exposures(text: str) -> list[int]:
+    """Exposures in µs of ``1,5,20``, in ms."""
+    try:
+        return [round(1000 * float(part)) for part in text.split(",")]
+    except (ValueError, OverflowError):
+        raise RangeError("exposures", text, "times in ms, such as 1,5,20") from None
+
+
+@contextlib.contextmanager
+def progress_bar(title: str) -> Iterator[Any]:
+    """A callback (done, total, what) that moves a bar on a terminal; silent elsewhere."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None)
+
+        def move(done: float, total: float, what: str) -> None:
+            bar.update(task, completed=done, total=total, description=f"{title}: {what}")
+
+        yield move
+
+
+def summary(recording: Recording) -> str:
+    """What a recording holds and where, in a few lines."""
+    manifest = recording.manifest
+    counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
+    video = manifest["settings"].get("video")
+    scene = Path(video["source"]).name if video else (manifest.get("scene") or {}).get("name", "no scene file")
+    size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
+    lines = [
+        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}",
+        f"  RAW frames: {counts['frames']} of {size}, {bits}",
+    ]
+    if counts["frames"] == 0:
+        lines[1] += " (no frame's last row is fully exposed in this time)"
+    if grid["width"]:
+        lines.append(
+            f"  events: {counts['events']} ({counts['events_on']} ON, {counts['events_off']} OFF) "
+            f"on {grid['width']}x{grid['height']} px"
+        )
+    if counts.get("events_dropped"):
+        lines.append(f"  {counts['events_dropped']} more events were lost in the sensor's read-out")
+    lines += _reached(manifest["settings"].get("render"))
+    if recording.path is not None:
+        pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
+        lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
+    return "\n".join(lines)
+
+
+def _reached(render: dict[str, Any] | None) -> list[str]:
+    """What a render of a wanted quality has come to."""
+    if render is None:
+        return []
+    audit = render["audit"]
+    lines = [f"  render: error {render['error_rms_noise']:.2f} of the sensor's noise (asked for {render['quality']:g})"]
+    if render["pairs_over_quality"]:
+        share = render["pairs_over_quality"] / max(1, render["pairs_rendered"])
+        lines[0] += f"; {100 * share:.2g} % of the pixels need more rays than the most allowed"
+    if audit["filled_in"]:
+        bound = audit["exceeding_fraction_at_most"]
+        verdict = "" if bound <= audit["wanted_at_most"] else ": more than it should; ask for a smaller --quality"
+        lines.append(
+            f"  audit: of {audit['filled_in']} values not rendered at most {100 * bound:.2g} % are off by more than "
+            f"{audit['tolerance_noise']:g} of the noise (99 % confidence){verdict}"
+        )
+    return lines
