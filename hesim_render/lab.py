@@ -109,7 +109,7 @@ def write_captures(
             if bench.evs is not None:
                 session.write_static(folder.path / "evs_static.npz", ticks)
                 session.write_steps(folder.path / "evs_steps.npz", trials)
-            _describe(bench, folder.path, f"{illuminant}, {bench.lux:.4g} lux on the brightest patch; seed {seed}")
+            _describe(bench, folder.path, illuminant, seed)
         return folder.commit()
     except BaseException:
         folder.discard()
@@ -212,7 +212,7 @@ class _Session:
         return on.reshape(shape), off.reshape(shape)
 
 
-def _describe(bench: Bench, folder: Path, how: str) -> None:
+def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
     """``capture.yaml``, and the sensor's file where it is not one that ships."""
     spec, layout = bench.sensor.spec, bench.sensor.layout
     shipped = bench.sensor.file in list_names("sensors") and content_hash(
@@ -226,6 +226,7 @@ def _describe(bench: Bench, folder: Path, how: str) -> None:
         "tile_rows": tile_rows,
         "tile_cols": tile_cols,
         "sensor": bench.sensor.file if shipped else "sensor.yaml",
+        "illuminant": illuminant,
         "roi": {"x": layout.col0, "y": layout.row0, "width_px": layout.cols, "height_px": layout.rows},
     }
     if bench.evs is not None:
@@ -236,7 +237,10 @@ def _describe(bench: Bench, folder: Path, how: str) -> None:
             "k": reference.k_dn_per_e, "t_ref_us": reference.t_ref_us, "filter": reference.filter
         }  # fmt: skip
         content["contrast_of"] = "signal"
-    content["notes"] = f"a virtual session, hesim-render lab {spec.name}: {how}"
+    content["notes"] = (
+        f"a virtual session, hesim-render lab {spec.name}: {illuminant}, {bench.lux:.4g} lux on the brightest patch; "
+        f"seed {seed}"
+    )
     _dump(content, folder / CAPTURE_NAME)
 
 

@@ -101,7 +101,9 @@ def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moment
         "beta_covariance": covariance,
     }
     if captures.sensor is not None and captures.sensor.evs is not None:
-        arrays["evs_signal_dn_per_s"] = signal_at_event_pixels(composite.rate_dn_per_s, captures.sensor)
+        arrays["evs_signal_dn_per_s"], arrays["evs_signal_uneven"] = signal_at_event_pixels(
+            composite, captures.sensor, captures.spec.illuminant
+        )
     return arrays | _figures(result, lit, dark_moments, tile)
 
 

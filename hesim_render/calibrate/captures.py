@@ -51,6 +51,7 @@ class CaptureSpec(Strict):
     roi: Region | None = Field(None, description="the whole sensor where it is left out")
     theta_hardware_v: PositiveFloat | None = None
     signal_reference: SignalReference | None = None
+    illuminant: str | None = Field(None, description="light on a neutral scene: tells filters that frames lack")
     contrast_of: Literal["signal", "voltage"] = "signal"
     evs_tile_rows: PositiveInt | None = Field(
         None, description="event pixels of a tile, where they are not one a pixel"

@@ -8,12 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from hesim_render import spectra
 from hesim_render.calibrate.dark import ADC_VARIANCE_DN2, DarkModel
 from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.variance import variance_map
 from hesim_render.specs.sensor import SensorSpec
 
 _CLEAR_SIGMAS = 6.0
+#: Relative standard deviation of the frame pixels around an event pixel from which they do not tell its signal.
+_UNEVEN = 0.1
+#: Times their noise variance that a few of them may scatter.
+_NOISE_MARGIN = 3.0
 
 
 @dataclass(frozen=True)
@@ -87,47 +92,90 @@ def compose(lit: Moments, dark: DarkModel, usable: NDArray[np.bool_], beta: NDAr
     return Composite(rate.astype(np.float32), error.astype(np.float32))
 
 
-def signal_at_event_pixels(rate_dn_per_s: NDArray, sensor: SensorSpec, sigma_px: float = 1.0) -> NDArray[np.float32]:
-    """Composite at the event pixels, on the event grid [y, x], DN/s.
+def signal_at_event_pixels(
+    composite: Composite, sensor: SensorSpec, illuminant: str | None = None, sigma_px: float = 1.0
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Composite at the event pixels, on the event grid [y, x], DN/s, and where it is not to be relied on.
 
     A pixel with both roles is taken as it is; an event-only one is interpolated from frame pixels of its
     own filter by a normalised Gaussian (σ in pixels, widened until it finds any).
 
+    Parameters
+    ----------
+    illuminant : light on the neutral scene. It tells the response of an event filter that no frame pixel has (the
+        white of many sensors) over that of each frame pixel's, which is ∫ light · filter · λ dλ of both.
+
     Returns
     -------
-    NaN where no frame pixel has the event pixel's filter: its signal cannot be had from the frames.
+    The signal, NaN where no frame pixel has the event pixel's filter and the light is not known (what a filter passes
+    of an unknown spectrum does not follow from what others do), and whether the frame pixels around that it was taken
+    from differ by more than a tenth beyond their noise, as at an edge of the scene.
+
+    Raises
+    ------
+    SpecError
+        If the illuminant is unknown or does not cover the response.
     """
     tile = sensor.tile_rows
     height, width = len(tile), len(tile[0])
+    rate_dn_per_s, error = composite.rate_dn_per_s, composite.standard_error_dn_per_s
     grid = sensor.evs_grid
     if grid is None:
-        return np.empty((0, 0), np.float32)
+        return np.empty((0, 0), np.float32), np.empty((0, 0), bool)
     shape = rate_dn_per_s.shape[0] // height * grid.rows_per_tile, rate_dn_per_s.shape[1] // width * grid.cols_per_tile
-    signal = np.full(shape, np.nan, np.float32)
-    rows, cols = np.indices(rate_dn_per_s.shape)
+    signal, uneven = np.full(shape, np.nan, np.float32), np.zeros(shape, bool)
+    values: NDArray
+    differ: NDArray
     for k, (i, j) in enumerate(sensor.positions("evs")):
         pixel = sensor.pixels[tile[i][j]]
         if "aps" in pixel.roles:
             values = rate_dn_per_s[i::height, j::width]
+            differ = np.zeros(values.shape, bool)
         else:
-            same = [p for p in sensor.positions("aps") if sensor.pixels[tile[p[0]][p[1]]].filter == pixel.filter]
-            known = np.zeros(rate_dn_per_s.shape, bool)
-            for a, b in same:
-                known |= (rows % height == a) & (cols % width == b)
-            values = _smoothed(rate_dn_per_s, known & np.isfinite(rate_dn_per_s), sigma_px, max(height, width))[
-                i::height, j::width
-            ]
+            scaled, noise = np.full((2, *rate_dn_per_s.shape), np.nan)
+            for (a, b), ratio in _like_it(sensor, pixel.filter, illuminant).items():
+                cut = np.s_[a::height, b::width]
+                scaled[cut], noise[cut] = ratio * rate_dn_per_s[cut], ratio * error[cut]
+            values, differ = (v[i::height, j::width] for v in _smoothed(scaled, noise, sigma_px, max(height, width)))
         a, b = divmod(k, grid.cols_per_tile)
         signal[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = values
-    return signal
+        uneven[a :: grid.rows_per_tile, b :: grid.cols_per_tile] = differ
+    return signal, uneven
 
 
-def _smoothed(values: NDArray, known: NDArray[np.bool_], sigma_px: float, widest_px: float) -> NDArray:
-    result = np.full(values.shape, np.nan)
-    filled = np.where(known, values, 0.0)
+def _like_it(sensor: SensorSpec, name: str, illuminant: str | None) -> dict[tuple[int, int], float]:
+    """Frame positions that tell the signal through filter `name`, and its ratio to theirs."""
+    filters = {p: sensor.pixels[sensor.tile_rows[p[0]][p[1]]].filter for p in sensor.positions("aps")}
+    same = {p: 1.0 for p, other in filters.items() if other == name}
+    if same or illuminant is None:
+        return same
+    light = spectra.illuminant(illuminant)
+    total = {}
+    for other in {name, *filters.values()}:
+        response = sensor.filter_response(other)
+        spectra.require_coverage(light, response, f"illuminant {illuminant!r}", f"filter {other!r}")
+        per_watt = spectra.Spectrum(response.wavelength_nm, response.values * response.wavelength_nm)
+        total[other] = spectra.integrate_product(light, per_watt)
+    return {p: total[name] / total[other] for p, other in filters.items()}
+
+
+def _smoothed(
+    values: NDArray, noise: NDArray, sigma_px: float, widest_px: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Normalised Gaussian mean of the finite values, and where they differ by `_UNEVEN` beyond their noise."""
+    result, uneven = np.full(values.shape, np.nan), np.zeros(values.shape, bool)
+    known = np.isfinite(values)
+    filled, noise = np.where(known, values, 0.0), np.where(known, noise, 0.0)
     while sigma_px <= widest_px:
-        weight = gaussian_filter(known.astype(float), sigma_px, truncate=3)
+
+        def blur(image: NDArray, sigma_px: float = sigma_px) -> NDArray:
+            return gaussian_filter(image, sigma_px, truncate=3)
+
+        weight = blur(known.astype(float))
         use = ~np.isfinite(result) & (weight > 1e-3)
-        result[use] = gaussian_filter(filled, sigma_px, truncate=3)[use] / weight[use]
+        weight = np.maximum(weight, 1e-3)
+        mean = blur(filled) / weight
+        excess = blur(filled * filled) / weight - mean * mean - _NOISE_MARGIN * blur(noise * noise) / weight
+        result[use], uneven[use] = mean[use], (excess > (_UNEVEN * mean) ** 2)[use]
         sigma_px *= 2
-    return result
+    return result, uneven

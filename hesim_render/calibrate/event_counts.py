@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,9 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import binom
 
 from hesim_render.calibrate.captures import CaptureSet
+from hesim_render.calibrate.result import read_calibration, read_maps
 from hesim_render.errors import SpecError
+from hesim_render.units import S_PER_US
 
 _CHANCE = 1e-7
 
@@ -48,8 +51,12 @@ class StaticCapture:
         return [*lit, (np.zeros_like(self.signal_dn), self.dark_n_on, self.dark_n_off)]
 
 
-def read_static(captures: CaptureSet) -> StaticCapture:
+def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> StaticCapture:
     """Read and check ``evs_static.npz``.
+
+    Parameters
+    ----------
+    calibration : ``calibration.yaml`` of the frames, whose composite is the signal where the file gives none.
 
     Raises
     ------
@@ -57,8 +64,16 @@ def read_static(captures: CaptureSet) -> StaticCapture:
         If arrays are missing or do not fit each other, or the counts hold nothing to fit.
     """
     file = captures.folder / "evs_static.npz"
-    data = captures.arrays("evs_static", ("signal_dn", "n_on", "n_off", "n_trials"))
-    signal = np.asarray(data["signal_dn"])
+    evs = captures.sensor.evs if captures.sensor is not None else None
+    if evs is not None and evs.reference == "last_event":
+        raise SpecError(
+            "sensors with reference 'last_event' make no comparisons at fixed times: their counts have no probability "
+            "per trial, and their events cannot be calibrated",
+            file=captures.folder / "capture.yaml",
+            key="sensor",
+        )
+    data = captures.arrays("evs_static", ("n_on", "n_off", "n_trials"))
+    signal = np.asarray(data["signal_dn"]) if "signal_dn" in data else _composite_signal(captures, calibration, file)
     if signal.ndim != 2 or signal.dtype.kind not in "uif":
         raise SpecError(f"signal_dn has shape {signal.shape}; expected numbers [row, col]", file=file)
     trials = _trials(data["n_trials"], file)
@@ -93,6 +108,46 @@ def read_static(captures: CaptureSet) -> StaticCapture:
         trials,
         event_tile(captures, signal.shape),
     )
+
+
+def _composite_signal(captures: CaptureSet, calibration: str | Path | None, file: Path) -> NDArray[np.float64]:
+    """Signal [row, col] at the event pixels from the frames' composite, in DN of each pixel's own filter.
+
+    It is a rate times the exposure of the signal reference; NaN at edges of the scene, where it is interpolated badly.
+
+    Raises
+    ------
+    SpecError
+        If it cannot be had.
+    """
+    rate = None
+    if calibration is not None and Path(calibration).exists() and "aps" in read_calibration(calibration):
+        maps = read_maps(calibration, "aps")
+        if "evs_signal_uneven" in maps:
+            rate = np.where(maps["evs_signal_uneven"], np.nan, maps["evs_signal_dn_per_s"])
+    if rate is None:
+        raise SpecError(
+            "holds no array 'signal_dn', the clean signal at the event pixels; give it, or state the sensor in "
+            "capture.yaml and calibrate frames of the same scene first, into the same --out",
+            file=file,
+        )
+    if not np.isfinite(rate).any():
+        raise SpecError(
+            "no frame pixel has the filter of the event pixels: state the light on the neutral scene and calibrate the "
+            "frames again, or give signal_dn in evs_static.npz",
+            file=captures.folder / "capture.yaml",
+            key="illuminant",
+        )
+    reference = captures.spec.signal_reference
+    if reference is None or reference.filter != "own":
+        raise SpecError(
+            "the signal is to be taken from the frames: state {k, t_ref_us, filter: own}, or give signal_dn in "
+            "evs_static.npz",
+            file=captures.folder / "capture.yaml",
+            key="signal_reference",
+        )
+    # below 0 is the noise of a dark patch
+    return np.maximum(rate.astype(np.float64), 0.0) * reference.t_ref_us * S_PER_US
 
 
 def _trials(value: NDArray, file: object) -> int:

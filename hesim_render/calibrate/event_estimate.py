@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 
 from hesim_render.calibrate.event_dispersion import Dispersion
-from hesim_render.calibrate.event_fit import maximise, quasi_sandwich, sandwich, start_values
+from hesim_render.calibrate.event_fit import Scatter, maximise, quasi_sandwich, sandwich, search, start_values
 from hesim_render.calibrate.event_model import (
     EventCounts,
     Law,
@@ -130,9 +130,11 @@ def fit_events(
     fisher_covariance = covariance * mask[:, None] * mask
     used_covariance = fisher_covariance
     if dispersed:
-        scatter = bins.scatter()[0] * bins.pixels[0][:, None, None]
-        few = bins.pixels[0] < 10
-        scatter[few] = _model_scatter(bins, eta[0], theta, law, mismatch, spread)[few]
+        own, lit_dark = bins.scatter_about(
+            *(bins.trials * p for p in probabilities(eta, bins.counts.signal_dn, theta, law, mismatch))
+        )
+        pixels = bins.pixels[0][:, None, None]
+        scatter = Scatter(own[0] * pixels, lit_dark[0] * pixels, bins.dark_bin)
         if inverse is None:
             used_covariance = sandwich(eta[0], counts, theta, law, mismatch, free, scatter)
         else:
@@ -157,7 +159,7 @@ def _best_start(
     counts: EventCounts, theta: float | NDArray, theta_v: float, law: Law, mismatch: float
 ) -> NDArray[np.float64]:
     """Where the likeliest of several searches for A, B, C and D ends: from one start alone it may be a side hill."""
-    tried, _, _ = maximise(counts, start_values(counts, theta_v, law), theta, law, mismatch, [True] * 4 + [False] * 2)
+    tried, _, _ = search(counts, start_values(counts, theta_v, law), theta, law, mismatch, [True] * 4 + [False] * 2)
     likelihood = [_likelihood(counts, eta, theta, law, mismatch) for eta in tried]
     return tried[int(np.nanargmax(likelihood))]
 
@@ -193,7 +195,7 @@ def _dispersion_factor(bins: PooledEvents, eta: NDArray, theta_v: float | NDArra
     """Scatter of ON − OFF over the pixels beyond counting: what a test of their asymmetry must allow for."""
     scatter = bins.scatter()[0]
     on, off = probabilities(eta, bins.counts.signal_dn[0], theta_v, law, mismatch)
-    use = bins.pixels[0] > 5
+    use = bins.pixels[0] > 1
     measured = (scatter[:, 0, 0] + scatter[:, 1, 1] - 2 * scatter[:, 0, 1])[use]
     expected = (bins.trials * (on + off))[use]
     return max(1.0, float(np.sum(measured * bins.pixels[0][use]) / np.sum(expected * bins.pixels[0][use])))
@@ -218,7 +220,7 @@ def _without(eta: NDArray, index: int) -> NDArray[np.float64]:
     """The parameters with one of them set to what leaves it out: A, C or D of 0."""
     changed = eta.copy()
     if index == 3:
-        changed[2] = np.hypot(changed[2], changed[3])
+        changed[2] += changed[3] ** 2
     changed[index] = 0.0
     return changed
 
@@ -265,10 +267,12 @@ def _model_scatter(
     least = 1e-3 / np.maximum(bins.counts.trials[0], 1)
     on, off = (np.maximum(p, least) for p in probabilities(eta, signal, theta_v, law, mismatch))
     total, difference = spread.in_time if spread is not None else (1.0, 1.0)
+    # the trinomial covariance, scaled in its sum and difference, so that it stays one however large P is
+    both, apart = total * (on + off) * (1 - on - off), difference * (on + off - (on - off) ** 2)
+    skew = np.sqrt(total * difference) * (on * (1 - on) - off * (1 - off))
     one = np.empty((signal.size, 2, 2))
-    one[:, 0, 0] = on * (1 - on) * (total + difference) / 2
-    one[:, 1, 1] = off * (1 - off) * (total + difference) / 2
-    one[:, 0, 1] = one[:, 1, 0] = np.sqrt(on * off) * (total - difference) / 2 - on * off
+    one[:, 0, 0], one[:, 1, 1] = (both + apart) / 4 + skew / 2, (both + apart) / 4 - skew / 2
+    one[:, 0, 1] = one[:, 1, 0] = (both - apart) / 4
     one *= n
     if spread is not None and mismatch > 0:
         u, _ = threshold_over_noise(eta, signal, theta_v, law)

@@ -7,6 +7,7 @@ tile positions or bootstrap samples), so that 200 starts cost little more than o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.event_model import EventCounts, Law, log_likelihood, log_probabilities
 
 _ROUNDS = 300
-_LEAST = np.array([0.0, -30.0, -np.inf, -np.inf, -0.95, 0.0])
+#: ln of the factors of C that a search tries first.
+_REACH_OF_C = np.linspace(-3.0, 3.0, 25)
+_LEAST = np.array([0.0, -30.0, 0.0, -np.inf, -0.95, 0.0])
 _LARGEST = np.array([np.inf, 60.0, np.inf, np.inf, 0.95, 0.5])
 
 
@@ -29,7 +32,7 @@ def start_values(counts: EventCounts, theta_v: float, law: Law) -> NDArray[np.fl
     starts = np.zeros((noise.size, 6))
     starts[:, 0] = np.maximum(x - b, 0.01 * b) / bright
     starts[:, 1] = np.log(b)
-    starts[:, 2] = noise / (bright if law == "linear" else np.sqrt(bright))
+    starts[:, 2] = noise**2 / (bright**2 if law == "linear" else bright)
     return starts
 
 
@@ -39,6 +42,47 @@ def _threshold_over_noise(counts: EventCounts, bins: NDArray[np.intp]) -> float:
 
     rate = (counts.on[bins].sum() + counts.off[bins].sum() + 1) / (2 * counts.trials[bins].sum() + 2)
     return max(-float(ndtri(min(rate, 0.49))), 0.05)
+
+
+def search(
+    counts: EventCounts, start: NDArray, theta_v: float | NDArray, law: Law, mismatch: float, free: Sequence[bool]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """`maximise` from starts that may be far off.
+
+    Far off, P is 0 or ½ in most bins, and the likelihood sends A and C, of which only the ratio then counts, away
+    for good. So least squares of u, the Q⁻¹ of each bin's rate, comes first: it is linear in A and B, and C is the
+    best of many about the start's; D stays.
+    """
+    return maximise(counts, _approach(counts, start, theta_v, law, mismatch, free), theta_v, law, mismatch, free)
+
+
+def _approach(
+    counts: EventCounts, start: NDArray, theta_v: float | NDArray, law: Law, mismatch: float, free: Sequence[bool]
+) -> NDArray[np.float64]:
+    """Least squares of u [fit, 6]; a start whose A, B or C is not free stays as it is."""
+    if not all(free[:3]):
+        return np.array(start)
+    from scipy.special import ndtri
+
+    p = np.minimum((counts.on + counts.off + 0.5) / (2 * counts.trials + 1), 0.49)
+    v = -ndtri(p)
+    u = v / np.sqrt(np.maximum(1 - (mismatch * v) ** 2, 0.1))
+    weight = counts.trials * np.exp(-v * v) / p  # inverse variance of u, but for a factor
+    shot = counts.signal_dn if law == "linear" else np.sqrt(counts.signal_dn)
+    scale = np.exp(_REACH_OF_C)[:, None]  # [scale, 1], against [fit, scale, bin]
+    w, e = start[:, 2, None, None] * scale**2, start[:, 3, None, None] * scale
+    base = theta_v / np.sqrt(2 * np.maximum((1 + e * shot) ** 2 + w * shot**2, 1e-12))
+    slope = base * counts.signal_dn
+    aa, ab, bb = (np.sum(weight * x * y, axis=-1) for x, y in ((slope, slope), (slope, base), (base, base)))
+    ay, by = np.sum(weight * slope * u, axis=-1), np.sum(weight * base * u, axis=-1)
+    a = np.maximum((ay * bb - by * ab) / np.maximum(aa * bb - ab * ab, 1e-300), 0.0)
+    b = (by - a * ab) / bb
+    cost = np.where(b > 0, np.sum(weight * (u - a[..., None] * slope - b[..., None] * base) ** 2, axis=-1), np.inf)
+    best = np.argmin(cost, axis=1)
+    near, row = np.array(start), np.arange(len(start))
+    near[:, 0], near[:, 1] = a[row, best], np.log(np.maximum(b[row, best], 1e-12))
+    near[:, 2], near[:, 3] = w[row, best, 0], e[row, best, 0]
+    return np.where(np.isfinite(cost[row, best])[:, None], near, start)
 
 
 def maximise(
@@ -86,7 +130,8 @@ def maximise(
         step = _solve(now, score, information, damping[:, None])
         limit = np.tile([0.0, 1.0, 0.0, 0.0, 0.3, 0.1], (len(now), 1))
         limit[:, 0] = np.maximum(np.exp(now[:, 1]) / bright, now[:, 0]) * 0.7
-        limit[:, 2:4] = np.maximum(1 / reach, np.hypot(now[:, 2], now[:, 3]))[:, None] * 0.7
+        strength = np.maximum(1 / reach, np.sqrt(now[:, 2] + now[:, 3] ** 2))
+        limit[:, 2], limit[:, 3] = 0.7 * strength**2, 0.7 * strength
         step /= np.maximum(1, np.max(np.abs(step) / limit, axis=1))[:, None]
         trial = np.where(mask, np.clip(now + step, _LEAST, _LARGEST), now)
         new_value, new_score, new_information = _evaluate(
@@ -155,6 +200,30 @@ def _evaluate(
     return value, score, fisher
 
 
+@dataclass(frozen=True)
+class Scatter:
+    """How the bins' total counts (ON, OFF) scatter, measured over their pixels.
+
+    Attributes
+    ----------
+    own : [bin, 2, 2], covariance of a bin's counts.
+    lit_dark : [bin, 2, 2], of a lit bin's counts with those of the same pixels in the dark, which are a part of
+        bin `dark_bin` [bin]: a pixel's threshold moves both. −1 where there is none.
+    """
+
+    own: NDArray[np.float64]
+    lit_dark: NDArray[np.float64]
+    dark_bin: NDArray[np.intp]
+
+    def of_sum(self, influence: NDArray) -> NDArray[np.float64]:
+        """Covariance [6, 6] of the sum over bins of counts times `influence` [bin, 2, 6]."""
+        own = np.einsum("bip,bij,bjq->pq", influence, self.own, influence, optimize=True)
+        lit = self.dark_bin >= 0
+        dark = influence[self.dark_bin[lit]]
+        both = np.einsum("bip,bij,bjq->pq", influence[lit], self.lit_dark[lit], dark, optimize=True)
+        return own + both + both.T
+
+
 def sandwich(
     parameters: NDArray,
     counts: EventCounts,
@@ -162,14 +231,9 @@ def sandwich(
     law: Law,
     mismatch: float,
     free: Sequence[bool],
-    scatter: NDArray,
+    scatter: Scatter,
 ) -> NDArray[np.float64]:
-    """Covariance [6, 6] of one maximum-likelihood fit where counts scatter as `scatter`, not as a trinomial.
-
-    Parameters
-    ----------
-    scatter : [bin, 2, 2], covariance of a bin's total counts (ON, OFF), measured over its pixels.
-    """
+    """Covariance [6, 6] of one maximum-likelihood fit where counts scatter as `scatter`, not as a trinomial."""
     mask = np.asarray(free, bool)
     one = EventCounts(counts.signal_dn, counts.trials, counts.on, counts.off)
     _, _, fisher = _evaluate(one, parameters[None], theta_v, law, mismatch, mask, None)
@@ -177,7 +241,7 @@ def sandwich(
     on, off = np.exp(log_on), np.exp(log_off)
     both = (on[:, None] * on_slope + off[:, None] * off_slope) / np.maximum(1 - on - off, 1e-12)[:, None]
     influence = np.stack([on_slope + both, off_slope + both], axis=1)
-    meat = np.einsum("bip,bij,bjq->pq", influence, scatter, influence, optimize=True) * mask[:, None] * mask
+    meat = scatter.of_sum(influence) * mask[:, None] * mask
     bread = np.linalg.inv(fisher[0])
     return bread @ meat @ bread
 
@@ -189,15 +253,14 @@ def quasi_sandwich(
     law: Law,
     mismatch: float,
     inverse_covariance: NDArray,
-    scatter: NDArray,
+    scatter: Scatter,
     bread: NDArray,
 ) -> NDArray[np.float64]:
     """The same for one quasi-likelihood fit with `inverse_covariance` [bin, 2, 2] and covariance `bread`."""
     log_on, log_off, on_slope, off_slope = log_probabilities(parameters, counts.signal_dn, theta_v, law, mismatch)
     slope = _count_slopes(counts, np.exp(log_on), np.exp(log_off), on_slope, off_slope)
     influence = np.einsum("bij,bjp->bip", inverse_covariance, slope)
-    meat = np.einsum("bip,bij,bjq->pq", influence, scatter, influence, optimize=True)
-    return bread @ meat @ bread
+    return bread @ scatter.of_sum(influence) @ bread
 
 
 def _count_slopes(

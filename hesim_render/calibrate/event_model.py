@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 Law = Literal["linear", "sqrt"]
-#: Order of the parameters of the fit, with C and D as C √(1 − D²) and C D: then g = (1 + e y)² + (f y)² has
-#: neither bounds nor the singularity of (C, D) at C = 0, which would trap a search.
-PARAMETERS = ("A", "ln B", "f", "e", "rho", "leak")
+#: Order of the parameters of the fit, with C and D as w = C² (1 − D²) and e = C D: g = (1 + e y)² + w y² has neither
+#: the singularity of (C, D) at C = 0 nor, as C √(1 − D²) would, a slope that vanishes at |D| = 1 and traps a search.
+PARAMETERS = ("A", "ln B", "w", "e", "rho", "leak")
 _SMALLEST = 1e-300
 _LARGEST_U = 1e6
 _HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
@@ -44,32 +44,30 @@ class EventCounts:
 def threshold_over_noise(
     parameters: NDArray, signal_dn: NDArray, theta_v: float | NDArray, law: Law
 ) -> tuple[NDArray, NDArray]:
-    """u [..., bin] and ∂ ln u / ∂ (A, ln B, f, e) [..., bin, 4]; `parameters` [..., 6] as `PARAMETERS`."""
-    a, b, f, e = (parameters[..., k, None] for k in range(4))
+    """u [..., bin] and ∂ ln u / ∂ (A, ln B, w, e) [..., bin, 4]; `parameters` [..., 6] as `PARAMETERS`."""
+    a, b, w, e = (parameters[..., k, None] for k in range(4))
     b = np.exp(b)
     shot = signal_dn if law == "linear" else np.sqrt(signal_dn)
     x = a * signal_dn + b
-    g = np.maximum((1 + e * shot) ** 2 + (f * shot) ** 2, 1e-12)
+    g = np.maximum((1 + e * shot) ** 2 + w * shot**2, 1e-12)
     # a search may run far off; beyond this, P is 0 in double precision all the same
     u = np.minimum(theta_v * x / np.sqrt(2 * g), _LARGEST_U)
-    slopes = np.stack([signal_dn / x, b / x, -shot * f * shot / g, -shot * (1 + e * shot) / g], axis=-1)
+    slopes = np.stack([signal_dn / x, b / x, -0.5 * shot**2 / g, -shot * (1 + e * shot) / g], axis=-1)
     return u, slopes
 
 
 def natural(parameters: NDArray, covariance: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(A, B, C, D, ρ, λ) [..., 6] and their covariance [..., 6, 6] from the fit's parameters."""
-    f, e = parameters[..., 2], parameters[..., 3]
-    c = np.hypot(e, f)
+    w, e = parameters[..., 2], parameters[..., 3]
+    c = np.sqrt(e * e + w)
     safe = np.maximum(c, 1e-30)
-    d, r = e / safe, np.abs(f) / safe
     values = parameters.copy()
-    values[..., 1], values[..., 2], values[..., 3] = np.exp(parameters[..., 1]), c, d
+    values[..., 1], values[..., 2], values[..., 3] = np.exp(parameters[..., 1]), c, e / safe
     slope = np.zeros((*parameters.shape, 6))
     slope[..., range(6), range(6)] = 1.0
     slope[..., 1, 1] = values[..., 1]
-    sign = np.where(f < 0, -1.0, 1.0)
-    slope[..., 2, 2], slope[..., 2, 3] = np.where(c > 0, r, 1.0) * sign, d
-    slope[..., 3, 2], slope[..., 3, 3] = -d * r / safe * sign, r * r / safe
+    slope[..., 2, 2], slope[..., 2, 3] = 0.5 / safe, e / safe
+    slope[..., 3, 2], slope[..., 3, 3] = -0.5 * e / safe**3, w / safe**3
     return values, slope @ covariance @ slope.swapaxes(-1, -2)
 
 
@@ -77,7 +75,7 @@ def from_natural(values: NDArray) -> NDArray[np.float64]:
     """The fit's parameters from (A, B, C, D, ρ, λ) [..., 6]."""
     parameters = values.copy()
     parameters[..., 1] = np.log(values[..., 1])
-    parameters[..., 2] = values[..., 2] * np.sqrt(1 - values[..., 3] ** 2)
+    parameters[..., 2] = values[..., 2] ** 2 * (1 - values[..., 3] ** 2)
     parameters[..., 3] = values[..., 2] * values[..., 3]
     return parameters
 

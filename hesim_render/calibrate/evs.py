@@ -13,15 +13,12 @@ from hesim_render.calibrate.captures import CaptureSet, read_captures
 from hesim_render.calibrate.event_counts import StaticCapture, bad_event_pixels, read_static
 from hesim_render.calibrate.event_dispersion import Dispersion, dispersion
 from hesim_render.calibrate.event_estimate import NO_FIT, EventFit, fit_events, with_mismatch_error
-from hesim_render.calibrate.event_fit import maximise
 from hesim_render.calibrate.event_model import (
-    EventCounts,
     Law,
-    from_natural,
-    natural,
     threshold_over_noise,
 )
 from hesim_render.calibrate.event_pool import PooledEvents, pool_events
+from hesim_render.calibrate.event_starts import multi_start
 from hesim_render.calibrate.moments import Progress
 from hesim_render.calibrate.thresholds import (
     Steps,
@@ -35,7 +32,6 @@ from hesim_render.errors import SpecError
 
 #: A difference of log-likelihood that decides between the shot laws; below it the paper's stands.
 DECISIVE = 5.0
-_STARTS = 200
 _LAWS: tuple[Law, Law] = ("linear", "sqrt")
 
 
@@ -79,7 +75,8 @@ def calibrate_evs(
     Parameters
     ----------
     folder : capture set with ``capture.yaml``, ``evs_static.npz`` and, for θ, ``evs_steps.npz``.
-    out : the calibration; its section ``evs`` is written, others are kept.
+    out : the calibration; its section ``evs`` is written, others are kept. Where ``evs_static.npz`` has no
+        ``signal_dn``, the composite in its section ``aps`` is the signal: frames of the same scene.
     report : HTML file, if one is wanted; it covers every section of `out`.
     progress : called with what is being done and the fraction done.
     bootstrap : number of resamplings of the pixels for a second opinion on the standard errors.
@@ -102,7 +99,7 @@ def calibrate_evs(
     captures = read_captures(folder)
     tell = progress or (lambda what, fraction: None)
     tell("reading event counts", 0.0)
-    static = read_static(captures)
+    static = read_static(captures, out)
     result = analyse(captures, static, seed, tell)
     errors = bootstrap_errors(result, bootstrap, seed) if bootstrap else None
     tell("writing", 0.95)
@@ -173,8 +170,9 @@ def analyse(
     ]
     if thresholds is not None and steps is not None and captures.spec.contrast_of == "signal":
         thresholds = _with_conversion_error(thresholds, steps.signal_dn, best)
-    if thresholds is not None and sorted_pool is not pooled:
-        best, *fits = (_with_threshold_error(fit, thresholds) for fit in (best, *fits))
+    if group is not None and relative is not None:
+        sampling = float(relative[group[good]].std() / np.sqrt(good.sum()))
+        best, *fits = (_with_sampling_error(fit, sampling) for fit in (best, *fits))
     tell("200 starts", 0.8)
     starts, errors = multi_start(pooled.together(), best, theta_v, mismatch, seed)
     return EvsCalibration(
@@ -248,10 +246,10 @@ def _check_fit(fit: EventFit, captures: CaptureSet) -> None:
         )
 
 
-def _with_threshold_error(fit: EventFit, thresholds: Thresholds) -> EventFit:
-    """Relative thresholds are those to the measured mean, whose error A and B, proportional to θ, share."""
+def _with_sampling_error(fit: EventFit, relative: float) -> EventFit:
+    """Adds what the mean of the measured thresholds lacks: relative to that of these pixels, not of all such."""
     change = np.zeros(6)
-    change[:2] = fit.values[:2] * thresholds.theta_error / thresholds.theta
+    change[:2] = fit.values[:2] * relative
     change = np.where(fit.free, change, 0.0)
     return replace(fit, covariance=fit.covariance + np.outer(change, change))
 
@@ -289,31 +287,6 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
         return None
     a, b = fit.values[:2]
     return np.log((a * steps.signal_dn * np.exp(steps.contrast) + b) / (a * steps.signal_dn + b))
-
-
-def multi_start(
-    pooled: PooledEvents, fit: EventFit, theta_v: float, mismatch: float, seed: int, starts: int = _STARTS
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Maximum likelihood from many starts: A, B, C spread by e² either way, D over (−0.9, 0.9).
-
-    Returns
-    -------
-    (A, B, C, D) [start, 4] each start ended at, and their standard errors [4] from the Fisher information.
-    """
-    bins = pooled.position(0).counts
-    counts = EventCounts(*(v[0] for v in (bins.signal_dn, bins.trials, bins.on, bins.off)))
-    rng = np.random.default_rng(seed)
-    begin = np.tile(fit.values, (starts, 1))
-    free = np.array(fit.free)
-    spread = np.where(free[:3], rng.uniform(-2, 2, (starts, 3)), 0)
-    begin[:, :3] *= np.exp(spread)
-    if free[3]:
-        begin[:, 3] = rng.uniform(-0.9, 0.9, starts)
-    begin[:, 4:] = np.where(free[4:], 0.0, begin[:, 4:])
-    eta, fisher, _ = maximise(counts, from_natural(begin), theta_v, fit.law, mismatch, fit.free)
-    values, covariance = natural(eta, np.linalg.pinv(fisher))
-    errors = np.sqrt(np.maximum(np.einsum("fii->fi", covariance)[:, :4], 0))
-    return values[:, :4], np.where(free[:4], np.median(errors, axis=0), np.nan)
 
 
 def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray[np.float64]:

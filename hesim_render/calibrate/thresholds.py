@@ -184,11 +184,11 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
     error2 = max(on_error, off_error)
     on, off = (np.sqrt(v) if v > 4 * e else 0.0 for v, e in ((on2, on_error), (off2, off_error)))
     error = error2 / (2 * max(on, off)) if max(on, off) > 0 else np.sqrt(error2)
-    # Thresholds of both polarities shift together where pixels share one: count that once, as correlation 1.
-    shared = np.sqrt(max(on2, 0) * max(off2, 0)) * theta_on * theta_off / steps.pixels
-    correlation = float(np.corrcoef(pixel_on[good], pixel_off[good])[0, 1]) if on and off else 0.0
-    covariance[0, 1] += shared * correlation
-    covariance[1, 0] += shared * correlation
+    # A pixel's two thresholds may shift together; the noise of their two estimates is independent.
+    widest = np.sqrt(max(on2, 0) * max(off2, 0)) if on and off else 0.0
+    shared = float(np.clip(np.cov(pixel_on[good], pixel_off[good])[0, 1], -widest, widest))
+    covariance[0, 1] += shared * theta_on * theta_off / steps.pixels
+    covariance[1, 0] = covariance[0, 1]
     return Thresholds(
         theta_on=float(theta_on),
         theta_off=float(theta_off),
