@@ -16,6 +16,7 @@ from hesim_render import mosaic
 from hesim_render.errors import SpecError
 from hesim_render.mosaic import Mosaic
 from hesim_render.specs.files import content_hash
+from hesim_render.specs.light import mixed_light
 
 if TYPE_CHECKING:
     from hesim_render.sensor import Sensor
@@ -54,8 +55,7 @@ def build(
 ) -> dict[str, Any]:
     """The manifest of a recording about to be made; frames and counts are added as it grows."""
     layout, spec = sensor.layout, sensor.spec
-    lamp = getattr(scene, "light", None)
-    light = lamp.illuminant.load() if lamp is not None and lamp.type != "none" else None
+    light = mixed_light(getattr(scene, "lights", ()))
     return {
         "schema_version": SCHEMA_VERSION,
         "software": software_versions(),

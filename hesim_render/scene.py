@@ -42,6 +42,7 @@ class Scene:
         motion: Sequence[TrackSpec | Mapping[str, Any]] = (),
         max_depth: int | None = None,
         radiance_scale: float = 1.0,
+        waveforms: Mapping[str, Any] | None = None,
         name: str = "mitsuba",
     ) -> Scene:
         """A scene that Mitsuba itself can load.
@@ -55,13 +56,14 @@ class Scene:
         motion : tracks (keys of `TrackSpec`) of shapes, by their id, and of ``camera``.
         max_depth : path length; default the scene's own path tracer with its depth, else 8.
         radiance_scale : multiplies all radiance, which is taken as W m⁻² sr⁻¹ nm⁻¹.
+        waveforms : flicker of emitters (keys of a scene file's ``waveform``), by the id of their shape or their own.
 
         Raises
         ------
         SpecError
             If the camera or the motion is not valid, or the file is missing.
         """
-        source: dict[str, Any] = {"radiance_scale": radiance_scale}
+        source: dict[str, Any] = {"radiance_scale": radiance_scale, "waveforms": dict(waveforms or {})}
         if isinstance(scene, Mapping):
             source["inline"] = dict(scene)
         else:

@@ -119,6 +119,15 @@ def product(*spectra: Spectrum, step_nm: float = INTEGRATION_STEP_NM) -> Spectru
     return Spectrum(grid, np.prod([s.at(grid) for s in spectra], axis=0))
 
 
+def summed(*spectra: Spectrum) -> Spectrum:
+    """The sum over all tables together; where one of them ends off zero, the sum falls within 0.001 nm."""
+    edges = np.array([s.support_nm for s in spectra])
+    steps = np.concatenate([edges[:, 0] - 1e-3, edges[:, 1] + 1e-3])
+    low, high = edges.min(), edges.max()
+    knots = np.unique(np.concatenate([s.wavelength_nm for s in spectra] + [steps[(steps > low) & (steps < high)]]))
+    return Spectrum(knots, np.sum([s.at(knots) for s in spectra], axis=0))
+
+
 def coverage(spectrum: Spectrum, response: Spectrum) -> float:
     """Share of ∫ response dλ that lies inside the table of `spectrum`."""
     total = integrate_product(response, constant(1.0, *response.support_nm))
@@ -190,6 +199,16 @@ def camera_sensitivity(camera: str, channel: str) -> Spectrum:
     if channel not in labels:
         raise SpecError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(labels)}")
     return Spectrum(np.asarray(curves.wavelengths), np.asarray(curves.values)[:, labels.index(channel)])
+
+
+def srgb_reflectances() -> tuple[Spectrum, Spectrum, Spectrum]:
+    """Reflectances of linear sRGB red, green and blue, Mallett and Yuksel (2019), 380-780 nm at 5 nm.
+
+    Each lies between 0 and 1, they sum to 1, and under D65 a mixture has the tristimulus values of its colour.
+    """
+    table = _colour().recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+    red, green, blue = (Spectrum(np.asarray(table.wavelengths), column) for column in np.asarray(table.values).T)
+    return red, green, blue
 
 
 @functools.cache

@@ -8,8 +8,10 @@ from scipy import integrate
 import hesim_render as hr
 from hesim_render.errors import SpecError
 from hesim_render.renderer import render_cube
+from hesim_render.renderer._mitsuba import mitsuba, spectrum_dict
 from hesim_render.renderer.lights import area_light_frame, form_factor_integral, irradiance
 from hesim_render.specs.scene import LightSpec
+from hesim_render.spectra import Spectrum, summed
 
 AREA = {"type": "area", "illuminance_lux": 800, "position_m": (0.5, 1.2, 0.8), "size_m": (0.6, 0.9)}
 LIGHTS = {
@@ -78,6 +80,47 @@ def test_a_card_at_the_plane_point_is_lit_as_asked(kind):
     assert np.all(error / expected < 1e-3)
     # 4.4 σ (false alarm 1e-5 each), and 2e-5 for the card's finite size and single precision
     assert np.all(np.abs(radiance.mean(axis=(0, 1)) - expected) < 4.4 * error + 2e-5 * expected)
+
+
+def test_an_evenly_spaced_spectrum_is_the_same_looked_up_faster():
+    mi = mitsuba()
+    rng = np.random.default_rng(2)
+    grids = (np.arange(360.0, 831.0, 5.0), np.linspace(380.123, 729.77, 301), np.array([300.0, 1100.0]))
+    for grid in grids:
+        spectrum = Spectrum(grid, rng.uniform(0, 3, grid.size))
+        quick = spectrum_dict(spectrum)
+        assert quick["type"] == "regular"
+        numbers = [",".join(f"{v:.9g}" for v in array) for array in (spectrum.wavelength_nm, spectrum.values)]
+        slow = {"type": "irregular", "wavelengths": numbers[0], "values": numbers[1]}
+        inside = rng.uniform(*spectrum.support_nm, 4000)
+        outside = np.concatenate([rng.uniform(200, grid[0] - 0.01, 200), rng.uniform(grid[-1] + 0.01, 1300, 200)])
+        seen = []
+        for plugin in (quick, slow):
+            texture = mi.load_dict(plugin)
+            si = mi.SurfaceInteraction3f()
+            values = []
+            for wavelengths in (inside, outside):
+                si.wavelengths = mi.UnpolarizedSpectrum(mi.Float(wavelengths.astype(np.float32)))
+                values.append(np.array(texture.eval(si))[0])
+            assert np.all(values[1] == 0)
+            seen.append(values[0])
+        np.testing.assert_allclose(seen[0], seen[1], atol=5e-5 * grid.size / 100 * 3)
+        np.testing.assert_allclose(seen[0], spectrum.at(inside), atol=5e-5 * grid.size / 100 * 3)
+    uneven = Spectrum(np.array([400.0, 500.0, 601.0]), np.ones(3))
+    assert spectrum_dict(uneven)["type"] == "irregular"
+    assert spectrum_dict(uneven.scaled(0)) == spectrum_dict(Spectrum(np.array([400.0, 700.0]), np.zeros(2)))
+
+
+def test_summed_spectra_end_each_where_their_table_does():
+    first, second = (
+        Spectrum(np.array([400.0, 600.0]), np.array([1.0, 2.0])),
+        Spectrum(np.array([500.0, 700.0]), np.ones(2)),
+    )
+    total = summed(first, second)
+    assert total.support_nm == (400.0, 700.0)
+    for wavelength in (400.0, 450.0, 499.99, 500.0, 550.0, 600.0, 600.01, 650.0, 700.0):
+        np.testing.assert_allclose(total.at(wavelength), first.at(wavelength) + second.at(wavelength), rtol=1e-12)
+    np.testing.assert_allclose(total.integral(), first.integral() + second.integral(), rtol=1e-5)
 
 
 def test_level_in_watts_is_the_integral_over_the_table():

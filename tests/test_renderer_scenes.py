@@ -149,13 +149,18 @@ camera: {origin_m: [0, 0, 0], target_m: [0, 0, -2], horizontal_fov_deg: 20}
     )
 
 
-def test_a_mitsuba_scene_without_emitter_is_dark_and_without_sensor_an_error():
-    sphere = {"type": "scene", "ball": {"type": "sphere"}}
-    scene = Scene.from_mitsuba(sphere, camera={"origin_m": (0, 0, 4)})
-    a, b, _ = flux_image(scene, bayer(), 2)
+def test_a_mitsuba_scene_without_emitter_or_sensor_is_an_error_unless_darkness_is_meant():
+    sphere, camera = {"type": "scene", "ball": {"type": "sphere"}}, {"origin_m": (0, 0, 4)}
+    with pytest.raises(SpecError, match=r"no emitter.*light: \{type: none\}"):
+        RenderedFlux(Scene.from_mitsuba(sphere, camera=camera), bayer(), 2)
+    dark = {"light": {"type": "none"}, "camera": camera}
+    a, b, _ = flux_image(make_scene(mitsuba={"inline": sphere}, **dark), bayer(), 2)
     assert np.all(a == 0) and np.all(b == 0)
+    sky = {"sky": {"type": "constant"}}
+    with pytest.raises(SpecError, match="has emitters"):
+        RenderedFlux(make_scene(mitsuba={"inline": sphere | sky}, **dark), bayer(), 2)
     with pytest.raises(SpecError, match="has no sensor"):
-        RenderedFlux(Scene.from_mitsuba(sphere), bayer(), 2)
+        RenderedFlux(Scene.from_mitsuba(sphere | sky), bayer(), 2)
 
 
 @pytest.mark.parametrize("kind", ["ply", "obj"])

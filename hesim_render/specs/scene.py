@@ -11,71 +11,25 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
-    AfterValidator,
+    Discriminator,
     Field,
     PositiveFloat,
     PositiveInt,
+    Tag,
     ValidationInfo,
     field_serializer,
+    field_validator,
     model_validator,
 )
 
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_matrix_about, rotation_vector
+from hesim_render.specs.light import LightSpec
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.target import ReflectanceSpec, TargetSpec
-
-Vector = tuple[float, float, float]
-
-
-def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:
-    if spec.load().values.min() < 0:
-        raise ValueError("a light's spectrum must not be negative")
-    return spec
-
-
-def _not_zero(vector: Vector) -> Vector:
-    if sum(c * c for c in vector) < 1e-18:
-        raise ValueError("a direction must not be the zero vector")
-    return vector
-
-
-Direction = Annotated[Vector, AfterValidator(_not_zero)]
-
-
-class LightSpec(Strict):
-    """Where the light comes from, its spectrum, and how much of it reaches a named plane.
-
-    Exactly one of `illuminance_lux` and `irradiance_w_m2` gives the level on the plane through
-    `plane_point_m` with normal `plane_normal` (default: the target's own), unshadowed and from
-    this light alone.
-    """
-
-    type: Literal["uniform", "point", "area", "directional", "none"]
-    illuminant: Annotated[SpectrumSpec, AfterValidator(_not_negative)] = SpectrumSpec(illuminant="D65")
-    illuminance_lux: float | None = Field(None, ge=0)
-    irradiance_w_m2: float | None = Field(None, ge=0, description="integrated over the illuminant's table")
-    position_m: Vector | None = Field(None, description="point and area lights")
-    size_m: tuple[PositiveFloat, PositiveFloat] | None = Field(None, description="area light: width, height")
-    direction: Direction | None = Field(None, description="directional light: the way the light travels")
-    plane_point_m: Vector = (0.0, 0.0, 0.0)
-    plane_normal: Direction = (0.0, 0.0, 1.0)
-
-    @model_validator(mode="after")
-    def _check(self) -> LightSpec:
-        levels = [v for v in (self.illuminance_lux, self.irradiance_w_m2) if v is not None]
-        if len(levels) != (self.type != "none"):
-            raise ValueError(
-                "a light of type 'none' has no level"
-                if self.type == "none"
-                else "a light needs exactly one of illuminance_lux and irradiance_w_m2"
-            )
-        needs = {"point": ["position_m"], "area": ["position_m", "size_m"], "directional": ["direction"]}
-        for name in ("position_m", "size_m", "direction"):
-            needed = name in needs.get(self.type, [])
-            if needed != (getattr(self, name) is not None):
-                raise ValueError(f"a light of type '{self.type}' {'needs' if needed else 'has no'} {name}")
-        return self
+from hesim_render.specs.waveform import WaveformSpec
 
 
 class ObjectSpec(Strict):
@@ -131,12 +85,52 @@ class CameraSpec(Strict):
 
 
 class KeyframeSpec(Strict):
-    """A rigid pose at one time: rotate about the track's pivot, then translate."""
+    """A rigid pose at one time: rotate about the track's pivot, then translate; or both as one matrix.
+
+    `matrix` takes the object from where the file places it to where it is then, whatever the pivot. It becomes
+    a rotation by the shortest way from the keyframe before, and a translation.
+    """
 
     t_us: int = Field(description="time, µs from the start")
     translation_m: Vector = (0.0, 0.0, 0.0)
     rotation_axis: Direction = (0.0, 0.0, 1.0)
     rotation_deg: float = 0.0
+    matrix: RigidMatrix | None = Field(None, description="4×4 by rows, instead of translation and rotation")
+
+    @model_validator(mode="after")
+    def _check(self) -> KeyframeSpec:
+        other = self.model_fields_set & {"translation_m", "rotation_axis", "rotation_deg"}
+        if self.matrix is not None and other:
+            raise ValueError(f"give matrix or {', '.join(sorted(other))}, not both")
+        return self
+
+    def resolved(self, pivot_m: Vector, before: KeyframeSpec | None) -> KeyframeSpec:
+        """The keyframe without a matrix: x → R (x − pivot) + pivot + translation."""
+        if self.matrix is None:
+            return self
+        axis, angle_deg = _turn(rotation_vector(self.matrix), before)
+        values, pivot = np.array(self.matrix, dtype=np.float64), np.array(pivot_m, dtype=np.float64)
+        shift = values[:3, 3] - pivot + rotation_matrix_about(axis, angle_deg) @ pivot
+        return KeyframeSpec(
+            t_us=self.t_us, translation_m=tuple(shift.tolist()), rotation_axis=axis, rotation_deg=angle_deg
+        )
+
+
+def _turn(rotation: NDArray[np.float64], before: KeyframeSpec | None) -> tuple[Vector, float]:
+    """Axis and angle of a rotation vector, with the whole turns that bring it nearest to the keyframe before.
+
+    Two keyframes about one axis are any number of turns apart; matrices do not count turns.
+    """
+    angle = float(np.linalg.norm(rotation))
+    angle_deg = float(np.degrees(angle))
+    axis = rotation / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+    if before is not None and before.rotation_deg != 0:
+        shared = np.array(before.rotation_axis) / np.linalg.norm(before.rotation_axis)
+        along = float(axis @ shared)
+        if angle == 0 or abs(abs(along) - 1) < 1e-9:
+            angle_deg *= np.sign(along) if angle > 0 else 0.0
+            axis, angle_deg = shared, angle_deg + 360 * round((before.rotation_deg - angle_deg) / 360)
+    return (float(axis[0]), float(axis[1]), float(axis[2])), angle_deg
 
 
 class TrackSpec(Strict):
@@ -154,6 +148,14 @@ class TrackSpec(Strict):
     repeat: bool = False
     keyframes: list[KeyframeSpec] = Field(min_length=2)
 
+    @field_validator("keyframes")
+    @classmethod
+    def _without_matrices(cls, frames: list[KeyframeSpec], info: ValidationInfo) -> list[KeyframeSpec]:
+        found: list[KeyframeSpec] = []
+        for frame in frames:
+            found.append(frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), found[-1] if found else None))
+        return found
+
     @model_validator(mode="after")
     def _check(self) -> TrackSpec:
         times = [frame.t_us for frame in self.keyframes]
@@ -168,19 +170,28 @@ class MitsubaSpec(Strict):
 
     In an inline dictionary a 4×4 list of rows stands for a transform. Radiance is taken as
     W m⁻² sr⁻¹ nm⁻¹ times `radiance_scale`. The first sensor is the camera unless the scene file
-    has a `camera` section.
+    has a `camera` section. Emitters are named by the id of their shape, or by their own.
     """
 
     file: str | None = None
     builtin: Literal["cornell_box"] | None = None
     inline: Mapping[str, Any] | None = None
     radiance_scale: PositiveFloat = 1.0
+    waveforms: dict[str, WaveformSpec] = Field({}, description="flicker of emitters; their radiance is the time mean")
+    lit: tuple[str, ...] | None = Field(None, description="these emitters alone give light; default all")
+    unlit: tuple[str, ...] = Field((), description="these emitters give none")
 
     @model_validator(mode="after")
     def _check(self) -> MitsubaSpec:
         if sum(value is not None for value in (self.file, self.builtin, self.inline)) != 1:
             raise ValueError("give exactly one of file, builtin and inline")
+        if self.lit is not None and self.unlit:
+            raise ValueError("give lit or unlit, not both")
         return self
+
+    def may_shine(self, emitter: str) -> bool:
+        """Whether an emitter of this name is left on."""
+        return emitter not in self.unlit and (self.lit is None or emitter in self.lit)
 
     @field_serializer("inline", when_used="json")
     def _inline_as_text(self, inline: Mapping[str, Any] | None) -> Any:
@@ -200,6 +211,10 @@ def _plain(node: Any) -> Any:
     return node.tolist() if isinstance(node, np.ndarray) else str(node)
 
 
+def _one_or_several(light: Any) -> str:
+    return "several" if isinstance(light, list | tuple) else "one"
+
+
 class SceneSpec(Strict):
     """A whole scene file."""
 
@@ -209,7 +224,13 @@ class SceneSpec(Strict):
     target: TargetSpec | None = None
     objects: list[ObjectSpec] = []
     mitsuba: MitsubaSpec | None = None
-    light: LightSpec | None = None
+    light: (
+        Annotated[
+            Annotated[LightSpec, Tag("one")] | Annotated[tuple[LightSpec, ...], Tag("several"), Field(min_length=1)],
+            Discriminator(_one_or_several),
+        ]
+        | None
+    ) = Field(None, description="one light or a list")
     camera: CameraSpec | None = None
     motion: list[TrackSpec] = []
     max_depth: int | None = Field(
@@ -236,7 +257,7 @@ class SceneSpec(Strict):
         if len(set(tracks)) != len(tracks):
             raise ValueError("motion: one track for each object; put all its keyframes into that")
         if self.mitsuba is not None:
-            if self.target is not None or self.objects or self.light is not None:
+            if self.target is not None or self.objects or any(light.type != "none" for light in self.lights):
                 raise ValueError("a Mitsuba scene brings its own shapes and lights: drop target, objects and light")
             if self.camera is not None and self.camera.fit is not None:
                 raise ValueError("camera.fit is 'target' but the scene has no target")
@@ -245,6 +266,8 @@ class SceneSpec(Strict):
             raise ValueError("a scene needs a target, objects or a Mitsuba scene")
         if self.light is None:
             raise ValueError("light is required (type 'none' is darkness)")
+        if len(self.lights) > 1 and any(light.type == "none" for light in self.lights):
+            raise ValueError("light: type 'none' is darkness and stands alone")
         if self.camera is None:
             raise ValueError("camera is required")
         if self.camera.fit == "target" and self.target is None:
@@ -257,6 +280,13 @@ class SceneSpec(Strict):
             if track.object not in known:
                 raise ValueError(f"motion: no object {track.object!r} in the scene; there are {', '.join(known)}")
         return self
+
+    @property
+    def lights(self) -> tuple[LightSpec, ...]:
+        """All lights, none for a Mitsuba scene's own."""
+        if self.light is None:
+            return ()
+        return (self.light,) if isinstance(self.light, LightSpec) else self.light
 
 
 def read_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SceneSpec:

@@ -1,0 +1,320 @@
+"""Flicker: lights whose power follows a waveform, exactly, at the cost of one render for each waveform.
+
+Light adds up: Φ(t) = Σ w(t)·Φ_w, where Φ_w is the flux with only the lights of waveform w lit at their mean level and
+all others dark, and w has the time mean 1. While the geometry stands still each Φ_w is rendered once and the
+mean over an interval is exact: Φ_w times the mean of w, in closed form. Where something moves, the mean of a
+product is taken as the product of the means over pieces of time in which the image moves half a pixel or less,
+or ln w departs from a straight line by 0.002 or less, whichever are fewer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.backend import jit
+from hesim_render.flux import FluxSource, SampledFlux
+from hesim_render.scene import Scene
+from hesim_render.specs.light import LightSpec
+from hesim_render.specs.waveform import WaveformSpec
+from hesim_render.waveform import Waveform
+
+#: Most steps in which an event window that is passing a jump is followed.
+_WINDOW_STEPS = 8
+
+
+def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
+    """The scene once for each different waveform, lit only by the lights that have it; first those without any.
+
+    Scenes without flicker are one part, themselves.
+    """
+    own = scene.spec.mitsuba
+    if own is not None:
+        return _mitsuba_parts(scene)
+    lights = scene.spec.lights
+    flickering = [_flicker(light.waveform) for light in lights]
+    if not any(flickering):
+        return [(None, scene)]
+    parts: list[tuple[Waveform | None, Scene]] = []
+    for kind in _different(flickering):
+        lit = [
+            light.model_copy(update={"waveform": None}) if has == kind else light.unlit()
+            for light, has in zip(lights, flickering, strict=True)
+        ]
+        if any(light.is_lit for light in lit):
+            parts.append((kind.load() if kind else None, _with_lights(scene, lit)))
+    return parts or [(None, scene)]
+
+
+def _flicker(spec: WaveformSpec | None) -> WaveformSpec | None:
+    """A waveform that changes, or None."""
+    return None if spec is None or spec.load().is_constant else spec
+
+
+def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None]:
+    """Each once, None first."""
+    found: list[WaveformSpec | None] = [None] if None in kinds else []
+    for kind in kinds:
+        if kind not in found:
+            found.append(kind)
+    return found
+
+
+def _with_lights(scene: Scene, lights: list[LightSpec]) -> Scene:
+    return Scene(scene.spec.model_copy(update={"light": tuple(lights)}))
+
+
+def _mitsuba_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
+    own = scene.spec.mitsuba
+    assert own is not None
+    named = {name: spec for name, spec in own.waveforms.items() if _flicker(spec) is not None}
+    if not named:
+        return [(None, scene)]
+    parts: list[tuple[Waveform | None, Scene]] = []
+    for kind in _different([None, *named.values()]):
+        lights = (
+            {"unlit": (*own.unlit, *named)}
+            if kind is None
+            else {"lit": tuple(name for name, spec in named.items() if spec == kind and own.may_shine(name))}
+        )
+        part = own.model_copy(update={"waveforms": {}, **lights})
+        parts.append((kind.load() if kind else None, Scene(scene.spec.model_copy(update={"mitsuba": part}))))
+    return parts
+
+
+def flickering(scene: Scene, make: Callable[[Scene], FluxSource], window_us: float = 1.0) -> FluxSource:
+    """The source of a scene's flux, whatever its lights do.
+
+    Parameters
+    ----------
+    scene : with or without waveforms.
+    make : builds the source of one part of it (``lambda part: RenderedFlux(part, sensor)``), called once where
+        no light flickers.
+    window_us : in which event pixels integrate; a jump of the light is followed through it.
+    """
+    parts = light_parts(scene)
+    if len(parts) == 1 and parts[0][0] is None:
+        return make(parts[0][1])
+    waveforms, sources = [waveform for waveform, _ in parts], [make(part) for _, part in parts]
+    if sources[0].is_static or all(isinstance(source, SampledFlux) for source in sources):
+        return SampledFlickerFlux(waveforms, sources, window_us)
+    return FlickerFlux(waveforms, sources, window_us)
+
+
+class FlickerFlux:
+    """Sources of one scene under its different lights, each times its waveform; implements `FluxSource`.
+
+    Parameters
+    ----------
+    waveforms : of each source; None is steady.
+    sources : of the same geometry and camera.
+    window_us : in which event pixels integrate.
+
+    Attributes
+    ----------
+    sources : as given.
+    sensor, view : of the first source, where it has any.
+    is_static : False.
+    """
+
+    def __init__(
+        self, waveforms: Sequence[Waveform | None], sources: Sequence[FluxSource], window_us: float = 1.0
+    ) -> None:
+        self.sources, self._waveforms, self._window_us = tuple(sources), tuple(waveforms), window_us
+        first = self.sources[0]
+        self.sensor, self.view = getattr(first, "sensor", None), getattr(first, "view", None)
+        self.is_static = False
+        self._still = _StillFlux(self.sources) if first.is_static else None
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Those of the scene's motion, µs."""
+        return self.sources[0].slice_edges_us(begin_us, end_us)
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside the interval that follow motion and light, µs.
+
+        Around a jump of the light they are whole µs: the last before it, and some until a window that
+        begins after it has passed.
+        """
+        times = [self.sources[0].sample_times_us(begin_us, end_us), self._follow_us(begin_us, end_us)]
+        steps = max(1, min(_WINDOW_STEPS, round(self._window_us)))
+        after = np.ceil(self._window_us * np.arange(steps + 1) / steps)
+        for waveform in self._waveforms:
+            if waveform is not None:
+                jumps = waveform.jumps_us(begin_us, end_us)
+                times += [np.floor(jumps), (np.ceil(jumps)[:, None] + after).ravel()]
+        every = np.unique(np.concatenate(times))
+        return every[(every > begin_us) & (every < end_us)]
+
+    def _follow_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        lists = [waveform.follow_us(begin_us, end_us) for waveform in self._waveforms if waveform is not None]
+        return np.unique(np.concatenate(lists))
+
+    def _weights(self, begin_us: ArrayLike, end_us: ArrayLike) -> list[NDArray[np.float64]]:
+        """Mean of each source's waveform over the intervals."""
+        shape = np.broadcast_shapes(np.shape(begin_us), np.shape(end_us))
+        return [np.ones(shape) if w is None else w.mean(begin_us, end_us) for w in self._waveforms]
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """Mean Φ of each listed pixel over its own interval; see `FluxSource.mean_flux`."""
+        pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+        begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
+        if pixels.size == 0:
+            return self.sources[0].mean_flux(pixels, begin, end)
+        if self._still is not None:
+            return _weighted(self._still.halves(pixels), self._weights(begin, end))
+        low, high = float(begin.min()), float(end.max())
+        splits = self._splits_us(low, high)
+        if splits.size == 0:
+            return self._piece(pixels, begin, end, self._weights(begin, end))
+        return self._pieces(pixels, begin, end, np.concatenate([[low], splits, [high]]))
+
+    def _splits_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Where to cut an interval so that in each piece image or light hardly change, the fewer of the two."""
+        light = self._follow_us(begin_us, end_us)
+        if light.size == 0:
+            return light
+        motion = self.sources[0].sample_times_us(begin_us, end_us)
+        return motion if motion.size < light.size else light
+
+    def _piece(
+        self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, weights: list[NDArray[np.float64]]
+    ) -> tuple[Any, Any]:
+        """Every source's mean times that of its waveform; sources that are dark meanwhile are not asked."""
+        lit = [number for number, weight in enumerate(weights) if np.any(weight)]
+        halves = [self.sources[number].mean_flux(pixel, begin, end) for number in lit]
+        if not lit:
+            types = jit()
+            return types.Float(np.zeros(pixel.size, np.float32)), types.Float(np.zeros(pixel.size, np.float32))
+        return _weighted(halves, [weights[number] for number in lit])
+
+    def _pieces(
+        self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]
+    ) -> tuple[Any, Any]:
+        """The same piece by piece; a pixel takes part in those that meet its interval."""
+        import drjit as dr
+
+        types = jit()
+        begin, end = (np.broadcast_to(times, pixel.shape) for times in (begin, end))
+        length = end - begin
+        totals = [types.Float(np.zeros(pixel.size, np.float32)) for _ in range(2)]
+        for number, (low, high) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+            first, last = np.clip(begin, low, high), np.clip(end, low, high)
+            # an interval without length lies in the piece that begins there, or before the very end
+            instant = (length == 0) & (begin >= low) & ((begin < high) | (number == bounds.size - 2))
+            share = np.divide(last - first, length, out=instant.astype(np.float64), where=length > 0)
+            where = np.flatnonzero(share)
+            if where.size == 0:
+                continue
+            weights = [weight * share[where] for weight in self._weights(first[where], last[where])]
+            index = types.UInt32(where.astype(np.uint32))
+            for total, half in zip(totals, self._piece(pixel[where], first[where], last[where], weights), strict=True):
+                # every index occurs once, so this is no race and the sum's order is that of time
+                dr.scatter(total, dr.gather(types.Float, total, index) + half, index)
+            dr.eval(totals)
+        return totals[0], totals[1]
+
+
+class SampledFlickerFlux(FlickerFlux):
+    """The same where the sources take many windows at once, or nothing moves; implements `SampledFlux`."""
+
+    def flux_of_windows(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
+    ) -> Iterator[tuple[Any, Any]]:
+        """See `SampledFlux.flux_of_windows`."""
+        pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+        begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
+        if begin.size == 0:
+            return
+        if self._still is not None:
+            halves = self._still.halves(pixels)
+            for weights in np.stack(self._weights(begin, end), axis=1):
+                yield _weighted(halves, list(weights))
+            return
+        # windows in which light and image both change are cut; their pieces are windows of their own
+        low, high = float(begin.min()), float(end.max())
+        light, motion = self._follow_us(low, high), self.sources[0].sample_times_us(low, high)
+        cut = [min(_between(light, b, e), _between(motion, b, e), key=len) for b, e in zip(begin, end, strict=True)]
+        first = np.concatenate([[b, *inner] for b, inner in zip(begin, cut, strict=True)])
+        last = np.concatenate([[*inner, e] for e, inner in zip(end, cut, strict=True)])
+        count = np.array([inner.size + 1 for inner in cut])
+        length = np.repeat(end - begin, count)
+        share = np.divide(last - first, length, out=np.ones_like(length), where=length > 0)
+        weights = np.stack(self._weights(first, last), axis=1) * share[:, None]
+        streams = []
+        for source in self.sources:
+            assert isinstance(source, SampledFlux)
+            streams.append(source.flux_of_windows(pixels, first, last))
+        pieces = zip(weights, *streams, strict=True)
+        for number in count:
+            taken = [next(pieces) for _ in range(number)]
+            halves = [half for _, *parts in taken for half in parts]
+            yield _weighted(halves, [weight for own, *_ in taken for weight in own])
+
+
+class _StillFlux:
+    """Flux of sources that stand still: every pixel is rendered once, when it is first asked for."""
+
+    def __init__(self, sources: Sequence[FluxSource]) -> None:
+        self._sources = sources
+        self._known = np.zeros(0, dtype=np.bool_)
+        self._kept: list[list[Any]] = [[] for _ in sources]  # both halves of each source, by mosaic index
+
+    def halves(self, pixel: NDArray[np.uint32]) -> list[tuple[Any, Any]]:
+        """Both halves of each source, Dr.Jit Float [n] each."""
+        import drjit as dr
+
+        types = jit()
+        self._reach(int(pixel.max()) + 1 if pixel.size else 0)
+        fresh = np.unique(pixel[~self._known[pixel]])
+        if fresh.size:
+            where = types.UInt32(fresh)
+            for source, kept in zip(self._sources, self._kept, strict=True):
+                for whole, half in zip(kept, source.mean_flux(fresh, 0.0, 1.0), strict=True):
+                    dr.scatter(whole, half, where)
+                dr.eval(kept)
+            self._known[fresh] = True
+        index = types.UInt32(pixel)
+        found = [(dr.gather(types.Float, a, index), dr.gather(types.Float, b, index)) for a, b in self._kept]
+        dr.eval(found)
+        return found
+
+    def _reach(self, size: int) -> None:
+        """Make room for mosaic indices below `size`."""
+        import drjit as dr
+
+        missing = size - self._known.size
+        if missing <= 0:
+            return
+        types = jit()
+        self._known = np.concatenate([self._known, np.zeros(missing, dtype=np.bool_)])
+        for kept in self._kept:
+            room = [types.Float(np.zeros(missing, np.float32)) for _ in range(2)]
+            kept[:] = [dr.concat([*old]) for old in zip(kept, room, strict=True)] if kept else room
+
+
+def _between(times_us: NDArray[np.float64], begin_us: float, end_us: float) -> NDArray[np.float64]:
+    first, last = np.searchsorted(times_us, begin_us, side="right"), np.searchsorted(times_us, end_us, side="left")
+    return times_us[first : max(first, last)]
+
+
+def _weighted(halves: Sequence[tuple[Any, Any]], weights: Sequence[ArrayLike]) -> tuple[Any, Any]:
+    """Σ weight · half, of both halves; weights are one number or one for each pixel."""
+    import drjit as dr
+
+    types = jit()
+    # opaque: a number inside the kernel would make it a new one at every time
+    factors = [
+        dr.opaque(types.Float, float(np.asarray(w)))
+        if np.ndim(w) == 0
+        else types.Float(np.asarray(w, dtype=np.float32))
+        for w in weights
+    ]
+    total_a, total_b = (
+        sum((pair[k] * factor for pair, factor in zip(halves, factors, strict=True)), types.Float(0.0)) for k in (0, 1)
+    )
+    dr.eval(total_a, total_b)
+    return total_a, total_b

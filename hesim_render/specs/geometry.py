@@ -1,0 +1,59 @@
+"""Vectors and rigid poses as files write them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator
+
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+
+#: Largest departure of RᵀR from 1 that counts as rounding of the file's numbers.
+_RIGID_TOLERANCE = 1e-4
+
+
+def _not_zero(vector: Vector) -> Vector:
+    if sum(c * c for c in vector) < 1e-18:
+        raise ValueError("a direction must not be the zero vector")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_not_zero)]
+
+
+def _rigid(matrix: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    """Refuse what is not a rotation and a translation, and say why."""
+    values = np.array(matrix, dtype=np.float64)
+    if np.abs(values[3] - [0, 0, 0, 1]).max() > _RIGID_TOLERANCE:
+        raise ValueError("the last row of a pose must be 0, 0, 0, 1")
+    linear = values[:3, :3]
+    products = linear.T @ linear
+    sizes = np.sqrt(np.diag(products))
+    if np.abs(products - np.eye(3)).max() > _RIGID_TOLERANCE:
+        if np.abs(sizes - 1).max() > _RIGID_TOLERANCE / 2:
+            raise ValueError(f"not rigid: it scales by {sizes[0]:.4g}, {sizes[1]:.4g}, {sizes[2]:.4g} along x, y, z")
+        raise ValueError("not rigid: it shears; the columns must be perpendicular")
+    if np.linalg.det(linear) < 0:
+        raise ValueError("not rigid: it mirrors; the determinant must be +1")
+    return matrix
+
+
+#: A 4×4 pose by rows: rotation and translation only.
+RigidMatrix = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
+
+
+def rotation_vector(matrix: tuple[Row, Row, Row, Row]) -> NDArray[np.float64]:
+    """Axis times angle (0 to π) of a rigid matrix's rotation, the nearest one to its rounded numbers."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(np.array(matrix)[:3, :3]).as_rotvec()
+
+
+def rotation_matrix_about(axis: Vector, angle_deg: float) -> NDArray[np.float64]:
+    """Matrix [3, 3] of a right-handed turn about a unit axis."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(np.radians(angle_deg) * np.array(axis)).as_matrix()

@@ -1,0 +1,91 @@
+"""A light of a scene file: where it comes from, its spectrum, its level and how that changes with time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, PositiveFloat, model_validator
+
+from hesim_render.specs.files import Strict
+from hesim_render.specs.geometry import Direction, Vector
+from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.specs.waveform import WaveformSpec
+from hesim_render.spectra import Spectrum, scale_to_irradiance, scale_to_lux, summed
+
+
+def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:
+    if spec.load().values.min() < 0:
+        raise ValueError("a light's spectrum must not be negative")
+    return spec
+
+
+class LightSpec(Strict):
+    """Where the light comes from, its spectrum, and how much of it reaches a named plane.
+
+    Exactly one of `illuminance_lux` and `irradiance_w_m2` gives the level on the plane through
+    `plane_point_m` with normal `plane_normal` (default: the target's own), unshadowed and from
+    this light alone; of a light with a waveform it is the time mean.
+    """
+
+    type: Literal["uniform", "point", "area", "directional", "none"]
+    illuminant: Annotated[SpectrumSpec, AfterValidator(_not_negative)] = SpectrumSpec(illuminant="D65")
+    illuminance_lux: float | None = Field(None, ge=0)
+    irradiance_w_m2: float | None = Field(None, ge=0, description="integrated over the illuminant's table")
+    position_m: Vector | None = Field(None, description="point and area lights")
+    size_m: tuple[PositiveFloat, PositiveFloat] | None = Field(None, description="area light: width, height")
+    direction: Direction | None = Field(None, description="directional light: the way the light travels")
+    plane_point_m: Vector = (0.0, 0.0, 0.0)
+    plane_normal: Direction = (0.0, 0.0, 1.0)
+    waveform: WaveformSpec | None = Field(None, description="flicker; default steady")
+
+    @model_validator(mode="after")
+    def _check(self) -> LightSpec:
+        levels = [v for v in (self.illuminance_lux, self.irradiance_w_m2) if v is not None]
+        if len(levels) != (self.type != "none"):
+            raise ValueError(
+                "a light of type 'none' has no level"
+                if self.type == "none"
+                else "a light needs exactly one of illuminance_lux and irradiance_w_m2"
+            )
+        needs = {"point": ["position_m"], "area": ["position_m", "size_m"], "directional": ["direction"]}
+        for name in ("position_m", "size_m", "direction"):
+            needed = name in needs.get(self.type, [])
+            if needed != (getattr(self, name) is not None):
+                raise ValueError(f"a light of type '{self.type}' {'needs' if needed else 'has no'} {name}")
+        if self.type == "none" and self.waveform is not None:
+            raise ValueError("a light of type 'none' has no waveform")
+        return self
+
+    @property
+    def is_lit(self) -> bool:
+        """False in darkness: type 'none', or a level of zero."""
+        return self.type != "none" and bool(self.illuminance_lux or self.irradiance_w_m2)
+
+    def unlit(self) -> LightSpec:
+        """The same light switched off; what there is of its geometry stays."""
+        off = {"waveform": None, "illuminance_lux": 0.0, "irradiance_w_m2": None}
+        return self if self.type == "none" else self.model_copy(update=off)
+
+
+def irradiance(light: LightSpec) -> Spectrum | None:
+    """E(λ) on the light's plane, W m⁻² nm⁻¹, its time mean; None in darkness."""
+    if not light.is_lit:
+        return None
+    shape = light.illuminant.load()
+    if light.illuminance_lux is not None:
+        return scale_to_lux(shape, light.illuminance_lux)
+    assert light.irradiance_w_m2 is not None
+    return scale_to_irradiance(shape, light.irradiance_w_m2)
+
+
+def mixed_light(lights: Iterable[LightSpec]) -> Spectrum | None:
+    """Spectrum of all lights together, each as on its own plane: its shape is the light that white means there.
+
+    None in darkness.
+    """
+    given = list(lights)
+    if len(given) == 1 and given[0].type != "none":
+        return given[0].illuminant.load()
+    found = [level for level in map(irradiance, given) if level is not None]
+    return summed(*found) if found else None
