@@ -31,6 +31,7 @@ _HOMES = {
     "load_sensor": "hesim_render.sensor",
     "photocurrent": "hesim_render.radiometry",
     "simulate": "hesim_render.simulation",
+    "simulate_video": "hesim_render.video_simulation",
 }
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "load_sensor",
     "photocurrent",
     "simulate",
+    "simulate_video",
 ]
 
 if TYPE_CHECKING:
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from hesim_render.scene import Scene, load_scene
     from hesim_render.sensor import Sensor, load_sensor
     from hesim_render.simulation import simulate
+    from hesim_render.video_simulation import simulate_video
 
 
 def __getattr__(name: str) -> Any:

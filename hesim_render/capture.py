@@ -13,7 +13,7 @@ from hesim_render.backend import jit
 from hesim_render.crosstalk import with_crosstalk
 from hesim_render.errors import RangeError
 from hesim_render.evs import EvsStage
-from hesim_render.flux import FluxSource
+from hesim_render.flux import FluxSource, SampledFlux
 from hesim_render.frame import Frame
 from hesim_render.noise.aps import APS_TERMS, ApsNoise
 from hesim_render.noise.evs import EVS_TERMS, EvsNoise
@@ -102,6 +102,18 @@ class Capture:
         self._event_flux = EventFlux(self._evs_pixel.size)
 
     @property
+    def event_windows(self) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
+        """Event pixels, and begin and end of each of their windows, µs."""
+        length = self._stage.noise.spec.window_us if self._stage is not None else 0
+        ends = self._samples.astype(np.float64)
+        return self._evs_pixel, ends - length, ends
+
+    @property
+    def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:
+        """Frame pixels and all exposures of the run."""
+        return self._aps_pixel, list(self._exposures)
+
+    @property
     def event_flux(self) -> EventFlux:
         """Mean noise-free flux of the event pixels over all samples taken so far."""
         return self._event_flux
@@ -126,6 +138,9 @@ class Capture:
         """Frames and blocks of events (`EVENT_DTYPE`), each kind in order of time."""
         if self._flux.is_static:
             yield from self._run_static(progress)
+            return
+        if isinstance(self._event_source, SampledFlux):
+            yield from self._run_sampled(self._event_source, progress)
             return
         edges = self._flux.slice_edges_us(0, self._duration_us)
         bounds = np.concatenate([[0.0], edges, [float(self._duration_us)]])
@@ -160,6 +175,28 @@ class Capture:
             yield self._step(event_a, event_b, int(t_us))
             if progress is not None:
                 progress(float(t_us), self._duration_us, "simulated µs")
+
+    def _run_sampled(self, source: SampledFlux, progress: Progress | None) -> Iterator[Frame | NDArray]:
+        """A source without slices: all event samples in one go, each frame in one piece when its time has come."""
+        waiting = list(self._exposures)
+        if self._stage is not None:
+            halves = source.flux_of_windows(*self.event_windows)
+            for t_us, (half_a, half_b) in zip(self._samples, halves, strict=True):
+                while waiting and waiting[0].end_us <= t_us:
+                    yield self._whole_frame(waiting.pop(0))
+                self._event_flux.add(half_a, half_b)
+                yield self._step(half_a, half_b, int(t_us))
+                if progress is not None:
+                    progress(float(t_us), self._duration_us, "simulated µs")
+        for exposure in waiting:
+            yield self._whole_frame(exposure)
+            if progress is not None and self._stage is None:
+                progress(exposure.end_us, self._duration_us, "simulated µs")
+
+    def _whole_frame(self, exposure: Exposure) -> Frame:
+        frame = self._open(exposure)
+        self._expose(frame, 0.0, float(self._duration_us))
+        return self._read_out(frame)
 
     def _static_flux(self, source: FluxSource, *lists: NDArray[np.uint32]) -> Iterator[tuple[Any, Any]]:
         """Both halves of the flux of each list of pixels, from one render of all of them."""

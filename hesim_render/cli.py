@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,13 +14,17 @@ import typer
 from hesim_render import __version__
 from hesim_render.errors import HesimError, RangeError
 from hesim_render.output import check_target, discard_unfinished, output_errors
+from hesim_render.terminal import parse_exposures, parse_roi, progress_bar, split_overrides, summary
 
 if TYPE_CHECKING:
     from hesim_render.recording import Recording
 
+#: Runs that take longer, by estimate, ask to be wanted.
+LONG_MINUTES = 30
+
 app = typer.Typer(
     name="hesim-render",
-    help="Render a scene into RAW frames and events of a hybrid event-frame sensor.",
+    help="Render a scene, or turn a video, into RAW frames and events of a hybrid event-frame sensor.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -109,7 +112,12 @@ def simulate(
     duration: Annotated[float, typer.Option(help="simulated time, s")] = 0.1,
     roi: Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")] = None,
     seed: Annotated[int, typer.Option(help="of all noise and of the render")] = 7,
-    samples: Annotated[int | None, typer.Option(help="rays per pixel and slice of time")] = None,
+    quality: Annotated[
+        float | None, typer.Option(help="error of the render as a part of the sensor's noise (default 0.5)")
+    ] = None,
+    exact: Annotated[bool, typer.Option("--exact", help="render every pixel of every slice, all alike")] = False,
+    samples: Annotated[int | None, typer.Option(help="with --exact: rays per pixel and slice of time")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")] = False,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -127,9 +135,86 @@ def simulate(
     scene_changes, sensor_changes = split_overrides(set_ or [])
     recording = _simulate(
         scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
-        overwrite=overwrite, duration_s=duration, seed=seed, samples=samples, clean=clean, without=without or (),
+        overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
+        max_minutes=None if yes else LONG_MINUTES, on_estimate=lambda expected: typer.echo(f"estimate: {expected}"),
+        clean=clean, without=without or (),
     )  # fmt: skip
     typer.echo(summary(recording))
+
+
+@app.command()
+def video(
+    source: Annotated[
+        str, typer.Argument(metavar="INPUT", help="a video file, a folder of numbered pictures, or a .npy file")
+    ],
+    sensor: Annotated[str, typer.Option(help="a name (see 'list sensors') or the path of a sensor file")],
+    out: Annotated[Path, typer.Option(help="folder to write the recording to")],
+    duration: Annotated[float | None, typer.Option(help="simulated time, s; default the whole video")] = None,
+    roi: Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")] = None,
+    seed: Annotated[int, typer.Option(help="of all noise")] = 7,
+    fps: Annotated[
+        float | None, typer.Option(help="pictures per second; for folders and .npy, else instead of time stamps")
+    ] = None,
+    slow_motion: Annotated[
+        float | None, typer.Option(help="how much slower the video plays than the scene was")
+    ] = None,
+    duty: Annotated[float | None, typer.Option(help="part of a picture's time the shutter was open, 0 to 1")] = None,
+    interpolation: Annotated[str | None, typer.Option(help="none (default), linear or motion")] = None,
+    motion_factor: Annotated[int | None, typer.Option(help="pictures made of one by interpolation motion")] = None,
+    transfer: Annotated[str | None, typer.Option(help="srgb, bt709, gamma, linear, pq or hlg")] = None,
+    gamma: Annotated[float | None, typer.Option(help="exponent of transfer gamma")] = None,
+    primaries: Annotated[str | None, typer.Option(help="bt709 (sRGB), bt2020, p3, smpte170m or bt470bg")] = None,
+    matrix: Annotated[str | None, typer.Option(help="of YUV: bt709, bt601, bt2020 or smpte240m")] = None,
+    range_: Annotated[str | None, typer.Option("--range", help="limited or full")] = None,
+    bit_depth: Annotated[int | None, typer.Option(help="of integer values in .npy and TIFF files")] = None,
+    mode: Annotated[str | None, typer.Option(help="matrix (default) or spectral")] = None,
+    others: Annotated[
+        str | None, typer.Option(help="filters outside the matrix see: luma (default) or spectral")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option(help="camera file whose matrix and white balance are undone")] = None,
+    illuminant: Annotated[str | None, typer.Option(help="light on white (default D65)")] = None,
+    white_lux: Annotated[float | None, typer.Option(help="illuminance of white, lux (default 1000)")] = None,
+    white_e_per_s: Annotated[float | None, typer.Option(help="or photo-electrons per second of white")] = None,
+    white_filter: Annotated[str | None, typer.Option(help="behind this filter")] = None,
+    fit: Annotated[str | None, typer.Option(help="cover (default), stretch or pixel")] = None,
+    lens_shading: Annotated[
+        bool, typer.Option("--lens-shading", help="apply the sensor's relative illumination")
+    ] = False,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
+    ] = None,
+    clean: Annotated[bool, typer.Option("--clean", help="no noise at all")] = False,
+    without: Annotated[
+        list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing recording")] = False,
+) -> None:
+    """Put a video in front of a sensor and record it: RAW frames, events and their ground truth."""
+    if duration is not None:
+        _check_duration(duration)
+    scene_changes, sensor_changes = split_overrides(set_ or [])
+    for key in scene_changes:
+        raise RangeError("--set", key, "a key of the sensor file, as sensor.aps.exposure_us")
+    _check_output(out, overwrite)
+    import hesim_render as hr
+    from hesim_render.camera import load_camera
+
+    loaded_sensor = hr.load_sensor(sensor, sensor_changes)
+    if roi is not None:
+        loaded_sensor = loaded_sensor.crop(*parse_roi(roi))
+    with progress_bar(f"{Path(source).name} → {sensor}") as progress:
+        recording = hr.simulate_video(
+            source, loaded_sensor, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed,
+            clean=clean, without=without or (), fps=fps, slow_motion=slow_motion, duty=duty,
+            interpolation=interpolation, motion_factor=motion_factor, transfer=transfer, gamma=gamma,
+            primaries=primaries, matrix=matrix, range=range_, bit_depth=bit_depth, mode=mode, others=others,
+            camera=None if camera is None else load_camera(camera), illuminant=illuminant, white_lux=white_lux,
+            white_e_per_s=white_e_per_s, white_filter=white_filter, fit=fit, lens_shading=lens_shading,
+        )  # fmt: skip
+    typer.echo(
+        "\n".join([summary(recording), *(f"note: {text}" for text in recording.manifest["settings"]["video"]["notes"])])
+    )
 
 
 @app.command()
@@ -246,39 +331,6 @@ def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")
     typer.echo(summary(loaded))
 
 
-def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """``--set`` items for the scene file and for the sensor file (those that begin with ``sensor.``)."""
-    from hesim_render.specs.files import parse_override
-
-    scene: dict[str, Any] = {}
-    sensor: dict[str, Any] = {}
-    for key, value in map(parse_override, texts):
-        if key.startswith("sensor."):
-            sensor[key.removeprefix("sensor.")] = value
-        else:
-            scene[key] = value
-    return scene, sensor
-
-
-def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
-    """Width, height and optional first column and row of ``512x384`` or ``512x384+100+200``."""
-    size, *offset = text.lower().split("+")
-    try:
-        width, height = (int(part) for part in size.split("x"))
-        x, y = (int(part) for part in offset) if offset else (None, None)
-    except ValueError:
-        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384") from None
-    return width, height, x, y
-
-
-def parse_exposures(text: str) -> list[int]:
-    """Exposures in µs of ``1,5,20``, in ms."""
-    try:
-        return [round(1000 * float(part)) for part in text.split(",")]
-    except (ValueError, OverflowError):
-        raise RangeError("exposures", text, "times in ms, such as 1,5,20") from None
-
-
 def _check_duration(duration_s: float) -> None:
     if not 0 < duration_s < float("inf"):
         raise RangeError("--duration", duration_s, "a time above 0, in seconds")
@@ -311,50 +363,6 @@ def _simulate(
     loaded_scene = hr.load_scene(scene, scene_changes)
     with progress_bar(f"{scene} → {sensor}") as progress:
         return hr.simulate(loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress, **options)
-
-
-@contextlib.contextmanager
-def progress_bar(title: str) -> Iterator[Any]:
-    """A callback (done, total, what) that moves a bar on a terminal; silent elsewhere."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None)
-
-        def move(done: float, total: float, what: str) -> None:
-            bar.update(task, completed=done, total=total, description=f"{title}: {what}")
-
-        yield move
-
-
-def summary(recording: Recording) -> str:
-    """What a recording holds and where, in a few lines."""
-    manifest = recording.manifest
-    counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
-    scene = (manifest.get("scene") or {}).get("name", "no scene file")
-    size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
-    lines = [
-        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}",
-        f"  RAW frames: {counts['frames']} of {size}, {bits}",
-    ]
-    if counts["frames"] == 0:
-        lines[1] += " (no frame's last row is fully exposed in this time)"
-    if grid["width"]:
-        lines.append(
-            f"  events: {counts['events']} ({counts['events_on']} ON, {counts['events_off']} OFF) "
-            f"on {grid['width']}x{grid['height']} px"
-        )
-    if counts.get("events_dropped"):
-        lines.append(f"  {counts['events_dropped']} more events were lost in the sensor's read-out")
-    if recording.path is not None:
-        pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
-        lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
-    return "\n".join(lines)
 
 
 def _interrupted(*_: Any) -> None:

@@ -8,13 +8,14 @@ falls into its own exposure, also with a rolling shutter.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.backend import jit
-from hesim_render.flux import FluxSource
+from hesim_render.flux import FluxSource, SampledFlux
 
 
 def mixed(image: NDArray, part: float) -> NDArray:
@@ -28,7 +29,11 @@ def mixed(image: NDArray, part: float) -> NDArray:
 
 def with_crosstalk(flux: FluxSource, shape: tuple[int, int], part: float) -> FluxSource:
     """The source as the pixels of a region [row, col] see it; itself where no part leaves a pixel."""
-    return CrosstalkFlux(flux, shape, part) if part > 0 else flux
+    if part <= 0:
+        return flux
+    return (
+        SampledCrosstalkFlux(flux, shape, part) if isinstance(flux, SampledFlux) else CrosstalkFlux(flux, shape, part)
+    )
 
 
 class CrosstalkFlux:
@@ -56,21 +61,10 @@ class CrosstalkFlux:
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
         """See `FluxSource.mean_flux`; both halves are mixed alike."""
-        import drjit as dr
 
         types = jit()
         own = np.asarray(pixel, dtype=np.int64).ravel()
-        rows, cols = self._shape
-        row, col = np.divmod(own, cols)
-        sites = np.stack(
-            [
-                own,
-                own - cols * (row > 0),
-                own + cols * (row < rows - 1),
-                own - (col > 0),
-                own + (col < cols - 1),
-            ]
-        )
+        sites = self._sites(own)
         begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
         if begin.ndim == end.ndim == 0:
             asked, place = np.unique(sites, return_inverse=True)
@@ -81,7 +75,26 @@ class CrosstalkFlux:
             asked, number = np.divmod(asked, intervals.size)
             begin, end = intervals.real[number], intervals.imag[number]
         halves = self._flux.mean_flux(asked.astype(np.uint32), begin, end)
-        index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
+        return self._mix(halves, [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)])
+
+    def _sites(self, own: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Each pixel and its four neighbours, itself where it lacks one, [5, n]."""
+        rows, cols = self._shape
+        row, col = np.divmod(own, cols)
+        return np.stack(
+            [
+                own,
+                own - cols * (row > 0),
+                own + cols * (row < rows - 1),
+                own - (col > 0),
+                own + (col < cols - 1),
+            ]
+        )
+
+    def _mix(self, halves: tuple[Any, Any], index: list[Any]) -> tuple[Any, Any]:
+        import drjit as dr
+
+        types = jit()
         result = []
         for half in halves:
             centre, *around = (dr.gather(types.Float, half, where) for where in index)
@@ -90,3 +103,19 @@ class CrosstalkFlux:
             )
         dr.eval(result)
         return result[0], result[1]
+
+
+class SampledCrosstalkFlux(CrosstalkFlux):
+    """The same of a source that is asked for many windows at once; implements `SampledFlux`."""
+
+    def flux_of_windows(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
+    ) -> Iterator[tuple[Any, Any]]:
+        """See `SampledFlux.flux_of_windows`."""
+        types = jit()
+        sites = self._sites(np.asarray(pixel, dtype=np.int64).ravel())
+        asked, place = np.unique(sites, return_inverse=True)
+        index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
+        assert isinstance(self._flux, SampledFlux)
+        for halves in self._flux.flux_of_windows(asked.astype(np.uint32), begin_us, end_us):
+            yield self._mix(halves, index)

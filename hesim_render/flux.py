@@ -5,7 +5,8 @@ The renderer and the video path implement `FluxSource`; nothing downstream knows
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Iterator
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,5 +48,29 @@ class FluxSource(Protocol):
             their difference its standard error. Both use the same random numbers at every call, so
             a static pixel is exactly static; therefore accumulate each half over time and compare
             the sums, never add the errors of slices. Exact sources return the same array twice.
+        """
+        ...
+
+
+@runtime_checkable
+class SampledFlux(FluxSource, Protocol):
+    """A source that is better asked for many windows at once than for one after another.
+
+    It has no slice edges: `mean_flux` takes intervals of any length.
+    """
+
+    def flux_of_windows(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
+    ) -> Iterator[tuple[Any, Any]]:
+        """Mean Φ of the same pixels in one window after another.
+
+        Parameters
+        ----------
+        pixel : [n] mosaic indices, spread evenly over the region.
+        begin_us, end_us : [m], windows in order of time.
+
+        Yields
+        ------
+        half_a, half_b : Dr.Jit Float [n], e⁻/s, as `mean_flux` gives them.
         """
         ...

@@ -174,7 +174,7 @@ class FolderWriter:
 
     def __init__(self, path: str | Path, manifest: Mapping[str, Any], overwrite: bool = False) -> None:
         self._folder = OutputFolder(path, manifests.MANIFEST_NAME, overwrite)
-        self._manifest: dict[str, Any] = {**manifest, "frames": [], "counts": {}}
+        self.manifest: dict[str, Any] = {**manifest, "frames": [], "counts": {}}
         self._on = self._off = self._dropped = 0
         self._mosaic = Mosaic.model_validate(manifest["mosaic"])
         self._finished = False
@@ -196,14 +196,14 @@ class FolderWriter:
             raise
 
     def _mosaic_mask(self) -> NDArray[np.bool_]:
-        roi = self._manifest["roi"]
+        roi = self.manifest["roi"]
         return self._mosaic.tiled(np.array(self._mosaic.tile_aps), (roi["height_px"], roi["width_px"]))
 
     def add_frame(self, frame: Frame) -> None:
         from hesim_render.dng import write_dng
         from hesim_render.preview import thumbnail
 
-        number = len(self._manifest["frames"])
+        number = len(self.manifest["frames"])
         file, truth = f"frames/{number:06d}.dng", f"truth/{number:06d}.npz"
         with output_errors(self._folder.target):
             write_dng(
@@ -219,7 +219,7 @@ class FolderWriter:
                 electrons_mean=np.asarray(frame.electrons_mean, dtype=np.float32),
                 electrons_stderr=np.asarray(frame.electrons_stderr, dtype=np.float32),
             )
-        self._manifest["frames"].append({**frame.times, "file": file, "truth": truth})
+        self.manifest["frames"].append({**frame.times, "file": file, "truth": truth})
 
     def add_events(self, events: NDArray) -> None:
         with output_errors(self._folder.target):
@@ -244,14 +244,14 @@ class FolderWriter:
 
         with output_errors(self._folder.target):
             self._events.close()
-            self._manifest["counts"] = {
-                "frames": len(self._manifest["frames"]),
+            self.manifest["counts"] = {
+                "frames": len(self.manifest["frames"]),
                 "events": self._on + self._off,
                 "events_on": self._on,
                 "events_off": self._off,
                 "events_dropped": self._dropped,
             }
-            text = manifests.to_text(self._manifest) + "\n"
+            text = manifests.to_text(self.manifest) + "\n"
             (self._folder.path / manifests.MANIFEST_NAME).write_text(text, encoding="utf-8")
             write_previews(Recording.load(self._folder.path), self._folder.path)
         target = self._folder.commit()
@@ -281,6 +281,7 @@ class RecordingWriter:
     duration_us : length of the recording.
     settings : what else was asked for (``clean``, ``without``, ``samples``, ``backend``); plain values.
     overwrite : replace an existing recording.
+    mosaic : instead of the sensor's under the scene's light, where that says too little (a video's light).
 
     Raises
     ------
@@ -298,10 +299,13 @@ class RecordingWriter:
         duration_us: int,
         settings: Mapping[str, Any] | None = None,
         overwrite: bool = False,
+        mosaic: Mosaic | None = None,
     ) -> None:
         self._manifest = manifests.build(
             sensor, scene=scene, seed=seed, duration_us=duration_us, settings=settings or {}
         )
+        if mosaic is not None:
+            self._manifest["mosaic"] = mosaic.model_dump(mode="json")
         self._folder = None if path is None else FolderWriter(path, self._manifest, overwrite)
         self._frames: list[Frame] = []
         self._events: list[NDArray] = []
@@ -340,6 +344,11 @@ class RecordingWriter:
         if self._folder is not None:
             self._folder.set_events_dropped(count)
         self._dropped = int(count)
+
+    def add_settings(self, settings: Mapping[str, Any]) -> None:
+        """What only the run itself could tell, beside the settings given at the start."""
+        for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
+            manifest["settings"] = {**manifest["settings"], **settings}
 
     def finish(self) -> Recording:
         """The recording; a folder is complete and has its name now."""

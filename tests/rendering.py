@@ -51,3 +51,13 @@ def mono(cols=64, rows=48, **overrides):
     """`reference-mono` (flat 400-700 nm response, 5 µm, f/4) with a centred region."""
     changes = {key.replace("__", "."): value for key, value in overrides.items()}
     return hr.load_sensor("reference-mono", changes).crop(cols, rows)
+
+
+def mitsuba_scene(shapes, motion=(), depth=3):
+    """A scene of Mitsuba's own, from a dictionary, under a camera that sees 0.8 m of the plane z = 0 from 2 m."""
+    return make_scene(
+        mitsuba={"inline": shapes},
+        camera={"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22.62},
+        motion=list(motion),
+        max_depth=depth,
+    )

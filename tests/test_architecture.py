@@ -11,16 +11,17 @@ PACKAGE = Path(__file__).parent.parent / "hesim_render"
 
 # lowest first; a module may import its own layer and those below. Names are modules or packages.
 LAYERS = [
-    {"errors", "units", "rng", "backend", "spectra", "colorimetry", "events", "frame", "output"},
+    {"errors", "units", "rng", "backend", "spectra", "colorimetry", "events", "frame", "output"}
+    | {"bands", "transfer", "waveform"},
     {"specs"},
     {"optics", "layout", "noise"},
-    {"sensor", "flux", "crosstalk", "mosaic", "schedule"},
-    {"radiometry", "scene", "renderer"},
+    {"sensor", "flux", "crosstalk", "mosaic", "camera", "schedule"},
+    {"radiometry", "scene", "flicker", "renderer", "video"},
     {"aps", "evs"},
     {"capture"},
     {"eventfile", "npzfile", "dng", "preview", "manifest", "showcase", "recording"},
-    {"simulation", "calibrate", "bench", "lab", "isp"},
-    {"cli"},
+    {"simulation", "video_simulation", "calibrate", "bench", "lab", "isp"},
+    {"cli", "terminal"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

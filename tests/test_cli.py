@@ -37,7 +37,7 @@ def fails(capsys, *arguments):
 def test_help_lists_the_commands():
     done = subprocess.run([sys.executable, "-m", "hesim_render.cli", "--help"], capture_output=True, text=True)
     assert done.returncode == 0
-    for command in ("doctor", "list", "simulate", "demo", "view", "lab", "calibrate", "isp"):
+    for command in ("doctor", "list", "simulate", "video", "demo", "view", "lab", "calibrate", "isp"):
         assert command in done.stdout
 
 

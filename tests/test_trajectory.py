@@ -97,11 +97,15 @@ def test_drjit_evaluation_equals_numpy(repeat):
     times = np.linspace(-800, 4400, 521)
     local = moving.local_us(times) if repeat else times - 500
     point, direction = np.array([0.7, -0.3, 0.9]), np.array([0.6, 0.0, -0.8])
-    vectors = (types.Array3f(*map(float, vector)) for vector in (point, direction))
-    moved, turned = moving.move(types.Float(local.astype(np.float32)), *vectors)
+    vectors = [types.Array3f(*map(float, vector)) for vector in (point, direction)]
+    pose = moving.pose_at(types.Float(local.astype(np.float32)))
+    moved, turned = pose.to_world(vectors[0]), pose.turn_to_world(vectors[1])
     poses = moving.matrix(times)
     np.testing.assert_allclose(np.array(moved).T, poses[:, :3, :3] @ point + poses[:, :3, 3], atol=3e-6)
     np.testing.assert_allclose(np.array(turned).T, poses[:, :3, :3] @ direction, atol=3e-6)
+    back, returned = pose.to_rest(moved), pose.turn_to_rest(turned)
+    np.testing.assert_allclose(np.array(back).T, np.broadcast_to(point, (521, 3)), atol=6e-6)
+    np.testing.assert_allclose(np.array(returned).T, np.broadcast_to(direction, (521, 3)), atol=3e-6)
 
 
 def test_a_track_without_motion_does_not_move():

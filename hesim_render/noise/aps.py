@@ -238,6 +238,26 @@ class ApsNoise:
         _, gain, mean, gaussian = self._parts(values, exposure_us * S_PER_US, pixels, np)
         return np.asarray(gain * gain * mean + gaussian + (ADC_VARIANCE_DN2 if adc else 0.0), dtype=np.float64)
 
+    def noise_equivalent_e(self, electrons: NDArray, exposure_us: float) -> NDArray[np.float64]:
+        """Standard deviation of a frame pixel in electrons at its input, PRNU included.
+
+        What an error of the clean signal is measured against; a render's error is a fixed pattern, as
+        PRNU is. Nominal values of the first frame position; rounding counts with 1/12 DN².
+
+        Parameters
+        ----------
+        electrons : [n], noise-free electrons of the exposure.
+
+        Returns
+        -------
+        [n], electrons.
+        """
+        signal = np.maximum(np.asarray(electrons, dtype=np.float64), 0.0)
+        _, gain, mean, gaussian = self._parts(signal, exposure_us * S_PER_US, self._host_pixels(None, False), np)
+        temporal_dn2 = gain * gain * mean + gaussian + ADC_VARIANCE_DN2
+        fixed_e = self.spec.prnu_rel * signal
+        return np.sqrt(temporal_dn2 / self.spec.system_gain_dn_per_e**2 + fixed_e**2)
+
     def to_polynomial(self) -> list[list[list[float]]]:
         """The variance as [tile_row][tile_col][β0 … β5] in DN and s; exact for the physical form.
 

@@ -38,6 +38,9 @@ EVS_TERMS = ("shot", "dark_current", "mismatch", "leak", "bandwidth", "refractor
 #: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
 LEAST_THRESHOLD_REL = 0.05
 
+#: Least noise that deviations of the clean signal are measured against, in thresholds.
+LEAST_NOISE_THETA = 0.05
+
 Map = float | NDArray[np.float32]
 
 
@@ -244,6 +247,28 @@ class EvsNoise:
         # with full anticorrelation s² is a square that can be 0: rounding must not take it below
         variance = xp.maximum((k.light * root + k.cross) * root + k.dark, 0.0)
         return xp.log(x), variance / (x * x)
+
+    def noise_equivalent_e(self, electrons: NDArray, event_pixel: NDArray[np.integer]) -> NDArray[np.float64]:
+        """The change of a window's electrons that equals one standard deviation of ln x, or θ/20 if that is more.
+
+        What a deviation of the clean signal is measured against. The floor keeps a sensor (nearly) without
+        noise from asking for the impossible: θ/20 moves no threshold crossing by more than a twentieth.
+
+        Parameters
+        ----------
+        electrons : [n], noise-free electrons of the window.
+        event_pixel : [n], places on the event grid, row-major.
+
+        Returns
+        -------
+        [n], electrons.
+        """
+        where = self.layout.evs_position.ravel()[event_pixel]
+        k = _Coefficients(**{name: values[where] for name, values in vars(self._table).items()})
+        x = k.slope * electrons + k.base
+        _, variance = self._log_level(np.maximum(electrons, 0.0), k, np)
+        theta = min(self.spec.contrast_threshold_on, self.spec.contrast_threshold_off)
+        return np.maximum(np.sqrt(variance), LEAST_NOISE_THETA * theta) * x / k.slope
 
     def _position_number(self, position: int | tuple[int, int] | None) -> int:
         known = self.layout.spec.positions("evs")

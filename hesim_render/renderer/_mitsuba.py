@@ -7,7 +7,7 @@ in `builder`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 from hesim_render import backend
 from hesim_render.errors import SpecError
 from hesim_render.spectra import Spectrum
+
+#: Largest departure of a wavelength from an even grid, relative, that counts as rounding.
+_EVEN = 1e-9
 
 
 def mitsuba() -> Any:
@@ -75,13 +78,86 @@ def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[N
         raise SpecError(f"Mitsuba cannot read this scene: {' '.join(lines)[:400]}", file=file, key=key) from None
 
 
+def load_scene(
+    mi: Any, source: Path | dict[str, Any], shines: Callable[[str], bool] | None = None, names: Sequence[str] = ()
+) -> Any:
+    """A scene from an XML file or a dictionary, nothing merged; where asked to, with some of its emitters left out.
+
+    Parameters
+    ----------
+    shines : whether the emitter of a name is wanted. Its name is the id of its shape, or its own.
+    names : that must be emitters of the scene.
+
+    Raises
+    ------
+    SpecError
+        If a name is not one of an emitter.
+    """
+    if shines is None:
+        if isinstance(source, Path):
+            return mi.load_file(str(source), optimize=False)
+        return mi.load_dict(source, optimize=False)
+    parser = mi.parser
+    config = parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    resolver = mi.file_resolver()
+    if isinstance(source, Path):
+        inner = mi.FileResolver(resolver)
+        inner.prepend(str(source.resolve().parent))
+        mi.set_file_resolver(inner)
+    try:
+        state = (
+            parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
+        )
+        parser.transform_all(config, state)
+        _switch_off(state, shines, names)
+        return parser.instantiate(config, state)
+    finally:
+        mi.set_file_resolver(resolver)
+
+
+def _switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:
+    """Take the unwanted emitters out of a parsed scene; a shape that loses its own stays."""
+    import mitsuba as mi
+
+    nodes, known = state.nodes, set()
+    for node in nodes:
+        properties = node.props
+        for key in list(properties.keys()):
+            if properties.type(key) != mi.Properties.Type.ResolvedReference:
+                continue
+            child = nodes[properties[key].index()]
+            if child.type != mi.ObjectType.Emitter:
+                continue
+            both = [node.props.id(), child.props.id()] if node.type == mi.ObjectType.Shape else [child.props.id()]
+            # its own name counts where it is asked for: in a dictionary each shape may call its light 'emitter'
+            name = next((name for name in both if name in names), both[0])
+            known.add(name)
+            if not shines(name):
+                del properties[key]
+    for name in names:
+        if name not in known:
+            there = ", ".join(sorted(repr(k) for k in known if k)) or "none with a name"
+            raise SpecError(f"no emitter {name!r} in the Mitsuba scene; there are {there}")
+
+
 def spectrum_dict(spectrum: Spectrum) -> dict[str, Any]:
     """A spectrum as an explicit Mitsuba plugin, absolute: Mitsuba neither normalises nor reshapes it.
 
-    (A bare number as radiance would mean a spectrum shaped like D65, and ``d65`` is normalised.)
+    (A bare number as radiance would mean a spectrum shaped like D65, and ``d65`` is normalised.) On an evenly
+    spaced grid, ``regular``: the same values without the search that makes ``irregular`` 15-30 % of a render.
     """
     if not np.any(spectrum.values):
-        return {"type": "uniform", "value": 0.0}  # 'irregular' refuses an all-zero table
+        return {"type": "uniform", "value": 0.0}  # an all-zero table is refused
+    low, high = spectrum.support_nm
+    even = np.linspace(low, high, spectrum.wavelength_nm.size)
+    if np.abs(spectrum.wavelength_nm - even).max() <= _EVEN * high:
+        return {
+            "type": "regular",
+            "wavelength_min": low,
+            "wavelength_max": high,
+            "values": ",".join(f"{value:.9g}" for value in spectrum.values),
+        }
     return {
         "type": "irregular",
         "wavelengths": ",".join(f"{value:.9g}" for value in spectrum.wavelength_nm),
@@ -120,7 +196,7 @@ class Movable:
 
     def __init__(self, parameters: Any, prefix: str) -> None:
         self._parameters = parameters
-        self._prefix = prefix
+        self.prefix = prefix
         self._to_world: NDArray[np.float64] | None = None
         self.is_mesh = f"{prefix}.vertex_positions" in parameters
         if self.is_mesh:
@@ -142,13 +218,13 @@ class Movable:
             import mitsuba as mi
 
             # a transform whose entries are arrays, not literals: setting it does not recompile anything
-            self._parameters[f"{self._prefix}.to_world"] = mi.AffineTransform4f((pose @ self._to_world).tolist())
+            self._parameters[f"{self.prefix}.to_world"] = mi.AffineTransform4f((pose @ self._to_world).tolist())
             return
         positions = self._vertices @ rotation.T + shift
-        self._parameters[f"{self._prefix}.vertex_positions"] = positions.astype(np.float32).ravel()
+        self._parameters[f"{self.prefix}.vertex_positions"] = positions.astype(np.float32).ravel()
         if self._normals is not None:
             turned = self._normals @ rotation.T
-            self._parameters[f"{self._prefix}.vertex_normals"] = turned.astype(np.float32).ravel()
+            self._parameters[f"{self.prefix}.vertex_normals"] = turned.astype(np.float32).ravel()
 
 
 def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
 from hesim_render.renderer import lights
-from hesim_render.renderer._mitsuba import Movable, as_spec_error, box_corners, make_mesh, spectrum_dict, transform
+from hesim_render.renderer._mitsuba import (
+    Movable,
+    as_spec_error,
+    box_corners,
+    load_scene,
+    make_mesh,
+    spectrum_dict,
+    transform,
+)
 from hesim_render.renderer.targets import build_target
 from hesim_render.renderer.trajectory import Trajectory, rotation_about
 from hesim_render.specs.scene import MitsubaSpec, ObjectSpec, SceneSpec
@@ -51,6 +59,14 @@ class BuiltScene:
             matrix = trajectory.matrix(t_us)
             for shape in self.groups[name]:
                 shape.set_pose(matrix)
+        if self.trajectories:
+            self.parameters.update()
+
+    def rest(self) -> None:
+        """Put every moving object back where the file places it."""
+        for name in self.trajectories:
+            for shape in self.groups[name]:
+                shape.set_pose(np.eye(4))
         if self.trajectories:
             self.parameters.update()
 
@@ -128,9 +144,8 @@ def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[
         name = f"object_{number}"
         content[name] = _object(mi, item, name, spec.folder)
         groups[item.name] = [name]
-    assert spec.light is not None
     try:
-        content.update(lights.emitters(mi, spec.light))
+        content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     return content, groups
@@ -205,19 +220,39 @@ def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> Any:
-    """A scene of Mitsuba's own."""
+    """A scene of Mitsuba's own, with the emitters that are wanted."""
     if source.file is not None:
         path = spec.folder / source.file
         if not path.is_file():
             raise SpecError(f"no such Mitsuba scene file: {path}", file=spec.file, key="mitsuba.file")
-        with as_spec_error(path):
-            scene = mi.load_file(str(path), optimize=False)
+        content: Path | dict[str, Any] = path
+        where: tuple[Path | None, str | None] = (path, None)
     else:
-        content = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {})
-        with as_spec_error(spec.file, "mitsuba.inline"):
-            scene = mi.load_dict({"type": "scene", **content}, optimize=False)
+        own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {})
+        content, where = {"type": "scene", **own}, (spec.file, "mitsuba.inline")
+    with as_spec_error(*where):
+        scene = load_scene(mi, content)
     if not isinstance(scene, mi.Scene):
         raise SpecError("the Mitsuba file describes no scene", file=source.file or spec.file, key="mitsuba")
+    meant_dark = bool(spec.lights)  # of type 'none', or the scene file would have been refused
+    if meant_dark and scene.emitters():
+        raise SpecError("type 'none' is darkness, but the Mitsuba scene has emitters", file=spec.file, key="light")
+    if not meant_dark and not scene.emitters():
+        raise SpecError(
+            "the Mitsuba scene has no emitter, so there is nothing to see; if it is meant to be dark, write "
+            "'light: {type: none}' beside it",
+            file=spec.file,
+            key="mitsuba",
+        )
+    if source.lit is not None or source.unlit or source.waveforms:
+        names = [*(source.lit or ()), *source.unlit, *source.waveforms]
+        try:
+            with as_spec_error(*where):
+                scene = load_scene(mi, content, source.may_shine, names)
+        except SpecError as error:
+            if error.file is not None:
+                raise
+            raise SpecError(str(error), file=spec.file, key="mitsuba") from None
     return scene
 
 
@@ -249,9 +284,11 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
 
     A Mitsuba scene is taken as it is: its RGB colours become spectra over the whole visible range.
     """
-    if spec.mitsuba is not None or spec.light is None or lights.irradiance(spec.light) is None:
+    if spec.mitsuba is not None or not any(light.is_lit for light in spec.lights):
         return
-    yield "light.illuminant", spec.light.illuminant.load()
+    for number, light in enumerate(spec.lights):
+        if light.is_lit:
+            yield f"{lights.key_of(spec.lights, number)}.illuminant", light.illuminant.load()
     if spec.target is not None:
         for piece in build_target(spec.target):
             yield f"target ({piece.name})", piece.reflectance

@@ -255,3 +255,9 @@ class RayFactory:
         local = dr.normalize(types.Array3f(x, -y, -1.0))
         direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
         return types.Array3f(*self._origin), direction
+
+    def project(self, point: Any) -> tuple[Any, Any]:
+        """Column and row in the region of world points, the camera at rest; infinite or NaN behind it."""
+        away = [component - origin for component, origin in zip(point, self._origin, strict=True)]
+        x, y, z = (sum(self._rotation[k][axis] * away[k] for k in range(3)) for axis in range(3))
+        return (x / -z - self._first[0]) / self._step, (-y / -z - self._first[1]) / self._step

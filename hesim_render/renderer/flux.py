@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.backend import jit
-from hesim_render.errors import RangeError
+from hesim_render.errors import RangeError, SpecError
+from hesim_render.layout import Layout
 from hesim_render.renderer.timeline import Timeline
 from hesim_render.renderer.tracer import BLOCK_RAYS, PixelTracer
 from hesim_render.renderer.wavelengths import WavelengthSampler
@@ -26,6 +27,33 @@ def used_responses(sensor: Sensor) -> dict[str, Spectrum]:
     spec = sensor.spec
     used = {spec.pixels[letter].filter for letter in "".join(spec.tile_rows)}
     return {name: response for name, response in sensor.responses.items() if name in used}
+
+
+def require_finite(half_a: Any, half_b: Any, scene: Scene, layout: Layout, pixel: NDArray[np.uint32]) -> None:
+    """Refuse flux that is not a number or infinite.
+
+    Parameters
+    ----------
+    half_a, half_b : Dr.Jit Float [n], of the mosaic indices `pixel` of the region `layout`.
+
+    Raises
+    ------
+    SpecError
+        With scene file and the first such pixel.
+    """
+    import drjit as dr
+
+    if np.isfinite(dr.sum(half_a)[0]) and np.isfinite(dr.sum(half_b)[0]):
+        return  # one number for the host, not one for each pixel
+    both = np.array(half_a) + np.array(half_b)
+    wrong = np.flatnonzero(~np.isfinite(both))
+    if wrong.size:
+        row, col = divmod(int(pixel[wrong[0]]), layout.cols)
+        raise SpecError(
+            f"scene {scene.name!r} has a radiance that is not finite ({both[wrong[0]]}), seen by {wrong.size} of "
+            f"{both.size} pixels, the first in row {row}, column {col} of the region: check its emitters and materials",
+            file=scene.spec.file,
+        )
 
 
 class RenderedFlux:
@@ -57,7 +85,7 @@ class RenderedFlux:
     Raises
     ------
     SpecError
-        If the scene cannot be loaded or does not cover a filter's response.
+        If the scene cannot be loaded or does not cover a filter's response; later, if its radiance is not finite.
     RangeError
         If `samples` is odd or below 2, or `max_motion_px` is not above 0.
     """
@@ -124,6 +152,7 @@ class RenderedFlux:
             return zeros, dr.zeros(jit().Float, pixels.size)
         self._tracer.pose(self._timeline.pose_time_us(float(np.min(begin_us)), float(np.max(end_us))))
         ((half_a, half_b),) = self._tracer.trace(pixels, begin_us, end_us, self._choose, self._weigh)
+        require_finite(half_a, half_b, self.scene, self.sensor.layout, pixels)
         return half_a, half_b
 
     def _choose(self, pixel: Any, u: Any) -> list[Any]:

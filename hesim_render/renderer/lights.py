@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import pi
 from typing import Any
 
@@ -10,22 +11,11 @@ from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
 from hesim_render.renderer._mitsuba import spectrum_dict, transform
-from hesim_render.specs.scene import LightSpec
-from hesim_render.spectra import Spectrum, scale_to_irradiance, scale_to_lux
+from hesim_render.specs.light import LightSpec, irradiance
+from hesim_render.spectra import Spectrum, summed
 
 #: Dimmest light, relative to facing the plane squarely, that can still set a level on it.
 _GRAZING = 1e-6
-
-
-def irradiance(light: LightSpec) -> Spectrum | None:
-    """E(λ) on the light's plane, W m⁻² nm⁻¹; None in darkness (type 'none' or a level of zero)."""
-    if light.type == "none" or not (light.illuminance_lux or light.irradiance_w_m2):
-        return None
-    shape = light.illuminant.load()
-    if light.illuminance_lux is not None:
-        return scale_to_lux(shape, light.illuminance_lux)
-    assert light.irradiance_w_m2 is not None
-    return scale_to_irradiance(shape, light.irradiance_w_m2)
 
 
 def form_factor_integral(
@@ -83,70 +73,84 @@ def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
     return frame
 
 
-def emitters(mi: Any, light: LightSpec) -> dict[str, Any]:
-    """Entries of the Mitsuba scene for a light; empty in darkness.
+def emitters(mi: Any, given: Sequence[LightSpec]) -> dict[str, Any]:
+    """Entries of the Mitsuba scene for its lights, at their time means.
 
-    ``uniform``: L = E/π from everywhere, as of a plane under an even sky, visible behind the scene.
-    ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``: a one-sided Lambertian
-    rectangle, L = E / ∫ cos θ dω exactly.
+    ``uniform``: L = E/π from everywhere, as of a plane under an even sky, visible behind the scene; several
+    are one sky of their sum. ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``:
+    a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black where it is switched off.
 
     Raises
     ------
     SpecError
-        If the light cannot reach its plane from the front.
+        If a light cannot reach its plane from the front.
     """
-    level = irradiance(light)
-    if level is None:
-        return {}
-    plane = np.array(light.plane_point_m, dtype=np.float64)
-    normal = _unit(np.array(light.plane_normal, dtype=np.float64), light, "light.plane_normal")
-    if light.type == "uniform":
-        # Sampling directions by the BSDF alone has no variance under an even sky, sampling the sky
-        # has: its weight is 0, and a black point light takes the share that Mitsuba insists on.
-        return {
-            "light": {
-                "type": "constant",
-                "radiance": spectrum_dict(level.scaled(1 / pi)),
-                "sampling_weight": 0.0,
-            },
-            "light_unlit": {"type": "point", "position": [0, 0, 0], "intensity": {"type": "uniform", "value": 0.0}},
-        }
+    entries: dict[str, Any] = {}
+    skies: list[Spectrum] = []
+    for number, light in enumerate(given):
+        name = "light" if len(given) == 1 else f"light_{number}"
+        level = irradiance(light)
+        if light.type == "area":
+            entries[name] = _area(mi, light, level, key_of(given, number))
+        elif level is None:
+            continue
+        elif light.type == "uniform":
+            skies.append(level.scaled(1 / pi))
+        else:
+            entries[name] = _beam(light, level, key_of(given, number))
+    if skies:
+        # Sampling directions by the BSDF alone has no variance under an even sky, sampling the sky has: its
+        # weight is 0. Where no other light takes the share that Mitsuba insists on, a black point light does.
+        radiance = skies[0] if len(skies) == 1 else summed(*skies)
+        if not any(entry["type"] != "rectangle" or "emitter" in entry for entry in entries.values()):
+            black = {"type": "uniform", "value": 0.0}
+            entries["light_unlit"] = {"type": "point", "position": [0, 0, 0], "intensity": black}
+        entries["light_sky"] = {"type": "constant", "radiance": spectrum_dict(radiance), "sampling_weight": 0.0}
+    return entries
+
+
+def key_of(given: Sequence[LightSpec], number: int) -> str:
+    """Where a light stands in the scene file."""
+    return "light" if len(given) == 1 else f"light.{number}"
+
+
+def _beam(light: LightSpec, level: Spectrum, key: str) -> dict[str, Any]:
+    """A directional or a point light."""
+    plane, normal = _plane(light, key)
     if light.type == "directional":
-        travel = _unit(np.array(light.direction, dtype=np.float64), light, "light.direction")
-        across = level.scaled(1 / _facing(float(-travel @ normal)))
-        return {
-            "light": {"type": "directional", "direction": travel.tolist(), "irradiance": spectrum_dict(across)},
-        }
-    if light.type == "point":
-        away = np.array(light.position_m, dtype=np.float64) - plane
-        distance2 = float(away @ away)
-        cosine = _facing(float(_unit(away, light, "light.position_m") @ normal))
-        return {
-            "light": {
-                "type": "point",
-                "position": list(light.position_m or ()),
-                "intensity": spectrum_dict(level.scaled(distance2 / cosine)),
-            }
-        }
+        travel = _unit(np.array(light.direction, dtype=np.float64), light, f"{key}.direction")
+        across = level.scaled(1 / _facing(float(-travel @ normal), key))
+        return {"type": "directional", "direction": travel.tolist(), "irradiance": spectrum_dict(across)}
+    away = np.array(light.position_m, dtype=np.float64) - plane
+    cosine = _facing(float(_unit(away, light, f"{key}.position_m") @ normal), key)
+    intensity = spectrum_dict(level.scaled(float(away @ away) / cosine))
+    return {"type": "point", "position": list(light.position_m or ()), "intensity": intensity}
+
+
+def _area(mi: Any, light: LightSpec, level: Spectrum | None, key: str) -> dict[str, Any]:
+    plane, normal = _plane(light, key)
     frame = area_light_frame(light)
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = frame[:3, 3] + signs @ frame[:3, :2].T
-    radiance = level.scaled(1 / _facing(form_factor_integral(corners, plane, normal)))
-    return {
-        "light": {
-            "type": "rectangle",
-            "to_world": transform(mi, frame),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
-            "emitter": {"type": "area", "radiance": spectrum_dict(radiance)},
-        }
+    rectangle: dict[str, Any] = {
+        "type": "rectangle",
+        "to_world": transform(mi, frame),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
     }
+    if level is not None:
+        corners = frame[:3, 3] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ frame[:3, :2].T
+        radiance = level.scaled(1 / _facing(form_factor_integral(corners, plane, normal), key))
+        rectangle["emitter"] = {"type": "area", "radiance": spectrum_dict(radiance)}
+    return rectangle
 
 
-def _facing(cosine: float) -> float:
+def _plane(light: LightSpec, key: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Point and unit normal of the plane on which the level holds."""
+    normal = _unit(np.array(light.plane_normal, dtype=np.float64), light, f"{key}.plane_normal")
+    return np.array(light.plane_point_m, dtype=np.float64), normal
+
+
+def _facing(cosine: float, key: str) -> float:
     if cosine < _GRAZING:
-        raise SpecError(
-            "the light does not reach its plane from the front (see plane_point_m, plane_normal)", key="light"
-        )
+        raise SpecError("the light does not reach its plane from the front (see plane_point_m, plane_normal)", key=key)
     return cosine
 
 

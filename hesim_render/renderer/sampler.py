@@ -69,23 +69,25 @@ def sampler_class(variant: str) -> Any:
         def __init__(self, props: Any = None) -> None:
             super().__init__(props if props is not None else mi.Properties())
 
-        def setup(self, key: Any, pixel: Any, half: Any, sample: Any, samples_per_half: int) -> None:
+        def setup(self, key: Any, pixel: Any, half: Any, sample: Any, samples_per_half: Any, most: int = 0) -> None:
             """Start one wavefront.
 
             Parameters
             ----------
             key : UInt64, opaque.
             pixel, half, sample : UInt32 per lane; `sample` counts within its half.
-            samples_per_half : n.
+            samples_per_half : n; a number, or with `most` a UInt32 per lane, a power of two each.
+            most : largest n of all lanes.
             """
             self.key, self.pixel, self.half, self.sample = key, pixel, half, sample
             self.dimension = dr.zeros(mi.UInt32, dr.width(pixel))
-            self._bits = max(0, (samples_per_half - 1).bit_length())
+            self._bits = max(0, ((most or samples_per_half) - 1).bit_length())
+            self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
 
         def _pair(self) -> tuple[Any, Any]:
             self.dimension = self.dimension + 1
             bits = mi.Philox4x32(self.key, self.pixel, self.half, self.dimension).next_uint32x4()
-            point = permute(self.sample, (1 << self._bits) - 1, bits[0]) if self._bits else self.sample
+            point = permute(self.sample, self._mask, bits[0]) if self._bits else self.sample
             x, y = zero_two_point(point, self._bits)
             return mi.Float((x ^ bits[1]) >> 8) * 2.0**-24, mi.Float((y ^ bits[2]) >> 8) * 2.0**-24
 

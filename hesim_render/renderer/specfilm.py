@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.errors import RangeError, SpecError
+from hesim_render.flicker import light_parts
 from hesim_render.renderer._mitsuba import spectrum_dict, transform, using_variant
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import MITSUBA_AXES, View, place_camera
@@ -91,7 +92,7 @@ def reference_flux(
     Parameters
     ----------
     samples : rays per pixel and repeat.
-    t_us : objects and camera are frozen at this time.
+    t_us : objects, camera and lights are frozen at this time.
     variant : a spectral Mitsuba variant, such as ``scalar_spectral``; default the backend's.
     repeats : independent renders, 2 or more; their scatter gives the standard error.
 
@@ -108,42 +109,51 @@ def reference_flux(
         raise RangeError("repeats", repeats, "2 or more")
     if sensor.spec.lens.psf_fwhm_um > 0:
         raise SpecError("the reference estimator renders no lens PSF; set it to 0", key="lens.psf_fwhm_um")
+    parts = [(1.0 if w is None else float(w.mean(t_us, t_us)), part) for w, part in light_parts(scene)]
+    view: View | None = None
+    renders = np.zeros(1)
     with using_variant(variant) as mi:
-        built = build(mi, scene.spec, used_responses(sensor))
-        view = place_camera(scene.spec, sensor, built.mitsuba_sensor())
-        responses = used_responses(view.sensor)
-        shape = view.sensor.layout.shape
-        if built.is_dark:
-            dark = {name: np.zeros(shape) for name in responses}
-            return ReferenceFlux(dark, dict(dark), view.sensor)
-        built.pose(t_us)
-        # channels come back in the order of their names
-        keys = {name: f"channel_{number:03d}" for number, name in enumerate(responses)}
-        film = {
-            "type": "specfilm",
-            "width": view.sensor.cols,
-            "height": view.sensor.rows,
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-            **{keys[name]: spectrum_dict(response) for name, response in responses.items()},
-        }
-        camera = mi.load_dict(perspective_dict(mi, view, camera_at(scene, view, t_us), film))
-        renders = np.stack(
-            [
-                np.array(
-                    mi.render(built.scene, sensor=camera, integrator=built.integrator, spp=samples, seed=seed + k),
-                    dtype=np.float64,
-                )
-                for k in range(repeats)
-            ]
-        )
+        for power, part in parts:
+            view, own = _renders(mi, part, sensor, samples, t_us, repeats, seed)
+            renders = renders + power * own
+    assert view is not None
     scale = scene.spec.mitsuba.radiance_scale if scene.spec.mitsuba is not None else 1.0
-    renders *= (view.sensor.relative_illumination * scale)[None, :, :, None]
+    renders = renders * (view.sensor.relative_illumination * scale)[None, :, :, None]
     mean = renders.mean(axis=0)
     stderr = renders.std(axis=0, ddof=1) / np.sqrt(repeats)
-    names = list(responses)
+    names = list(used_responses(view.sensor))
     return ReferenceFlux(
         {name: mean[:, :, k] for k, name in enumerate(names)},
         {name: stderr[:, :, k] for k, name in enumerate(names)},
         view.sensor,
     )
+
+
+def _renders(
+    mi: Any, scene: Scene, sensor: Sensor, samples: int, t_us: float, repeats: int, seed: int
+) -> tuple[View, NDArray[np.float64]]:
+    """The placed camera and [repeat, row, col, filter] before relative illumination, lights at their mean."""
+    built = build(mi, scene.spec, used_responses(sensor))
+    view = place_camera(scene.spec, sensor, built.mitsuba_sensor())
+    responses = used_responses(view.sensor)
+    if built.is_dark:
+        return view, np.zeros((repeats, *view.sensor.layout.shape, len(responses)))
+    built.pose(t_us)
+    film = {
+        "type": "specfilm",
+        "width": view.sensor.cols,
+        "height": view.sensor.rows,
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+        # channels come back in the order of their names
+        **{f"channel_{number:03d}": spectrum_dict(response) for number, response in enumerate(responses.values())},
+    }
+    camera = mi.load_dict(perspective_dict(mi, view, camera_at(scene, view, t_us), film))
+    renders = [
+        np.array(
+            mi.render(built.scene, sensor=camera, integrator=built.integrator, spp=samples, seed=seed + k),
+            dtype=np.float64,
+        )
+        for k in range(repeats)
+    ]
+    return view, np.stack(renders)

@@ -106,7 +106,16 @@ class Timeline:
 
     def _camera_pieces(self, begin_us: float, end_us: float) -> int:
         """How many parts of an interval keep the camera's own image motion below the limit."""
-        assert self._camera is not None
+        pieces = int(np.ceil(self.camera_motion_px(begin_us, end_us) / self._max_motion_px - 1e-9))
+        return max(1, min(pieces, int((end_us - begin_us) / self._min_slice_us)))
+
+    def camera_motion_px(self, begin_us: float, end_us: float) -> float:
+        """Farthest that anything at rest may move in the image during an interval, pixels.
+
+        Measured at the nearest and the farthest corner of the scene's box, at the pace of the fastest part.
+        """
+        if self._camera is None:
+            return 0.0
         times = np.linspace(begin_us, end_us, max(_LEAST_STEPS, int((end_us - begin_us) / _CAMERA_STEP_US)) + 1)
         poses = self._camera.matrix(times) @ self._view.camera_to_world
         fastest_px = 0.0
@@ -117,8 +126,30 @@ class Timeline:
             seen = self._view.unproject(np.array([nearest, farthest]), now)
             moved = self._view.project(seen, then) - self._view.project(seen, now)
             fastest_px = max(fastest_px, float(np.linalg.norm(moved, axis=-1).max()))
-        pieces = int(np.ceil(fastest_px * (times.size - 1) / self._max_motion_px - 1e-9))
-        return max(1, min(pieces, int((end_us - begin_us) / self._min_slice_us)))
+        return fastest_px * (times.size - 1)
+
+    def object_motion_px(self, name: str, begin_us: float, end_us: float) -> float:
+        """Length of the longest way a corner of one moving object goes in the image during an interval, pixels."""
+        trajectory = self._trajectories[name]
+        times = np.linspace(begin_us, end_us, _LEAST_STEPS + 1)
+        poses = trajectory.matrix(times)
+        points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        camera = self._view.camera_to_world
+        if self._camera is not None:
+            camera = self._camera.matrix(np.array(0.5 * (begin_us + end_us))) @ camera
+        places = self._view.project(points, np.broadcast_to(camera, poses.shape))
+        return float(np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=0).max())
+
+    def extent_px(self, name: str, t_us: float) -> float:
+        """Least extent of one moving object's box in the image, of its two, pixels."""
+        pose = self._trajectories[name].matrix(t_us)
+        camera = (
+            self._view.camera_to_world
+            if self._camera is None
+            else self._camera.matrix(t_us) @ self._view.camera_to_world
+        )
+        places = self._view.project(self._corners[name] @ pose[:3, :3].T + pose[:3, 3], camera)
+        return float(np.ptp(places, axis=0).min())
 
     def edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """All slice edges strictly inside an interval, increasing."""

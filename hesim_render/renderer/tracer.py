@@ -203,7 +203,8 @@ class PixelTracer:
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
         if spread is not None:
             assert self.camera is not None
-            origin, direction = self.camera.move(spread[0] + choice[1] * spread[1], origin, direction)
+            pose = self.camera.pose_at(spread[0] + choice[1] * spread[1])
+            origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
         bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice[0]))
         primary = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
         radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary, active=active)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import degrees, radians
 from typing import Any
 
@@ -69,6 +70,35 @@ def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], f
     return step[1:] / sine, 2 * float(np.arctan2(sine, step[0]))
 
 
+@dataclass(frozen=True)
+class DevicePose:
+    """Rigid poses, one a lane: x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
+
+    w: Any
+    v: Any
+    shift: Any
+    pivot: Any
+
+    def _turn(self, vector: Any, v: Any) -> Any:
+        import drjit as dr
+
+        x = type(self.v)(vector)
+        twice = 2 * dr.cross(v, x)
+        return x + self.w * twice + dr.cross(v, twice)
+
+    def turn_to_world(self, direction: Any) -> Any:
+        return self._turn(direction, self.v)
+
+    def to_world(self, point: Any) -> Any:
+        return self._turn(type(self.v)(point) - self.pivot, self.v) + self.pivot + self.shift
+
+    def turn_to_rest(self, direction: Any) -> Any:
+        return self._turn(direction, -self.v)
+
+    def to_rest(self, point: Any) -> Any:
+        return self._turn(type(self.v)(point) - self.pivot - self.shift, -self.v) + self.pivot
+
+
 class Trajectory:
     """A track evaluated: pose(t) = translate(T(t)) · pivot + R(t) · (x − pivot).
 
@@ -127,26 +157,25 @@ class Trajectory:
         pose[..., 3, 3] = 1.0
         return pose
 
-    def move(self, local_us: Any, point: Any, direction: Any) -> tuple[Any, Any]:
-        """Pose applied per lane in Dr.Jit: a point and a direction at each lane's own time.
+    def pose_at(self, local_us: Any) -> DevicePose:
+        """Pose of every lane at its own time.
 
         Parameters
         ----------
         local_us : Dr.Jit Float, time since the first keyframe as from `local_us`; it may run past the
             end of the track by less than a period.
-        point, direction : Dr.Jit 3-vectors (any Array3f type), metres and unit length.
         """
         import drjit as dr
 
         types = jit()
-        floats, integers = types.Float, types.UInt32
+        floats, integers, vector = types.Float, types.UInt32, types.Array3f
         if self._device is None:
             knots = self.knots_us - self.knots_us[0]
-            tables = (knots, self.arc_axis, self.arc_rad, self.start_rotation, self.translation_m)
+            tables = (knots, self.arc_axis, self.arc_rad, self.start_rotation, self.translation_m, self.pivot_m)
             self._device = tuple(floats(np.ascontiguousarray(table, dtype=np.float32).ravel()) for table in tables)
             dr.eval(*self._device)
             dr.make_opaque(*self._device)
-        knots, axis, angle, start, translation = self._device
+        knots, axis, angle, start, translation, pivot = self._device
         count = self.knots_us.size
         period = dr.gather(floats, knots, count - 1)
         if self.repeat:
@@ -156,7 +185,6 @@ class Trajectory:
         segment = integers(after) - 1
         begin = dr.gather(floats, knots, segment)
         share = (local_us - begin) / (dr.gather(floats, knots, segment + 1) - begin)
-        vector = type(point)
 
         def three(table: Any, index: Any) -> Any:
             return vector(*(dr.gather(floats, table, index * 3 + k) for k in range(3)))
@@ -165,18 +193,14 @@ class Trajectory:
         turn_v = three(axis, segment) * sine
         base_w = dr.gather(floats, start, segment * 4)
         base_v = vector(*(dr.gather(floats, start, segment * 4 + k) for k in (1, 2, 3)))
-        w = cosine * base_w - dr.dot(turn_v, base_v)
-        v = cosine * base_v + base_w * turn_v + dr.cross(turn_v, base_v)
-
-        def turned(x: Any) -> Any:
-            x = vector(x)
-            twice = 2 * dr.cross(v, x)
-            return x + w * twice + dr.cross(v, twice)
-
         first = three(translation, segment)
-        shift = first + share * (three(translation, segment + 1) - first)
-        pivot = vector(*(float(c) for c in self.pivot_m))
-        return turned(vector(point) - pivot) + pivot + shift, turned(direction)
+        zero = dr.opaque(integers, 0)
+        return DevicePose(
+            w=cosine * base_w - dr.dot(turn_v, base_v),
+            v=cosine * base_v + base_w * turn_v + dr.cross(turn_v, base_v),
+            shift=first + share * (three(translation, segment + 1) - first),
+            pivot=three(pivot, zero),
+        )
 
     def __repr__(self) -> str:
         turns = degrees(float(np.sum(np.abs(self.arc_rad))))

@@ -1,0 +1,167 @@
+"""A scene in which every ray has a time of its own: what moves rests in a scene of its own, and rays go to it.
+
+Mitsuba has no animated transforms, and setting a pose costs a rebuild. Here a ray is turned into each
+moving object's own frame at the ray's own time, met with the object at rest, and the nearest hit of all
+frames is turned back. Any number of instants is then one kernel, motion within an exposure is exact, and
+nothing is rebuilt or recompiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.errors import SpecError
+from hesim_render.renderer.builder import BuiltScene
+from hesim_render.renderer.trajectory import DevicePose, Trajectory
+
+
+class NeedsExactMode(SpecError):
+    """A scene that paths between resting and rigidly moving surfaces do not describe."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Shapes that move together.
+
+    Parameters
+    ----------
+    name : of the object.
+    scene : mitsuba.Scene of them alone, at rest.
+    trajectory : how they move.
+    corners : bounding-box corners at rest, [n, 3], m.
+    """
+
+    name: str
+    scene: Any
+    trajectory: Trajectory
+    corners: NDArray[np.float64]
+
+    def swept_box(self, begin_us: float, end_us: float, steps: int = 16) -> NDArray[np.float64]:
+        """Axis-parallel box around every place the group takes within an interval, [2, 3], m."""
+        times = np.linspace(begin_us, end_us, steps + 1)
+        poses = self.trajectory.matrix(times)
+        points = self.corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        # between two steps a corner leaves their chord by less than the chord's own length
+        margin = np.linalg.norm(np.diff(points, axis=0), axis=-1).max(initial=0.0) / 2 + 1e-6
+        return np.stack([points.min(axis=(0, 1)) - margin, points.max(axis=(0, 1)) + margin])
+
+
+class MovingScene:
+    """The parts of a built scene: what rests, with all light, and each group that moves.
+
+    Parameters
+    ----------
+    built : from `build`, its moving shapes anywhere.
+
+    Raises
+    ------
+    NeedsExactMode
+        If a moving shape emits light, or the scene's integrator is not Mitsuba's path tracer.
+    """
+
+    def __init__(self, built: BuiltScene) -> None:
+        mi = built.mi
+        if not path_traced(built):
+            name = built.integrator.class_name()
+            raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
+        self.mi = mi
+        moving = {
+            shape: group
+            for group, trajectory in built.trajectories.items()
+            for shape in (part.prefix for part in built.groups[group])
+        }
+        built.rest()
+        parts: dict[str, dict[str, Any]] = {name: {} for name in built.trajectories}
+        resting: dict[str, Any] = {}
+        for number, shape in enumerate(built.scene.shapes()):
+            group = moving.get(shape.id())
+            if group is None:
+                resting[f"shape_{number}"] = shape
+                continue
+            if shape.is_emitter():
+                raise NeedsExactMode(f"{group!r} moves and emits light")
+            parts[group][f"shape_{number}"] = shape
+        for number, emitter in enumerate(built.scene.emitters()):
+            if emitter.get_shape() is None:
+                resting[f"emitter_{number}"] = emitter
+        self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
+        self.has_static_shapes = any(key.startswith("shape") for key in resting)
+        self.groups = [
+            Group(
+                name,
+                mi.load_dict({"type": "scene", **shapes}, optimize=False),
+                built.trajectories[name],
+                np.concatenate([part.corners for part in built.groups[name]]),
+            )
+            for name, shapes in parts.items()
+        ]
+
+    def intersect(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> Any:
+        """The nearest surface of all parts, `SurfaceInteraction3f` in world space.
+
+        Parameters
+        ----------
+        ray : Ray3f in world space.
+        poses : of each group, per lane.
+        """
+        import drjit as dr
+
+        mi = self.mi
+        nearest, chosen, ray_there = self.static.ray_intersect_preliminary(ray, coherent, active), mi.UInt32(0), ray
+        for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
+            local = mi.Ray3f(ray)
+            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+            hit = group.scene.ray_intersect_preliminary(local, coherent, active)
+            closer = hit.t < nearest.t
+            nearest = dr.select(closer, hit, nearest)
+            chosen = dr.select(closer, mi.UInt32(number), chosen)
+            ray_there = dr.select(closer, local, ray_there)
+        si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active)
+        for number, pose in enumerate(poses, start=1):
+            here = chosen == number
+            si.p = dr.select(here, mi.Point3f(pose.to_world(si.p)), si.p)
+            si.n = dr.select(here, mi.Normal3f(pose.turn_to_world(si.n)), si.n)
+            for vector in ("s", "t", "n"):
+                turned = pose.turn_to_world(getattr(si.sh_frame, vector))
+                own = getattr(si.sh_frame, vector)
+                setattr(si.sh_frame, vector, dr.select(here, type(own)(turned), own))
+            for vector in ("dp_du", "dp_dv"):
+                own = getattr(si, vector)
+                setattr(si, vector, dr.select(here, mi.Vector3f(pose.turn_to_world(own)), own))
+        return si
+
+    def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any]:
+        """Where the point that a ray meets at one time was at another, in world space, and whether it meets any."""
+        import drjit as dr
+
+        mi = self.mi
+        hit = self.static.ray_intersect_preliminary(ray, True, mi.Bool(True))
+        nearest, point = hit.t, ray(hit.t)
+        for group, pose, before in zip(self.groups, now, then, strict=True):
+            local = mi.Ray3f(ray)
+            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+            hit = group.scene.ray_intersect_preliminary(local, True, mi.Bool(True))
+            closer = hit.t < nearest
+            nearest = dr.minimum(nearest, hit.t)
+            point = dr.select(closer, mi.Point3f(before.to_world(local(hit.t))), point)
+        return point, nearest < dr.inf
+
+    def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
+        """Whether anything lies on a ray before its `maxt`."""
+        mi = self.mi
+        blocked = self.static.ray_test(ray, active)
+        for group, pose in zip(self.groups, poses, strict=True):
+            local = mi.Ray3f(ray)
+            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+            blocked |= group.scene.ray_test(local, active & ~blocked)
+        return blocked
+
+
+def path_traced(built: BuiltScene) -> bool:
+    """Whether the scene is rendered by Mitsuba's path tracer, whose paths run between surfaces only."""
+    return built.integrator.class_name() == "PathIntegrator"

@@ -1,0 +1,39 @@
+"""Which listed pixels lie next to which: lists of pixels as pictures, and what happens around each."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+
+class Neighbours:
+    """A list of mosaic pixels, spread about evenly over a region, on a map of cells of about one pixel each.
+
+    Parameters
+    ----------
+    pixel : [n], mosaic indices (row · cols + col).
+    shape : rows and columns of the region.
+    """
+
+    def __init__(self, pixel: NDArray[np.integer], shape: tuple[int, int]) -> None:
+        rows, cols = shape
+        self.cell_px = max(1, int(np.sqrt(rows * cols / max(1, pixel.size))))
+        row, col = np.divmod(pixel.astype(np.int64), cols)
+        self._shape = -(-rows // self.cell_px), -(-cols // self.cell_px)
+        self._cell = (row // self.cell_px) * self._shape[1] + col // self.cell_px
+        self._count = ndimage.uniform_filter(self._image(np.ones(pixel.size)), 3, mode="constant").ravel()[self._cell]
+
+    def _image(self, values: NDArray) -> NDArray:
+        flat = np.zeros(self._shape[0] * self._shape[1], dtype=values.dtype)
+        flat[self._cell] = values
+        return flat.reshape(self._shape)
+
+    def mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean over the listed pixels among each one's 3×3 cells, [n]."""
+        total = ndimage.uniform_filter(self._image(values), 3, mode="constant").ravel()[self._cell]
+        return np.maximum(total, 0.0) / self._count
+
+    def most(self, values: NDArray, radius: int) -> NDArray:
+        """Largest value within `radius` cells of each pixel, diagonally too, [n]."""
+        return ndimage.maximum_filter(self._image(values), size=2 * radius + 1).ravel()[self._cell]

@@ -1,0 +1,176 @@
+"""A path tracer whose rays have times of their own, and which knows what each path has come near.
+
+The estimator is the common one (Veach 1997): light sampled at every vertex, combined with the
+surface's own sampling by the power heuristic; Russian roulette from the fifth vertex on. It is
+written here because Mitsuba's own follows a path through one scene at one time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from hesim_render.renderer.moving import MovingScene
+from hesim_render.renderer.trajectory import DevicePose
+
+_ROULETTE_DEPTH = 5
+_ROULETTE_MOST = 0.95
+
+
+#: Bits of what a path has come near.
+MET_SWEPT = 1  # the box that a moving group sweeps
+MET_PASSING = 2  # that box, but not the one where the group is at the path's own time
+
+
+class Boxes:
+    """Axis-parallel boxes of each moving group, per lane, that segments of paths are tested against.
+
+    Parameters
+    ----------
+    swept, present : pairs (low, high) of 3-vectors, one for each group, metres: where the group is at some
+        time of an interval, and where it is in the lane's own window.
+    told : Dr.Jit Bool for each group: whether `MET_PASSING` is wanted of it.
+    """
+
+    def __init__(self, swept: Sequence[tuple[Any, Any]], present: Sequence[tuple[Any, Any]], told: Sequence[Any]):
+        self._groups = list(zip(swept, present, told, strict=True))
+
+    def met(self, ray: Any, length: Any, active: Any) -> Any:
+        """Bits of what the ray's first `length` metres come near."""
+        import drjit as dr
+
+        inverse = dr.rcp(ray.d)
+        found: Any = 0
+        for swept, present, told in self._groups:
+            near = active & _meets(ray, inverse, length, swept)
+            bits = dr.select(near, MET_SWEPT, 0)
+            passing = near & ~_meets(ray, inverse, length, present)
+            found |= bits | dr.select(passing & told, MET_PASSING, 0)
+        return found
+
+
+def _meets(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
+    import drjit as dr
+
+    one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
+    enter, leave = dr.max(dr.minimum(one, other)), dr.min(dr.maximum(one, other))
+    # 0 · ∞ for a direction along a face compares as false: taken as meeting
+    return ~((enter > leave) | (leave < 0) | (enter > length))
+
+
+class PathIntegrator:
+    """Radiance along rays through a `MovingScene`.
+
+    Parameters
+    ----------
+    scene : what is traced.
+    max_depth : longest path in segments, 2 is direct light; below 0 there is no limit.
+    hide_emitters : whether lights seen directly are left out.
+    """
+
+    def __init__(self, scene: MovingScene, max_depth: int, hide_emitters: bool = False) -> None:
+        self._scene, self._max_depth, self._hide = scene, max_depth if max_depth >= 0 else 1 << 30, hide_emitters
+
+    def sample(
+        self, sampler: Any, ray: Any, poses: Sequence[DevicePose], boxes: Boxes | None, active: Any
+    ) -> tuple[Any, Any]:
+        """One path a lane.
+
+        Parameters
+        ----------
+        sampler : `next_1d`, `next_2d`.
+        ray : Ray3f with wavelengths, world space.
+        poses : of each group of the scene, per lane.
+        boxes : what to test the paths' segments against, or None.
+
+        Returns
+        -------
+        radiance : Spectrum, W m⁻² sr⁻¹ nm⁻¹.
+        met : UInt32, bits of `boxes` met by any segment; 0 without boxes.
+        """
+        import drjit as dr
+
+        mi, scene = self._scene.mi, self._scene
+        context = mi.BSDFContext()
+        depth, met = mi.UInt32(0), mi.UInt32(0)
+        throughput, radiance = mi.Spectrum(1.0), mi.Spectrum(0.0)
+        stretch = mi.Float(1.0)  # of solid angle by refraction
+        before = dr.zeros(mi.Interaction3f)
+        before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
+        ray, active = mi.Ray3f(ray), mi.Bool(active)
+        most = dr.opaque(mi.UInt32, self._max_depth)
+
+        def step(*state: Any) -> tuple[Any, ...]:
+            sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active = state
+            si = scene.intersect(ray, poses, depth == 0, active)
+            if boxes is not None:
+                met |= boxes.met(ray, si.t, active)
+
+            # what the ray runs into gives light itself
+            light = si.emitter(scene.static, active)
+            shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
+            if self._hide:
+                shines &= ~((depth == 0) & ~si.is_valid())
+            seen = mi.DirectionSample3f(scene.static, si, before)
+            light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~before_delta)
+            share = dr.select(before_delta, 1.0, _power(before_pdf, light_pdf))
+            radiance = dr.fma(throughput, dr.select(shines, light.eval(si, shines) * share, 0.0), radiance)
+
+            goes_on = active & si.is_valid() & (depth + 1 < most)
+            bsdf = si.bsdf()
+
+            # light sampled from here
+            asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            seen, weight = scene.static.sample_emitter_direction(si, sampler.next_2d(), False, asks)
+            asks &= seen.pdf != 0
+            shadow = si.spawn_ray_to(seen.p)
+            infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
+            # a sky has no distance; Mitsuba gives it one that is measured by what rests in the scene
+            shadow.d = dr.select(infinite, seen.d, shadow.d)
+            shadow.maxt = dr.select(infinite, dr.inf, shadow.maxt)
+            asks &= dr.any(weight != 0)
+            if boxes is not None:
+                met |= boxes.met(shadow, shadow.maxt, asks)
+            clear = asks & ~scene.occluded(shadow, poses, asks)
+
+            towards = si.to_local(seen.d)
+            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(
+                context, si, towards, sampler.next_1d(), sampler.next_2d(), goes_on
+            )
+            value = si.to_world_mueller(value, -towards, si.wi)
+            share = dr.select(seen.delta, 1.0, _power(seen.pdf, pdf))
+            radiance = dr.fma(throughput, dr.select(clear, value * weight * share, 0.0), radiance)
+
+            # the way the surface sends the path on
+            chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
+            following = si.spawn_ray(si.to_world(chosen.wo))
+            ray.o, ray.d, ray.maxt = following.o, following.d, following.maxt
+            throughput = dr.select(goes_on, throughput * chosen_weight, throughput)
+            stretch *= dr.select(goes_on, chosen.eta, 1.0)
+            before = mi.Interaction3f(si)
+            before_pdf = chosen.pdf
+            before_delta = mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+            goes_on &= dr.any(throughput != 0)
+            depth = dr.select(si.is_valid(), depth + 1, depth)
+
+            if self._max_depth > _ROULETTE_DEPTH:
+                survival = dr.minimum(dr.max(throughput) * stretch * stretch, _ROULETTE_MOST)
+                at_risk = depth >= _ROULETTE_DEPTH
+                luck = sampler.next_1d()
+                throughput = dr.select(at_risk, throughput * dr.rcp(survival), throughput)
+                goes_on &= ~at_risk | (luck < survival)
+            active = goes_on
+            return sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active
+
+        state = (sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active)
+        end = dr.while_loop(state, lambda *values: values[-1], step, label="paths")
+        return end[4], end[2]
+
+
+def _power(a: Any, b: Any) -> Any:
+    """Power heuristic of exponent 2: the weight of the strategy with density `a`."""
+    import drjit as dr
+
+    a, b = a * a, b * b
+    share = a / (a + b)
+    return dr.select(dr.isfinite(share), share, 0.0)
