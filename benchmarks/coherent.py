@@ -6,10 +6,10 @@
 
 (c) runs at the wanted quality over two chunks of ticks, the second of which is timed. Its error is the rms over
 pixels, in units of each one's own event noise (3 % of the signal), against a reference of 8192 rays a pixel, on
-one pixel in eight, in two ticks that are filled in for the most part. (b) and (a) then get as many samples as bring them to that error, by their
-own measured error, and one tick of each is timed at that number; what they reach is printed beside.
-Activity is the share of pixels whose flux changes by more than 1 % from one tick to the next, at 256 rays with
-the same random numbers.
+one pixel in eight, in two ticks that are filled in for the most part. (b) and (a) then get as many samples as
+bring them to that error, by their own measured error, and one tick of each is timed at that number; what they
+reach is printed beside. Activity is the share of pixels whose flux changes by more than 1 % from one tick to the
+next, at 256 rays with the same random numbers.
 """
 
 from __future__ import annotations

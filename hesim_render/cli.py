@@ -365,28 +365,48 @@ def _simulate(
         return hr.simulate(loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress, **options)
 
 
-def _interrupted(*_: Any) -> None:
-    raise KeyboardInterrupt
+class _Interrupts:
+    """SIGINT and SIGTERM end a run alike; and are remembered, for a library may turn the exception into its own."""
+
+    def __init__(self) -> None:
+        self.happened = False
+        self._before: dict[int, Any] = {}
+
+    def _note(self, *_: Any) -> None:
+        self.happened = True
+        raise KeyboardInterrupt
+
+    def __enter__(self) -> _Interrupts:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point. Exit status 0; 2 with one line on stderr where the user can help it; 130 when interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    # a terminated run cleans up like an interrupted one
-    previous = signal.signal(signal.SIGTERM, _interrupted)
-    try:
-        status = app(args=given or ["--help"], standalone_mode=False)
-    except HesimError as error:
-        _fail(str(error))
-    except _ClickError as error:
-        _fail(error.format_message().replace("Value error, ", ""))
-    except (KeyboardInterrupt, typer.Abort):
-        status = _INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(0)
-    finally:
-        signal.signal(signal.SIGTERM, previous)
+    with _Interrupts() as interrupts:
+        try:
+            status = app(args=given or ["--help"], standalone_mode=False)
+        except (KeyboardInterrupt, typer.Abort):
+            status = _INTERRUPTED
+        except BrokenPipeError:
+            sys.stderr.close()
+            sys.exit(0)
+        except Exception as error:
+            if interrupts.happened:
+                status = _INTERRUPTED
+            elif isinstance(error, HesimError):
+                _fail(str(error))
+            elif isinstance(error, _ClickError):
+                _fail(error.format_message().replace("Value error, ", ""))
+            else:
+                raise
     if status == _INTERRUPTED:  # newer typer turns the exception into this status itself
         discard_unfinished()
         sys.stderr.write("hesim-render: interrupted\n")

@@ -31,6 +31,7 @@ class Stream(IntEnum):
     ROW_OFFSET = 19
     THRESHOLD_ON = 20
     THRESHOLD_OFF = 21
+    RENDER_PILOT = 22
 
 
 def stream_key(seed: int, stream: Stream) -> int:

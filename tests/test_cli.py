@@ -213,7 +213,7 @@ def test_interrupt_exits_130_and_leaves_nothing(tmp_path):
     command = [sys.executable, "-m", "hesim_render.cli", "simulate", "rotating-star", "--sensor", "gen2", "--roi"]
     for number in (signal.SIGINT, signal.SIGTERM):
         child = subprocess.Popen(
-            [*command, "512x384", "--duration", "5", "--out", out],
+            [*command, "512x384", "--duration", "5", "--yes", "--out", out],
             stderr=subprocess.PIPE,
             text=True,
             # a test run in the background of a shell ignores SIGINT, and its children would too

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from hesim_render.renderer.timed import LEAST_SAMPLES, MOST_SAMPLES, SweptBoxes,
 _GAIN_STEP, _ENOUGH = 0.9, 200
 #: Times that a pair is rendered again with more rays, each time with as many as its scatter then asks for.
 _ROUNDS = 3
+#: Rays of a pixel that decide how many it gets.
+_PILOT_SAMPLES = 16
 _LEAST_BIT, _MOST_BIT = LEAST_SAMPLES.bit_length() - 1, MOST_SAMPLES.bit_length() - 1
 
 #: Flux of pairs, e⁻/s → what their noise is worth, e⁻/s; both [n], the second argument tells which pairs.
@@ -156,25 +158,18 @@ class AdaptiveTracer:
 
     def render_all(
         self, pairs: Pairs, unit: NoiseUnit, near: Neighbours, swept: SweptBoxes | None = None
-    ) -> tuple[PairResult, NDArray[np.int64]]:
-        """The same for a whole picture, and the rays that each of its pixels needs.
+    ) -> PairResult:
+        """The same for a whole picture; the pairs' own numbers of rays are not used.
 
-        Few rays may all have missed what a pixel sees a little of: its neighbours' scatter speaks for it too.
+        A few rays with random numbers of their own decide on the number, each pixel's with its neighbours': were
+        it the picture's own rays, those that miss what a pixel sees a little of would be believed too often.
         """
-        result = self.render(pairs, unit, swept)
-        needed = self.needed(np.sqrt(near.mean(result.scatter.astype(np.float64) ** 2)))
-        short = np.flatnonzero(needed > result.samples)
-        if short.size:
-            again = self.render(_rows(pairs, short, needed[short]), lambda flux, which: unit(flux, short[which]), swept)
-            for name in ("half_a", "half_b", "samples", "scatter"):
-                getattr(result, name)[short] = getattr(again, name)
-            result.met[short] |= again.met
-        return result, needed
-
-
-def _rows(pairs: Pairs, where: NDArray[np.integer], samples: NDArray[np.int64]) -> Pairs:
-    interval = None if pairs.interval is None else pairs.interval[where]
-    return Pairs(pairs.pixel[where], pairs.begin_us[where], pairs.end_us[where], samples, interval)
+        rays = np.full(pairs.pixel.size, _PILOT_SAMPLES)
+        pilot = self.tracer.trace(pairs.pixel, pairs.begin_us, pairs.end_us, rays, pilot=True)
+        mean = 0.5 * (pilot.half_a.astype(np.float64) + pilot.half_b)
+        scatter = pilot.scatter / unit(mean, np.arange(pairs.pixel.size))
+        needed = self.needed(np.sqrt(near.mean(scatter**2)))
+        return self.render(replace(pairs, samples=needed), unit, swept)
 
 
 def _bit(samples: NDArray[np.int64]) -> NDArray[np.int64]:

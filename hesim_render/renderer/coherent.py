@@ -150,9 +150,9 @@ class CoherentFlux:
             for first in range(0, pixels.size, _PIXELS_AT_ONCE):
                 part = slice(first, first + _PIXELS_AT_ONCE)
                 listed = pixels[part]
-                pairs = Pairs(listed, begin[part], end[part], np.full(listed.size, 2 * LEAST_SAMPLES))
+                pairs = Pairs(listed, begin[part], end[part], np.full(listed.size, LEAST_SAMPLES))
                 near = Neighbours(listed, self.sensor.layout.shape)
-                result, _ = self.adaptive.render_all(pairs, self._unit(listed), near)
+                result = self.adaptive.render_all(pairs, self._unit(listed), near)
                 halves[0, part], halves[1, part] = result.half_a, result.half_b
         half_a, half_b = types.Float(halves[0]), types.Float(halves[1])
         require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)

@@ -135,21 +135,21 @@ class MovingScene:
                 setattr(si, vector, dr.select(here, mi.Vector3f(pose.turn_to_world(own)), own))
         return si
 
-    def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any]:
-        """Where the point that a ray meets at one time was at another, in world space, and whether it meets any."""
+    def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any, Any]:
+        """Where the point that a ray meets at one time was at another, in world space; whether it meets any; whose."""
         import drjit as dr
 
         mi = self.mi
         hit = self.static.ray_intersect_preliminary(ray, True, mi.Bool(True))
-        nearest, point = hit.t, ray(hit.t)
-        for group, pose, before in zip(self.groups, now, then, strict=True):
+        nearest, point, whose = hit.t, ray(hit.t), dr.zeros(mi.UInt32, dr.width(ray))
+        for number, (group, pose, before) in enumerate(zip(self.groups, now, then, strict=True), start=1):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
             hit = group.scene.ray_intersect_preliminary(local, True, mi.Bool(True))
             closer = hit.t < nearest
-            nearest = dr.minimum(nearest, hit.t)
+            nearest, whose = dr.minimum(nearest, hit.t), dr.select(closer, number, whose)
             point = dr.select(closer, mi.Point3f(before.to_world(local(hit.t))), point)
-        return point, nearest < dr.inf
+        return point, nearest < dr.inf, whose
 
     def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
         """Whether anything lies on a ray before its `maxt`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
 
 
 class Neighbours:
@@ -37,3 +38,23 @@ class Neighbours:
     def most(self, values: NDArray, radius: int) -> NDArray:
         """Largest value within `radius` cells of each pixel, diagonally too, [n]."""
         return ndimage.maximum_filter(self._image(values), size=2 * radius + 1).ravel()[self._cell]
+
+    def inside(self, outlines_px: list[NDArray[np.float64]]) -> NDArray[np.bool_]:
+        """Pixels within a cell of the convex hull of any of some sets of points (column, row; mosaic pixels), [n]."""
+        found = np.zeros(self._shape, np.bool_)
+        for points in outlines_px:
+            low = np.floor(points.min(axis=0) / self.cell_px).astype(np.int64) - 1
+            high = np.ceil(points.max(axis=0) / self.cell_px).astype(np.int64) + 2
+            (left, top), (right, bottom) = np.maximum(low, 0), np.minimum(high, self._shape[::-1])
+            if right <= left or bottom <= top:
+                continue
+            x = (np.arange(left, right) + 0.5)[None, :] * self.cell_px
+            y = (np.arange(top, bottom) + 0.5)[:, None] * self.cell_px
+            within = np.ones((bottom - top, right - left), np.bool_)
+            try:
+                for a, b, c in ConvexHull(points).equations:
+                    within &= a * x + b * y + c <= 1.5 * self.cell_px
+            except QhullError:
+                pass  # points on a line, seen edge-on: the box around them will do
+            found[top:bottom, left:right] |= within
+        return found.ravel()[self._cell]

@@ -170,9 +170,8 @@ class Refinement:
         """Every pixel in one window."""
         windows, interval = np.full(self._pixel.size, window), np.zeros(self._pixel.size, np.uint32)
         pairs = Pairs(self._pixel, self._begin_us[windows], self._end_us[windows], self._samples, interval)
-        result, needed = self._adaptive.render_all(pairs, self._unit, self._near, swept)
-        # where far fewer would have done, the next time begins with fewer
-        self._samples = np.maximum(needed, result.samples // 4)
+        result = self._adaptive.render_all(pairs, self._unit, self._near, swept)
+        self._samples = result.samples
         return result
 
     # ---- what is near -----------------------------------------------------------------------------
@@ -197,10 +196,30 @@ class Refinement:
                     out[there] = self._near.most(row.view(np.uint8), size)[there].view(np.bool_)
         return spread
 
-    def _pace(self, begin_us: float, end_us: float) -> NDArray[np.float32]:
-        """Motion around each pixel, listed pixels per µs: the most of all that are within reach of it."""
-        motion = self._tracer.motion_px(self._pixel, begin_us, end_us) / np.float32(self._near.cell_px)
-        return _PACE_MARGIN * self._near.most(motion, int(_REACH)) / np.float32(max(end_us - begin_us, 1e-3))
+    def _pace(self, begin_us: float, end_us: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+        """Motion around each pixel, listed pixels per µs: the most within reach of it; and which group it sees."""
+        motion, group = self._tracer.motion_px(self._pixel, begin_us, end_us)
+        most = self._near.most(motion / np.float32(self._near.cell_px), int(_REACH))
+        return _PACE_MARGIN * most / np.float32(max(end_us - begin_us, 1e-3)), group
+
+    def _motion(
+        self, chunk: _Chunk, intervals: list[tuple[int, int]], pace: NDArray[np.float32], seen: NDArray[np.uint32]
+    ) -> NDArray[np.float32]:
+        """Motion around each pixel in each interval, listed pixels, [intervals, n].
+
+        A pixel that does not see an object now, but lies where it comes by within the interval, has the motion of
+        that object.
+        """
+        length = np.array([[chunk.end_us[high] - chunk.end_us[low]] for low, high in intervals], np.float32)
+        motion = pace * length
+        for number, group in enumerate(self._groups, start=1):
+            for row, interval in zip(motion, intervals, strict=True):
+                span = chunk.span_us(*interval)
+                far = self._timeline.object_motion_px(group.name, *span) / self._near.cell_px
+                if far > 0:
+                    there = self._near.inside(self._timeline.outlines_px(group.name, *span)) & (seen != number)
+                    row[there] = np.maximum(row[there], np.float32(far))
+        return motion
 
     def _swept(
         self, intervals: list[tuple[float, float]], windows: list[tuple[float, float]], parts: int
@@ -247,7 +266,7 @@ class Refinement:
         """Render the last window, then halve intervals as long as something happens in them."""
         last, count = chunk.last, self._pixel.size
         most = _REACH / self._tightness**0.5
-        pace = self._pace(*chunk.span_us(0, last))
+        pace, seen = self._pace(*chunk.span_us(0, last))
         swept = self._swept([chunk.span_us(0, last)], [chunk.span_us(last, last)], 1)
         result = self._render_all(chunk.first + last, swept)
         chunk.rendered[1:] = False
@@ -262,8 +281,7 @@ class Refinement:
         while True:
             active = (met & MET_SWEPT) != 0
             if not everything:
-                length = np.array([[chunk.end_us[high] - chunk.end_us[low]] for low, high in intervals])
-                motion = pace * length.astype(np.float32)
+                motion = self._motion(chunk, intervals, pace, seen)
                 active &= ((met & MET_PASSING) != 0) | (motion > most) | self._spread(change, motion)
             wide = [k for k, (low, high) in enumerate(intervals) if high - low >= 2]
             if not wide:

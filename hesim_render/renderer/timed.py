@@ -109,7 +109,9 @@ class TimedTracer:
         self._cols = dr.opaque(types.UInt32, layout.cols)
         self._first_index = dr.opaque(types.UInt32, int(layout.full_index[0, 0]))
         self._full_cols = dr.opaque(types.UInt32, layout.spec.geometry.cols)
-        self._key = dr.opaque(types.UInt64, stream_key(seed, Stream.RENDER))
+        self._keys = [
+            dr.opaque(types.UInt64, stream_key(seed, stream)) for stream in (Stream.RENDER, Stream.RENDER_PILOT)
+        ]
         self._sampler = sampler_class(mi.variant())()
         self._wavelengths = WavelengthSampler(self.sensor.responses)
         self._filter = types.UInt32(layout.filter_index.ravel().astype(np.uint32))
@@ -125,6 +127,7 @@ class TimedTracer:
         samples: NDArray[np.integer],
         swept: SweptBoxes | None = None,
         interval: NDArray[np.uint32] | None = None,
+        pilot: bool = False,
     ) -> PairFlux:
         """Flux of every listed pair.
 
@@ -133,9 +136,11 @@ class TimedTracer:
         pixel, begin_us, end_us : [n], mosaic index and time window.
         samples : [n], rays of each pair, a power of two from `LEAST_SAMPLES` to `MOST_SAMPLES`.
         swept : boxes whose meeting by any path is to be told, and `interval` [n], which set each pair has.
+        pilot : take other random numbers, so that what they show may decide about the pair.
         """
         import drjit as dr
 
+        self._key = self._keys[1 if pilot else 0]
         mitsuba()  # the variant may have been changed by other code
         tracks = [group.trajectory for group in self.parts.groups] + ([self.camera] if self.camera else [])
         # wrapped on the host in double precision: float32 µs would lose their fractions within seconds
@@ -169,15 +174,18 @@ class TimedTracer:
             first = last
         return out
 
-    def motion_px(self, pixel: NDArray[np.uint32], begin_us: float, end_us: float) -> NDArray[np.float32]:
+    def motion_px(
+        self, pixel: NDArray[np.uint32], begin_us: float, end_us: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """How far in the image what each pixel sees at the end of an interval was at its begin, [n] pixels.
 
-        Along the straight line; from the ray through the middle of each pixel. 0 where it sees nothing.
+        Along the straight line; from the ray through the middle of each pixel. 0 where it sees nothing. And what
+        that is: 0 for anything at rest, else the number of the group, from 1.
         """
         import drjit as dr
 
         mi, types = mitsuba(), jit()
-        out = np.zeros(pixel.size, np.float32)
+        out, who = np.zeros(pixel.size, np.float32), np.zeros(pixel.size, np.uint32)
         tracks = [group.trajectory for group in self.parts.groups] + ([self.camera] if self.camera else [])
         local = [[types.Float(np.float32(track.local_us(t))) for track in tracks] for t in (begin_us, end_us)]
         for values in local:
@@ -195,14 +203,16 @@ class TimedTracer:
             if self.camera is not None:
                 origin, direction = now[count].to_world(origin), now[count].turn_to_world(direction)
             ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-            point, seen = self.parts.place_before(ray, now[:count], then[:count])
+            point, seen, group = self.parts.place_before(ray, now[:count], then[:count])
             if self.camera is not None:
                 point = then[count].to_rest(point)
             place = self._rays.project(point)
             far = dr.sqrt(dr.square(place[0] - col) + dr.square(place[1] - types.Float(row)))
             far = dr.select(seen & dr.isfinite(far), far, 0.0)
+            dr.eval(far, group)
             out[first : first + part.size] = np.array(far)[: part.size]
-        return out
+            who[first : first + part.size] = np.array(group)[: part.size]
+        return out, who
 
     def _block(
         self, lanes: list[NDArray], packets: NDArray[np.int64], size: int, tables: Any, out: PairFlux, part: slice

@@ -140,6 +140,22 @@ class Timeline:
         places = self._view.project(points, np.broadcast_to(camera, poses.shape))
         return float(np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=0).max())
 
+    def outlines_px(self, name: str, begin_us: float, end_us: float, parts: int = 6) -> list[NDArray[np.float64]]:
+        """Where a moving object's box is seen during an interval: points whose convex hulls hold it, in some parts.
+
+        Returns
+        -------
+        For each part of the interval, column and row of all corners at its begin, middle and end, [k, 2] pixels.
+        """
+        times = np.linspace(begin_us, end_us, 2 * parts + 1)
+        poses = self._trajectories[name].matrix(times)
+        points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        camera = np.broadcast_to(self._view.camera_to_world, poses.shape)
+        if self._camera is not None:
+            camera = self._camera.matrix(times) @ camera
+        places = self._view.project(points, camera)
+        return [places[2 * k : 2 * k + 3].reshape(-1, 2) for k in range(parts)]
+
     def extent_px(self, name: str, t_us: float) -> float:
         """Least extent of one moving object's box in the image, of its two, pixels."""
         pose = self._trajectories[name].matrix(t_us)
