@@ -285,3 +285,100 @@ def test_the_audit_covers_the_true_fraction(monkeypatch):
         covered += source.audit.bound >= fraction
     assert np.mean(fractions) > 2e-3, "nothing was missed: this shows nothing"
     assert covered >= 95
+
+
+class EdgeFlux:
+    """An edge of contrast 4 that crosses a row of pixels, in closed form; implements `FluxSource`.
+
+    Pixel i has Φ = Φ₀ (1 + 3 c), c = clip(v t − i, 0, 1) the part that the bright side covers.
+    """
+
+    is_static = False
+    dark_e_per_s = 2e5
+
+    def __init__(self, px_per_s, samples_per_s):
+        self._px_per_us, self._step_us = px_per_s * 1e-6, 1e6 / samples_per_s
+
+    def slice_edges_us(self, begin_us, end_us):
+        return np.empty(0)
+
+    def sample_times_us(self, begin_us, end_us):
+        times = np.arange(1, int(end_us / self._step_us) + 1) * self._step_us
+        return times[(times > begin_us) & (times < end_us)]
+
+    def mean_flux(self, pixel, begin_us, end_us):
+        t_us = 0.5 * (np.asarray(begin_us) + np.asarray(end_us))
+        covered = np.clip(self._px_per_us * t_us - (pixel % 16), 0, 1)
+        from hesim_render.backend import jit
+
+        flux = jit().Float(self.dark_e_per_s * (1 + 3 * covered))
+        return flux, flux
+
+
+@pytest.mark.parametrize(("samples_per_s", "most_us"), [(3200, 15.0), (6400, 5.0)])
+def test_crossing_times_of_a_moving_edge(samples_per_s, most_us):
+    """0.1 pixel per slice of 1/3200 s, θ = 0.1: ln x = ln x₀ + kθ where 1 + 3 c = e^{kθ}; then half as far apart."""
+    from hesim_render.capture import Capture, noise_models
+
+    v_px_per_s, theta = 320.0, 0.1
+    changes = {
+        "evs.reference": "last_event", "evs.tick_us": None, "evs.window_us": 1, "evs.contrast_threshold_on": theta,
+        "evs.contrast_threshold_off": theta, "evs.photoreceptor_cutoff_hz": 300,
+        "evs.coefficients": [{"beta1": 1.0, "beta2": 1e-6, "beta3": 0.0, "beta4": 1e-9, "beta5": 0.0}],
+    }  # fmt: skip
+    sensor = hr.load_sensor("reference-mono", changes).crop(16, 2)
+    _, evs = noise_models(sensor, clean=True)
+    capture = Capture(EdgeFlux(v_px_per_s, samples_per_s), sensor, None, evs, 50000, 1)
+    events = np.concatenate(list(capture.run()))
+    assert np.all(events["polarity"] == 1)
+    off_us = []
+    for x in range(2, 14):
+        times = np.sort(events["t_us"][(events["x"] == x) & (events["y"] == 0)])
+        k = np.arange(1, int(np.log(4) / theta) + 1)
+        wanted = (x + (np.exp(k * theta) - 1) / 3) / v_px_per_s * 1e6
+        assert times.size == wanted.size
+        off_us.append(times - wanted)
+    assert np.sqrt(np.mean(np.concatenate(off_us) ** 2)) < most_us
+
+
+def near_misses(some, others):
+    """Events of `some` with none of `others` at the same pixel and polarity within one tick."""
+    known = {(t + shift, x, y, p) for t, x, y, p in others.tolist() for shift in (-1250, 0, 1250)}
+    return sum((t, x, y, p) not in known for t, x, y, p in some.tolist())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
+def test_render_noise_makes_less_than_one_event_in_a_hundred(name):
+    """Noise-free sensor, default quality, against a render of a fifth of its error with other random numbers."""
+    scene, sensor = hr.load_scene(name), hr.load_sensor("gen2").crop(384, 288)
+    found, wanted = (
+        hr.simulate(scene, sensor, duration_s=0.04, clean=True, quality=quality, seed=seed).events
+        for quality, seed in ((0.5, 3), (0.1, 1))
+    )
+    assert wanted.size > 2000
+    assert abs(found.size / wanted.size - 1) < 0.01
+    assert near_misses(found, wanted) < 0.01 * wanted.size
+
+
+@pytest.mark.slow
+def test_five_thousand_windows_keep_memory_and_compile_nothing():
+    import resource
+
+    import drjit as dr
+
+    scene, sensor = hr.load_scene("rotating-star"), mono(48, 36)
+    source = CoherentFlux(scene, sensor, quality=1.0, seed=1)
+    pixels = sensor.layout.evs_pixel.ravel()
+    compiled, peak = 0, 0
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for number, _ in enumerate(source.flux_of_windows(pixels, *windows(5000))):
+            if number == 1000:
+                dr.kernel_history_clear()
+                peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            elif number % 100 == 99:
+                history = dr.kernel_history([dr.KernelType.JIT])
+                compiled += sum(not entry["cache_hit"] for entry in history) if number > 1000 else 0
+    assert compiled == 0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak < 20_000  # KiB

@@ -25,8 +25,9 @@ from hesim_render.units import S_PER_US
 QUALITY = 0.5
 #: A filled-in flux may be off by this many times the wanted error of a rendered one.
 TOLERANCE_PER_QUALITY = 3.0
-#: Motion between two samples of a sensor without a tick of its own, pixels.
-_STEP_PX = 0.25
+#: Motion between two samples of a sensor without a tick of its own, pixels. ln x is taken as straight between them:
+#: the threshold crossings of an edge of contrast 4 are then off by less than 2 % of the time of a tenth of a pixel.
+_STEP_PX = 0.05
 #: Pixels of a frame that are held at a time.
 _PIXELS_AT_ONCE = 1 << 20
 

@@ -40,6 +40,8 @@ _REACH = 6.0
 _PACE_MARGIN = np.float32(1.1)
 #: Part of its own extent that an object may move within an interval without passing something unseen.
 _PASSING = 0.5
+#: Part of its own extent below which the box swept by an object is about the box of an interval twice as long.
+_SLOW = 0.1
 #: Windows in a chunk at most, and what a chunk may take of memory.
 _CHUNK, _CHUNK_BYTES = 32, 256 * 2**20
 #: Bytes per pixel and window: both halves, two flags, temporaries.
@@ -224,13 +226,18 @@ class Refinement:
     def _swept(
         self, intervals: list[tuple[float, float]], windows: list[tuple[float, float]], parts: int
     ) -> SweptBoxes | None:
-        """Boxes of every interval; an object that goes far in one of its `parts` may pass something unseen."""
+        """Boxes of every interval; an object that goes far in one of its `parts` may pass something unseen.
+
+        None where all are so slow that nothing would be ruled out that the interval twice as long has not.
+        """
         if not self._groups:
+            return None
+        names = [group.name for group in self._groups]
+        own = np.array([[self._timeline.object_motion_px(n, *interval) for n in names] for interval in intervals])
+        if parts > 1 and np.all(own / parts < _SLOW * self._extent_px):
             return None
         swept = np.array([[group.swept_box(*interval) for group in self._groups] for interval in intervals])
         present = np.array([[group.swept_box(*window) for group in self._groups] for window in windows])
-        names = [group.name for group in self._groups]
-        own = np.array([[self._timeline.object_motion_px(n, *interval) for n in names] for interval in intervals])
         return SweptBoxes(swept, present, own / parts > _PASSING * self._extent_px)
 
     # ---- a chunk ----------------------------------------------------------------------------------
@@ -300,7 +307,8 @@ class Refinement:
                 result = self._render(windows, place, self._samples[place], which.astype(np.uint32), swept)
                 chunk.put(middles[which], place, result)
                 met = met & np.uint32(MET_SWEPT)
-                met[which, place] = self._met(result)
+                if swept is not None or not self._groups:
+                    met[which, place] = self._met(result)
                 change = self._beyond(chunk, middles, straight, active)
             halves = [[(low, int(m)), (int(m), high)] for (low, high), m in zip(intervals, middles, strict=True)]
             intervals = [interval for pair in halves for interval in pair]
