@@ -33,7 +33,7 @@ def test_permute_is_a_bijection(bits):
 
 def test_points_fill_every_elementary_interval():
     types = jit()
-    x, y = (np.array(v, dtype=np.float64) / 2**32 for v in zero_two_point(dr.arange(types.UInt32, 16), 4))
+    x, y = (np.array(v, dtype=np.float64) / 2**32 for v in zero_two_point(dr.arange(types.UInt32, 16)))
     for split in range(5):
         cells = np.floor(x * 2**split) * 2 ** (4 - split) + np.floor(y * 2 ** (4 - split))
         np.testing.assert_array_equal(np.sort(cells), np.arange(16))

@@ -41,16 +41,18 @@ def permute(index: Any, mask: int, key: Any) -> Any:
     return (i + key) & mask
 
 
-def zero_two_point(index: Any, bits: int) -> tuple[Any, Any]:
-    """Point of the (0, 2)-sequence of van der Corput and Sobol', as two UInt32 binary fractions."""
+def zero_two_point(index: Any) -> tuple[Any, Any]:
+    """Point of the (0, 2)-sequence of van der Corput and Sobol', as two UInt32 binary fractions.
+
+    The second generator matrix is Pascal's triangle modulo 2, the fifth Kronecker power of [[1, 1], [0, 1]]: five
+    steps, one for each.
+    """
     import drjit as dr
 
     x = dr.brev(index)
-    y = index & 0
-    direction = 1 << 31
-    for bit in range(bits):
-        y = y ^ (((index >> bit) & 1) * direction)
-        direction ^= direction >> 1
+    y = x
+    for shift, mask in ((1, 0xAAAAAAAA), (2, 0xCCCCCCCC), (4, 0xF0F0F0F0), (8, 0xFF00FF00), (16, 0xFFFF0000)):
+        y = y ^ ((y << shift) & mask)
     return x, y
 
 
@@ -88,7 +90,7 @@ def sampler_class(variant: str) -> Any:
             self.dimension = self.dimension + 1
             bits = mi.Philox4x32(self.key, self.pixel, self.half, self.dimension).next_uint32x4()
             point = permute(self.sample, self._mask, bits[0]) if self._bits else self.sample
-            x, y = zero_two_point(point, self._bits)
+            x, y = zero_two_point(point)
             return mi.Float((x ^ bits[1]) >> 8) * 2.0**-24, mi.Float((y ^ bits[2]) >> 8) * 2.0**-24
 
         def next_1d(self, active: Any = True) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +11,9 @@ import numpy as np
 
 from hesim_render.backend import jit
 from hesim_render.spectra import Spectrum
+
+#: Parts of a response's integral for which the first cell is tabled, so that the search starts next to its end.
+_BINS = 1024
 
 
 class WavelengthSampler:
@@ -28,25 +33,25 @@ class WavelengthSampler:
         import drjit as dr
 
         types = jit()
-        longest = max(response.wavelength_nm.size for response in responses.values())
-        self._bits = int(longest - 1).bit_length()
-        room = (1 << self._bits) + 1
-        nodes, values, shares, totals = [], [], [], []
+        room = max(response.wavelength_nm.size for response in responses.values()) + 1
+        nodes, values, shares, starts, totals = [], [], [], [], []
         for response in responses.values():
             grid, table = response.wavelength_nm, response.values
             area = np.concatenate([[0.0], np.cumsum((table[1:] + table[:-1]) / 2 * np.diff(grid))])
-            more = room - grid.size
+            share, more = (area / area[-1]).astype(np.float32), room - grid.size
+            place = np.arange(_BINS + 1, dtype=np.float32) / _BINS
+            starts.append(np.clip(np.searchsorted(share, place, side="right") - 1, 0, grid.size - 2))
             nodes.append(np.pad(grid, (0, more), mode="edge"))
             values.append(np.pad(table, (0, more), mode="edge"))
-            shares.append(np.pad(area / area[-1], (0, more), constant_values=2.0))  # never reached
+            shares.append(np.pad(share, (0, more), constant_values=2.0))  # never reached
             totals.append(area[-1])
         self._room = room
         self._nodes, self._values, self._shares = (
             types.Float(np.concatenate(table).astype(np.float32)) for table in (nodes, values, shares)
         )
         self._totals = types.Float(np.array(totals, dtype=np.float32))
-        self._last = types.UInt32(np.array([r.wavelength_nm.size - 2 for r in responses.values()], dtype=np.uint32))
-        dr.make_opaque(self._nodes, self._values, self._shares, self._totals, self._last)
+        self._starts = types.UInt32(np.concatenate(starts).astype(np.uint32))
+        dr.make_opaque(self._nodes, self._values, self._shares, self._totals, self._starts)
 
     def total(self, filter_index: Any) -> Any:
         """∫R dλ of each lane's filter, e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹ × nm."""
@@ -64,22 +69,34 @@ class WavelengthSampler:
         """
         import drjit as dr
 
-        floats = jit().Float
+        floats, uints = jit().Float, jit().UInt32
         base = filter_index * self._room
-        last = base + dr.gather(jit().UInt32, self._last, filter_index)
+        places = [(u + k) * 0.25 for k in range(4)]
+        bins = [filter_index * (_BINS + 1) + dr.minimum(uints(place * _BINS), _BINS - 1) for place in places]
+        low = [dr.gather(uints, self._starts, number) for number in bins]
+        high = [dr.gather(uints, self._starts, number + 1) for number in bins]
+
+        def halve(low: list[Any], high: list[Any]) -> tuple[list[Any], list[Any]]:
+            new_low, new_high = [], []
+            for place, a, b in zip(places, low, high, strict=True):
+                middle = (a + b + 1) >> 1
+                beyond = dr.gather(floats, self._shares, base + middle) <= place
+                new_low.append(dr.select(beyond, middle, a))
+                new_high.append(dr.select(beyond, b, dr.minimum(middle - 1, b)))
+            return new_low, new_high
+
+        def unsure(low: list[Any], high: list[Any]) -> Any:
+            return functools.reduce(operator.or_, (a < b for a, b in zip(low, high, strict=True)))
+
+        # one step nearly always; only in the tails does a bin hold many cells
+        low, _ = dr.while_loop((low, high), unsure, halve, label="wavelengths")
         wavelengths = []
-        for k in range(4):
-            place = (u + k) * 0.25
-            cell = base
-            for bit in reversed(range(self._bits)):
-                further = cell + (1 << bit)
-                cell = dr.select(dr.gather(floats, self._shares, further) <= place, further, cell)
-            cell = dr.minimum(cell, last)
+        for place, cell in zip(places, (base + a for a in low), strict=True):
             begin, end = dr.gather(floats, self._shares, cell), dr.gather(floats, self._shares, cell + 1)
             share = dr.clip((place - begin) / dr.maximum(end - begin, 1e-30), 0, 1)
-            low, high = dr.gather(floats, self._values, cell), dr.gather(floats, self._values, cell + 1)
-            root = dr.sqrt(dr.maximum(low * low + share * (high * high - low * low), 0))
-            within = share * (low + high) / dr.maximum(low + root, 1e-30)
+            first, second = dr.gather(floats, self._values, cell), dr.gather(floats, self._values, cell + 1)
+            root = dr.sqrt(dr.maximum(first * first + share * (second * second - first * first), 0))
+            within = share * (first + second) / dr.maximum(first + root, 1e-30)
             left, right = dr.gather(floats, self._nodes, cell), dr.gather(floats, self._nodes, cell + 1)
             wavelengths.append(left + (right - left) * within)
         return wavelengths
