@@ -34,6 +34,19 @@ app = typer.Typer(
 _ClickError: Any = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 
 
+#: Options that several commands share.
+SensorFile = Annotated[str, typer.Option(help="a name (see 'list sensors') or the path of a sensor file")]
+Region = Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")]
+SensorKeys = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
+]
+Clean = Annotated[bool, typer.Option("--clean", help="no noise at all")]
+Without = Annotated[
+    list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace what is there")]
+
 _INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
@@ -107,10 +120,10 @@ def list_(kind: Annotated[Kind, typer.Argument(help="scenes, sensors or illumina
 @app.command()
 def simulate(
     scene: Annotated[str, typer.Argument(help="a name (see 'list scenes') or the path of a scene file")],
-    sensor: Annotated[str, typer.Option(help="a name (see 'list sensors') or the path of a sensor file")],
+    sensor: SensorFile,
     out: Annotated[Path, typer.Option(help="folder to write the recording to")],
     duration: Annotated[float, typer.Option(help="simulated time, s")] = 0.1,
-    roi: Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")] = None,
+    roi: Region = None,
     seed: Annotated[int, typer.Option(help="of all noise and of the render")] = 7,
     quality: Annotated[
         float | None, typer.Option(help="error of the render as a part of the sensor's noise (default 0.5)")
@@ -124,11 +137,9 @@ def simulate(
             "--set", metavar="KEY=VALUE", help="change a key of the scene file, or with sensor. of the sensor file"
         ),
     ] = None,
-    clean: Annotated[bool, typer.Option("--clean", help="no noise at all")] = False,
-    without: Annotated[
-        list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing recording")] = False,
+    clean: Clean = False,
+    without: Without = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render a scene and record it: RAW frames, events and their ground truth."""
     _check_duration(duration)
@@ -147,10 +158,10 @@ def video(
     source: Annotated[
         str, typer.Argument(metavar="INPUT", help="a video file, a folder of numbered pictures, or a .npy file")
     ],
-    sensor: Annotated[str, typer.Option(help="a name (see 'list sensors') or the path of a sensor file")],
+    sensor: SensorFile,
     out: Annotated[Path, typer.Option(help="folder to write the recording to")],
     duration: Annotated[float | None, typer.Option(help="simulated time, s; default the whole video")] = None,
-    roi: Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")] = None,
+    roi: Region = None,
     seed: Annotated[int, typer.Option(help="of all noise")] = 7,
     fps: Annotated[
         float | None, typer.Option(help="pictures per second; for folders and .npy, else instead of time stamps")
@@ -180,15 +191,10 @@ def video(
     lens_shading: Annotated[
         bool, typer.Option("--lens-shading", help="apply the sensor's relative illumination")
     ] = False,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
-    ] = None,
-    clean: Annotated[bool, typer.Option("--clean", help="no noise at all")] = False,
-    without: Annotated[
-        list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing recording")] = False,
+    set_: SensorKeys = None,
+    clean: Clean = False,
+    without: Without = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Put a video in front of a sensor and record it: RAW frames, events and their ground truth."""
     if duration is not None:
@@ -246,14 +252,9 @@ def lab(
     lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
     illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
     seed: Annotated[int, typer.Option(help="of all temporal noise")] = 7,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
-    ] = None,
-    without: Annotated[
-        list[str] | None, typer.Option(metavar="TERM", help="switch one noise term off, as aps.read; repeatable")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing capture set")] = False,
+    set_: SensorKeys = None,
+    without: Without = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """A virtual calibration session: dark and lit captures to calibrate from."""
 
@@ -307,7 +308,7 @@ def isp(
     recording: Annotated[Path, typer.Argument(help="folder of a recording")],
     out: Annotated[Path | None, typer.Option(help="folder of the pictures; default NAME-pictures beside it")] = None,
     pipeline: Annotated[Path | None, typer.Option(help="YAML file that changes the steps (docs/isp.md)")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace existing pictures")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Develop the RAW frames of a recording into pictures."""
     from hesim_render.isp import develop_recording, load_pipeline
