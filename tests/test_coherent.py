@@ -7,7 +7,8 @@ from scipy import stats
 
 import hesim_render as hr
 from hesim_render.errors import RangeError, SpecError
-from hesim_render.renderer import refinement
+from hesim_render.renderer import refinement, sketch
+from hesim_render.renderer.audit import Audit, least_checked
 from hesim_render.renderer.coherent import CoherentFlux
 from hesim_render.renderer.flux import RenderedFlux, used_responses
 from hesim_render.renderer.refinement import Refinement
@@ -41,7 +42,10 @@ def fluxes(source, sensor, count):
 
 
 def deviations(source, sensor, count, seed=0):
-    """Every pair rendered with the rays it would have had, less what the refinement gave, in units of noise."""
+    """What the refinement gave less every pair rendered with the rays of its chunk, in units of noise.
+
+    And what it rendered, and the flux of every pair from 256 rays each.
+    """
     pixels = sensor.layout.evs_pixel.ravel()
     work = Refinement(
         source.adaptive, source._timeline, source.audit, pixels, *windows(count), source._event_unit(pixels), seed
@@ -49,19 +53,22 @@ def deviations(source, sensor, count, seed=0):
     got, rendered = [], []
     settle = work._settle
 
-    def settle_and_note(chunk):
-        settle(chunk)
+    def settle_and_note(chunk, sketch):
+        settle(chunk, sketch)
         rendered.append(chunk.rendered[1:].copy())
 
     work._settle = settle_and_note
     got = np.array([0.5 * (a + b) for a, b in work.run()])[1:]
     rendered = np.concatenate(rendered)
+    truth = np.empty_like(got)
     off = np.zeros_like(got, dtype=np.float64)
     place = np.arange(pixels.size)
     for tick in range(1, count):
-        truth = work._render(np.full(place.size, tick), place, work._samples).mean
-        off[tick - 1] = (got[tick - 1] - truth) / work._unit(truth.astype(np.float64), place)
-    return off, rendered
+        window = np.full(place.size, tick)
+        same = work._render(window, place, work._samples).mean
+        off[tick - 1] = (got[tick - 1] - same) / work._unit(same.astype(np.float64), place)
+        truth[tick - 1] = work._render(window, place, np.full(place.size, 256)).mean
+    return off, rendered, truth
 
 
 def sphere(position, radius, reflectance):
@@ -131,17 +138,18 @@ def test_what_passes_between_coarse_renders_is_found(name):
     scene = rendering.mitsuba_scene({**shapes, "lamp": LAMP, "sky": SKY}, motion, depth)
     sensor = mono(48, 36)
     source = CoherentFlux(scene, sensor, quality=1.0, seed=5)
-    off, rendered = deviations(source, source.sensor, 33)
-    flux = fluxes(CoherentFlux(scene, sensor, quality=1.0, seed=5), source.sensor, 33)
-    changes = np.abs(np.diff(flux, axis=0)) > 0.1 * flux[1:]
+    off, rendered, truth = deviations(source, source.sensor, 33)
+    changes = np.abs(np.diff(truth, axis=0)) > 0.1 * truth[1:]
     assert changes.sum() > 100, "nothing happens in this scene"
-    # a caustic's own noise moves with it: there nearly everything has to be rendered
-    assert rendered.mean() < 0.75 or name == "caustic"
+    assert rendered.mean() < 0.5
     filled = np.abs(off[~rendered]) > source.audit.tolerance
     assert filled.sum() <= 0.01 * filled.size
-    # the change itself is not smoothed away: pairs that really jump are right too
-    jumping = (np.abs(np.diff(flux, axis=0)) > 0.3 * flux[1:]) & ~rendered
-    assert np.count_nonzero(np.abs(off[jumping]) > source.audit.tolerance) <= max(3, 0.05 * jumping.sum())
+    # the change itself is not smoothed away: pairs that really jump are right too. Not so in a caustic of a small lamp:
+    # fewer than one ray in sixteen finds it, and what these do not see is filled in (docs/rendering.md says so)
+    jumps = np.zeros_like(rendered)
+    jumps[1:] = np.abs(np.diff(truth, axis=0)) > 0.3 * truth[1:]
+    missed = np.count_nonzero(np.abs(off[jumps]) > source.audit.tolerance)
+    assert missed <= max(3, (0.25 if name == "caustic" else 0.05) * jumps.sum())
 
 
 @pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
@@ -177,7 +185,7 @@ def test_a_pair_does_not_depend_on_its_company():
 def test_quality_is_reached_and_costs_rays():
     scene, sensor = hr.load_scene("camera-sweep"), mono()
     pixels = np.arange(64 * 48, dtype=np.uint32)
-    rays = []
+    rays, errors = [], []
     for quality in (1.0, 0.5):
         source = CoherentFlux(scene, sensor, quality, seed=1)
         for _ in range(2):  # the first time measures what stratification gains
@@ -187,7 +195,9 @@ def test_quality_is_reached_and_costs_rays():
         reached = source.adaptive.reached
         assert reached.rms < 1.1 * quality and reached.pairs >= pixels.size
         rays.append(source.rays_traced - before)
-    assert rays[1] > 2 * rays[0]
+        errors.append(reached.rms)
+    # the error of stratified rays falls as n^-0.5 to n^-1; their number is a power of two, so either may come short
+    assert errors[1] < 0.75 * errors[0] and rays[1] > 1.5 * rays[0]
 
 
 def test_the_error_that_is_told_is_the_error():
@@ -260,8 +270,6 @@ def test_a_long_run_is_refused_unless_wanted():
 
 def test_bound_of_the_audit():
     """Clopper and Pearson against the binomial sum: at the bound, so few excesses have a chance of 1 %."""
-    from hesim_render.renderer.audit import Audit, least_checked
-
     for checked, exceeded in ((300, 0), (2000, 3), (5000, 80)):
         audit = Audit(1.0)
         audit.add(10**6, checked, exceeded)
@@ -269,22 +277,35 @@ def test_bound_of_the_audit():
     assert (1 - 0.01) ** least_checked(0.01) <= 0.01 < (1 - 0.01) ** (least_checked(0.01) - 1)
 
 
-@pytest.mark.slow
 def test_the_audit_covers_the_true_fraction(monkeypatch):
-    """At least 95 of 100 runs; a bound of 99 % confidence misses that with a chance of 5e-4."""
+    """At least 95 of 100 audits of one run; a bound of 99 % confidence misses that with a chance of 5e-4."""
     # loosened until something is missed, and never refined further
-    monkeypatch.setattr(refinement, "_REFINE_AT", 3.0)
+    monkeypatch.setattr(sketch, "_CHANGE", 4.0)
+    monkeypatch.setattr(refinement, "_STEP_PX", 6.0)
     monkeypatch.setattr(refinement, "MOST_EXCEEDED", 0.99)
-    scene, sensor = hr.load_scene("rotating-star"), mono(32, 24)
-    covered, fractions = 0, []
+    source = CoherentFlux(hr.load_scene("rotating-star"), mono(32, 24), quality=0.5, seed=7)
+    pixels = source.sensor.layout.evs_pixel.ravel()
+    work = Refinement(
+        source.adaptive, source._timeline, source.audit, pixels, *windows(33), source._event_unit(pixels), 0
+    )
+    work._checks = 300
+    settle, kept = work._settle, []
+    work._settle = lambda chunk, drawn: (settle(chunk, drawn), kept.append(chunk))
+    list(work.run())
+    (chunk,) = kept
+    window, place = np.nonzero(~chunk.rendered)
+    truth = work._render(window, place, work._samples[place]).mean
+    off = (chunk.mean(window, place) - truth) / work._unit(truth.astype(np.float64), place)
+    fraction = np.mean(np.abs(off) > source.audit.tolerance)
+    assert 0.005 < fraction < 0.2, "nothing was missed, or everything: this shows nothing"
+    bounds = []
     for seed in range(100):
-        source = CoherentFlux(scene, sensor, quality=0.5, seed=7)
-        off, rendered = deviations(source, source.sensor, 33, seed=seed)
-        fraction = np.mean(np.abs(off[~rendered]) > source.audit.tolerance)
-        fractions.append(fraction)
-        covered += source.audit.bound >= fraction
-    assert np.mean(fractions) > 2e-3, "nothing was missed: this shows nothing"
-    assert covered >= 95
+        audit = Audit(source.audit.tolerance)
+        audit.add(place.size, *work._check(chunk, np.random.default_rng(seed)))
+        bounds.append(audit.bound)
+    assert np.count_nonzero(np.array(bounds) >= fraction) >= 95
+    # and no audit that says one would pass: the bound follows the fraction
+    assert fraction < np.mean(bounds) < 5 * fraction
 
 
 class EdgeFlux:

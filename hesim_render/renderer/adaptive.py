@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.renderer.neighbours import Neighbours
-from hesim_render.renderer.timed import LEAST_SAMPLES, MOST_SAMPLES, SweptBoxes, TimedTracer
+from hesim_render.renderer.timed import LEAST_SAMPLES, MOST_SAMPLES, PairFlux, SweptBoxes, TimedTracer
 
 #: What twice the rays gain over independent ones where that was not measured yet, and pairs that measure it.
 _GAIN_STEP, _ENOUGH = 0.9, 200
 #: Times that a pair is rendered again with more rays, each time with as many as its scatter then asks for.
 _ROUNDS = 3
+#: A pair is rendered again where it needs so many times the rays that it got.
+_FAR_OFF = 4
 #: Rays of a pixel that decide how many it gets.
-_PILOT_SAMPLES = 16
+PILOT_SAMPLES = 16
 _LEAST_BIT, _MOST_BIT = LEAST_SAMPLES.bit_length() - 1, MOST_SAMPLES.bit_length() - 1
 
 #: Flux of pairs, e⁻/s → what their noise is worth, e⁻/s; both [n], the second argument tells which pairs.
@@ -55,23 +57,20 @@ class Pairs:
     pixel : mosaic index.
     begin_us, end_us : window.
     samples : rays to begin with, powers of two.
-    interval : which set of boxes each pair is tested against, or None.
     """
 
     pixel: NDArray[np.uint32]
     begin_us: NDArray[np.float64]
     end_us: NDArray[np.float64]
     samples: NDArray[np.int64]
-    interval: NDArray[np.uint32] | None = None
 
 
 @dataclass
 class PairResult:
-    """Flux of pairs: both halves in e⁻/s, bits of boxes met, rays used, scatter of rays in units of noise; [n]."""
+    """Flux of pairs: both halves in e⁻/s, rays used, scatter of rays in units of noise; [n]."""
 
     half_a: NDArray[np.float32]
     half_b: NDArray[np.float32]
-    met: NDArray[np.uint32]
     samples: NDArray[np.int64]
     scatter: NDArray[np.float32]
 
@@ -119,19 +118,20 @@ class AdaptiveTracer:
         most = np.maximum.accumulate(most)
         return np.int64(1) << (_LEAST_BIT + np.searchsorted(most[:-1], scatter))
 
-    def render(self, pairs: Pairs, unit: NoiseUnit, swept: SweptBoxes | None = None) -> PairResult:
+    def needed_near(self, scatter: NDArray[np.floating], near: Neighbours) -> NDArray[np.int64]:
+        """The same from the few rays of a pilot, which say more together with the neighbours'."""
+        return self.needed(np.sqrt(0.5 * (scatter**2 + near.mean(scatter**2))))
+
+    def render(self, pairs: Pairs, unit: NoiseUnit) -> PairResult:
         """Flux of pairs, each with as many rays as it needs."""
         count = pairs.pixel.size
-        halves = np.empty((2, count), np.float32)
-        out = PairResult(
-            halves[0], halves[1], np.zeros(count, np.uint32), pairs.samples.copy(), np.empty(count, np.float32)
-        )
+        half_a, half_b, scatter = np.empty((3, count), np.float32)
+        out = PairResult(half_a, half_b, pairs.samples.copy(), scatter)
         waiting = np.arange(count)
         for repeat in range(_ROUNDS):
-            interval = None if pairs.interval is None else pairs.interval[waiting]
             samples = out.samples[waiting]
             begin, end = pairs.begin_us[waiting], pairs.end_us[waiting]
-            flux = self.tracer.trace(pairs.pixel[waiting], begin, end, samples, swept, interval)
+            flux = self.tracer.trace(pairs.pixel[waiting], begin, end, samples)
             noise = unit(0.5 * (flux.half_a.astype(np.float64) + flux.half_b), waiting)
             measured = 0.5 * (flux.half_a.astype(np.float64) - flux.half_b) / noise
             scatter = flux.scatter / noise
@@ -140,10 +140,8 @@ class AdaptiveTracer:
             self._independent += np.bincount(bit, scatter**2 / samples, _MOST_BIT + 1)
             self._pairs += np.bincount(bit, minlength=_MOST_BIT + 1)
             out.half_a[waiting], out.half_b[waiting], out.scatter[waiting] = flux.half_a, flux.half_b, scatter
-            # what any of a pair's rays came near stays true of it, also where more rays follow
-            out.met[waiting] |= flux.met
             needed = self.needed(scatter)
-            again = needed > samples if repeat < _ROUNDS - 1 else np.zeros(waiting.size, np.bool_)
+            again = (needed >= _FAR_OFF * samples) & (repeat < _ROUNDS - 1)
             kept = ~again
             self.reached.pairs += int(np.count_nonzero(kept))
             self.reached.squares += float(np.sum(measured[kept] ** 2))
@@ -156,20 +154,28 @@ class AdaptiveTracer:
                 break
         return out
 
-    def render_all(
-        self, pairs: Pairs, unit: NoiseUnit, near: Neighbours, swept: SweptBoxes | None = None
-    ) -> PairResult:
-        """The same for a whole picture; the pairs' own numbers of rays are not used.
+    def pilot(
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        swept: SweptBoxes | None = None,
+        interval: NDArray[np.uint32] | None = None,
+    ) -> PairFlux:
+        """A few rays of each pair, with random numbers of their own: what they show may decide about the pair.
 
-        A few rays with random numbers of their own decide on the number, each pixel's with its neighbours': were
-        it the picture's own rays, those that miss what a pixel sees a little of would be believed too often.
+        Were they the picture's own rays, those that miss what a pixel sees a little of would be believed too often.
         """
-        rays = np.full(pairs.pixel.size, _PILOT_SAMPLES)
-        pilot = self.tracer.trace(pairs.pixel, pairs.begin_us, pairs.end_us, rays, pilot=True)
+        return self.tracer.trace(
+            pixel, begin_us, end_us, np.full(pixel.size, PILOT_SAMPLES), swept, interval, pilot=True
+        )
+
+    def render_all(self, pairs: Pairs, unit: NoiseUnit, near: Neighbours) -> PairResult:
+        """A whole picture; a pilot decides on the number of rays of each pixel with its neighbours."""
+        pilot = self.pilot(pairs.pixel, pairs.begin_us, pairs.end_us)
         mean = 0.5 * (pilot.half_a.astype(np.float64) + pilot.half_b)
         scatter = pilot.scatter / unit(mean, np.arange(pairs.pixel.size))
-        needed = self.needed(np.sqrt(near.mean(scatter**2)))
-        return self.render(replace(pairs, samples=needed), unit, swept)
+        return self.render(replace(pairs, samples=self.needed_near(scatter, near)), unit)
 
 
 def _bit(samples: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.renderer.coherent import CoherentFlux
-from hesim_render.renderer.refinement import chunk_length
+from hesim_render.renderer.refinement import BYTES_PER_PAIR, chunk_length
 from hesim_render.schedule import Exposure
 
 #: Pixels tried, and pairs of neighbouring windows, spread over the run; pixels that measure the speed.
@@ -92,7 +92,8 @@ def estimate(
     chosen = some(event_pixel if event_pixel.size else frame_pixel, _PIXELS_FOR_SPEED)
     start = time.perf_counter()
     rate = max(1.0, tried(chosen, 0.0, 1.0)[1] * chosen.size) / (time.perf_counter() - start)
-    chunk = 0 if flux.is_static else 3 * 16 * event_pixel.size * (chunk_length(max(1, event_pixel.size)) + 1)
+    windows = chunk_length(max(1, event_pixel.size)) + 1
+    chunk = 0 if flux.is_static else BYTES_PER_PAIR * event_pixel.size * windows
     flux.forget()
     return Estimate(
         seconds=rays / rate,

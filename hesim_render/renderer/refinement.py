@@ -1,19 +1,12 @@
 """The same pixels in many time windows, at the cost of what changes between them.
 
-Windows come in chunks. The last of a chunk is rendered everywhere; in between, intervals are halved as
-long as something happens in them:
+Windows come in chunks. A sketch of a few rays per pixel (`Sketcher`) says in which of them a pixel may change and
+how many rays it will need there; the picture itself is rendered in the last window of a chunk, wherever the scene's
+motion can reach, and in between only where straight lines will not do. Random numbers are the same at all times, so
+what nothing comes near is constant to the bit.
 
-1. Random numbers are the same at all times. A pixel none of whose paths (to the surface, to the lights,
-   onwards) meets the box that a moving object sweeps during an interval is therefore exactly constant
-   in it, shadows, mirrors and caustics included, and needs no second look.
-2. Of the others, an interval is halved and its middle rendered where the pixel, or one from which the
-   motion can reach it, changes by more than the tolerance: between the ends at first, then between the
-   middle and the straight line through the ends.
-3. Where the picture moves farther than a few pixels in the interval, or an object by a good part of its
-   own size, the ends say nothing: the middle is rendered in any case.
-
-What is left is filled in on straight lines. A random sample of it is rendered after all to control the
-refinement, and another one to state what it has missed (`Audit`).
+A random sample of what was filled in is rendered after all to control the refinement, and another one to state what
+it has missed (`Audit`).
 """
 
 from __future__ import annotations
@@ -27,32 +20,30 @@ from numpy.typing import NDArray
 
 from hesim_render.renderer.adaptive import AdaptiveTracer, NoiseUnit, PairResult, Pairs
 from hesim_render.renderer.audit import MOST_EXCEEDED, Audit, least_checked
-from hesim_render.renderer.neighbours import Neighbours
-from hesim_render.renderer.paths import MET_PASSING, MET_SWEPT
-from hesim_render.renderer.timed import LEAST_SAMPLES, SweptBoxes
+from hesim_render.renderer.sketch import Gaps, Sketch, Sketcher
+from hesim_render.renderer.surroundings import Surroundings
+from hesim_render.renderer.timed import LEAST_SAMPLES, MOST_SAMPLES
 from hesim_render.renderer.timeline import Timeline
 
-#: Change that has an interval halved, in tolerances of the audit.
-_REFINE_AT = 0.7
-#: Farthest motion within an interval that can be followed from its ends, in listed pixels.
-_REACH = 6.0
-#: Motion is measured along straight lines, from one ray a pixel.
-_PACE_MARGIN = np.float32(1.1)
-#: Part of its own extent that an object may move within an interval without passing something unseen.
-_PASSING = 0.5
-#: Part of its own extent below which the box swept by an object is about the box of an interval twice as long.
-_SLOW = 0.1
+#: Motion between two rendered windows, in listed pixels, up to which a straight line is believed where it fits.
+_STEP_PX = 0.5
+#: Rays in the last window of a chunk, over those that a pixel needs for itself. Squared error falls by n^-1.5 and the
+#: cost is shared by the chunk: from 2 to 4 the total is about the same.
+_LASTING = 4
+#: Scatter of the rays of a picture over that of its sketch, neighbours together, from which on the sketch is known to
+#: miss what counts: light that few rays find.
+_HIDDEN = 2.0
 #: Windows in a chunk at most, and what a chunk may take of memory.
-_CHUNK, _CHUNK_BYTES = 32, 256 * 2**20
-#: Bytes per pixel and window: both halves, two flags, temporaries.
-_BYTES_PER_PAIR = 16
+_CHUNK, _CHUNK_BYTES = 32, 2**30
+#: Bytes per pixel and window: both halves, the sketch, flags, temporaries.
+BYTES_PER_PAIR = 40
 #: Times that a chunk is refined further before all of it is rendered.
-_REPEATS = 3
+_REPEATS = 4
 
 
 def chunk_length(pixels: int) -> int:
     """Windows in a chunk of so many pixels, a power of two from 4 on."""
-    room = _CHUNK_BYTES // (_BYTES_PER_PAIR * pixels)
+    room = _CHUNK_BYTES // (BYTES_PER_PAIR * pixels)
     return max(4, min(_CHUNK, 1 << max(0, room.bit_length() - 1)))
 
 
@@ -65,19 +56,12 @@ class _Chunk:
     first : number of its first window.
     half_a, half_b : e⁻/s.
     rendered : what was, not filled in.
-    begin_us, end_us : its windows.
     """
 
     first: int
     half_a: NDArray[np.float32]
     half_b: NDArray[np.float32]
     rendered: NDArray[np.bool_]
-    begin_us: NDArray[np.float64]
-    end_us: NDArray[np.float64]
-
-    @property
-    def last(self) -> int:
-        return self.half_a.shape[0] - 1
 
     def mean(self, window: Any, place: Any = slice(None)) -> NDArray[np.float32]:
         return np.float32(0.5) * (self.half_a[window, place] + self.half_b[window, place])
@@ -86,15 +70,26 @@ class _Chunk:
         self.half_a[window, place], self.half_b[window, place] = result.half_a, result.half_b
         self.rendered[window, place] = True
 
-    def fill(self, low: int, middle: int, high: int) -> None:
-        """Put a window on the straight line through two others."""
-        centre = self.begin_us + self.end_us
-        part = np.float32((centre[middle] - centre[low]) / (centre[high] - centre[low]))
-        for half in (self.half_a, self.half_b):
-            half[middle] = half[low] + part * (half[high] - half[low])
+    def fill(self, centre_us: NDArray[np.float64]) -> None:
+        """Put what was not rendered on straight lines between what was; both ends always count as that."""
+        there = self.rendered.copy()
+        there[0] = there[-1] = True
+        before, after = nearest(there)
+        for window in range(1, there.shape[0] - 1):
+            place = np.flatnonzero(~there[window])
+            low, high = before[window, place], after[window, place]
+            part = ((centre_us[window] - centre_us[low]) / (centre_us[high] - centre_us[low])).astype(np.float32)
+            for half in (self.half_a, self.half_b):
+                begin = half[low, place]
+                half[window, place] = begin + part * (half[high, place] - begin)
 
-    def span_us(self, low: int, high: int) -> tuple[float, float]:
-        return float(self.begin_us[low]), float(self.end_us[high])
+
+def nearest(there: NDArray[np.bool_]) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """The last window up to each one, and the first from it on, where something is; -1 and their number for none."""
+    number = np.arange(there.shape[0], dtype=np.int8)[:, None]
+    before = np.maximum.accumulate(np.where(there, number, np.int8(-1)), axis=0)
+    after = np.minimum.accumulate(np.where(there, number, np.int8(there.shape[0]))[::-1], axis=0)[::-1]
+    return before, after
 
 
 class Refinement:
@@ -122,33 +117,36 @@ class Refinement:
         unit: NoiseUnit,
         seed: int,
     ) -> None:
-        self._adaptive, self._tracer, self._timeline, self._audit = adaptive, adaptive.tracer, timeline, audit
+        self._adaptive, self._audit = adaptive, audit
         self._pixel, self._begin_us, self._end_us, self._unit, self._seed = pixel, begin_us, end_us, unit, seed
-        self._groups = self._tracer.parts.groups
-        self._near = Neighbours(pixel, self._tracer.sensor.layout.shape)
+        self._around = Surroundings(adaptive.tracer, timeline, pixel, float(begin_us[0]) if begin_us.size else 0.0)
+        self._sketcher = Sketcher(adaptive, self._around, pixel, unit, audit.tolerance)
         self._chunk = chunk_length(pixel.size)
         chunks = max(1, -(-(begin_us.size - 1) // self._chunk))
         self._checks = max(256, -(-4 * least_checked(MOST_EXCEEDED) // chunks))
-        self._extent_px = np.array([timeline.extent_px(group.name, float(begin_us[0])) for group in self._groups])
         self._samples = np.full(pixel.size, LEAST_SAMPLES)
-        self._tightness = 1.0  # divides the change that has an interval halved
+        self._hidden = np.zeros(pixel.size, np.bool_)
+        self._tightness = 1.0  # divides the change that counts
 
     def run(self) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         """Both halves of the flux, e⁻/s [n], window after window."""
-        start = self._render_all(0, None)
+        count, windows, first = self._pixel.size, self._begin_us.size, 0
+        everywhere = np.arange(count)
+        flux, scatter = self._sketcher.begin(float(self._begin_us[0]), float(self._end_us[0]))
+        self._samples = self._lasting(flux, scatter)
+        start = self._render(np.zeros(count, np.int64), everywhere, self._samples)
         half_a, half_b = start.half_a, start.half_b
         yield half_a, half_b
-        count, windows, first = self._pixel.size, self._begin_us.size, 0
         while first < windows - 1:
             last = min(first + self._chunk, windows - 1)
             shape, part = (last - first + 1, count), slice(first, last + 1)
             halves = np.empty((2, *shape), np.float32)
-            chunk = _Chunk(
-                first, halves[0], halves[1], np.zeros(shape, np.bool_), self._begin_us[part], self._end_us[part]
-            )
+            chunk = _Chunk(first, halves[0], halves[1], np.zeros(shape, np.bool_))
             chunk.half_a[0], chunk.half_b[0], chunk.rendered[0] = half_a, half_b, True
-            self._settle(chunk)
+            sketch = Sketch.after(self._begin_us[part], self._end_us[part], flux, scatter)
+            self._settle(chunk, sketch)
             half_a, half_b = chunk.half_a[-1].copy(), chunk.half_b[-1].copy()
+            flux, scatter = sketch.flux[-1].copy(), sketch.scatter[-1].copy()
             for k in range(1, last - first + 1):
                 yield chunk.half_a[k], chunk.half_b[k]
             first = last
@@ -160,102 +158,101 @@ class Refinement:
         window: NDArray[np.integer],
         place: NDArray[np.integer],
         samples: NDArray[np.int64],
-        interval: NDArray[np.uint32] | None = None,
-        swept: SweptBoxes | None = None,
     ) -> PairResult:
         """Pairs of a window and a place in the list."""
         unit = self._unit
-        pairs = Pairs(self._pixel[place], self._begin_us[window], self._end_us[window], samples, interval)
-        return self._adaptive.render(pairs, lambda flux, which: unit(flux, place[which]), swept)
-
-    def _render_all(self, window: int, swept: SweptBoxes | None) -> PairResult:
-        """Every pixel in one window."""
-        windows, interval = np.full(self._pixel.size, window), np.zeros(self._pixel.size, np.uint32)
-        pairs = Pairs(self._pixel, self._begin_us[windows], self._end_us[windows], self._samples, interval)
-        result = self._adaptive.render_all(pairs, self._unit, self._near, swept)
-        self._samples = result.samples
-        return result
-
-    # ---- what is near -----------------------------------------------------------------------------
-
-    def _spread(self, changed: NDArray[np.bool_], motion: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Pixels that what changed another can reach, interval by interval, [intervals, n].
-
-        Whatever passes over a pixel between two windows was within half its way of it in one of them.
-
-        Parameters
-        ----------
-        motion : around each pixel within each interval, [intervals, n], listed pixels.
-        """
-        spread = changed.copy()
-        for row, far, out in zip(changed, motion, spread, strict=True):
-            if not row.any():
-                continue
-            radius = np.minimum(far / 2 + 0.25, _REACH).astype(np.int8)
-            for size in range(1, int(radius.max()) + 1):
-                there = radius == size
-                if there.any():
-                    out[there] = self._near.most(row.view(np.uint8), size)[there].view(np.bool_)
-        return spread
-
-    def _pace(self, begin_us: float, end_us: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-        """Motion around each pixel, listed pixels per µs: the most within reach of it; and which group it sees."""
-        motion, group = self._tracer.motion_px(self._pixel, begin_us, end_us)
-        most = self._near.most(motion / np.float32(self._near.cell_px), int(_REACH))
-        return _PACE_MARGIN * most / np.float32(max(end_us - begin_us, 1e-3)), group
-
-    def _motion(
-        self, chunk: _Chunk, intervals: list[tuple[int, int]], pace: NDArray[np.float32], seen: NDArray[np.uint32]
-    ) -> NDArray[np.float32]:
-        """Motion around each pixel in each interval, listed pixels, [intervals, n].
-
-        A pixel that does not see an object now, but lies where it comes by within the interval, has the motion of
-        that object.
-        """
-        length = np.array([[chunk.end_us[high] - chunk.end_us[low]] for low, high in intervals], np.float32)
-        motion = pace * length
-        for number, group in enumerate(self._groups, start=1):
-            for row, interval in zip(motion, intervals, strict=True):
-                span = chunk.span_us(*interval)
-                far = self._timeline.object_motion_px(group.name, *span) / self._near.cell_px
-                if far > 0:
-                    there = self._near.inside(self._timeline.outlines_px(group.name, *span)) & (seen != number)
-                    row[there] = np.maximum(row[there], np.float32(far))
-        return motion
-
-    def _swept(
-        self, intervals: list[tuple[float, float]], windows: list[tuple[float, float]], parts: int
-    ) -> SweptBoxes | None:
-        """Boxes of every interval; an object that goes far in one of its `parts` may pass something unseen.
-
-        None where all are so slow that nothing would be ruled out that the interval twice as long has not.
-        """
-        if not self._groups:
-            return None
-        names = [group.name for group in self._groups]
-        own = np.array([[self._timeline.object_motion_px(n, *interval) for n in names] for interval in intervals])
-        if parts > 1 and np.all(own / parts < _SLOW * self._extent_px):
-            return None
-        swept = np.array([[group.swept_box(*interval) for group in self._groups] for interval in intervals])
-        present = np.array([[group.swept_box(*window) for group in self._groups] for window in windows])
-        return SweptBoxes(swept, present, own / parts > _PASSING * self._extent_px)
+        pairs = Pairs(self._pixel[place], self._begin_us[window], self._end_us[window], samples)
+        return self._adaptive.render(pairs, lambda flux, which: unit(flux, place[which]))
 
     # ---- a chunk ----------------------------------------------------------------------------------
 
-    def _settle(self, chunk: _Chunk) -> None:
-        """Fill a chunk; refine it further until the control sample is content."""
+    def _settle(self, chunk: _Chunk, sketch: Sketch) -> None:
+        """Render the last window and what changes before it, and more until the control sample is content."""
         rng = np.random.Generator(np.random.Philox(key=[self._seed % 2**64, chunk.first]))
+        moving = self._render_last(chunk, sketch)
         for repeat in range(_REPEATS + 1):
-            self._refine(chunk, everything=repeat == _REPEATS)
+            if repeat < _REPEATS:
+                self._sketcher.refine(sketch, self._tightness)
+                self._render_changes(chunk, sketch, moving)
+            else:
+                self._render_at(chunk, sketch, *np.nonzero(~chunk.rendered))
+            chunk.fill(0.5 * (sketch.begin_us + sketch.end_us))
             checked, exceeded = self._check(chunk, rng)
-            if repeat == _REPEATS or 2 * exceeded <= MOST_EXCEEDED * checked:
+            if 2 * exceeded <= MOST_EXCEEDED * checked:
                 break
-            self._tightness *= 2.0
+            self._tightness *= 2**0.5
         if repeat == 0:
-            self._tightness = max(1.0, self._tightness / 2**0.25)
+            self._tightness = max(1.0, self._tightness / 2**0.125)
         # a fresh sample, which has decided nothing
         self._audit.add(int(np.count_nonzero(~chunk.rendered)), *self._check(chunk, rng))
         self._audit.refined += repeat > 0
+
+    def _lasting(self, flux: NDArray[np.float32], scatter: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Rays of each pixel in a window that stands for many others: more, for they are traced once for all."""
+        return np.minimum(_LASTING * self._sketcher.samples(flux, scatter), MOST_SAMPLES)
+
+    def _render_last(self, chunk: _Chunk, sketch: Sketch) -> NDArray[np.int64]:
+        """The last window of a chunk, where the scene's motion can reach; those pixels.
+
+        All others stay as they were at its begin, to the bit.
+        """
+        last = sketch.last
+        moving = np.flatnonzero(self._sketcher.end(sketch))
+        self._samples[moving] = self._lasting(sketch.flux[last], sketch.scatter[last])[moving]
+        for half in (chunk.half_a, chunk.half_b):
+            half[last] = half[0]
+        result = self._render(np.full(moving.size, chunk.first + last), moving, self._samples[moving])
+        self._samples[moving] = result.samples
+        chunk.put(last, moving, result)
+        scatter, drawn = np.zeros((2, self._pixel.size))
+        noise = self._unit(result.mean.astype(np.float64), moving)
+        scatter[moving], drawn[moving] = result.scatter, sketch.scatter[last, moving] / noise
+        near = self._around.near
+        self._hidden = near.mean(scatter**2) > _HIDDEN**2 * near.mean(drawn**2)
+        return moving
+
+    def _render_changes(self, chunk: _Chunk, sketch: Sketch, place: NDArray[np.int64]) -> None:
+        """Render some pixels in the windows between which straight lines will not do.
+
+        Gaps between rendered windows are split, all pixels' at once, for one of three reasons: the sketch bends; it
+        makes steps, and motion is too far for the picture's own straightness to be believed, or it is not straight;
+        or the picture changes across the gap and the sketch, whose rays are few, does not.
+        """
+        tightness, last = self._tightness, sketch.last
+        if last < 2:
+            return
+        earlier_step, later_step = nearest(self._sketcher.steps(sketch, tightness))
+        pace = self._sketcher.motion(sketch, [sketch.span_us(0, last)])[0] / np.float32(last)
+        # where the sketch was not enough before, the picture itself says where it is not straight
+        hidden = self._hidden if tightness == 1 else np.ones_like(self._hidden)
+        gaps, bent = Gaps(place, np.zeros_like(place), np.full_like(place, last)), hidden[place]
+        while gaps.place.size:
+            place, low, high = gaps
+            first, second = chunk.mean(low, place), chunk.mean(high, place)
+            middle = (low + high) // 2
+            earlier, later = (steps[middle, place].astype(np.int64) for steps in (earlier_step, later_step))
+            step = np.where((later < high) & (later - middle <= middle - earlier), later, earlier)
+            moves = (step > low) & (step < high) & (bent | (pace[place] * (high - low) > _STEP_PX))
+            bends, bend = self._sketcher.bends(sketch, gaps, tightness)
+            blind = self._sketcher.misses(sketch, gaps, second - first, tightness) | (hidden[place] & bent)
+            kept = np.flatnonzero(moves | bends | blind)
+            gaps, middle = gaps.of(kept), np.where(moves, step, np.where(bends, bend, middle))[kept]
+            self._render_at(chunk, sketch, middle, gaps.place)
+            first, second = first[kept], second[kept]
+            straight = first + sketch.part(gaps.low, middle, gaps.high) * (second - first)
+            allowed = self._sketcher.allowed(np.minimum(first, second), gaps.place, tightness)
+            bent = np.tile(np.abs(chunk.mean(middle, gaps.place) - straight) > allowed, 2)
+            gaps = gaps.split(middle)
+            wide = gaps.high - gaps.low >= 2
+            gaps, bent = gaps.of(wide), bent[wide]
+
+    def _render_at(self, chunk: _Chunk, sketch: Sketch, window: NDArray[np.int64], place: NDArray[np.int64]) -> None:
+        """Pairs, each with the rays it needs at its own time; those that are there already are left."""
+        missing = ~chunk.rendered[window, place]
+        window, place = window[missing], place[missing]
+        if window.size:
+            samples = self._sketcher.samples_at(sketch, window, place)
+            chunk.put(window, place, self._render(chunk.first + window, place, samples))
 
     def _check(self, chunk: _Chunk, rng: np.random.Generator) -> tuple[int, int]:
         """Render a random sample of the filled-in pairs; how many, and how many are off by too much."""
@@ -268,64 +265,3 @@ class Refinement:
         noise = self._unit(truth.astype(np.float64), place)
         off = np.abs(truth - chunk.mean(window, place)) > self._audit.tolerance * noise
         return chosen.size, int(np.count_nonzero(off))
-
-    def _refine(self, chunk: _Chunk, everything: bool) -> None:
-        """Render the last window, then halve intervals as long as something happens in them."""
-        last, count = chunk.last, self._pixel.size
-        most = _REACH / self._tightness**0.5
-        pace, seen = self._pace(*chunk.span_us(0, last))
-        swept = self._swept([chunk.span_us(0, last)], [chunk.span_us(last, last)], 1)
-        result = self._render_all(chunk.first + last, swept)
-        chunk.rendered[1:] = False
-        chunk.put(last, slice(None), result)
-        met = self._met(result)[None]
-        # what nothing came near is exactly as before, whatever number of rays it was given now
-        still = (met[0] & MET_SWEPT) == 0
-        for half in (chunk.half_a, chunk.half_b):
-            half[1:, still] = half[0, still]
-        change = self._beyond(chunk, np.array([last]), chunk.mean(0)[None], ~still[None])
-        intervals = [(0, last)]
-        while True:
-            active = (met & MET_SWEPT) != 0
-            if not everything:
-                motion = self._motion(chunk, intervals, pace, seen)
-                active &= ((met & MET_PASSING) != 0) | (motion > most) | self._spread(change, motion)
-            wide = [k for k, (low, high) in enumerate(intervals) if high - low >= 2]
-            if not wide:
-                return
-            intervals, active, met = [intervals[k] for k in wide], active[wide], met[wide]
-            middles = np.array([(low + high) // 2 for low, high in intervals])
-            for (low, high), middle in zip(intervals, middles, strict=True):
-                chunk.fill(low, int(middle), high)
-            which, place = np.nonzero(active)
-            change = np.zeros_like(active)
-            if place.size:
-                straight = np.stack([chunk.mean(middle) for middle in middles])
-                spans = [chunk.span_us(*interval) for interval in intervals]
-                swept = self._swept(spans, [chunk.span_us(m, m) for m in middles], 2)
-                windows = chunk.first + middles[which]
-                result = self._render(windows, place, self._samples[place], which.astype(np.uint32), swept)
-                chunk.put(middles[which], place, result)
-                met = met & np.uint32(MET_SWEPT)
-                if swept is not None or not self._groups:
-                    met[which, place] = self._met(result)
-                change = self._beyond(chunk, middles, straight, active)
-            halves = [[(low, int(m)), (int(m), high)] for (low, high), m in zip(intervals, middles, strict=True)]
-            intervals = [interval for pair in halves for interval in pair]
-            met, change = np.repeat(met, 2, axis=0), np.repeat(change, 2, axis=0)
-            assert met.shape == (len(intervals), count)
-
-    def _met(self, result: PairResult) -> NDArray[np.uint32]:
-        """What was met; everything is, where the camera moves."""
-        return result.met if self._tracer.camera is None else result.met | np.uint32(MET_SWEPT)
-
-    def _beyond(
-        self, chunk: _Chunk, window: NDArray, expected: NDArray[np.float32], where: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Where rendered flux departs from what was expected by enough to look closer, [windows, n]."""
-        found = np.zeros_like(where)
-        which, place = np.nonzero(where)
-        seen, wanted = chunk.mean(window[which], place).astype(np.float64), expected[which, place]
-        least = _REFINE_AT / self._tightness * self._audit.tolerance * self._unit(np.minimum(seen, wanted), place)
-        found[which, place] = np.abs(seen - wanted) > least
-        return found

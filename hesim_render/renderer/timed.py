@@ -28,6 +28,8 @@ BLOCK_RAYS = (1 << 20, 1 << 17, 1 << 14)
 #: Rays of a pair; one kernel serves all their numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
+#: Width of the area in which a pilot's rays start, in pixels: it sees what comes before the pixel does.
+PILOT_FOOTPRINT = 1.25
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ class TimedTracer:
         self._keys = [
             dr.opaque(types.UInt64, stream_key(seed, stream)) for stream in (Stream.RENDER, Stream.RENDER_PILOT)
         ]
+        self._footprints = [dr.opaque(types.Float, width) for width in (1.0, PILOT_FOOTPRINT)]
         self._sampler = sampler_class(mi.variant())()
         self._wavelengths = WavelengthSampler(self.sensor.responses)
         self._filter = types.UInt32(layout.filter_index.ravel().astype(np.uint32))
@@ -136,11 +139,12 @@ class TimedTracer:
         pixel, begin_us, end_us : [n], mosaic index and time window.
         samples : [n], rays of each pair, a power of two from `LEAST_SAMPLES` to `MOST_SAMPLES`.
         swept : boxes whose meeting by any path is to be told, and `interval` [n], which set each pair has.
-        pilot : take other random numbers, so that what they show may decide about the pair.
+        pilot : take other random numbers and a somewhat larger area, so that what they show may decide about the
+            pair.
         """
         import drjit as dr
 
-        self._key = self._keys[1 if pilot else 0]
+        self._key, self._footprint = self._keys[pilot], self._footprints[pilot]
         mitsuba()  # the variant may have been changed by other code
         tracks = [group.trajectory for group in self.parts.groups] + ([self.camera] if self.camera else [])
         # wrapped on the host in double precision: float32 µs would lose their fractions within seconds
@@ -268,7 +272,7 @@ class TimedTracer:
         sampler = self._sampler
         index = self._first_index + row * self._full_cols + col
         sampler.setup(self._key, index, half, sample, per_half, MOST_SAMPLES // 2)
-        aperture, choice = sampler.next_2d(), sampler.next_2d()
+        aperture, choice = (sampler.next_2d() - 0.5) * self._footprint + 0.5, sampler.next_2d()
         blur = sampler.next_2d() if self._rays.has_psf else None
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
         instant = choice[1] * span
