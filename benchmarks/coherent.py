@@ -1,6 +1,7 @@
 """Seconds per simulated second of a moving scene, three ways at the same error, against the share that changes.
 
     python benchmarks/coherent.py [--scenes star,sweep,glass] [--activities 3,10,25,100] [--quality 0.5]
+    python benchmarks/coherent.py --area
 
 (a) `mi.render` with `specfilm`, once per tick; (b) the exact mode; (c) the coherent mode. 346×260 pixels, 800 Hz.
 
@@ -10,6 +11,8 @@ one pixel in eight, in two ticks that are filled in for the most part. (b) and (
 bring them to that error, by their own measured error, and one tick of each is timed at that number; what they
 reach is printed beside. Activity is the share of pixels whose flux changes by more than 1 % from one tick to the
 next, at 256 rays with the same random numbers.
+
+With `--area`: what (c) takes for eight chequered tiles that turn, and for the same eight of which four rest.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -132,6 +136,38 @@ def glass(speed: float) -> Scene:
             track("glass", [0.3, 0, 0.2], [-0.35, 0.25, 0.1]),
             track("metal", [-0.2, 0, 0.1], [0.4, 0.25, -0.2]),
             track("box", [0.3, 0, 0], [0.05, 0.15, 0.45]),
+        ],
+    }
+    return Scene(SceneSpec.model_validate(spec))
+
+
+def tiles(moving: int) -> Scene:
+    """Eight chequered tiles before a wall, the first of which turn."""
+    places = [(0.11 * (k % 4 - 1.5), 0.11 * (k // 4 - 0.5)) for k in range(8)]
+    tile = {
+        "shape": "rectangle",
+        "size_m": [0.07, 0.07, 0],
+        "reflectance": 0.7,
+        "pattern": 0.2,
+        "pattern_count": [5, 5],
+    }
+    spec = {
+        "schema_version": 1,
+        "name": "tiles",
+        "description": "eight tiles",
+        "objects": [
+            {"name": "wall", "shape": "rectangle", "size_m": [4, 4, 0], "position_m": [0, 0, -0.3], "reflectance": 0.4},
+            *({"name": f"tile{k}", "position_m": [x, y, 0], **tile} for k, (x, y) in enumerate(places)),
+        ],
+        "light": {"type": "directional", "direction": [0.3, 0, -1], "illuminance_lux": 2000},
+        "camera": {"origin_m": [0, 0, 1], "target_m": [0, 0, 0], "horizontal_fov_deg": 26},
+        "motion": [
+            {
+                "object": f"tile{k}",
+                "repeat": True,
+                "keyframes": [{"t_us": 0, "rotation_deg": 0}, {"t_us": 400_000, "rotation_deg": 360}],
+            }
+            for k in range(moving)
         ],
     }
     return Scene(SceneSpec.model_validate(spec))
@@ -260,9 +296,16 @@ def coherent(scene: Scene, sensor: hr.Sensor, quality: float, ticks: list[int]) 
     return kept, (time.perf_counter() - start) / CHUNK, source
 
 
-def needed(measure: object, reference: Reference, target: float, tick: int, first: int, power: float) -> int:
+def needed(
+    measure: Callable[[int], tuple[np.ndarray, float]],
+    reference: Reference,
+    target: float,
+    tick: int,
+    first: int,
+    power: float,
+) -> int:
     """Samples that bring a method to a squared error, from one measurement."""
-    image, _ = measure(first)  # type: ignore[operator]
+    image, _ = measure(first)
     return max(2, 2 * round(first * (reference.square_error(image, tick) / target) ** (1 / power) / 2))
 
 
@@ -294,12 +337,32 @@ def compare(name: str, wanted: int, quality: float) -> None:
     )
 
 
+def compare_area(quality: float) -> None:
+    """Seconds of (c) for all tiles moving and for half of them."""
+    seconds = []
+    for moving in (8, 4):
+        scene = tiles(moving)
+        sensor = place_camera(scene.spec, hr.load_sensor("reference-mono", SENSOR), None).sensor
+        share = activity(scene, sensor, [CHUNK + 11, CHUNK + 24])
+        _, per_tick, source = coherent(scene, sensor, quality, [])
+        seconds.append(per_tick * 1e6 / TICK_US)
+        rendered = 1 - source.audit.skipped / (sensor.rows * sensor.cols * 2 * CHUNK)
+        print(
+            f"{moving} tiles turn: {100 * share:.1f} % change, {seconds[-1]:.0f} s/s, rendered {100 * rendered:.1f} %"
+        )
+    print(f"half the area takes 1/{seconds[0] / seconds[1]:.2f} of the time")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--activities", default="3,10,25,100")
     parser.add_argument("--quality", type=float, default=0.5)
+    parser.add_argument("--area", action="store_true")
     options = parser.parse_args()
+    if options.area:
+        compare_area(options.quality)
+        return
     for name in options.scenes.split(","):
         for wanted in options.activities.split(","):
             compare(name, int(wanted), options.quality)
