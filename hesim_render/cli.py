@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
@@ -14,7 +13,7 @@ import typer
 from hesim_render import __version__
 from hesim_render.errors import HesimError, RangeError
 from hesim_render.output import check_target, discard_unfinished, output_errors
-from hesim_render.terminal import parse_exposures, parse_roi, progress_bar, split_overrides, summary
+from hesim_render.terminal import Interrupts, parse_exposures, parse_roi, progress_bar, split_overrides, summary
 
 if TYPE_CHECKING:
     from hesim_render.recording import Recording
@@ -366,32 +365,10 @@ def _simulate(
         return hr.simulate(loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress, **options)
 
 
-class _Interrupts:
-    """SIGINT and SIGTERM end a run alike; and are remembered, for a library may turn the exception into its own."""
-
-    def __init__(self) -> None:
-        self.happened = False
-        self._before: dict[int, Any] = {}
-
-    def _note(self, *_: Any) -> None:
-        self.happened = True
-        raise KeyboardInterrupt
-
-    def __enter__(self) -> _Interrupts:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point. Exit status 0; 2 with one line on stderr where the user can help it; 130 when interrupted."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    with _Interrupts() as interrupts:
+    with Interrupts() as interrupts:
         try:
             status = app(args=given or ["--help"], standalone_mode=False)
         except (KeyboardInterrupt, typer.Abort):

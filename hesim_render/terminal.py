@@ -1,8 +1,9 @@
-"""What commands read from and write to a terminal: texts into values, a progress bar, a summary."""
+"""What commands read from and write to a terminal: texts into values, a progress bar, a summary, interrupts."""
 
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -110,3 +111,25 @@ def _reached(render: dict[str, Any] | None) -> list[str]:
             f"{audit['tolerance_noise']:g} of the noise (99 % confidence){verdict}"
         )
     return lines
+
+
+class Interrupts:
+    """SIGINT and SIGTERM end a run alike; and are remembered, for a library may turn the exception into its own."""
+
+    def __init__(self) -> None:
+        self.happened = False
+        self._before: dict[int, Any] = {}
+
+    def _note(self, *_: Any) -> None:
+        self.happened = True
+        raise KeyboardInterrupt
+
+    def __enter__(self) -> Interrupts:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
