@@ -374,7 +374,7 @@ def test_render_noise_makes_less_than_one_event_in_a_hundred(name):
     """Noise-free sensor, default quality, against a render of a fifth of its error with other random numbers.
 
     An event of a change that just misses or just makes the threshold may move to another time or pixel; such swaps
-    are as many too many as too few, and were 1.5 % of the events of camera-sweep.
+    are as many too many as too few, and were 1.5 to 2.5 % of the events of camera-sweep.
     """
     scene, sensor = hr.load_scene(name), hr.load_sensor("gen2").crop(384, 288)
     found, wanted = (

@@ -16,7 +16,7 @@ _GAIN_STEP, _ENOUGH = 0.9, 200
 #: Times that a pair is rendered again with more rays, each time with as many as its scatter then asks for.
 _ROUNDS = 3
 #: A pair is rendered again where it needs so many times the rays that it got.
-_FAR_OFF = 4
+_FAR_OFF = 2
 #: Rays of a pixel that decide how many it gets.
 PILOT_SAMPLES = 16
 _LEAST_BIT, _MOST_BIT = LEAST_SAMPLES.bit_length() - 1, MOST_SAMPLES.bit_length() - 1
