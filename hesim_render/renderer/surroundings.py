@@ -66,7 +66,7 @@ class Surroundings:
     def motion(
         self, spans: list[tuple[float, float]], pace: NDArray[np.float32], seen: NDArray[np.uint32]
     ) -> NDArray[np.float32]:
-        """Motion around each pixel in each interval, listed pixels, [intervals, n].
+        """Motion around each pixel in each interval, listed pixels, [intervals, n]; the rest as `pace` gives it.
 
         A pixel that does not see an object now, but lies where it comes by within the interval, has the motion of
         that object.
