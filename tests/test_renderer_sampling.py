@@ -7,17 +7,23 @@ from scipy import stats
 
 from hesim_render.backend import jit
 from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.sampler import permute, sampler_class, zero_two_point
+from hesim_render.renderer.sampler import permute, sampler_class, third_coordinates, zero_two_point
 from hesim_render.renderer.wavelengths import WavelengthSampler
 from hesim_render.spectra import Spectrum
 
 
-def draws(pixels, per_half, dimensions, seed=11):
-    """Pairs [pixel, half, sample, dimension, 2]."""
+def started(pixels, per_half, seed=11):
+    """A sampler of all pixels, halves and samples, in this order."""
     mi = mitsuba()
     index = np.indices((pixels, 2, per_half)).reshape(3, -1).astype(np.uint32)
     sampler = sampler_class(mi.variant())()
     sampler.setup(mi.UInt64(seed), *(mi.UInt32(i) for i in index), per_half)
+    return sampler
+
+
+def draws(pixels, per_half, dimensions, seed=11):
+    """Pairs [pixel, half, sample, dimension, 2]."""
+    sampler = started(pixels, per_half, seed)
     pairs = [np.array(sampler.next_2d()).T for _ in range(dimensions)]
     return np.stack(pairs, axis=1).reshape(pixels, 2, per_half, dimensions, 2)
 
@@ -37,6 +43,55 @@ def test_points_fill_every_elementary_interval():
     for split in range(5):
         cells = np.floor(x * 2**split) * 2 ** (4 - split) + np.floor(y * 2 ** (4 - split))
         np.testing.assert_array_equal(np.sort(cells), np.arange(16))
+
+
+def test_points_are_those_of_sobol():
+    """SciPy's table of direction numbers is the oracle; it goes through the points in Gray-code order."""
+    types = jit()
+    count = 4096
+    place = np.arange(count) ^ (np.arange(count) >> 1)
+    expected = np.empty((count, 3))
+    expected[place] = stats.qmc.Sobol(3, scramble=False, bits=32).random(count)
+    pair = [np.array(v, dtype=np.float64) / 2**32 for v in zero_two_point(dr.arange(types.UInt32, count))]
+    np.testing.assert_array_equal(np.stack([*pair, third_coordinates(0, 12) / 2**32], axis=1), expected)
+    np.testing.assert_array_equal(third_coordinates(11, 1), third_coordinates(0, 12)[[0, 2048]])
+
+
+@pytest.mark.parametrize("per_half", [64, 4096])
+def test_place_and_instant_are_stratified_together(per_half):
+    pair, third = started(20, per_half).next_3d()
+    points = np.stack([*np.array(pair), np.array(third)], axis=1).reshape(20, 2, per_half, 3)
+    for axis in range(3):
+        cells = np.sort(np.floor(points[..., axis] * per_half), axis=2)
+        np.testing.assert_array_equal(cells, np.broadcast_to(np.arange(per_half), cells.shape))
+    # Sobol's first three coordinates are a net of t = 1 (Sobol 1967): any box of volume 2/n holds two points
+    bits = per_half.bit_length() - 2
+    for i in range(bits + 1):
+        for j in range(bits - i + 1):
+            split = 2.0 ** np.array([i, j, bits - i - j])
+            x, y, z = np.moveaxis(np.floor(points * split), -1, 0)
+            cell = np.sort((x * split[1] + y) * split[2] + z, axis=2)
+            np.testing.assert_array_equal(cell, np.broadcast_to(np.arange(per_half) // 2, cell.shape))
+
+
+def test_a_moving_edge_costs_fewer_rays_with_the_instant_among_the_coordinates():
+    """RMS error of the mean of a step in x + v t, against the same with the instant drawn apart.
+
+    A simulation in numpy with SciPy's points gave 0.38 and 0.60 of independent rays for 128 points and v = 1.
+    """
+    per_half, pixels = 128, 2000
+    sampler = started(pixels, per_half)
+    (x, y), t = sampler.next_3d()
+    apart = sampler.next_1d()
+    rng = np.random.default_rng(3)
+    angle, edge = rng.uniform(0, 2 * np.pi, (pixels, 1, 1)), rng.uniform(-1, 1, (pixels, 1, 1))
+    gains = []
+    for instant in (t, apart):
+        u, v, w = (np.array(a, dtype=float).reshape(pixels, 2, per_half) - 0.5 for a in (x, y, instant))
+        means = (u * np.cos(angle) + v * np.sin(angle) + w > edge).mean(axis=2)
+        share = means.mean(axis=1)
+        gains.append(np.sqrt(np.mean((means[:, 0] - means[:, 1]) ** 2) / 2 / np.mean(share * (1 - share) / per_half)))
+    assert gains[0] < 0.45 and gains[1] > 0.5
 
 
 def test_samples_of_a_half_are_stratified_and_uniform():

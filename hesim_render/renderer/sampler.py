@@ -1,12 +1,16 @@
 """Random numbers of a rendered sample: a pure function of (seed, pixel, half, sample, dimension).
 
-Every dimension pair of every pixel and half is a (0, 2)-sequence of its own: sample j of n takes
-point π(j) of the sequence, π a random permutation, and both coordinates are shifted digitally (XOR)
-by random bits. Permutation and shifts come from Philox4x32 with the counters (pixel on the full
-sensor, half, dimension). Each sample is uniform, so estimates are unbiased; the n samples of a half
-are stratified in every single dimension and in each pair, unlike pairs are independent, and so are
-the halves. (Owen scrambling in place of the shift was measured: 1.6 times the error at 16 samples,
-for the spectra are smooth.)
+Every draw of every pixel and half, of one to three dimensions, is a Sobol' sequence of its own: sample j
+of n takes point π(j) of the sequence, π a random permutation, and each coordinate is shifted digitally
+(XOR) by random bits. Permutation and shifts come from Philox4x32 with the counters (pixel on the full
+sensor, half, draw). Each sample is uniform, so estimates are unbiased; the n samples of a half are
+stratified in every single dimension and jointly in those of one draw, unlike draws are independent, and
+so are the halves. (Owen scrambling in place of the shift was measured: 1.6 times the error at 16
+samples, for the spectra are smooth.)
+
+Place in the pixel and instant are one draw: an edge that moves is a surface in those three dimensions,
+and where it passes over a pixel or two within the window, 128 rays of a half have 0.6 times the error
+that they have with the instant drawn apart (0.37 against 0.6 of that of independent rays).
 
 Padding of low-dimensional sequences: Kollig and Keller 2002, "Efficient multidimensional sampling";
 permutation: Kensler 2013, "Correlated multi-jittered sampling".
@@ -16,6 +20,12 @@ from __future__ import annotations
 
 import functools
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Bits of an index that one table of the third generator matrix covers.
+_TABLE_BITS = 11
 
 
 def permute(index: Any, mask: int, key: Any) -> Any:
@@ -56,6 +66,22 @@ def zero_two_point(index: Any) -> tuple[Any, Any]:
     return x, y
 
 
+def third_coordinates(first_bit: int, bits: int) -> NDArray[np.uint32]:
+    """Sobol's third coordinate of the indices 0 … 2^bits - 1, shifted left by `first_bit`, as binary fractions.
+
+    Direction numbers of the primitive polynomial x² + x + 1 with m = 1, 3: Joe and Kuo 2008, "Constructing Sobol
+    sequences with better two-dimensional projections".
+    """
+    m = [1, 3]
+    while len(m) < first_bit + bits:
+        m.append(2 * m[-1] ^ 4 * m[-2] ^ m[-2])
+    directions = [value << (31 - bit) for bit, value in enumerate(m)][first_bit:]
+    table = np.zeros(1, np.uint32)
+    for direction in directions[:bits]:
+        table = np.concatenate([table, table ^ np.uint32(direction)])
+    return table
+
+
 @functools.cache
 def sampler_class(variant: str) -> Any:
     """`CounterSampler` for one Mitsuba variant (its base class differs between variants)."""
@@ -65,11 +91,16 @@ def sampler_class(variant: str) -> Any:
     mi: Any = mitsuba
     assert mi.variant() == variant
 
+    def _unit(bits: Any) -> Any:
+        return mi.Float(bits >> 8) * 2.0**-24
+
     class CounterSampler(mi.Sampler):
         """See the module. Its state is plain Dr.Jit arrays: only those take part in symbolic loops."""
 
         def __init__(self, props: Any = None) -> None:
             super().__init__(props if props is not None else mi.Properties())
+            self._tables = [mi.UInt32(third_coordinates(first, _TABLE_BITS)) for first in (0, _TABLE_BITS)]
+            dr.make_opaque(*self._tables)
 
         def setup(self, key: Any, pixel: Any, half: Any, sample: Any, samples_per_half: Any, most: int = 0) -> None:
             """Start one wavefront.
@@ -86,18 +117,28 @@ def sampler_class(variant: str) -> Any:
             self._bits = max(0, ((most or samples_per_half) - 1).bit_length())
             self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
 
-        def _pair(self) -> tuple[Any, Any]:
+        def _draw(self) -> tuple[Any, Any]:
+            """Index of the point to take, and the random bits that shift its coordinates."""
             self.dimension = self.dimension + 1
             bits = mi.Philox4x32(self.key, self.pixel, self.half, self.dimension).next_uint32x4()
-            point = permute(self.sample, self._mask, bits[0]) if self._bits else self.sample
-            x, y = zero_two_point(point)
-            return mi.Float((x ^ bits[1]) >> 8) * 2.0**-24, mi.Float((y ^ bits[2]) >> 8) * 2.0**-24
+            return (permute(self.sample, self._mask, bits[0]) if self._bits else self.sample), bits
 
         def next_1d(self, active: Any = True) -> Any:
-            return self._pair()[0]
+            return self.next_2d()[0]
 
         def next_2d(self, active: Any = True) -> Any:
-            return mi.Point2f(*self._pair())
+            point, bits = self._draw()
+            x, y = zero_two_point(point)
+            return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2]))
+
+        def next_3d(self) -> tuple[Any, Any]:
+            """A pair, and a third number stratified with it; for up to 2^22 samples in a half."""
+            point, bits = self._draw()
+            x, y = zero_two_point(point)
+            z = dr.gather(mi.UInt32, self._tables[0], point & ((1 << _TABLE_BITS) - 1))
+            if self._bits > _TABLE_BITS:
+                z ^= dr.gather(mi.UInt32, self._tables[1], point >> _TABLE_BITS)
+            return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2])), _unit(z ^ bits[3])
 
         def fork(self) -> CounterSampler:
             return self

@@ -272,10 +272,11 @@ class TimedTracer:
         sampler = self._sampler
         index = self._first_index + row * self._full_cols + col
         sampler.setup(self._key, index, half, sample, per_half, MOST_SAMPLES // 2)
-        aperture, choice = (sampler.next_2d() - 0.5) * self._footprint + 0.5, sampler.next_2d()
+        (aperture, moment), choice = sampler.next_3d(), sampler.next_1d()
+        aperture = (aperture - 0.5) * self._footprint + 0.5
         blur = sampler.next_2d() if self._rays.has_psf else None
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
-        instant = choice[1] * span
+        instant = moment * span
         groups = self.parts.groups
         poses = [group.trajectory.pose_at(t + instant) for group, t in zip(groups, rest, strict=False)]
         if self.camera is not None:
@@ -283,7 +284,7 @@ class TimedTracer:
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
         boxes = _boxes_of(mi, tables, rest[-1], len(groups)) if tables is not None else None
         which = dr.gather(types.UInt32, self._filter, pixel)
-        bands = mi.UnpolarizedSpectrum(*self._wavelengths.sample(which, choice[0]))
+        bands = mi.UnpolarizedSpectrum(*self._wavelengths.sample(which, choice))
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
         radiance, met = self._integrator.sample(sampler, primary, poses, boxes, active)
         scale = self._wavelengths.total(which) * dr.gather(types.Float, self._illumination, pixel)

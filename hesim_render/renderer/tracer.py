@@ -198,14 +198,14 @@ class PixelTracer:
         col = pixel - row * self._cols
         sampler = self._sampler
         sampler.setup(self._key, self._first_index + row * self._full_cols + col, half, sample, self.samples // 2)
-        aperture, choice = sampler.next_2d(), sampler.next_2d()
+        (aperture, moment), choice = sampler.next_3d(), sampler.next_1d()
         blur = sampler.next_2d() if self._rays.has_psf else None
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
         if spread is not None:
             assert self.camera is not None
-            pose = self.camera.pose_at(spread[0] + choice[1] * spread[1])
+            pose = self.camera.pose_at(spread[0] + moment * spread[1])
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
-        bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice[0]))
+        bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice))
         primary = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
         radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary, active=active)
         return values(pixel, radiance)
