@@ -90,7 +90,11 @@ class MovingScene:
             if emitter.get_shape() is None:
                 resting[f"emitter_{number}"] = emitter
         self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
-        self.has_static_shapes = any(key.startswith("shape") for key in resting)
+        lights = self.static.emitters()
+        #: Light that a ray meets: from everywhere beyond the scene, and corners of boxes around all other [n, 2, 3], m.
+        self.has_sky = any(light.is_environment() for light in lights)
+        boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
+        self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
         self.groups = [
             Group(
                 name,
@@ -112,15 +116,7 @@ class MovingScene:
         import drjit as dr
 
         mi = self.mi
-        nearest, chosen, ray_there = self.static.ray_intersect_preliminary(ray, coherent, active), mi.UInt32(0), ray
-        for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
-            local = mi.Ray3f(ray)
-            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            hit = group.scene.ray_intersect_preliminary(local, coherent, active)
-            closer = hit.t < nearest.t
-            nearest = dr.select(closer, hit, nearest)
-            chosen = dr.select(closer, mi.UInt32(number), chosen)
-            ray_there = dr.select(closer, local, ray_there)
+        nearest, chosen, ray_there = self._nearest(ray, poses, coherent, active)
         si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active)
         for number, pose in enumerate(poses, start=1):
             here = chosen == number
@@ -134,6 +130,26 @@ class MovingScene:
                 own = getattr(si, vector)
                 setattr(si, vector, dr.select(here, mi.Vector3f(pose.turn_to_world(own)), own))
         return si
+
+    def distance(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
+        """To the nearest surface of all parts, m; infinite where there is none."""
+        return self._nearest(ray, poses, False, active)[0].t
+
+    def _nearest(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Preliminary intersection, number of its part (0 rests), and the ray in that part's frame."""
+        import drjit as dr
+
+        mi = self.mi
+        nearest, chosen, ray_there = self.static.ray_intersect_preliminary(ray, coherent, active), mi.UInt32(0), ray
+        for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
+            local = mi.Ray3f(ray)
+            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+            hit = group.scene.ray_intersect_preliminary(local, coherent, active)
+            closer = hit.t < nearest.t
+            nearest = dr.select(closer, hit, nearest)
+            chosen = dr.select(closer, mi.UInt32(number), chosen)
+            ray_there = dr.select(closer, local, ray_there)
+        return nearest, chosen, ray_there
 
     def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any, Any]:
         """Where the point that a ray meets at one time was at another, in world space; whether it meets any; whose."""

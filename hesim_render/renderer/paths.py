@@ -10,12 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.trajectory import DevicePose
 
 _ROULETTE_DEPTH = 5
 _ROULETTE_MOST = 0.95
-
+#: Lights that have boxes of their own to tell whether a ray may meet them; more share one.
+_MOST_LAMPS = 8
 
 #: Bits of what a path has come near.
 MET_SWEPT = 1  # the box that a moving group sweeps
@@ -69,7 +72,17 @@ class PathIntegrator:
     """
 
     def __init__(self, scene: MovingScene, max_depth: int, hide_emitters: bool = False) -> None:
+        import drjit as dr
+
         self._scene, self._max_depth, self._hide = scene, max_depth if max_depth >= 0 else 1 << 30, hide_emitters
+        lamps = scene.lamp_boxes
+        if len(lamps) > _MOST_LAMPS:
+            lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
+        # rounding must not take a light's rim
+        margin = 1e-4 * np.linalg.norm(lamps[:, 1] - lamps[:, 0], axis=-1)[:, None, None]
+        lamps = lamps + margin * np.array([[[-1], [1]]])
+        self._lamps = [tuple(scene.mi.Vector3f(corner) for corner in box) for box in lamps]
+        dr.make_opaque(self._lamps)
 
     def sample(
         self, sampler: Any, ray: Any, poses: Sequence[DevicePose], boxes: Boxes | None, active: Any
@@ -100,23 +113,26 @@ class PathIntegrator:
         ray, active = mi.Ray3f(ray), mi.Bool(active)
         most = dr.opaque(mi.UInt32, self._max_depth)
 
-        def step(*state: Any) -> tuple[Any, ...]:
-            sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active = state
-            si = scene.intersect(ray, poses, depth == 0, active)
-            if boxes is not None:
-                met |= boxes.met(ray, si.t, active)
-
-            # what the ray runs into gives light itself
+        def shine(si: Any, active: Any, depth: Any, before: Any, pdf: Any, delta: Any) -> Any:
+            """Light that what a ray runs into gives itself."""
             light = si.emitter(scene.static, active)
             shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
             if self._hide:
                 shines &= ~((depth == 0) & ~si.is_valid())
             seen = mi.DirectionSample3f(scene.static, si, before)
-            light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~before_delta)
-            share = dr.select(before_delta, 1.0, _power(before_pdf, light_pdf))
-            radiance = dr.fma(throughput, dr.select(shines, light.eval(si, shines) * share, 0.0), radiance)
+            light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~delta)
+            share = dr.select(delta, 1.0, _power(pdf, light_pdf))
+            return dr.select(shines, light.eval(si, shines) * share, 0.0)
 
-            goes_on = active & si.is_valid() & (depth + 1 < most)
+        def step(*state: Any) -> tuple[Any, ...]:
+            """One vertex from which the path may go on; its last segment is left for after the loop."""
+            sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, _ = state
+            si = scene.intersect(ray, poses, depth == 0, active)
+            if boxes is not None:
+                met |= boxes.met(ray, si.t, active)
+            radiance = dr.fma(throughput, shine(si, active, depth, before, before_pdf, before_delta), radiance)
+
+            goes_on = active & si.is_valid()
             bsdf = si.bsdf()
 
             # light sampled from here
@@ -159,12 +175,43 @@ class PathIntegrator:
                 luck = sampler.next_1d()
                 throughput = dr.select(at_risk, throughput * dr.rcp(survival), throughput)
                 goes_on &= ~at_risk | (luck < survival)
-            active = goes_on
-            return sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active
+            active = goes_on & (depth + 1 < most)
+            left = goes_on & ~active
+            state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray
+            return *state, active, left
 
-        state = (sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active)
-        end = dr.while_loop(state, lambda *values: values[-1], step, label="paths")
-        return end[4], end[2]
+        left = active & (most <= 1)
+        active &= most > 1
+        state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, left
+        if self._max_depth == 2:
+            end = step(*state)  # the loop itself costs time
+        else:
+            end = dr.while_loop(state, lambda *values: values[-2], step, label="paths")
+        _, depth, met, throughput, radiance, _, *before, ray, _, left = end
+
+        # the last segment matters only where it runs into light
+        if not (scene.has_sky or self._lamps):
+            return radiance, met
+        if not scene.has_sky:
+            left &= self._near_lamps(ray)
+        if self._lamps:
+            si = scene.intersect(ray, poses, depth == 0, left)
+        else:
+            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+            si.t, si.wi, si.wavelengths = scene.distance(ray, poses, left), -ray.d, ray.wavelengths
+        if boxes is not None:
+            met |= boxes.met(ray, si.t, left)
+        # the throughput of a path that has ended may be anything
+        return dr.select(left, dr.fma(throughput, shine(si, left, depth, *before), radiance), radiance), met
+
+    def _near_lamps(self, ray: Any) -> Any:
+        """Whether a ray runs into the box around a light."""
+        import drjit as dr
+
+        inverse, near = dr.rcp(ray.d), self._scene.mi.Bool(False)
+        for box in self._lamps:
+            near |= _meets(ray, inverse, dr.inf, box)
+        return near
 
 
 def _power(a: Any, b: Any) -> Any:
