@@ -34,6 +34,9 @@ from hesim_render.renderer.timed import PairFlux, SweptBoxes
 _CHANGE = 0.7
 #: Error of a sketch that moves, over the scatter of its rays: an edge is where they say to within about a fifth.
 _DOUBT = 0.1
+#: Pixels that need fewer than so many rays get more than they need, n^0.6 in proportion: with an error that falls by
+#: n^-0.75 that is the least time for the same error over all pixels.
+_MANY, _CHEAP = 128, 0.6
 #: Gaps whose flux in all windows is held at a time.
 _GAPS_AT_ONCE = 1 << 16
 
@@ -287,7 +290,9 @@ class Sketcher:
     def samples(self, flux: NDArray[np.float32], scatter: NDArray[np.float32]) -> NDArray[np.int64]:
         """How many rays each pixel needs in a sketched window, its neighbours' scatter counted in, [n]."""
         noise = self._unit(flux.astype(np.float64), self._everywhere)
-        return self._adaptive.needed_near(scatter / noise, self._around.near)
+        needed = self._adaptive.needed_near(scatter / noise, self._around.near)
+        generous = np.rint(_CHEAP * np.log2(needed) + (1 - _CHEAP) * np.log2(_MANY)).astype(np.int64)
+        return np.maximum(needed, np.int64(1) << generous)
 
     def samples_at(self, sketch: Sketch, window: NDArray[np.integer], place: NDArray[np.integer]) -> NDArray[np.int64]:
         """The same for some pixels of some windows."""
