@@ -7,10 +7,12 @@
 
 (c) runs at the wanted quality over two chunks of ticks, the second of which is timed. Its error is the rms over
 pixels, in units of each one's own event noise (3 % of the signal), against a reference of 8192 rays a pixel, on
-one pixel in eight, in two ticks that are filled in for the most part. (b) and (a) then get as many samples as
-bring them to that error, by their own measured error, and one tick of each is timed at that number; what they
-reach is printed beside. Activity is the share of pixels whose flux changes by more than 1 % from one tick to the
-next, at 256 rays with the same random numbers.
+one pixel in eight, in two ticks that are filled in for the most part. (a) and (b) then get as many samples as
+bring their noise to that error, and one tick of each is timed at that number. Their noise is measured from two
+independent pictures, so the floor that their error has besides (nothing moves within a picture of (a), nor do
+objects within a slice of (b)) is not held against them; the error that they reach is printed beside. Activity is
+the share of pixels whose flux changes by more than 1 % from one tick to the next, at 256 rays with the same random
+numbers.
 
 With `--area`: what (c) takes for eight chequered tiles that turn, and for the same eight of which four rest.
 """
@@ -20,7 +22,6 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from collections.abc import Callable
 
 import numpy as np
 
@@ -204,6 +205,10 @@ class Reference:
         electrons = self.flux[tick] * WINDOW_US * 1e-6
         return self._noise.noise_equivalent_e(electrons, self.pixel) / (WINDOW_US * 1e-6)
 
+    def square_noise(self, one: np.ndarray, other: np.ndarray, tick: int) -> float:
+        """Mean variance of pictures of which these are two, in the same units."""
+        return float(np.mean(((one - other)[self.pixel] / self._scale(tick)) ** 2)) / 2
+
     def square_error(self, flux: np.ndarray, tick: int) -> float:
         """Mean squared error of a whole picture in units of the event noise, the reference's own taken off."""
         off = (flux[self.pixel] - self.flux[tick]) / self._scale(tick)
@@ -211,26 +216,25 @@ class Reference:
 
 
 def exact_tick(scene: Scene, sensor: hr.Sensor, samples: int, tick: int) -> tuple[np.ndarray, float]:
-    """(b): the picture of one tick and its time; slices are rendered one after another as a run does it."""
+    """(b): both halves of the picture of one tick, and its time; slices are rendered one by one as a run does it."""
     flux = RenderedFlux(scene, sensor, samples=samples, seed=5)
     pixels = np.arange(sensor.rows * sensor.cols, dtype=np.uint32)
 
     def picture(number: int) -> np.ndarray:
         begin, end = window(number)
         bounds = np.concatenate([[begin], flux.slice_edges_us(begin, end), [end]])
-        total = np.zeros(pixels.size)
+        total = np.zeros((2, pixels.size))
         for a, b in zip(bounds[:-1], bounds[1:], strict=True):
-            half_a, half_b = flux.mean_flux(pixels, a, b)
-            total += 0.5 * (np.array(half_a, dtype=np.float64) + np.array(half_b)) * (b - a) / (end - begin)
+            total += np.array(flux.mean_flux(pixels, a, b), dtype=np.float64) * (b - a) / (end - begin)
         return total
 
     picture(tick - 1)  # compiles
     start = time.perf_counter()
-    image = picture(tick)
-    return image, time.perf_counter() - start
+    halves = picture(tick)
+    return halves, time.perf_counter() - start
 
 
-def specfilm_tick(scene: Scene, sensor: hr.Sensor, spp: int, tick: int) -> tuple[np.ndarray, float]:
+def specfilm_tick(scene: Scene, sensor: hr.Sensor, spp: int, tick: int, seed: int = 0) -> tuple[np.ndarray, float]:
     """(a): mi.render at the middle of one tick, in passes of 256 samples where there are more."""
     mi = mitsuba()
     responses = used_responses(sensor)
@@ -254,7 +258,11 @@ def specfilm_tick(scene: Scene, sensor: hr.Sensor, spp: int, tick: int) -> tuple
         images = [
             np.array(
                 mi.render(
-                    built.scene, sensor=camera, integrator=built.integrator, spp=-(-spp // passes), seed=97 * number + k
+                    built.scene,
+                    sensor=camera,
+                    integrator=built.integrator,
+                    spp=-(-spp // passes),
+                    seed=97 * number + k + seed,
                 )
             )[:, :, 0]
             for k in range(passes)
@@ -296,17 +304,9 @@ def coherent(scene: Scene, sensor: hr.Sensor, quality: float, ticks: list[int]) 
     return kept, (time.perf_counter() - start) / CHUNK, source
 
 
-def needed(
-    measure: Callable[[int], tuple[np.ndarray, float]],
-    reference: Reference,
-    target: float,
-    tick: int,
-    first: int,
-    power: float,
-) -> int:
-    """Samples that bring a method to a squared error, from one measurement."""
-    image, _ = measure(first)
-    return max(2, 2 * round(first * (reference.square_error(image, tick) / target) ** (1 / power) / 2))
+def needed(first: int, square_noise: float, target: float, power: float) -> int:
+    """Samples that bring squared noise to a target, from that of `first`; even."""
+    return max(2, 2 * round(first * (square_noise / target) ** (1 / power) / 2))
 
 
 def compare(name: str, wanted: int, quality: float) -> None:
@@ -318,10 +318,13 @@ def compare(name: str, wanted: int, quality: float) -> None:
     pictures, seconds_c, source = coherent(scene, sensor, quality, ticks)
     target = float(np.mean([reference.square_error(pictures[tick], tick) for tick in ticks]))
     tick = ticks[0]
-    spp_b = needed(lambda n: exact_tick(scene, sensor, n, tick), reference, target, tick, 16, 1.2)
-    image, seconds_b = exact_tick(scene, sensor, spp_b, tick)
-    error_b = reference.square_error(image, tick) ** 0.5
-    spp_a = needed(lambda n: specfilm_tick(scene, sensor, n, tick), reference, target, tick, 64, 1.0)
+    halves, _ = exact_tick(scene, sensor, 16, tick)
+    # stratified: squared noise was seen to fall by n^-1.2 or faster
+    spp_b = needed(16, reference.square_noise(*halves, tick) / 2, target, 1.2)
+    halves, seconds_b = exact_tick(scene, sensor, spp_b, tick)
+    error_b = reference.square_error(halves.mean(axis=0), tick) ** 0.5
+    images = [specfilm_tick(scene, sensor, 64, tick, seed)[0] for seed in (0, 10_000)]
+    spp_a = needed(64, reference.square_noise(*images, tick), target, 1.0)
     image, seconds_a = specfilm_tick(scene, sensor, spp_a, tick)
     error_a = reference.square_error(image, tick) ** 0.5
     per_second = 1e6 / TICK_US
