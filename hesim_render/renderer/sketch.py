@@ -37,6 +37,11 @@ _DOUBT = 0.1
 #: Pixels that need fewer than so many rays get more than they need, n^0.6 in proportion: with an error that falls by
 #: n^-0.75 that is the least time for the same error over all pixels.
 _MANY, _CHEAP = 128, 0.6
+#: Rays for each noise unit by which the brightest of the next pixels is above a pixel: what they may miss of it is
+#: worth four units at most. So many rays at most for that.
+_SLIVER, _MOST_FOR_SLIVERS = 0.25, 512
+#: Change of one of the next pixels, in tolerances of a pixel's own, of which this one may have a part unseen.
+_BESIDE = 128
 #: Gaps whose flux in all windows is held at a time.
 _GAPS_AT_ONCE = 1 << 16
 
@@ -249,7 +254,9 @@ class Sketcher:
             before, flux = sketch.flux[window - 1], sketch.flux[window]
             tolerance = self.allowed(np.minimum(before, flux), self._everywhere, tightness)
             least = np.maximum(tolerance - _DOUBT * sketch.scatter[window], 0.1 * tolerance)
-            found[window - 1 : window + 1] |= np.abs(flux - before) > least
+            change = np.abs(flux - before)
+            beside = self._around.near.most(change, 1) > _BESIDE * tolerance
+            found[window - 1 : window + 1] |= (change > least) | beside
         return found
 
     def bends(self, sketch: Sketch, gaps: Gaps, tightness: float) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -287,18 +294,30 @@ class Sketcher:
         """Change that counts, e⁻/s."""
         return _CHANGE / tightness * self._tolerance * self._unit(flux.astype(np.float64), place)
 
-    def samples(self, flux: NDArray[np.float32], scatter: NDArray[np.float32]) -> NDArray[np.int64]:
-        """How many rays each pixel needs in a sketched window, its neighbours' scatter counted in, [n]."""
+    def samples(
+        self, flux: NDArray[np.float32], scatter: NDArray[np.float32], brightest: NDArray[np.float32] | None = None
+    ) -> NDArray[np.int64]:
+        """How many rays each pixel needs in a sketched window, its neighbours' scatter counted in, [n].
+
+        Parameters
+        ----------
+        brightest : flux in this window and those before and after it, e⁻/s.
+        """
         noise = self._unit(flux.astype(np.float64), self._everywhere)
         needed = self._adaptive.needed_near(scatter / noise, self._around.near)
         generous = np.rint(_CHEAP * np.log2(needed) + (1 - _CHEAP) * np.log2(_MANY)).astype(np.int64)
-        return np.maximum(needed, np.int64(1) << generous)
+        # a sliver of something bright next to the pixel or to the window, too thin for the pilot to see
+        beside = self._around.near.most(flux if brightest is None else brightest, 1) - flux
+        unseen = np.ceil(np.log2(np.clip(_SLIVER * beside / noise, 1, _MOST_FOR_SLIVERS))).astype(np.int64)
+        return np.maximum(needed, np.int64(1) << np.maximum(generous, unseen))
 
     def samples_at(self, sketch: Sketch, window: NDArray[np.integer], place: NDArray[np.integer]) -> NDArray[np.int64]:
         """The same for some pixels of some windows."""
         numbers = np.unique(window)
         for number in numbers:
             if number not in sketch.samples:
-                sketch.samples[number] = self.samples(sketch.flux[number], sketch.scatter[number]).astype(np.int16)
+                brightest = sketch.flux[max(0, number - 1) : number + 2].max(axis=0)
+                samples = self.samples(sketch.flux[number], sketch.scatter[number], brightest)
+                sketch.samples[number] = samples.astype(np.int16)
         table = np.stack([sketch.samples[number] for number in numbers])
         return table[np.searchsorted(numbers, window), place].astype(np.int64)
