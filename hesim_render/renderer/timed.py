@@ -11,20 +11,15 @@ from numpy.typing import NDArray
 
 from hesim_render.backend import jit
 from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.builder import build
-from hesim_render.renderer.camera import RayFactory, place_camera
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paths import Boxes, PathIntegrator
-from hesim_render.renderer.sampler import sampler_class
-from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer
 from hesim_render.renderer.wavelengths import WavelengthSampler
 from hesim_render.rng import Stream, stream_key
 from hesim_render.scene import Scene
 from hesim_render.sensor import Sensor
 from hesim_render.spectra import Spectrum
 
-#: Work goes in blocks of these many rays: each new length compiles a kernel, and memory stays bounded.
-BLOCK_RAYS = (1 << 20, 1 << 17, 1 << 14)
 #: Rays of a pair; one kernel serves all their numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
@@ -64,7 +59,7 @@ class SweptBoxes:
     told: NDArray[np.bool_]
 
 
-class TimedTracer:
+class TimedTracer(Tracer):
     """Paths from mosaic pixels into a `MovingScene`.
 
     Random numbers are a pure function of (seed, pixel on the full sensor, half, sample), the same in
@@ -72,11 +67,8 @@ class TimedTracer:
 
     Parameters
     ----------
-    scene, sensor : what and through what.
+    scene, sensor, responses, progress, block_rays : see `Tracer`.
     seed : of the run.
-    responses : spectra that the scene must cover.
-    progress : called with the number of rays traced so far, after each block.
-    block_rays : sizes of the work blocks, largest first.
 
     Raises
     ------
@@ -95,32 +87,18 @@ class TimedTracer:
     ) -> None:
         import drjit as dr
 
-        mi, types = mitsuba(), jit()
-        self.progress, self._block_rays = progress, block_rays
-        self.rays_done = 0
-        self.built = build(mi, scene.spec, responses)
-        self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
-        tracks = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
-        self.camera = next((trajectory for trajectory in tracks if trajectory.moves), None)
+        super().__init__(scene, sensor, responses, progress, block_rays)
+        types = jit()
         self.parts = MovingScene(self.built)
-        depth = _max_depth(self.built.integrator)
-        self._integrator = PathIntegrator(self.parts, depth)
-        self._rays = RayFactory(self.view)
-        self.sensor = self.view.sensor
-        layout = self.sensor.layout
-        self._cols = dr.opaque(types.UInt32, layout.cols)
-        self._first_index = dr.opaque(types.UInt32, int(layout.full_index[0, 0]))
-        self._full_cols = dr.opaque(types.UInt32, layout.spec.geometry.cols)
+        self._integrator = PathIntegrator(self.parts, _max_depth(self.built.integrator))
         self._keys = [
             dr.opaque(types.UInt64, stream_key(seed, stream)) for stream in (Stream.RENDER, Stream.RENDER_PILOT)
         ]
         self._footprints = [dr.opaque(types.Float, width) for width in (1.0, PILOT_FOOTPRINT)]
-        self._sampler = sampler_class(mi.variant())()
         self._wavelengths = WavelengthSampler(self.sensor.responses)
-        self._filter = types.UInt32(layout.filter_index.ravel().astype(np.uint32))
-        mitsuba_scene = scene.spec.mitsuba
-        scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
-        self._illumination = types.Float(self.sensor.relative_illumination.ravel() * np.float32(scale))
+        self._filter = types.UInt32(self.sensor.layout.filter_index.ravel().astype(np.uint32))
+        illumination = self.sensor.relative_illumination.ravel() * np.float32(self.radiance_scale)
+        self._illumination = types.Float(illumination)
 
     def trace(
         self,
@@ -167,14 +145,11 @@ class TimedTracer:
         while first < pixel.size:
             done = int(ends[first - 1]) if first else 0
             rays = (int(ends[-1]) - done) * _PACKET
-            # the largest block that is filled at least by half, else the smallest
-            size = next((s for s in self._block_rays if 2 * rays > s), self._block_rays[-1])
+            size = self._block_size(rays)
             last = int(np.searchsorted(ends, done + size // _PACKET, side="right"))
             part = slice(first, last)
             self._block([table[part] for table in lanes], packets[part], size, tables, out, part)
-            self.rays_done += (int(ends[last - 1]) - done) * _PACKET
-            if self.progress is not None:
-                self.progress(self.rays_done)
+            self._report((int(ends[last - 1]) - done) * _PACKET)
             first = last
         return out
 
@@ -199,8 +174,8 @@ class TimedTracer:
         for first in range(0, pixel.size, room):
             part = pixel[first : first + room]
             listed = types.UInt32(np.pad(part, (0, room - part.size), mode="edge"))
-            row = listed // self._cols
-            col = types.Float(listed - row * self._cols)
+            row, column = self._row_and_col(listed)
+            col = types.Float(column)
             middle = types.Float(0.5), types.Float(0.5)
             origin, direction = self._rays.rays(types.Float(row), col, middle, None)
             then, now = ([track.pose_at(t) for track, t in zip(tracks, times, strict=True)] for times in local)
@@ -267,11 +242,9 @@ class TimedTracer:
         import drjit as dr
 
         mi, types = self.built.mi, jit()
-        row = pixel // self._cols
-        col = pixel - row * self._cols
+        row, col = self._row_and_col(pixel)
         sampler = self._sampler
-        index = self._first_index + row * self._full_cols + col
-        sampler.setup(self._key, index, half, sample, per_half, MOST_SAMPLES // 2)
+        sampler.setup(self._key, self._index(row, col), half, sample, per_half, MOST_SAMPLES // 2)
         (aperture, moment), choice = sampler.next_3d(), sampler.next_1d()
         aperture = (aperture - 0.5) * self._footprint + 0.5
         blur = sampler.next_2d() if self._rays.has_psf else None

@@ -29,17 +29,82 @@ Wavelengths = Callable[[Any, Any], list[Any]]
 Values = Callable[[Any, Any], list[Any]]
 
 
-class PixelTracer:
-    """A scene, a placed camera and their random numbers; averages over each pixel's rays.
+class Tracer:
+    """A scene, a placed camera and the pixels of its sensor; what the tracers of both modes have in common.
 
     Parameters
     ----------
     scene, sensor : what and through what.
-    samples : rays per pixel, even; a half of them for each of two independent estimates.
-    seed : of the run.
     responses : spectra that the scene must cover.
     progress : called with the number of rays traced so far, after each block.
     block_rays : sizes of the work blocks, largest first.
+
+    Attributes
+    ----------
+    built, view : the scene in Mitsuba, the placed camera.
+    sensor : with the lens in use.
+    camera : its trajectory, or None where it rests.
+    radiance_scale : factor from the scene's own radiance to W m⁻² sr⁻¹ nm⁻¹.
+    rays_done : so far.
+
+    Raises
+    ------
+    SpecError
+        If the scene cannot be loaded or does not cover a response.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        responses: Mapping[str, Spectrum],
+        progress: Callable[[int], None] | None,
+        block_rays: tuple[int, ...],
+    ) -> None:
+        import drjit as dr
+
+        mi, types = mitsuba(), jit()
+        self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
+        self.built = build(mi, scene.spec, responses)
+        self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
+        self.sensor = self.view.sensor
+        tracks = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
+        self.camera = next((trajectory for trajectory in tracks if trajectory.moves), None)
+        mitsuba_scene = scene.spec.mitsuba
+        self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
+        self._rays = RayFactory(self.view)
+        self._sampler = sampler_class(mi.variant())()
+        layout = self.sensor.layout
+        self._cols = dr.opaque(types.UInt32, layout.cols)
+        self._first_index = dr.opaque(types.UInt32, int(layout.full_index[0, 0]))
+        self._full_cols = dr.opaque(types.UInt32, layout.spec.geometry.cols)
+
+    def _row_and_col(self, pixel: Any) -> tuple[Any, Any]:
+        row = pixel // self._cols
+        return row, pixel - row * self._cols
+
+    def _index(self, row: Any, col: Any) -> Any:
+        """Number of a pixel on the full sensor, whatever the region: what its random numbers follow."""
+        return self._first_index + row * self._full_cols + col
+
+    def _block_size(self, rays: int) -> int:
+        """The largest block that is filled at least by half, else the smallest."""
+        return next((size for size in self._block_rays if 2 * rays > size), self._block_rays[-1])
+
+    def _report(self, rays: int) -> None:
+        self.rays_done += rays
+        if self.progress is not None:
+            self.progress(self.rays_done)
+
+
+class PixelTracer(Tracer):
+    """Averages over each pixel's rays, every pixel with as many, objects at rest.
+
+    Parameters
+    ----------
+    scene, sensor, responses, progress, block_rays : see `Tracer`.
+    samples : rays per pixel, even; a half of them for each of two independent estimates.
+    seed : of the run.
 
     Raises
     ------
@@ -65,25 +130,10 @@ class PixelTracer:
             raise RangeError("samples", samples, "an even number of rays per pixel, 2 or more")
         if samples > block_rays[0]:
             raise RangeError("samples", samples, f"at most {block_rays[0]} rays per pixel")
-        mi, types = mitsuba(), jit()
-        self.samples, self.progress = samples, progress
-        self._block_rays = tuple(size for size in block_rays if size >= samples)
-        self._rays_done = 0
-        self.built = build(mi, scene.spec, responses)
-        self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
-        moving = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
-        self.camera = next((trajectory for trajectory in moving if trajectory.moves), None)
-        mitsuba_scene = scene.spec.mitsuba
-        #: Factor from the scene's own radiance to W m⁻² sr⁻¹ nm⁻¹.
-        self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
+        super().__init__(scene, sensor, responses, progress, tuple(size for size in block_rays if size >= samples))
+        self.samples = samples
         self._posed_us: float | None = None
-        self._rays = RayFactory(self.view)
-        layout = self.view.sensor.layout
-        self._cols = dr.opaque(types.UInt32, layout.cols)
-        self._first_index = dr.opaque(types.UInt32, int(layout.full_index[0, 0]))
-        self._full_cols = dr.opaque(types.UInt32, layout.spec.geometry.cols)
-        self._key = dr.opaque(types.UInt64, stream_key(seed, Stream.RENDER))
-        self._sampler = sampler_class(mi.variant())()
+        self._key = dr.opaque(jit().UInt64, stream_key(seed, Stream.RENDER))
 
     @property
     def pixel_count(self) -> int:
@@ -131,9 +181,7 @@ class PixelTracer:
         for first, last, size in self._blocks(pixel.size):
             spread = None if times is None else [values[first:last] for values in times]
             parts.append(self._block(pixel[first:last], spread, size // self.samples, wavelengths, values))
-            self._rays_done += (last - first) * self.samples
-            if self.progress is not None:
-                self.progress(self._rays_done)
+            self._report((last - first) * self.samples)
         if len(parts) == 1:
             return parts[0]
         channels = range(len(parts[0]))
@@ -143,9 +191,7 @@ class PixelTracer:
         """First and last pixel and the ray count of each block; the last one is padded."""
         first = 0
         while first < count:
-            rays = (count - first) * self.samples
-            # the largest block that is filled at least by half, else the smallest
-            size = next((s for s in self._block_rays if 2 * rays > s), self._block_rays[-1])
+            size = self._block_size((count - first) * self.samples)
             last = min(count, first + size // self.samples)
             yield first, last, size
             first = last
@@ -194,10 +240,9 @@ class PixelTracer:
     ) -> list[Any]:
         """The wanted quantities of one ray per lane."""
         mi, types = self.built.mi, jit()
-        row = pixel // self._cols
-        col = pixel - row * self._cols
+        row, col = self._row_and_col(pixel)
         sampler = self._sampler
-        sampler.setup(self._key, self._first_index + row * self._full_cols + col, half, sample, self.samples // 2)
+        sampler.setup(self._key, self._index(row, col), half, sample, self.samples // 2)
         (aperture, moment), choice = sampler.next_3d(), sampler.next_1d()
         blur = sampler.next_2d() if self._rays.has_psf else None
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
