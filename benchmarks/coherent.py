@@ -50,19 +50,23 @@ SENSOR = {
     "evs.contrast_threshold_on": 0.2,
     "evs.contrast_threshold_off": 0.2,
 }
-#: How fast each scene has to move for about this share of its pixels, in per cent, to change; 100 is the most.
+#: How fast each scene has to move for about this share of its pixels, in per cent, to change. At 100 the star fills the
+#: picture and turns by half a period a tick; of the others, parts never change: it is the most they reach.
 SPEEDS = {
-    "star": {3: 0.05, 10: 1.7, 25: 7.0, 100: 100.0},
+    "star": {3: 0.05, 10: 1.7, 25: 7.0, 100: 40.0},
     "sweep": {3: 0.12, 10: 0.45, 25: 4.0, 100: 60.0},
     "glass": {3: 0.15, 10: 1.0, 25: 5.0, 100: 60.0},
 }
 
 
 def star(speed: float) -> Scene:
-    """A textured target that turns, half a turn per second at speed 1."""
+    """A textured target that turns, half a turn per second at speed 1; it fills the picture from speed 40 on."""
     period = round(2e6 / speed)
     keys = [{"t_us": 0, "rotation_deg": 0}, {"t_us": period, "rotation_deg": -360}]
-    return hr.load_scene("rotating-star", {"motion": [{"object": "target", "repeat": True, "keyframes": keys}]})
+    changes: dict = {"motion": [{"object": "target", "repeat": True, "keyframes": keys}]}
+    if speed >= SPEEDS["star"][100]:
+        changes["camera.fit_margin"] = 1.8
+    return hr.load_scene("rotating-star", changes)
 
 
 def sweep(speed: float) -> Scene:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from hesim_render.noise.evs import EVS_TERMS, EvsNoise
 from hesim_render.schedule import Exposure, exposures, ticks_us
 from hesim_render.sensor import Sensor
 from hesim_render.units import S_PER_US
+
+if TYPE_CHECKING:
+    from hesim_render.recording import RecordingWriter
 
 #: Called with (done, total, what): µs of simulated time, or rays while a static scene renders.
 Progress = Callable[[float, float, str], None]
@@ -156,6 +159,18 @@ class Capture:
             yield from self._sample_events(window, begin, end)
             if progress is not None:
                 progress(end, self._duration_us, "simulated µs")
+
+    def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
+        """Run, and write frames, events and the truth of the event pixels as they come."""
+        for item in self.run(progress):
+            if isinstance(item, np.ndarray):
+                writer.add_events(item)
+            else:
+                writer.add_frame(item)
+        if self._stage is not None:
+            truth = self.event_flux
+            writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
+            writer.set_events_dropped(self.events_dropped)
 
     def _run_static(self, progress: Progress | None) -> Iterator[Frame | NDArray]:
         """A scene that stands still: its flux is rendered once and serves all times."""

@@ -112,15 +112,7 @@ def simulate(
         settings=settings,
         overwrite=overwrite,
     ) as writer:
-        for item in capture.run(progress):
-            if isinstance(item, np.ndarray):
-                writer.add_events(item)
-            else:
-                writer.add_frame(item)
-        if evs is not None:
-            truth = capture.event_flux
-            writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
-            writer.set_events_dropped(capture.events_dropped)
+        capture.record(writer, progress)
         if rendering:
             writer.add_settings({"render": _report(rendering)})
         return writer.finish()

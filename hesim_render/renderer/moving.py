@@ -104,6 +104,9 @@ class MovingScene:
             )
             for name, shapes in parts.items()
         ]
+        self._group_boxes = [
+            device_box(mi, np.stack([g.corners.min(axis=0), g.corners.max(axis=0)])) for g in self.groups
+        ]
 
     def intersect(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> Any:
         """The nearest surface of all parts, `SurfaceInteraction3f` in world space.
@@ -144,8 +147,9 @@ class MovingScene:
         for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            hit = group.scene.ray_intersect_preliminary(local, coherent, active)
-            closer = hit.t < nearest.t
+            near = active & meets_box(local, dr.rcp(local.d), nearest.t, self._group_boxes[number - 1])
+            hit = group.scene.ray_intersect_preliminary(local, coherent, near)
+            closer = near & (hit.t < nearest.t)
             nearest = dr.select(closer, hit, nearest)
             chosen = dr.select(closer, mi.UInt32(number), chosen)
             ray_there = dr.select(closer, local, ray_there)
@@ -169,13 +173,36 @@ class MovingScene:
 
     def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
         """Whether anything lies on a ray before its `maxt`."""
+        import drjit as dr
+
         mi = self.mi
         blocked = self.static.ray_test(ray, active)
-        for group, pose in zip(self.groups, poses, strict=True):
+        for group, pose, box in zip(self.groups, poses, self._group_boxes, strict=True):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            blocked |= group.scene.ray_test(local, active & ~blocked)
+            near = active & ~blocked & meets_box(local, dr.rcp(local.d), local.maxt, box)
+            blocked |= group.scene.ray_test(local, near)
         return blocked
+
+
+def device_box(mi: Any, corners: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Corners [2, 3] of an axis-parallel box for `meets_box`, somewhat widened: rounding must not take a rim."""
+    import drjit as dr
+
+    margin = 1e-4 * float(np.linalg.norm(corners[1] - corners[0]))
+    box = mi.Vector3f(corners[0] - margin), mi.Vector3f(corners[1] + margin)
+    dr.make_opaque(*box)
+    return box
+
+
+def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
+    """Whether the first `length` metres of a ray meet a box; `inverse` is 1 / ray.d."""
+    import drjit as dr
+
+    one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
+    enter, leave = dr.max(dr.minimum(one, other)), dr.min(dr.maximum(one, other))
+    # 0 · ∞ for a direction along a face compares as false: taken as meeting
+    return ~((enter > leave) | (leave < 0) | (enter > length))
 
 
 def path_traced(built: BuiltScene) -> bool:

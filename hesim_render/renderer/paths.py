@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.renderer.moving import MovingScene
+from hesim_render.renderer.moving import MovingScene, device_box, meets_box
 from hesim_render.renderer.trajectory import DevicePose
 
 _ROULETTE_DEPTH = 5
@@ -45,20 +45,11 @@ class Boxes:
         inverse = dr.rcp(ray.d)
         found: Any = 0
         for swept, present, told in self._groups:
-            near = active & _meets(ray, inverse, length, swept)
+            near = active & meets_box(ray, inverse, length, swept)
             bits = dr.select(near, MET_SWEPT, 0)
-            passing = near & ~_meets(ray, inverse, length, present)
+            passing = near & ~meets_box(ray, inverse, length, present)
             found |= bits | dr.select(passing & told, MET_PASSING, 0)
         return found
-
-
-def _meets(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
-    import drjit as dr
-
-    one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
-    enter, leave = dr.max(dr.minimum(one, other)), dr.min(dr.maximum(one, other))
-    # 0 · ∞ for a direction along a face compares as false: taken as meeting
-    return ~((enter > leave) | (leave < 0) | (enter > length))
 
 
 class PathIntegrator:
@@ -72,17 +63,11 @@ class PathIntegrator:
     """
 
     def __init__(self, scene: MovingScene, max_depth: int, hide_emitters: bool = False) -> None:
-        import drjit as dr
-
         self._scene, self._max_depth, self._hide = scene, max_depth if max_depth >= 0 else 1 << 30, hide_emitters
         lamps = scene.lamp_boxes
         if len(lamps) > _MOST_LAMPS:
             lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
-        # rounding must not take a light's rim
-        margin = 1e-4 * np.linalg.norm(lamps[:, 1] - lamps[:, 0], axis=-1)[:, None, None]
-        lamps = lamps + margin * np.array([[[-1], [1]]])
-        self._lamps = [tuple(scene.mi.Vector3f(corner) for corner in box) for box in lamps]
-        dr.make_opaque(self._lamps)
+        self._lamps = [device_box(scene.mi, box) for box in lamps]
 
     def sample(
         self, sampler: Any, ray: Any, poses: Sequence[DevicePose], boxes: Boxes | None, active: Any
@@ -210,7 +195,7 @@ class PathIntegrator:
 
         inverse, near = dr.rcp(ray.d), self._scene.mi.Bool(False)
         for box in self._lamps:
-            near |= _meets(ray, inverse, dr.inf, box)
+            near |= meets_box(ray, inverse, dr.inf, box)
         return near
 
 
