@@ -154,10 +154,10 @@ class PathIntegrator:
             goes_on &= dr.any(throughput != 0)
             depth = dr.select(si.is_valid(), depth + 1, depth)
 
+            luck = sampler.next_1d()  # Mitsuba draws it whatever the depth
             if self._max_depth > _ROULETTE_DEPTH:
                 survival = dr.minimum(dr.max(throughput) * stretch * stretch, _ROULETTE_MOST)
                 at_risk = depth >= _ROULETTE_DEPTH
-                luck = sampler.next_1d()
                 throughput = dr.select(at_risk, throughput * dr.rcp(survival), throughput)
                 goes_on &= ~at_risk | (luck < survival)
             active = goes_on & (depth + 1 < most)
