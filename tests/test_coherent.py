@@ -144,12 +144,12 @@ def test_what_passes_between_coarse_renders_is_found(name):
     assert rendered.mean() < 0.5
     filled = np.abs(off[~rendered]) > source.audit.tolerance
     assert filled.sum() <= 0.01 * filled.size
-    # the change itself is not smoothed away: pairs that really jump are right too. Not so in a caustic of a small lamp:
+    # the change itself is not smoothed away: pairs that change are right too. Less so in a caustic of a small lamp:
     # fewer than one ray in sixteen finds it, and what these do not see is filled in (docs/rendering.md says so)
-    jumps = np.zeros_like(rendered)
-    jumps[1:] = np.abs(np.diff(truth, axis=0)) > 0.3 * truth[1:]
-    missed = np.count_nonzero(np.abs(off[jumps]) > source.audit.tolerance)
-    assert missed <= max(3, (0.25 if name == "caustic" else 0.05) * jumps.sum())
+    changing = np.zeros_like(rendered)
+    changing[1:] = changes
+    missed = np.mean(np.abs(off[changing]) > source.audit.tolerance)
+    assert missed <= (0.25 if name == "caustic" else 0.1)
 
 
 @pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
@@ -289,6 +289,9 @@ def test_a_scene_that_needs_the_exact_mode_gets_it():
     assert settings["mode"] == "exact" and "emits light" in settings["exact_because"]
     with pytest.raises(SpecError, match="moves and emits light"):
         hr.simulate(scene, sensor, duration_s=0.005, quality=0.5)
+    hiding = {"integrator": {"type": "path", "max_depth": 3, "hide_emitters": True}, "wall": plane(DIFFUSE), "sky": SKY}
+    settings = hr.simulate(rendering.mitsuba_scene(hiding, depth=None), sensor, duration_s=0.005).manifest["settings"]
+    assert settings["mode"] == "exact" and "hides lights" in settings["exact_because"]
 
 
 def test_a_long_run_is_refused_unless_wanted():

@@ -61,7 +61,7 @@ class MovingScene:
     Raises
     ------
     NeedsExactMode
-        If a moving shape emits light, or the scene's integrator is not Mitsuba's path tracer.
+        If a moving shape emits light, the scene's integrator is not Mitsuba's path tracer, or it hides lights.
     """
 
     def __init__(self, built: BuiltScene) -> None:
@@ -69,6 +69,8 @@ class MovingScene:
         if not path_traced(built):
             name = built.integrator.class_name()
             raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
+        if built.integrator.hide_emitters:
+            raise NeedsExactMode("the integrator hides lights that are seen directly")
         self.mi = mi
         moving = {
             shape: group

@@ -59,11 +59,10 @@ class PathIntegrator:
     ----------
     scene : what is traced.
     max_depth : longest path in segments, 2 is direct light; below 0 there is no limit.
-    hide_emitters : whether lights seen directly are left out.
     """
 
-    def __init__(self, scene: MovingScene, max_depth: int, hide_emitters: bool = False) -> None:
-        self._scene, self._max_depth, self._hide = scene, max_depth if max_depth >= 0 else 1 << 30, hide_emitters
+    def __init__(self, scene: MovingScene, max_depth: int) -> None:
+        self._scene, self._max_depth = scene, max_depth if max_depth >= 0 else 1 << 30
         lamps = scene.lamp_boxes
         if len(lamps) > _MOST_LAMPS:
             lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
@@ -98,12 +97,10 @@ class PathIntegrator:
         ray, active = mi.Ray3f(ray), mi.Bool(active)
         most = dr.opaque(mi.UInt32, self._max_depth)
 
-        def shine(si: Any, active: Any, depth: Any, before: Any, pdf: Any, delta: Any) -> Any:
+        def shine(si: Any, active: Any, before: Any, pdf: Any, delta: Any) -> Any:
             """Light that what a ray runs into gives itself."""
             light = si.emitter(scene.static, active)
             shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
-            if self._hide:
-                shines &= ~((depth == 0) & ~si.is_valid())
             seen = mi.DirectionSample3f(scene.static, si, before)
             light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~delta)
             share = dr.select(delta, 1.0, _power(pdf, light_pdf))
@@ -115,7 +112,7 @@ class PathIntegrator:
             si = scene.intersect(ray, poses, depth == 0, active)
             if boxes is not None:
                 met |= boxes.met(ray, si.t, active)
-            radiance = dr.fma(throughput, shine(si, active, depth, before, before_pdf, before_delta), radiance)
+            radiance = dr.fma(throughput, shine(si, active, before, before_pdf, before_delta), radiance)
 
             goes_on = active & si.is_valid()
             bsdf = si.bsdf()
@@ -187,7 +184,7 @@ class PathIntegrator:
         if boxes is not None:
             met |= boxes.met(ray, si.t, left)
         # the throughput of a path that has ended may be anything
-        return dr.select(left, dr.fma(throughput, shine(si, left, depth, *before), radiance), radiance), met
+        return dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance), met
 
     def _near_lamps(self, ray: Any) -> Any:
         """Whether a ray runs into the box around a light."""

@@ -146,14 +146,14 @@ class Sketcher:
     def begin(self, begin_us: float, end_us: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Flux and scatter of every pixel in one window, e⁻/s."""
         result = self._everywhere_at(begin_us, end_us, None)
-        return np.float32(0.5) * (result.half_a + result.half_b), result.scatter
+        return result.mean, result.scatter
 
     def end(self, sketch: Sketch) -> NDArray[np.bool_]:
         """Trace the last window of a sketch, everywhere; which pixels the scene's motion can reach within it, [n]."""
         last = sketch.last
         swept = self._around.swept([sketch.span_us(0, last)], [sketch.span_us(last, last)], 1)
         result = self._everywhere_at(float(sketch.begin_us[last]), float(sketch.end_us[last]), swept)
-        sketch.flux[last], sketch.scatter[last] = np.float32(0.5) * (result.half_a + result.half_b), result.scatter
+        sketch.flux[last], sketch.scatter[last] = result.mean, result.scatter
         # what a neighbour's rays come near, some of this pixel's may
         bits = self._met(result)
         for bit in (MET_SWEPT, MET_PASSING):
@@ -222,7 +222,7 @@ class Sketcher:
         swept = self._around.swept(spans, [sketch.span_us(m, m) for m in middles], 2)
         times = sketch.begin_us[window], sketch.end_us[window]
         result = self._adaptive.pilot(self._pixel[place], *times, swept, which.astype(np.uint32))
-        sketch.flux[window, place] = np.float32(0.5) * (result.half_a + result.half_b)
+        sketch.flux[window, place] = result.mean
         sketch.scatter[window, place] = result.scatter
         sketch.met[window, place] = bits[which, place] & MET_SWEPT if swept is None else self._met(result)
         sketch.known[window, place] = True

@@ -43,6 +43,10 @@ class PairFlux:
     scatter: NDArray[np.float32]
     met: NDArray[np.uint32]
 
+    @property
+    def mean(self) -> NDArray[np.float32]:
+        return np.float32(0.5) * (self.half_a + self.half_b)
+
 
 @dataclass(frozen=True)
 class SweptBoxes:
