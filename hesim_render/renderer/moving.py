@@ -118,22 +118,19 @@ class MovingScene:
         ray : Ray3f in world space.
         poses : of each group, per lane.
         """
-        import drjit as dr
-
         mi = self.mi
         nearest, chosen, ray_there = self._nearest(ray, poses, coherent, active)
         si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active)
-        for number, pose in enumerate(poses, start=1):
-            here = chosen == number
-            si.p = dr.select(here, mi.Point3f(pose.to_world(si.p)), si.p)
-            si.n = dr.select(here, mi.Normal3f(pose.turn_to_world(si.n)), si.n)
-            for vector in ("s", "t", "n"):
-                turned = pose.turn_to_world(getattr(si.sh_frame, vector))
-                own = getattr(si.sh_frame, vector)
-                setattr(si.sh_frame, vector, dr.select(here, type(own)(turned), own))
-            for vector in ("dp_du", "dp_dv"):
-                own = getattr(si, vector)
-                setattr(si, vector, dr.select(here, mi.Vector3f(pose.turn_to_world(own)), own))
+        if not poses:
+            return si
+        pose = DevicePose.none(type(poses[0].shift))
+        for number, other in enumerate(poses, start=1):
+            pose = other.where(chosen == number, pose)
+        si.p, si.n = mi.Point3f(pose.to_world(si.p)), mi.Normal3f(pose.turn_to_world(si.n))
+        for part, names in ((si.sh_frame, ("s", "t", "n")), (si, ("dp_du", "dp_dv"))):
+            for name in names:
+                own = getattr(part, name)
+                setattr(part, name, type(own)(pose.turn_to_world(own)))
         return si
 
     def distance(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:

@@ -72,31 +72,62 @@ def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], f
 
 @dataclass(frozen=True)
 class DevicePose:
-    """Rigid poses, one a lane: x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
+    """Rigid poses, one a lane: x → R x + shift; `columns` are those of R."""
 
-    w: Any
-    v: Any
+    columns: tuple[Any, Any, Any]
     shift: Any
-    pivot: Any
 
-    def _turn(self, vector: Any, v: Any) -> Any:
+    @classmethod
+    def about(cls, w: Any, v: Any, pivot: Any, shift: Any) -> DevicePose:
+        """x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
         import drjit as dr
 
-        x = type(self.v)(vector)
-        twice = 2 * dr.cross(v, x)
-        return x + self.w * twice + dr.cross(v, twice)
+        x, y, z = v
+        vector = type(v)
+        rest = cls(
+            (
+                vector(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+                vector(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+                vector(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+            ),
+            dr.zeros(vector),
+        )
+        return cls(rest.columns, shift + pivot - rest.turn_to_world(pivot))
+
+    @classmethod
+    def none(cls, vector: Any) -> DevicePose:
+        """Of what stays where it is."""
+        import drjit as dr
+
+        return cls((vector(1, 0, 0), vector(0, 1, 0), vector(0, 0, 1)), dr.zeros(vector))
+
+    def where(self, condition: Any, other: DevicePose) -> DevicePose:
+        """This pose in lanes where a condition holds, another one in the rest."""
+        import drjit as dr
+
+        columns = (dr.select(condition, a, b) for a, b in zip(self.columns, other.columns, strict=True))
+        return DevicePose(tuple(columns), dr.select(condition, self.shift, other.shift))
 
     def turn_to_world(self, direction: Any) -> Any:
-        return self._turn(direction, self.v)
+        import drjit as dr
+
+        (x, y, z), (first, second, third) = direction, self.columns
+        return dr.fma(first, x, dr.fma(second, y, third * z))
 
     def to_world(self, point: Any) -> Any:
-        return self._turn(type(self.v)(point) - self.pivot, self.v) + self.pivot + self.shift
+        import drjit as dr
+
+        (x, y, z), (first, second, third) = point, self.columns
+        return dr.fma(first, x, dr.fma(second, y, dr.fma(third, z, self.shift)))
 
     def turn_to_rest(self, direction: Any) -> Any:
-        return self._turn(direction, -self.v)
+        import drjit as dr
+
+        vector = type(self.shift)
+        return vector(*(dr.dot(column, vector(direction)) for column in self.columns))
 
     def to_rest(self, point: Any) -> Any:
-        return self._turn(type(self.v)(point) - self.pivot - self.shift, -self.v) + self.pivot
+        return self.turn_to_rest(type(self.shift)(point) - self.shift)
 
 
 class Trajectory:
@@ -195,11 +226,11 @@ class Trajectory:
         base_v = vector(*(dr.gather(floats, start, segment * 4 + k) for k in (1, 2, 3)))
         first = three(translation, segment)
         zero = dr.opaque(integers, 0)
-        return DevicePose(
+        return DevicePose.about(
             w=cosine * base_w - dr.dot(turn_v, base_v),
             v=cosine * base_v + base_w * turn_v + dr.cross(turn_v, base_v),
-            shift=first + share * (three(translation, segment + 1) - first),
             pivot=three(pivot, zero),
+            shift=first + share * (three(translation, segment + 1) - first),
         )
 
     def __repr__(self) -> str:
