@@ -137,10 +137,10 @@ def test_halves_are_independent_and_their_difference_is_the_error():
 
 def test_error_falls_faster_than_random_sampling():
     errors = []
-    for samples in (8, 32):
+    for samples in (8, 128):
         a, b, _ = flux_image(hr.load_scene("flat-field"), mono(), samples)
         errors.append(np.sqrt(np.mean((a - b) ** 2)))
-    assert errors[1] < errors[0] / 3  # 4 times the samples: a factor of 2 without strata
+    assert errors[1] < errors[0] / 10  # 16 times the samples: a factor of 4 without strata, 15 was seen
 
 
 def test_same_seed_same_bits_in_any_order_chunk_or_crop():

@@ -28,6 +28,9 @@ from hesim_render.spectra import Spectrum, require_coverage
 
 #: Path length for a Mitsuba scene without a path tracer of its own.
 _DEFAULT_MITSUBA_DEPTH = 8
+#: Segments from which on Russian roulette ends some paths. Mitsuba's default is 5; but a vector of lanes takes as long
+#: as its longest path, so that roulette saves little, and what it adds to the noise is a lot.
+_ROULETTE_DEPTH = 16
 
 
 @dataclass
@@ -107,7 +110,7 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
         content, groups = _describe(mi, spec)
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
-        integrator = mi.load_dict({"type": "path", "max_depth": spec.max_depth or 2})
+        integrator = _path_tracer(mi, spec.max_depth or 2)
     parameters = mi.traverse(scene)
     trajectories = {track.object: Trajectory(track) for track in spec.motion if track.object != "camera"}
     movable: dict[str, list[Movable]] = {}
@@ -261,7 +264,11 @@ def _integrator(mi: Any, scene: Any, depth: int | None) -> Any:
     own = scene.integrator()
     if depth is None and isinstance(own, mi.MonteCarloIntegrator):
         return own
-    return mi.load_dict({"type": "path", "max_depth": depth or _DEFAULT_MITSUBA_DEPTH})
+    return _path_tracer(mi, depth or _DEFAULT_MITSUBA_DEPTH)
+
+
+def _path_tracer(mi: Any, depth: int) -> Any:
+    return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": _ROULETTE_DEPTH})
 
 
 def _plugin_dict(mi: Any, node: Mapping[str, Any]) -> dict[str, Any]:

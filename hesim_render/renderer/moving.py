@@ -34,12 +34,21 @@ class Group:
     scene : mitsuba.Scene of them alone, at rest.
     trajectory : how they move.
     corners : bounding-box corners at rest, [n, 3], m.
+    is_ball : whether they are one sphere.
     """
 
     name: str
     scene: Any
     trajectory: Trajectory
     corners: NDArray[np.float64]
+    is_ball: bool
+
+    @property
+    def ball(self) -> tuple[NDArray[np.float64], float]:
+        """Middle [3] and radius of a ball around them at rest, m."""
+        middle = (self.corners.min(axis=0) + self.corners.max(axis=0)) / 2
+        radius = float(np.linalg.norm(self.corners - middle, axis=1).max())
+        return middle, radius / 3**0.5 if self.is_ball else radius
 
     def swept_box(self, begin_us: float, end_us: float, steps: int = 16) -> NDArray[np.float64]:
         """Axis-parallel box around every place the group takes within an interval, [2, 3], m."""
@@ -71,6 +80,8 @@ class MovingScene:
             raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
         if built.integrator.hide_emitters:
             raise NeedsExactMode("the integrator hides lights that are seen directly")
+        import drjit as dr
+
         self.mi = mi
         moving = {
             shape: group
@@ -103,12 +114,16 @@ class MovingScene:
                 mi.load_dict({"type": "scene", **shapes}, optimize=False),
                 built.trajectories[name],
                 np.concatenate([part.corners for part in built.groups[name]]),
+                [shape.class_name() for shape in shapes.values()] == ["Sphere"],
             )
             for name, shapes in parts.items()
         ]
-        self._group_boxes = [
-            device_box(mi, np.stack([g.corners.min(axis=0), g.corners.max(axis=0)])) for g in self.groups
-        ]
+        self._balls = []
+        for group in self.groups:
+            middle, radius = group.ball
+            # somewhat widened: rounding must not take a rim
+            self._balls.append((mi.Point3f(middle), mi.Float(float((1.0001 * radius) ** 2))))
+        dr.make_opaque(self._balls)
 
     def intersect(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> Any:
         """The nearest surface of all parts, `SurfaceInteraction3f` in world space.
@@ -146,7 +161,7 @@ class MovingScene:
         for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            near = active & meets_box(local, dr.rcp(local.d), nearest.t, self._group_boxes[number - 1])
+            near = active & _meets_ball(local, nearest.t, self._balls[number - 1])
             hit = group.scene.ray_intersect_preliminary(local, coherent, near)
             closer = near & (hit.t < nearest.t)
             nearest = dr.select(closer, hit, nearest)
@@ -172,14 +187,12 @@ class MovingScene:
 
     def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
         """Whether anything lies on a ray before its `maxt`."""
-        import drjit as dr
-
         mi = self.mi
         blocked = self.static.ray_test(ray, active)
-        for group, pose, box in zip(self.groups, poses, self._group_boxes, strict=True):
+        for group, pose, ball in zip(self.groups, poses, self._balls, strict=True):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            near = active & ~blocked & meets_box(local, dr.rcp(local.d), local.maxt, box)
+            near = active & ~blocked & _meets_ball(local, local.maxt, ball)
             blocked |= group.scene.ray_test(local, near)
         return blocked
 
@@ -194,14 +207,38 @@ def device_box(mi: Any, corners: NDArray[np.float64]) -> tuple[Any, Any]:
     return box
 
 
+def inverse_of(direction: Any) -> Any:
+    """1 / d of each coordinate for `meets_box`; finite, for 0 · ∞ is nowhere."""
+    import drjit as dr
+
+    return dr.rcp(dr.select(abs(direction) < 1e-30, 1e-30, direction))
+
+
 def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
-    """Whether the first `length` metres of a ray meet a box; `inverse` is 1 / ray.d."""
+    """Whether the first `length` metres of a ray meet a box; `inverse` is `inverse_of` its direction."""
     import drjit as dr
 
     one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
-    enter, leave = dr.max(dr.minimum(one, other)), dr.min(dr.maximum(one, other))
-    # 0 · ∞ for a direction along a face compares as false: taken as meeting
-    return ~((enter > leave) | (leave < 0) | (enter > length))
+    # not dr.minimum and dr.maximum: what those do about NaN takes most of the time
+    ordered = one < other
+    near, far = dr.select(ordered, one, other), dr.select(ordered, other, one)
+    enter, leave = near.x, far.x
+    for axis in ("y", "z"):
+        first, last = getattr(near, axis), getattr(far, axis)
+        enter, leave = dr.select(first > enter, first, enter), dr.select(last < leave, last, leave)
+    return (enter <= leave) & (leave >= 0) & (enter <= length)
+
+
+def _meets_ball(ray: Any, length: Any, ball: tuple[Any, Any]) -> Any:
+    """Whether the first `length` metres of a ray meet a ball, given by its middle and the square of its radius."""
+    import drjit as dr
+
+    middle, square = ball
+    to = middle - ray.o
+    along, far = dr.dot(to, ray.d), dr.squared_norm(to)
+    # from outside it has to lie ahead, and its near side, whatever the radius, no farther than the ray goes
+    ahead = (far <= square) | ((along > 0) & ((along <= length) | (dr.square(along - length) <= square)))
+    return ahead & (dr.fma(-along, along, far) <= square)
 
 
 def path_traced(built: BuiltScene) -> bool:

@@ -1,7 +1,7 @@
 """A path tracer whose rays have times of their own, and which knows what each path has come near.
 
 The estimator is the common one (Veach 1997): light sampled at every vertex, combined with the
-surface's own sampling by the power heuristic; Russian roulette from the fifth vertex on. It is
+surface's own sampling by the power heuristic; Russian roulette where a path has gone on for long. It is
 written here because Mitsuba's own follows a path through one scene at one time.
 """
 
@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.renderer.moving import MovingScene, device_box, meets_box
+from hesim_render.renderer.moving import MovingScene, device_box, inverse_of, meets_box
 from hesim_render.renderer.trajectory import DevicePose
 
-_ROULETTE_DEPTH = 5
+#: Chance of going on, at most, where Russian roulette is played.
 _ROULETTE_MOST = 0.95
 #: Lights that have boxes of their own to tell whether a ray may meet them; more share one.
 _MOST_LAMPS = 8
@@ -42,7 +42,7 @@ class Boxes:
         """Bits of what the ray's first `length` metres come near."""
         import drjit as dr
 
-        inverse = dr.rcp(ray.d)
+        inverse = inverse_of(ray.d)
         found: Any = 0
         for swept, present, told in self._groups:
             near = active & meets_box(ray, inverse, length, swept)
@@ -59,10 +59,14 @@ class PathIntegrator:
     ----------
     scene : what is traced.
     max_depth : longest path in segments, 2 is direct light; below 0 there is no limit.
+    roulette_depth : segments from which on Russian roulette is played; below 0, never.
     """
 
-    def __init__(self, scene: MovingScene, max_depth: int) -> None:
-        self._scene, self._max_depth = scene, max_depth if max_depth >= 0 else 1 << 30
+    def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int) -> None:
+        self._scene = scene
+        self._max_depth, self._roulette_depth = (
+            depth if depth >= 0 else 1 << 30 for depth in (max_depth, roulette_depth)
+        )
         lamps = scene.lamp_boxes
         if len(lamps) > _MOST_LAMPS:
             lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
@@ -95,7 +99,7 @@ class PathIntegrator:
         before = dr.zeros(mi.Interaction3f)
         before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
         ray, active = mi.Ray3f(ray), mi.Bool(active)
-        most = dr.opaque(mi.UInt32, self._max_depth)
+        most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
 
         def shine(si: Any, active: Any, before: Any, pdf: Any, delta: Any) -> Any:
             """Light that what a ray runs into gives itself."""
@@ -152,9 +156,9 @@ class PathIntegrator:
             depth = dr.select(si.is_valid(), depth + 1, depth)
 
             luck = sampler.next_1d()  # Mitsuba draws it whatever the depth
-            if self._max_depth > _ROULETTE_DEPTH:
+            if self._max_depth > self._roulette_depth:
                 survival = dr.minimum(dr.max(throughput) * stretch * stretch, _ROULETTE_MOST)
-                at_risk = depth >= _ROULETTE_DEPTH
+                at_risk = depth >= roulette_depth
                 throughput = dr.select(at_risk, throughput * dr.rcp(survival), throughput)
                 goes_on &= ~at_risk | (luck < survival)
             active = goes_on & (depth + 1 < most)
@@ -190,7 +194,7 @@ class PathIntegrator:
         """Whether a ray runs into the box around a light."""
         import drjit as dr
 
-        inverse, near = dr.rcp(ray.d), self._scene.mi.Bool(False)
+        inverse, near = inverse_of(ray.d), self._scene.mi.Bool(False)
         for box in self._lamps:
             near |= meets_box(ray, inverse, dr.inf, box)
         return near

@@ -2,11 +2,11 @@
 
 Every draw of every pixel and half, of one to three dimensions, is a Sobol' sequence of its own: sample j
 of n takes point π(j) of the sequence, π a random permutation, and each coordinate is shifted digitally
-(XOR) by random bits. Permutation and shifts are hashed from the number of the draw and keys, which Philox4x32
-gives with the counters (pixel on the full sensor, half): Philox for every draw was a fifth of a path's time. Each sample is uniform, so estimates are unbiased; the n samples of a half are
-stratified in every single dimension and jointly in those of one draw, unlike draws are independent, and
-so are the halves. (Owen scrambling in place of the shift was measured: 1.6 times the error at 16
-samples, for the spectra are smooth.)
+(XOR) by random bits. Permutation and shifts are hashed from the number of the draw and four keys, which
+Philox4x32 gives with the counters (pixel on the full sensor, half). Each sample is uniform, so estimates
+are unbiased; the n samples of a half are stratified in every single dimension and jointly in those of one
+draw, unlike draws are independent, and so are the halves. (Owen scrambling in place of the shift was
+measured: 1.6 times the error at 16 samples, for the spectra are smooth.)
 
 Place in the pixel and instant are one draw: an edge that moves is a surface in those three dimensions,
 and where it passes over a pixel or two within the window, 128 rays of a half have 0.6 times the error
@@ -102,7 +102,8 @@ def sampler_class(variant: str) -> Any:
     assert mi.variant() == variant
 
     def _unit(bits: Any) -> Any:
-        return mi.Float(bits >> 8) * 2.0**-24
+        """The middle of one of 2^23 strata: at 0 itself some surfaces send no ray on, and the sample would be lost."""
+        return (mi.Float(bits >> 9) + 0.5) * 2.0**-23
 
     class CounterSampler(mi.Sampler):
         """See the module. Its state is plain Dr.Jit arrays: only those take part in symbolic loops."""

@@ -94,7 +94,8 @@ class TimedTracer(Tracer):
         super().__init__(scene, sensor, responses, progress, block_rays)
         types = jit()
         self.parts = MovingScene(self.built)
-        self._integrator = PathIntegrator(self.parts, _max_depth(self.built.integrator))
+        depths = (_told(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
+        self._integrator = PathIntegrator(self.parts, *depths)
         self._keys = [
             dr.opaque(types.UInt64, stream_key(seed, stream)) for stream in (Stream.RENDER, Stream.RENDER_PILOT)
         ]
@@ -282,11 +283,11 @@ def _boxes_of(mi: Any, tables: Any, interval: Any, groups: int) -> Boxes:
     return Boxes(swept, present, [dr.gather(mi.UInt32, told, place) != 0 for place in places])
 
 
-def _max_depth(integrator: Any) -> int:
-    """Mitsuba tells it only in words."""
+def _told(integrator: Any, property_name: str) -> int:
+    """A depth that an integrator was given, -1 for none; Mitsuba tells it only in words."""
     for line in str(integrator).splitlines():
         name, _, value = line.strip().rstrip(",").partition(" = ")
-        if name == "max_depth":
+        if name == property_name:
             depth = int(value)
             return -1 if depth >= 2**31 else depth
-    raise AssertionError("a path integrator has a depth")
+    raise AssertionError(f"a path integrator has a {property_name}")

@@ -199,38 +199,35 @@ class Trajectory:
         import drjit as dr
 
         types = jit()
-        floats, integers, vector = types.Float, types.UInt32, types.Array3f
+        floats, vector = types.Float, types.Array3f
         if self._device is None:
             knots = self.knots_us - self.knots_us[0]
-            tables = (knots, self.arc_axis, self.arc_rad, self.start_rotation, self.translation_m, self.pivot_m)
-            self._device = tuple(floats(np.ascontiguousarray(table, dtype=np.float32).ravel()) for table in tables)
-            dr.eval(*self._device)
+            # one row a segment, fetched as four packets of four: gathers of single numbers cost more than the poses
+            rows = [
+                *(knots[:-1, None], 1 / np.diff(knots)[:, None], self.arc_rad[:, None] / 2, self.arc_axis),
+                *(self.start_rotation, self.translation_m[:-1], np.diff(self.translation_m, axis=0)),
+            ]
+            tables = np.hstack(rows), knots, knots[-1:]
+            segments, times, period = (floats(table.astype(np.float32).ravel()) for table in tables)
+            self._device = segments, times, period, vector(*(floats(float(x)) for x in self.pivot_m))
             dr.make_opaque(*self._device)
-        knots, axis, angle, start, translation, pivot = self._device
-        count = self.knots_us.size
-        period = dr.gather(floats, knots, count - 1)
+        segments, times, period, pivot = self._device
         if self.repeat:
             local_us = dr.select(local_us >= period, local_us - period * dr.floor(local_us / period), local_us)
         local_us = dr.clip(local_us, 0, period)
-        after = dr.binary_search(1, count - 1, lambda i: dr.gather(floats, knots, integers(i)) <= local_us)
-        segment = integers(after) - 1
-        begin = dr.gather(floats, knots, segment)
-        share = (local_us - begin) / (dr.gather(floats, knots, segment + 1) - begin)
-
-        def three(table: Any, index: Any) -> Any:
-            return vector(*(dr.gather(floats, table, index * 3 + k) for k in range(3)))
-
-        sine, cosine = dr.sincos(share * dr.gather(floats, angle, segment) * 0.5)
-        turn_v = three(axis, segment) * sine
-        base_w = dr.gather(floats, start, segment * 4)
-        base_v = vector(*(dr.gather(floats, start, segment * 4 + k) for k in (1, 2, 3)))
-        first = three(translation, segment)
-        zero = dr.opaque(integers, 0)
+        last = self.knots_us.size - 1
+        after = dr.binary_search(1, last, lambda i: dr.gather(floats, times, types.UInt32(i)) <= local_us)
+        first = 4 * (types.UInt32(after) - 1)
+        row = [x for k in range(4) for x in dr.gather(types.Array4f, segments, first + k)]
+        share = (local_us - row[0]) * row[1]
+        sine, cosine = dr.sincos(share * row[2])
+        turn_v = vector(*row[3:6]) * sine
+        base_w, base_v = row[6], vector(*row[7:10])
         return DevicePose.about(
             w=cosine * base_w - dr.dot(turn_v, base_v),
             v=cosine * base_v + base_w * turn_v + dr.cross(turn_v, base_v),
-            pivot=three(pivot, zero),
-            shift=first + share * (three(translation, segment + 1) - first),
+            pivot=pivot,
+            shift=dr.fma(vector(*row[13:16]), share, vector(*row[10:13])),
         )
 
     def __repr__(self) -> str:

@@ -34,24 +34,25 @@ class WavelengthSampler:
 
         types = jit()
         room = max(response.wavelength_nm.size for response in responses.values()) + 1
-        nodes, values, shares, starts, totals = [], [], [], [], []
+        cells, shares, starts, totals = [], [], [], []
         for response in responses.values():
             grid, table = response.wavelength_nm, response.values
             area = np.concatenate([[0.0], np.cumsum((table[1:] + table[:-1]) / 2 * np.diff(grid))])
             share, more = (area / area[-1]).astype(np.float32), room - grid.size
             place = np.arange(_BINS + 1, dtype=np.float32) / _BINS
-            starts.append(np.clip(np.searchsorted(share, place, side="right") - 1, 0, grid.size - 2))
-            nodes.append(np.pad(grid, (0, more), mode="edge"))
-            values.append(np.pad(table, (0, more), mode="edge"))
-            shares.append(np.pad(share, (0, more), constant_values=2.0))  # never reached
+            start = np.clip(np.searchsorted(share, place, side="right") - 1, 0, grid.size - 2)
+            starts.append(np.stack([start[:-1], start[1:]], axis=1))
+            ends = np.stack([x for values in (share, table, grid, 0 * grid) for x in (values[:-1], values[1:])], axis=1)
+            cells.append(np.pad(ends, ((0, more), (0, 0)), mode="edge"))
+            shares.append(np.pad(share[:-1], (0, more), constant_values=2.0))  # never reached
             totals.append(area[-1])
-        self._room = room
-        self._nodes, self._values, self._shares = (
-            types.Float(np.concatenate(table).astype(np.float32)) for table in (nodes, values, shares)
+        self._room = room - 1
+        self._cells, self._shares, self._totals = (
+            types.Float(table.astype(np.float32).ravel())
+            for table in (np.concatenate(cells), np.concatenate(shares), np.array(totals))
         )
-        self._totals = types.Float(np.array(totals, dtype=np.float32))
-        self._starts = types.UInt32(np.concatenate(starts).astype(np.uint32))
-        dr.make_opaque(self._nodes, self._values, self._shares, self._totals, self._starts)
+        self._starts = types.UInt32(np.concatenate(starts).astype(np.uint32).ravel())
+        dr.make_opaque(self._cells, self._shares, self._totals, self._starts)
 
     def total(self, filter_index: Any) -> Any:
         """∫R dλ of each lane's filter, e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹ × nm."""
@@ -69,12 +70,12 @@ class WavelengthSampler:
         """
         import drjit as dr
 
-        floats, uints = jit().Float, jit().UInt32
+        types = jit()
+        floats, uints = types.Float, types.UInt32
         base = filter_index * self._room
         places = [(u + k) * 0.25 for k in range(4)]
-        bins = [filter_index * (_BINS + 1) + dr.minimum(uints(place * _BINS), _BINS - 1) for place in places]
-        low = [dr.gather(uints, self._starts, number) for number in bins]
-        high = [dr.gather(uints, self._starts, number + 1) for number in bins]
+        bins = [filter_index * _BINS + dr.minimum(uints(place * _BINS), _BINS - 1) for place in places]
+        low, high = zip(*(dr.gather(types.Array2u, self._starts, number) for number in bins), strict=True)
 
         def halve(low: list[Any], high: list[Any]) -> tuple[list[Any], list[Any]]:
             new_low, new_high = [], []
@@ -89,14 +90,14 @@ class WavelengthSampler:
             return functools.reduce(operator.or_, (a < b for a, b in zip(low, high, strict=True)))
 
         # one step nearly always; only in the tails does a bin hold many cells
-        low, _ = dr.while_loop((low, high), unsure, halve, label="wavelengths")
+        low, _ = dr.while_loop((list(low), list(high)), unsure, halve, label="wavelengths")
         wavelengths = []
         for place, cell in zip(places, (base + a for a in low), strict=True):
-            begin, end = dr.gather(floats, self._shares, cell), dr.gather(floats, self._shares, cell + 1)
+            # one packet each: gathers of single numbers cost more than what is done with them
+            begin, end, first, second = dr.gather(types.Array4f, self._cells, 2 * cell)
+            left, right = dr.gather(types.Array2f, self._cells, 4 * cell + 2)
             share = dr.clip((place - begin) / dr.maximum(end - begin, 1e-30), 0, 1)
-            first, second = dr.gather(floats, self._values, cell), dr.gather(floats, self._values, cell + 1)
             root = dr.sqrt(dr.maximum(first * first + share * (second * second - first * first), 0))
             within = share * (first + second) / dr.maximum(first + root, 1e-30)
-            left, right = dr.gather(floats, self._nodes, cell), dr.gather(floats, self._nodes, cell + 1)
             wavelengths.append(left + (right - left) * within)
         return wavelengths
