@@ -36,7 +36,7 @@ _CHANGE = 0.7
 _DOUBT = 0.1
 #: Pixels that need fewer than so many rays get more than they need, n^0.6 in proportion: with an error that falls by
 #: n^-0.75 that is the least time for the same error over all pixels.
-_MANY, _CHEAP = 128, 0.6
+_MANY, _CHEAP = 512, 0.6
 #: Rays for each noise unit by which the brightest of the next pixels is above a pixel: what they may miss of it is
 #: worth four units at most. So many rays at most for that.
 _SLIVER, _MOST_FOR_SLIVERS = 0.25, 512
