@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.renderer.coherent import CoherentFlux
 from hesim_render.renderer.refinement import BYTES_PER_PAIR, chunk_length
+from hesim_render.renderer.sketch import generous
 from hesim_render.schedule import Exposure
 
 #: Pixels tried, and pairs of neighbouring windows, spread over the run; pixels that measure the speed.
@@ -84,7 +85,7 @@ def estimate(
                 per_pair += [n, m]
                 changed.append(np.mean(np.abs(second - first) > flux.change_of_note(chosen, first)))
             share = min(1.0, 1 / chunk_length(event_pixel.size) + _PER_CHANGE * float(np.mean(changed)))
-            rays += float(np.mean(per_pair)) * event_pixel.size * (1 + share * (begin_us.size - 1))
+            rays += float(generous(np.mean(per_pair))) * event_pixel.size * (1 + share * (begin_us.size - 1))
     if exposures and frame_pixel.size:
         window = float(exposures[0].start_us), float(exposures[0].t_us)
         per_pair = tried(some(frame_pixel), *window)[1]
