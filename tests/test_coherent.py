@@ -8,9 +8,11 @@ from scipy import stats
 import hesim_render as hr
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.renderer import refinement, sketch
+from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.audit import Audit, least_checked
 from hesim_render.renderer.coherent import CoherentFlux
 from hesim_render.renderer.flux import RenderedFlux, used_responses
+from hesim_render.renderer.moving import meets_ball
 from hesim_render.renderer.refinement import Refinement
 from hesim_render.renderer.timed import TimedTracer
 
@@ -166,6 +168,26 @@ def test_flux_is_that_of_the_exact_mode(name):
         same = np.isclose(got.half_a, wanted, rtol=1e-4)
         assert same.mean() > 0.995
         assert np.sum(got.half_a) == pytest.approx(np.sum(wanted), rel=1e-3)
+
+
+def test_balls_rule_out_no_ray_that_meets_what_is_in_them():
+    """Against the roots of the quadratic in double precision; with ends before, inside and beyond the ball."""
+    mi, rng, count = mitsuba(), np.random.default_rng(1), 100_000
+    middle, radius = np.array([0.3, -0.2, 1.1]), 0.25
+    origin = middle + rng.normal(size=(count, 3)) * rng.choice([0.1, 0.5], (count, 1))
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    length = rng.exponential(0.5, count)
+    to = origin - middle
+    along, rest = np.sum(to * direction, axis=1), np.sum(to**2, axis=1) - radius**2
+    root = np.sqrt(np.maximum(along**2 - rest, 0))
+    meets = (along**2 > rest) & (-along - root < length) & (-along + root > 0)
+    ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*direction.T))
+    ball = mi.Point3f(middle), mi.Float((1.0001 * radius) ** 2)
+    found = np.array(meets_ball(ray, mi.Float(length), ball))
+    assert 0.1 < meets.mean() < 0.6
+    assert not np.any(meets & ~found)
+    assert np.mean(found & ~meets) < 0.05  # rays that end within a radius before it
 
 
 def lamps(count):

@@ -106,15 +106,23 @@ def test_samples_of_a_half_are_stratified_and_uniform():
 
 
 def test_dimensions_pixels_and_halves_are_uncorrelated():
-    pairs = draws(4000, 4, 3)
-    columns = pairs.transpose(0, 1, 2, 3, 4).reshape(4000, -1)
+    pairs = draws(4000, 4, 6)
+    columns = pairs.reshape(4000, -1)
     matrix = np.corrcoef(columns, rowvar=False)
     # within one dimension strata make samples of a half anticorrelated; everything else must be 0 on average
-    same = np.kron(np.eye(2), np.kron(np.ones((4, 4)), np.eye(6))).astype(bool)
+    same = np.kron(np.eye(2), np.kron(np.ones((4, 4)), np.eye(12))).astype(bool)
     off = matrix[~same]
     # 1e-4 over all entries by Bonferroni
     assert np.abs(off).max() < stats.norm.isf(1e-4 / off.size / 2) / np.sqrt(4000)
     assert matrix[same & ~np.eye(matrix.shape[0], dtype=bool)].mean() < -0.2
+
+
+def test_no_draw_is_zero_or_one():
+    """All strata of a coordinate, in which 0 itself would be: a surface that is asked there may send no ray on."""
+    first, second = (np.array(v) for v in started(1, 1 << 22).next_2d())
+    for drawn in (first, second):
+        assert drawn.min() > 0 and drawn.max() < 1
+        assert drawn.min() < 2.0**-20 and drawn.max() > 1 - 2.0**-20
 
 
 @pytest.mark.parametrize("per_half", [1, 3, 5])

@@ -161,7 +161,7 @@ class MovingScene:
         for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            near = active & _meets_ball(local, nearest.t, self._balls[number - 1])
+            near = active & meets_ball(local, nearest.t, self._balls[number - 1])
             hit = group.scene.ray_intersect_preliminary(local, coherent, near)
             closer = near & (hit.t < nearest.t)
             nearest = dr.select(closer, hit, nearest)
@@ -192,7 +192,7 @@ class MovingScene:
         for group, pose, ball in zip(self.groups, poses, self._balls, strict=True):
             local = mi.Ray3f(ray)
             local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            near = active & ~blocked & _meets_ball(local, local.maxt, ball)
+            near = active & ~blocked & meets_ball(local, local.maxt, ball)
             blocked |= group.scene.ray_test(local, near)
         return blocked
 
@@ -229,7 +229,7 @@ def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
     return (enter <= leave) & (leave >= 0) & (enter <= length)
 
 
-def _meets_ball(ray: Any, length: Any, ball: tuple[Any, Any]) -> Any:
+def meets_ball(ray: Any, length: Any, ball: tuple[Any, Any]) -> Any:
     """Whether the first `length` metres of a ray meet a ball, given by its middle and the square of its radius."""
     import drjit as dr
 

@@ -36,7 +36,7 @@ _CHANGE = 0.7
 _DOUBT = 0.1
 #: Pixels that need fewer than so many rays get more than they need, n^0.6 in proportion: with an error that falls by
 #: n^-0.75 that is the least time for the same error over all pixels. 512 did better than 128 on all three scenes of the
-#: benchmark, and no worse than 1024.
+#: benchmark, and 1024 no better on the one where it was tried.
 _MANY, _CHEAP = 512, 0.6
 #: Rays for each noise unit by which the brightest of the next pixels is above a pixel: what they may miss of it is
 #: worth four units at most. So many rays at most for that.
