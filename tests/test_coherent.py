@@ -429,21 +429,27 @@ def near_misses(some, others):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
 def test_render_noise_makes_less_than_one_event_in_a_hundred(name):
-    """Noise-free sensor, default quality, against a render of a fifth of its error with other random numbers.
+    """Noise-free sensor, default quality, against renders of a fifth of its error with other random numbers.
 
     An event of a change that just misses or just makes the threshold may move to another time or pixel; such swaps
-    are as many too many as too few, and were 1.5 to 2.5 % of the events of camera-sweep.
+    are as many too many as too few, and were 1.5 to 2.5 % of the events of camera-sweep. They alone make the number of
+    events of one run there, of 1835, scatter by 0.45 % and that of a reference by 0.3 %: of three runs and two
+    references together 1 % is three standard deviations (false alarm 0.3 %).
     """
     scene, sensor = hr.load_scene(name), hr.load_sensor("gen2").crop(384, 288)
-    found, wanted = (
-        hr.simulate(scene, sensor, duration_s=0.04, clean=True, quality=quality, seed=seed).events
-        for quality, seed in ((0.5, 3), (0.1, 1))
-    )
-    assert wanted.size > 1000
-    assert abs(found.size / wanted.size - 1) < 0.01
-    extra, missing = near_misses(found, wanted), near_misses(wanted, found)
-    assert extra - missing < 0.01 * wanted.size
-    assert extra < 0.03 * wanted.size
+
+    def events(quality, seed):
+        return hr.simulate(scene, sensor, duration_s=0.04, clean=True, quality=quality, seed=seed).events
+
+    wanted = [events(0.1, seed) for seed in (1, 2)]
+    found = [events(0.5, seed) for seed in (3, 4, 5)]
+    number = np.mean([one.size for one in wanted])
+    assert number > 1000
+    assert abs(np.mean([one.size for one in found]) / number - 1) < 0.01
+    extra = np.mean([near_misses(one, wanted[0]) for one in found])
+    missing = np.mean([near_misses(wanted[0], one) for one in found])
+    assert extra - missing < 0.01 * number
+    assert extra < 0.03 * number
 
 
 @pytest.mark.slow
