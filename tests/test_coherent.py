@@ -204,13 +204,17 @@ def lamps(count):
     }
 
 
-@pytest.mark.parametrize("depth", [2, 4, 12])
+@pytest.mark.parametrize(("depth", "roulette"), [(2, 16), (4, 16), (12, 16), (12, 3)])
 @pytest.mark.parametrize("light", [{"sky": SKY}, {"lamp": LAMP, "sky": SKY}, lamps(3), lamps(12)])
-def test_paths_are_those_of_mitsuba(light, depth):
-    """However long they are, and whatever their last segment may run into: the same rays to the same value."""
+def test_paths_are_those_of_mitsuba(light, depth, roulette):
+    """However long they are, and whatever their last segment may run into: the same rays to the same value.
+
+    With the roulette of a scene's own path tracer too.
+    """
     glossy = {"type": "roughconductor", "material": "none", "alpha": 0.2}
     shapes = {"ball": sphere((0, 0, 0.3), 0.2, 0.9), "wall": plane(DIFFUSE), "mirror": plane(glossy, z=0.1, half=0.3)}
-    scene = rendering.mitsuba_scene({**shapes, **light}, [], depth)
+    own = {"integrator": {"type": "path", "max_depth": depth, "rr_depth": roulette}}
+    scene = rendering.mitsuba_scene({**own, **shapes, **light}, [], None)
     sensor = mono(32, 24)
     exact = RenderedFlux(scene, sensor, samples=16, seed=3)
     timed = TimedTracer(scene, sensor, 3, used_responses(sensor))
