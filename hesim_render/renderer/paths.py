@@ -2,7 +2,8 @@
 
 The estimator is the common one (Veach 1997): light sampled at every vertex, combined with the
 surface's own sampling by the power heuristic; Russian roulette where a path has gone on for long. It is
-written here because Mitsuba's own follows a path through one scene at one time.
+written here because Mitsuba's own follows a path through one scene at one time. What it has besides: matt
+surfaces send some paths to the images of lamps in flat mirrors (`LampImages`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.renderer.images import Cones, LampImages
 from hesim_render.renderer.moving import MovingScene, device_box, inverse_of, meets_box
 from hesim_render.renderer.trajectory import DevicePose
 
@@ -71,6 +73,7 @@ class PathIntegrator:
         if len(lamps) > _MOST_LAMPS:
             lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
         self._lamps = [device_box(scene.mi, box) for box in lamps]
+        self._images = LampImages.of(scene.mi, scene.static)
 
     def sample(
         self, sampler: Any, ray: Any, poses: Sequence[DevicePose], boxes: Boxes | None, active: Any
@@ -136,9 +139,15 @@ class PathIntegrator:
             clear = asks & ~scene.occluded(shadow, poses, asks)
 
             towards = si.to_local(seen.d)
-            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(
-                context, si, towards, sampler.next_1d(), sampler.next_2d(), goes_on
-            )
+            lobe = sampler.next_1d()
+            place, choice = sampler.next_3d() if self._images else (sampler.next_2d(), None)
+            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
+            if self._images:
+                # a lamp's image takes two segments more
+                matt = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
+                cones = self._images.seen_from(si, matt)
+                pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
+                chosen_weight = _redirected(bsdf, context, si, cones, choice, place, chosen, chosen_weight)
             value = si.to_world_mueller(value, -towards, si.wi)
             share = dr.select(seen.delta, 1.0, _power(seen.pdf, pdf))
             radiance = dr.fma(throughput, dr.select(clear, value * weight * share, 0.0), radiance)
@@ -198,6 +207,27 @@ class PathIntegrator:
         for box in self._lamps:
             near |= meets_box(ray, inverse, dr.inf, box)
         return near
+
+
+def _redirected(
+    bsdf: Any, context: Any, si: Any, cones: Cones, choice: Any, place: Any, chosen: Any, weight: Any
+) -> Any:
+    """Weight of a surface's sample where some are drawn from cones instead; `chosen` becomes what was drawn."""
+    import drjit as dr
+    import mitsuba as mi
+
+    direction, drawn = cones.sample(choice, place)
+    towards = si.to_local(direction)
+    value, pdf = bsdf.eval_pdf(context, si, towards, drawn)
+    delta = ~drawn & mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+    own, pdf = 1 - cones.chance, dr.select(drawn, pdf, chosen.pdf)
+    mixed = dr.fma(own, pdf, cones.density(dr.select(drawn, direction, si.to_world(chosen.wo))))
+    weight = dr.select(drawn, value / mixed, weight * dr.select(delta, dr.rcp(own), pdf / mixed))
+    chosen.wo = dr.select(drawn, towards, chosen.wo)
+    chosen.pdf = dr.select(delta, chosen.pdf, mixed)
+    chosen.eta = dr.select(drawn, 1.0, chosen.eta)
+    chosen.sampled_type = dr.select(drawn, +mi.BSDFFlags.DiffuseReflection, chosen.sampled_type)
+    return dr.select(mixed > 0, weight, 0.0)
 
 
 def _power(a: Any, b: Any) -> Any:

@@ -41,6 +41,9 @@ _MANY, _CHEAP = 512, 0.6
 #: Rays for each noise unit by which the brightest of the next pixels is above a pixel: what they may miss of it is
 #: worth four units at most. So many rays at most for that.
 _SLIVER, _MOST_FOR_SLIVERS = 0.25, 512
+#: How far away a pixel may be from which something bright comes unseen: a penumbra that ends in deep shadow is so
+#: dark in its last pixels that sixteen rays find no light there, nor in the pixel before.
+_NEXT = 2
 #: Change of one of the next pixels, in tolerances of a pixel's own, of which this one may have a part unseen.
 _BESIDE = 128
 #: Gaps whose flux in all windows is held at a time.
@@ -261,7 +264,7 @@ class Sketcher:
             tolerance = self.allowed(np.minimum(before, flux), self._everywhere, tightness)
             least = np.maximum(tolerance - _DOUBT * sketch.scatter[window], 0.1 * tolerance)
             change = np.abs(flux - before)
-            beside = self._around.near.most(change, 1) > _BESIDE * tolerance
+            beside = self._around.near.most(change, _NEXT) > _BESIDE * tolerance
             found[window - 1 : window + 1] |= (change > least) | beside
         return found
 
@@ -312,8 +315,8 @@ class Sketcher:
         noise = self._unit(flux.astype(np.float64), self._everywhere)
         needed = self._adaptive.needed_near(scatter / noise, self._around.near)
         plenty = np.rint(np.log2(generous(needed))).astype(np.int64)
-        # a sliver of something bright next to the pixel or to the window, too thin for the pilot to see
-        beside = self._around.near.most(flux if brightest is None else brightest, 1) - flux
+        # something bright near the pixel or next to the window, too little of it for the pilot to see
+        beside = self._around.near.most(flux if brightest is None else brightest, _NEXT) - flux
         unseen = np.ceil(np.log2(np.clip(_SLIVER * beside / noise, 1, _MOST_FOR_SLIVERS))).astype(np.int64)
         return np.maximum(needed, np.int64(1) << np.maximum(plenty, unseen))
 

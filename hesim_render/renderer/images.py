@@ -1,0 +1,165 @@
+"""Images of lamps in flat mirrors: where light comes from that neither sampling a lamp nor a matt surface finds.
+
+A matt surface that a mirror shows a lamp is lit by its image. A shadow ray ends at the mirror, and of the surface's
+own directions few go to the image. So some of them are drawn from the cones around the images instead, and the
+density of the mixture is the density of all: one-sample multiple importance sampling with the balance heuristic
+(Veach 1997, section 9.2.4). Whatever such a ray runs into, the estimate stays unbiased.
+"""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Part of the directions that are drawn from the images, together. In a scene with floor, mirror and three more things
+#: 0.03 to 0.1 had the same noise within a tenth, 0.3 had more.
+_SHARE = 0.08
+#: Images that are known, those of the largest lamps.
+_MOST = 4
+#: Narrowest cone, as 1 - cos of its half angle: below it, float32 cannot tell whether a direction lies within.
+_NARROWEST = 1e-5
+#: How far the corners of a flat shape may be off its plane, over its size.
+_FLAT = 1e-5
+
+Image = tuple[NDArray[np.float64], float, NDArray[np.float64], float]
+
+
+class LampImages:
+    """Balls around the images of lamps, each behind its mirror.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    images : centre [3] and radius of each, m, and its mirror's unit normal [3] and offset: a point x is before the
+        mirror where x · normal > offset.
+    """
+
+    def __init__(self, mi: Any, images: list[Image]) -> None:
+        import drjit as dr
+
+        self._mi = mi
+        largest = sorted(images, key=lambda image: -image[1])[:_MOST]
+        self._images = [
+            (mi.Point3f(centre), mi.Float(radius**2), mi.Vector3f(normal), mi.Float(offset))
+            for centre, radius, normal, offset in largest
+        ]
+        dr.make_opaque(self._images)
+
+    @classmethod
+    def of(cls, mi: Any, scene: Any) -> LampImages:
+        """Those of the area lights of a Mitsuba scene in its flat, perfectly reflecting shapes."""
+        lamps = [shape.bbox() for shape in scene.shapes() if shape.is_emitter()]
+        found: list[Image] = []
+        for shape in scene.shapes():
+            plane = _mirror(mi, shape)
+            if plane is None:
+                continue
+            normal, offset = plane
+            for box in lamps:
+                low, high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
+                centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+                height = float(centre @ normal) - offset
+                both = mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide)
+                for side in (1.0, -1.0) if both else (1.0,):
+                    if side * height > -radius:
+                        found.append((centre - 2 * height * normal, radius, side * normal, side * offset))
+        return cls(mi, found)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def seen_from(self, si: Any, active: Any) -> Cones:
+        """Cones of directions from a surface point to the images that can light it."""
+        import drjit as dr
+
+        mi = self._mi
+        cones = []
+        upwards = dr.mulsign(mi.Vector3f(si.sh_frame.n), mi.Frame3f.cos_theta(si.wi))
+        for centre, square, normal, offset in self._images:
+            to = centre - si.p
+            far = dr.squared_norm(to)
+            axis = to * dr.rsqrt(far)
+            sine = dr.minimum(square / far, 1.0)
+            width = sine / (1 + dr.sqrt(1 - sine))
+            there = active & (far > 1.02 * square) & (width > _NARROWEST)
+            there &= (dr.dot(mi.Vector3f(si.p), normal) > offset) & (dr.dot(upwards, axis) > 0)
+            chance = dr.select(there, mi.Float(_SHARE / len(self._images)), 0.0)
+            cones.append((axis, width, chance))
+        return Cones(mi, cones)
+
+
+class Cones:
+    """Directions that are drawn from images instead of from a surface, per lane.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    cones : axis, 1 - cos of the half angle, and chance of being drawn, of each.
+    """
+
+    def __init__(self, mi: Any, cones: list[tuple[Any, Any, Any]]) -> None:
+        self._mi, self._cones = mi, cones
+        self.chance = sum((chance for _, _, chance in cones), mi.Float(0.0))
+
+    def sample(self, choice: Any, place: Any) -> tuple[Any, Any]:
+        """A direction, and whether one is drawn at all.
+
+        Parameters
+        ----------
+        choice, place : random numbers in [0, 1) and [0, 1)².
+        """
+        import drjit as dr
+
+        mi = self._mi
+        axis, width, before, drawn = mi.Vector3f(0, 0, 1), mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
+        for one, wide, chance in self._cones:
+            this = (choice >= before) & (choice < before + chance)
+            before += chance
+            drawn |= this
+            axis, width = dr.select(this, one, axis), dr.select(this, wide, width)
+        below = width * place.x  # 1 - cos
+        sine = dr.sqrt(below * (2 - below))
+        turn, rise = dr.sincos(2 * pi * place.y)
+        return mi.Frame3f(axis).to_world(mi.Vector3f(sine * rise, sine * turn, 1 - below)), drawn
+
+    def density(self, direction: Any) -> Any:
+        """Of directions drawn from the images, per steradian; its integral is `chance`."""
+        import drjit as dr
+
+        total = self._mi.Float(0.0)
+        for axis, width, chance in self._cones:
+            inside = (chance > 0) & (1 - dr.dot(direction, axis) <= width)
+            total += dr.select(inside, chance / (2 * pi * width), 0.0)
+        return total
+
+
+def _mirror(mi: Any, shape: Any) -> tuple[NDArray[np.float64], float] | None:
+    """Unit normal and offset of the plane of a flat shape whose surface is nothing but a mirror; else None."""
+    bsdf = shape.bsdf()
+    if bsdf is None or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):
+        return None
+    # most of the light goes through a pane of glass, or is scattered
+    others = (mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null)
+    if any(mi.has_flag(bsdf.flags(), flag) for flag in others):
+        return None
+    parameters = mi.traverse(shape)
+    if "vertex_positions" in parameters:
+        points = np.array(parameters["vertex_positions"], np.float64).reshape(-1, 3)
+        faces = np.array(parameters["faces"], np.int64).reshape(-1, 3)
+        normal = np.cross(points[faces[0, 1]] - points[faces[0, 0]], points[faces[0, 2]] - points[faces[0, 0]])
+    elif shape.class_name() in ("Rectangle", "Disk"):
+        matrix = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
+        points, normal = matrix[None, :3, 3], np.cross(matrix[:3, 0], matrix[:3, 1])
+    else:
+        return None
+    length = float(np.linalg.norm(normal))
+    if length == 0:
+        return None
+    normal, size = normal / length, float(np.ptp(points, axis=0).max())
+    heights = points @ normal
+    if np.ptp(heights) > _FLAT * size:
+        return None
+    return normal, float(heights.mean())
