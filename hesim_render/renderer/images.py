@@ -27,6 +27,7 @@ _NARROWEST = 1e-5
 #: How far the corners of a flat shape may be off its plane, over its size.
 _FLAT = 1e-5
 
+#: Centre and radius, m; unit normal and offset of the mirror.
 Image = tuple[NDArray[np.float64], float, NDArray[np.float64], float]
 
 
@@ -85,8 +86,8 @@ class LampImages:
             to = centre - si.p
             far = dr.squared_norm(to)
             axis = to * dr.rsqrt(far)
-            sine = dr.minimum(square / far, 1.0)
-            width = sine / (1 + dr.sqrt(1 - sine))
+            square_sine = dr.minimum(square / far, 1.0)
+            width = square_sine / (1 + dr.sqrt(1 - square_sine))
             there = active & (far > 1.02 * square) & (width > _NARROWEST)
             there &= (dr.dot(mi.Vector3f(si.p), normal) > offset) & (dr.dot(upwards, axis) > 0)
             chance = dr.select(there, mi.Float(_SHARE / len(self._images)), 0.0)
@@ -125,8 +126,8 @@ class Cones:
             axis, width = dr.select(this, one, axis), dr.select(this, wide, width)
         below = width * place.x  # 1 - cos
         sine = dr.sqrt(below * (2 - below))
-        turn, rise = dr.sincos(2 * pi * place.y)
-        return mi.Frame3f(axis).to_world(mi.Vector3f(sine * rise, sine * turn, 1 - below)), drawn
+        y, x = dr.sincos(2 * pi * place.y)
+        return mi.Frame3f(axis).to_world(mi.Vector3f(sine * x, sine * y, 1 - below)), drawn
 
     def density(self, direction: Any) -> Any:
         """Of directions drawn from the images, per steradian; its integral is `chance`."""
