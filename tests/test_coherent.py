@@ -12,7 +12,7 @@ from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.audit import Audit, least_checked
 from hesim_render.renderer.coherent import CoherentFlux
 from hesim_render.renderer.flux import RenderedFlux, used_responses
-from hesim_render.renderer.moving import meets_ball
+from hesim_render.renderer.parts import meets_ball
 from hesim_render.renderer.refinement import Refinement
 from hesim_render.renderer.timed import TimedTracer
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
 from hesim_render.renderer.builder import BuiltScene
+from hesim_render.renderer.parts import Part
 from hesim_render.renderer.trajectory import DevicePose, Trajectory
 
 
@@ -31,24 +32,15 @@ class Group:
     Parameters
     ----------
     name : of the object.
-    scene : mitsuba.Scene of them alone, at rest.
+    part : they themselves, at rest.
     trajectory : how they move.
     corners : bounding-box corners at rest, [n, 3], m.
-    is_ball : whether they are one sphere.
     """
 
     name: str
-    scene: Any
+    part: Part
     trajectory: Trajectory
     corners: NDArray[np.float64]
-    is_ball: bool
-
-    @property
-    def ball(self) -> tuple[NDArray[np.float64], float]:
-        """Middle [3] and radius of a ball around them at rest, m."""
-        middle = (self.corners.min(axis=0) + self.corners.max(axis=0)) / 2
-        radius = float(np.linalg.norm(self.corners - middle, axis=1).max())
-        return middle, radius / 3**0.5 if self.is_ball else radius
 
     def swept_box(self, begin_us: float, end_us: float, steps: int = 16) -> NDArray[np.float64]:
         """Axis-parallel box around every place the group takes within an interval, [2, 3], m."""
@@ -80,8 +72,6 @@ class MovingScene:
             raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
         if built.integrator.hide_emitters:
             raise NeedsExactMode("the integrator hides lights that are seen directly")
-        import drjit as dr
-
         self.mi = mi
         moving = {
             shape: group
@@ -99,7 +89,9 @@ class MovingScene:
             if shape.is_emitter():
                 raise NeedsExactMode(f"{group!r} moves and emits light")
             parts[group][f"shape_{number}"] = shape
-        for number, emitter in enumerate(built.scene.emitters()):
+        emitters = built.scene.emitters()
+        spare_even_skies(mi, emitters)
+        for number, emitter in enumerate(emitters):
             if emitter.get_shape() is None:
                 resting[f"emitter_{number}"] = emitter
         self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
@@ -108,22 +100,16 @@ class MovingScene:
         self.has_sky = any(light.is_environment() for light in lights)
         boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
         self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
+        self._resting = Part(mi, self.static, apart=False)
         self.groups = [
             Group(
                 name,
-                mi.load_dict({"type": "scene", **shapes}, optimize=False),
+                Part(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False), apart=True),
                 built.trajectories[name],
                 np.concatenate([part.corners for part in built.groups[name]]),
-                [shape.class_name() for shape in shapes.values()] == ["Sphere"],
             )
             for name, shapes in parts.items()
         ]
-        self._balls = []
-        for group in self.groups:
-            middle, radius = group.ball
-            # somewhat widened: rounding must not take a rim
-            self._balls.append((mi.Point3f(middle), mi.Float(float((1.0001 * radius) ** 2))))
-        dr.make_opaque(self._balls)
 
     def intersect(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> Any:
         """The nearest surface of all parts, `SurfaceInteraction3f` in world space.
@@ -132,15 +118,14 @@ class MovingScene:
         ----------
         ray : Ray3f in world space.
         poses : of each group, per lane.
+        coherent : whether neighbouring lanes' rays are alike.
         """
         mi = self.mi
         nearest, chosen, ray_there = self._nearest(ray, poses, coherent, active)
         si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active)
         if not poses:
             return si
-        pose = DevicePose.none(type(poses[0].shift))
-        for number, other in enumerate(poses, start=1):
-            pose = other.where(chosen == number, pose)
+        pose = _pose_of(chosen, poses)
         si.p, si.n = mi.Point3f(pose.to_world(si.p)), mi.Normal3f(pose.turn_to_world(si.n))
         for part, names in ((si.sh_frame, ("s", "t", "n")), (si, ("dp_du", "dp_dv"))):
             for name in names:
@@ -152,49 +137,62 @@ class MovingScene:
         """To the nearest surface of all parts, m; infinite where there is none."""
         return self._nearest(ray, poses, False, active)[0].t
 
+    def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any, Any]:
+        """Where the point that a ray meets at one time was at another, in world space; whether it meets any; whose."""
+        nearest, whose, ray_there = self._nearest(ray, now, True, self.mi.Bool(True))
+        point = ray_there(nearest.t)
+        return _pose_of(whose, then).to_world(point) if then else point, nearest.is_valid(), whose
+
+    def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
+        """Whether anything lies on a ray before its `maxt`."""
+        blocked = self._resting.blocks(ray, active)
+        for group, pose in zip(self.groups, poses, strict=True):
+            blocked |= group.part.blocks(_at_rest(ray, pose), active & ~blocked)
+        return blocked
+
     def _nearest(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> tuple[Any, Any, Any]:
         """Preliminary intersection, number of its part (0 rests), and the ray in that part's frame."""
         import drjit as dr
 
         mi = self.mi
-        nearest, chosen, ray_there = self.static.ray_intersect_preliminary(ray, coherent, active), mi.UInt32(0), ray
+        nearest, chosen, ray_there = self._resting.nearest(ray, coherent, active), mi.UInt32(0), ray
         for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
-            local = mi.Ray3f(ray)
-            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            near = active & meets_ball(local, nearest.t, self._balls[number - 1])
-            hit = group.scene.ray_intersect_preliminary(local, coherent, near)
-            closer = near & (hit.t < nearest.t)
+            local = _at_rest(ray, pose)
+            local.maxt = dr.select(nearest.t < ray.maxt, nearest.t, ray.maxt)
+            hit = group.part.nearest(local, coherent, active)
+            closer = hit.is_valid()
             nearest = dr.select(closer, hit, nearest)
             chosen = dr.select(closer, mi.UInt32(number), chosen)
             ray_there = dr.select(closer, local, ray_there)
         return nearest, chosen, ray_there
 
-    def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any, Any]:
-        """Where the point that a ray meets at one time was at another, in world space; whether it meets any; whose."""
-        import drjit as dr
 
-        mi = self.mi
-        hit = self.static.ray_intersect_preliminary(ray, True, mi.Bool(True))
-        nearest, point, whose = hit.t, ray(hit.t), dr.zeros(mi.UInt32, dr.width(ray))
-        for number, (group, pose, before) in enumerate(zip(self.groups, now, then, strict=True), start=1):
-            local = mi.Ray3f(ray)
-            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            hit = group.scene.ray_intersect_preliminary(local, True, mi.Bool(True))
-            closer = hit.t < nearest
-            nearest, whose = dr.minimum(nearest, hit.t), dr.select(closer, number, whose)
-            point = dr.select(closer, mi.Point3f(before.to_world(local(hit.t))), point)
-        return point, nearest < dr.inf, whose
+def _at_rest(ray: Any, pose: DevicePose) -> Any:
+    """A ray in the frame of what has a pose."""
+    local = type(ray)(ray)
+    local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+    return local
 
-    def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
-        """Whether anything lies on a ray before its `maxt`."""
-        mi = self.mi
-        blocked = self.static.ray_test(ray, active)
-        for group, pose, ball in zip(self.groups, poses, self._balls, strict=True):
-            local = mi.Ray3f(ray)
-            local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
-            near = active & ~blocked & meets_ball(local, local.maxt, ball)
-            blocked |= group.scene.ray_test(local, near)
-        return blocked
+
+def _pose_of(chosen: Any, poses: Sequence[DevicePose]) -> DevicePose:
+    """The pose of the group of each lane's number, from 1; 0 rests."""
+    pose = DevicePose.none(type(poses[0].shift))
+    for number, other in enumerate(poses, start=1):
+        pose = other.where(chosen == number, pose)
+    return pose
+
+
+def spare_even_skies(mi: Any, emitters: Sequence[Any]) -> None:
+    """Ask no surface for the light of a sky that is the same everywhere, where there is other light.
+
+    The surface's own directions find it, and rays towards it take from those to the lamps.
+    """
+    even = [emitter for emitter in emitters if emitter.class_name() == "ConstantBackgroundEmitter"]
+    if any(emitter.sampling_weight() > 0 for emitter in emitters if emitter not in even):
+        for emitter in even:
+            parameters = mi.traverse(emitter)
+            parameters["sampling_weight"] = 0.0
+            parameters.update()
 
 
 def device_box(mi: Any, corners: NDArray[np.float64]) -> tuple[Any, Any]:
@@ -227,18 +225,6 @@ def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
         first, last = getattr(near, axis), getattr(far, axis)
         enter, leave = dr.select(first > enter, first, enter), dr.select(last < leave, last, leave)
     return (enter <= leave) & (leave >= 0) & (enter <= length)
-
-
-def meets_ball(ray: Any, length: Any, ball: tuple[Any, Any]) -> Any:
-    """Whether the first `length` metres of a ray meet a ball, given by its middle and the square of its radius."""
-    import drjit as dr
-
-    middle, square = ball
-    to = middle - ray.o
-    along, far = dr.dot(to, ray.d), dr.squared_norm(to)
-    # from outside it has to lie ahead, and its near side, whatever the radius, no farther than the ray goes
-    ahead = (far <= square) | ((along > 0) & ((along <= length) | (dr.square(along - length) <= square)))
-    return ahead & (dr.fma(-along, along, far) <= square)
 
 
 def path_traced(built: BuiltScene) -> bool:

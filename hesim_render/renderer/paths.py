@@ -82,7 +82,7 @@ class PathIntegrator:
 
         Parameters
         ----------
-        sampler : `next_1d`, `next_2d`.
+        sampler : `next_vertex`, see `CounterSampler`.
         ray : Ray3f with wavelengths, world space.
         poses : of each group of the scene, per lane.
         boxes : what to test the paths' segments against, or None.
@@ -123,10 +123,11 @@ class PathIntegrator:
 
             goes_on = active & si.is_valid()
             bsdf = si.bsdf()
+            place, lobe, light, luck = sampler.next_vertex()
 
             # light sampled from here
             asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            seen, weight = scene.static.sample_emitter_direction(si, sampler.next_2d(), False, asks)
+            seen, weight = scene.static.sample_emitter_direction(si, light, False, asks)
             asks &= seen.pdf != 0
             shadow = si.spawn_ray_to(seen.p)
             infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -139,13 +140,15 @@ class PathIntegrator:
             clear = asks & ~scene.occluded(shadow, poses, asks)
 
             towards = si.to_local(seen.d)
-            lobe = sampler.next_1d()
-            place, choice = sampler.next_3d() if self._images else (sampler.next_2d(), None)
-            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
+            choice = lobe
             if self._images:
                 # a lamp's image takes two segments more
                 matt = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
                 cones = self._images.seen_from(si, matt)
+                # what is left of the number where no cone is chosen
+                lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
+            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
+            if self._images:
                 pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
                 chosen_weight = _redirected(bsdf, context, si, cones, choice, place, chosen, chosen_weight)
             value = si.to_world_mueller(value, -towards, si.wi)
@@ -164,7 +167,6 @@ class PathIntegrator:
             goes_on &= dr.any(throughput != 0)
             depth = dr.select(si.is_valid(), depth + 1, depth)
 
-            luck = sampler.next_1d()  # Mitsuba draws it whatever the depth
             if self._max_depth > self._roulette_depth:
                 survival = dr.minimum(dr.max(throughput) * stretch * stretch, _ROULETTE_MOST)
                 at_risk = depth >= roulette_depth

@@ -146,10 +146,30 @@ def sampler_class(variant: str) -> Any:
             """A pair, and a third number stratified with it; for up to 2^22 samples in a half."""
             point, bits = self._draw()
             x, y = zero_two_point(point)
+            return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2])), _unit(self._third(point) ^ bits[3])
+
+        def _third(self, point: Any) -> Any:
+            """Third coordinate of a point, as a binary fraction."""
             z = dr.gather(mi.UInt32, self._tables[0], point & ((1 << _TABLE_BITS) - 1))
             if self._bits > _TABLE_BITS:
                 z ^= dr.gather(mi.UInt32, self._tables[1], point >> _TABLE_BITS)
-            return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2])), _unit(z ^ bits[3])
+            return z
+
+        def next_vertex(self) -> tuple[Any, Any, Any, Any]:
+            """What a path needs where it meets a surface.
+
+            Returns
+            -------
+            place, lobe : [0, 1)² and [0, 1), stratified together: how the surface sends the path on.
+            light : [0, 1)², a point on a lamp. The same point as `place` with other shifts: no light is the product of
+                what the two decide.
+            luck : [0, 1), whether the path goes on at all.
+            """
+            point, bits = self._draw()
+            x, y = zero_two_point(point)
+            place = mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2]))
+            light = mi.Point2f(_unit(x ^ (bits[1] * _ODD)), _unit(y ^ (bits[2] * _ODD)))
+            return place, _unit(self._third(point) ^ bits[3]), light, self.next_1d()
 
         def fork(self) -> CounterSampler:
             return self
