@@ -120,9 +120,14 @@ class MovingScene:
         poses : of each group, per lane.
         coherent : whether neighbouring lanes' rays are alike.
         """
+        import drjit as dr
+
         mi = self.mi
-        nearest, chosen, ray_there = self._nearest(ray, poses, coherent, active)
-        si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active)
+        nearest, face, chosen, ray_there = self._nearest(ray, poses, coherent, active)
+        si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active & (face == 0))
+        for number, part in enumerate([self._resting, *(group.part for group in self.groups)]):
+            if len(part):
+                part.describe(si, ray_there, nearest, dr.select(chosen == number, face, 0))
         if not poses:
             return si
         pose = _pose_of(chosen, poses)
@@ -139,7 +144,7 @@ class MovingScene:
 
     def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any, Any]:
         """Where the point that a ray meets at one time was at another, in world space; whether it meets any; whose."""
-        nearest, whose, ray_there = self._nearest(ray, now, True, self.mi.Bool(True))
+        nearest, _, whose, ray_there = self._nearest(ray, now, True, self.mi.Bool(True))
         point = ray_there(nearest.t)
         return _pose_of(whose, then).to_world(point) if then else point, nearest.is_valid(), whose
 
@@ -150,21 +155,22 @@ class MovingScene:
             blocked |= group.part.blocks(_at_rest(ray, pose), active & ~blocked)
         return blocked
 
-    def _nearest(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Preliminary intersection, number of its part (0 rests), and the ray in that part's frame."""
+    def _nearest(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """Preliminary intersection, face of its part, number of that (0 rests), and the ray in its frame."""
         import drjit as dr
 
         mi = self.mi
-        nearest, chosen, ray_there = self._resting.nearest(ray, coherent, active), mi.UInt32(0), ray
+        nearest, face = self._resting.nearest(ray, coherent, active)
+        chosen, ray_there = mi.UInt32(0), ray
         for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
             local = _at_rest(ray, pose)
             local.maxt = dr.select(nearest.t < ray.maxt, nearest.t, ray.maxt)
-            hit = group.part.nearest(local, coherent, active)
+            hit, place = group.part.nearest(local, coherent, active)
             closer = hit.is_valid()
-            nearest = dr.select(closer, hit, nearest)
+            nearest, face = dr.select(closer, hit, nearest), dr.select(closer, place, face)
             chosen = dr.select(closer, mi.UInt32(number), chosen)
             ray_there = dr.select(closer, local, ray_there)
-        return nearest, chosen, ray_there
+        return nearest, face, chosen, ray_there
 
 
 def _at_rest(ray: Any, pose: DevicePose) -> Any:

@@ -1,8 +1,9 @@
 """Shapes that keep their places among themselves, and where rays meet them.
 
 Targets are flat, and so is most of what stands around them. A few faces and balls are tried one after the other within
-the kernel; a search through a tree of boxes, for which rays leave the kernel, takes longer. Where there are many, or
-anything else, rays are met by Mitsuba (Embree on a CPU, OptiX on a GPU). What a surface does with a ray is Mitsuba's in
+the kernel, and what Mitsuba knows of a face's surface is looked up once and for all; a search through a tree of boxes,
+for which rays leave the kernel, and corners fetched for each hit take longer. Where there are many shapes, or any of
+another form, rays are met by Mitsuba (Embree on a CPU, OptiX on a GPU). What a surface does with light is Mitsuba's in
 any case.
 """
 
@@ -15,72 +16,96 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Faces and balls of a part that are tried one by one, at most. Paths of four segments among 3, 6, 12, 24 and 48 faces
-#: took 0.93, 0.83, 1.06, 1.08 and 1.7 times as long as with Embree (AVX-512).
+#: Faces and balls of a part that are tried one by one, at most.
 _MOST = 8
 #: How far the corners of two triangles may be off those of a parallelogram, over its size.
 _FLAT = 1e-5
+#: How far directions on a face may differ from corner to corner.
+_SAME = 1e-5
 
 
 @dataclass(frozen=True)
 class Face:
-    """A parallelogram of two successive triangles of a mesh, spanned from a corner that only the first one has.
+    """A parallelogram of two successive triangles of a mesh.
 
     Parameters
     ----------
-    first : number of the first triangle.
-    own, opposite : which of its three corners each triangle shares not with the other.
-    along_u, along_v : where the two shared ones are in the first and in the second triangle.
+    triangle : number of the first; it is the half with u + v <= 1.
     to_uvh : [3, 4], metres to u and v, 0 to 1 on the face, and to the height over it in metres.
+    surface : what Mitsuba says of both triangles, [2, ...] each: `n` and `shading`, normals; `s`, the first axis of the
+        shading frame; `dp_du`, `dp_dv`; and `uv` [2, 3, 2], texture coordinates at (0, 0) and their change along u, v.
     """
 
-    first: int
-    own: int
-    opposite: int
-    along_u: tuple[int, int]
-    along_v: tuple[int, int]
+    triangle: int
     to_uvh: NDArray[np.float64]
-
-    def triangle(self, mi: Any, u: Any, v: Any) -> tuple[Any, Any]:
-        """Number of the triangle at a place on the face, and Mitsuba's coordinates in it."""
-        import drjit as dr
-
-        there = u + v <= 1
-        one = {self.own: 1 - u - v, self.along_u[0]: u, self.along_v[0]: v}
-        other = {self.opposite: u + v - 1, self.along_u[1]: 1 - v, self.along_v[1]: 1 - u}
-        place = mi.Point2f(*(dr.select(there, one[corner], other[corner]) for corner in (1, 2)))
-        return dr.select(there, mi.UInt32(self.first), mi.UInt32(self.first + 1)), place
+    surface: dict[str, NDArray[np.float64]]
 
 
-def faces_of(vertices: NDArray[np.float64], triangles: NDArray[np.int64]) -> list[Face]:
-    """The parallelograms that a mesh consists of, two successive triangles each; none if there is anything else.
+def faces_of(mi: Any, shape: Any) -> list[Face]:
+    """The faces of a mesh if they are all it is, not too many, and flat to light as well; else none."""
+    if not shape.is_mesh() or shape.face_count() > 2 * _MOST or shape.face_count() % 2:
+        return []
+    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    triangles = np.array(shape.faces_buffer(), np.int64).reshape(-1, 2, 3)
+    known = _at_corners(mi, shape)
+    found = []
+    for number, (first, second) in enumerate(triangles):
+        order = _parallelogram(vertices[first], vertices[second])
+        told = {name: values[number] for name, values in known.items()}
+        flat = all(np.allclose(told[name], told[name][0, 0], rtol=0, atol=_SAME) for name in ("n", "shading"))
+        if order is None or not flat:
+            return []
+        (own, on_u, on_v), (opposite, at_u, at_v) = order
+        corner = vertices[first[own]]
+        sides = vertices[first[on_u]] - corner, vertices[first[on_v]] - corner
+        normal = np.cross(*sides)
+        inverse = np.linalg.inv(np.stack([*sides, normal / np.linalg.norm(normal)], axis=1))
+        to_uvh = np.concatenate([inverse, -(inverse @ corner)[:, None]], axis=1)
+        one, other = told.pop("uv")
+        uv = [
+            [one[own], one[on_u] - one[own], one[on_v] - one[own]],
+            [other[at_u] + other[at_v] - other[opposite], other[opposite] - other[at_v], other[opposite] - other[at_u]],
+        ]
+        surface = {name: values[:, 0] for name, values in told.items()}
+        found.append(Face(2 * number, to_uvh, {**surface, "uv": np.array(uv)}))
+    return found
+
+
+def _parallelogram(
+    one: NDArray[np.float64], other: NDArray[np.float64]
+) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
+    """Which corners of two triangles lie at (0, 0), (1, 0), (0, 1), and at (1, 1), (1, 0), (0, 1); None if none do.
 
     Parameters
     ----------
-    vertices : [n, 3], m.
-    triangles : [k, 3], numbers of vertices.
+    one, other : corners, [3, 3], m.
     """
-    found: list[Face] = []
-    if len(triangles) % 2:
-        return []
-    for first in range(0, len(triangles), 2):
-        one, other = vertices[triangles[first]], vertices[triangles[first + 1]]
-        size = float(np.ptp(one, axis=0).max())
-        same = np.linalg.norm(one[:, None] - other, axis=2) <= _FLAT * size
-        if not np.array_equal(np.sort(same.sum(axis=0)), [0, 1, 1]) or same.sum(axis=1).max() > 1:
-            return []
-        own, opposite = int(np.argmin(same.sum(axis=1))), int(np.argmin(same.sum(axis=0)))
-        next_u, next_v = (own + 1) % 3, (own + 2) % 3
-        u, v = one[next_u] - one[own], one[next_v] - one[own]
-        normal = np.cross(u, v)
-        area = float(np.linalg.norm(normal))
-        if area <= _FLAT * size**2 or np.linalg.norm(one[own] + u + v - other[opposite]) > _FLAT * size:
-            return []
-        inverse = np.linalg.inv(np.stack([u, v, normal / area], axis=1))
-        to_uvh = np.concatenate([inverse, -inverse @ one[own][:, None]], axis=1)
-        along_u, along_v = (next_u, int(np.argmax(same[next_u]))), (next_v, int(np.argmax(same[next_v])))
-        found.append(Face(first, own, opposite, along_u, along_v, to_uvh))
-    return found
+    size = float(np.ptp(one, axis=0).max())
+    same = np.linalg.norm(one[:, None] - other, axis=2) <= _FLAT * size
+    if sorted(same.sum(axis=0)) != [0, 1, 1] or sorted(same.sum(axis=1)) != [0, 1, 1]:
+        return None
+    own, opposite = int(np.argmin(same.sum(axis=1))), int(np.argmin(same.sum(axis=0)))
+    on_u, on_v = (own + 1) % 3, (own + 2) % 3
+    u, v = one[on_u] - one[own], one[on_v] - one[own]
+    thin = np.linalg.norm(np.cross(u, v)) <= _FLAT * size**2
+    if thin or np.linalg.norm(one[own] + u + v - other[opposite]) > _FLAT * size:
+        return None
+    return (own, on_u, on_v), (opposite, int(np.argmax(same[on_u])), int(np.argmax(same[on_v])))
+
+
+def _at_corners(mi: Any, shape: Any) -> dict[str, NDArray[np.float64]]:
+    """What Mitsuba says of a mesh's surface at the corners of its triangles, [faces, 2, 3 corners, ...] each."""
+    import drjit as dr
+
+    count = shape.face_count()
+    hit = dr.zeros(mi.PreliminaryIntersection3f, 3 * count)
+    hit.valid, hit.t, hit.shape = mi.Bool(True), mi.Float(1.0), mi.ShapePtr(shape)
+    hit.prim_index = mi.UInt32(np.repeat(np.arange(count, dtype=np.uint32), 3))
+    hit.prim_uv = mi.Point2f(np.tile(np.array([[0, 0], [1, 0], [0, 1]], np.float32), (count, 1)).T)
+    ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(True))
+    told = {"n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "dp_du": si.dp_du, "dp_dv": si.dp_dv, "uv": si.uv}
+    return {name: np.array(value, np.float64).T.reshape(count // 2, 2, 3, -1) for name, value in told.items()}
 
 
 class Part:
@@ -99,39 +124,54 @@ class Part:
         self._mi = mi
         #: Middle and square of the radius of each ball, and its shape.
         self._balls: list[tuple[Any, Any, Any]] = []
-        #: Rows of the map to u, v and height of each face, the face, and its shape.
-        self._faces: list[tuple[list[tuple[Any, Any]], Face, Any]] = []
+        #: Rows of the map to u, v and height of each face, its first triangle, and its shape.
+        self._faces: list[tuple[list[tuple[Any, Any]], int, Any]] = []
+        #: What Mitsuba said of their surfaces: one value for both triangles, or one for each.
+        self._surfaces: list[dict[str, list[Any]]] = []
         #: What Mitsuba searches, and the ball around it.
         self._scene = self._around = None
         shapes = scene.shapes()
-        faces = [_faces(shape) for shape in shapes]
+        faces = [faces_of(mi, shape) for shape in shapes]
         is_ball = [shape.class_name() == "Sphere" for shape in shapes]
         simple = all(ball or found for ball, found in zip(is_ball, faces, strict=True))
         if simple and sum(is_ball) + sum(map(len, faces)) <= _MOST:
             for shape, found in zip(shapes, faces, strict=True):
-                rows = [[(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in face.to_uvh] for face in found]
-                self._faces += zip(rows, found, [mi.ShapePtr(shape)] * len(found), strict=True)
+                for face in found:
+                    rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in face.to_uvh]
+                    self._faces.append((rows, face.triangle, mi.ShapePtr(shape)))
+                    self._surfaces.append({name: _on_device(mi, value) for name, value in face.surface.items()})
                 if not found:
                     self._balls.append((*_ball_around(mi, shape.bbox(), 3**-0.5), mi.ShapePtr(shape)))
         else:
             self._scene = scene
             # somewhat widened: rounding must not take a rim
             self._around = _ball_around(mi, scene.bbox(), 1.0001) if apart else None
-        dr.make_opaque([ball[:2] for ball in self._balls], [rows for rows, _, _ in self._faces], self._around)
+        held = [ball[:2] for ball in self._balls], [face[0] for face in self._faces], self._surfaces, self._around
+        dr.make_opaque(held)
 
-    def nearest(self, ray: Any, coherent: Any, active: Any) -> Any:
-        """The first surface before a ray's `maxt`, `PreliminaryIntersection3f`; its t is infinite where there is none.
+    def __len__(self) -> int:
+        """Faces that are tried one by one."""
+        return len(self._faces)
+
+    def nearest(self, ray: Any, coherent: Any, active: Any) -> tuple[Any, Any]:
+        """The first surface before a ray's `maxt`.
 
         Parameters
         ----------
         ray : Ray3f in the part's own frame.
         coherent : whether neighbouring lanes' rays are alike.
+
+        Returns
+        -------
+        hit : `PreliminaryIntersection3f`, its t infinite where there is none; on a face, with the place on that.
+        face : UInt32, 1 to `len`, and 0 for anything else.
         """
         import drjit as dr
 
         mi = self._mi
+        face = mi.UInt32(0)
         if self._scene is not None:
-            return self._scene.ray_intersect_preliminary(ray, coherent, active & self._near(ray))
+            return self._scene.ray_intersect_preliminary(ray, coherent, active & self._near(ray)), face
         found = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
         found.t, end = mi.Float(dr.inf), ray.maxt
 
@@ -143,14 +183,12 @@ class Part:
         for middle, square, shape in self._balls:
             t = _to_ball(ray, middle, square)
             end = take(active & (t >= 0) & (t < end), t, shape)
-        for rows, face, shape in self._faces:
-            t, u, v, inside = _to_face(ray, rows)
+        for number, (rows, _, shape) in enumerate(self._faces, start=1):
+            t, place, inside = _to_face(ray, rows)
             closer = active & inside & (t >= 0) & (t < end)
-            end = take(closer, t, shape)
-            index, place = face.triangle(mi, u, v)
-            found.prim_index = dr.select(closer, index, found.prim_index)
+            end, face = take(closer, t, shape), dr.select(closer, number, face)
             found.prim_uv = dr.select(closer, place, found.prim_uv)
-        return found
+        return found, face
 
     def blocks(self, ray: Any, active: Any) -> Any:
         """Whether anything lies on a ray before its `maxt`."""
@@ -161,21 +199,53 @@ class Part:
             t = _to_ball(ray, middle, square)
             blocked |= (t >= 0) & (t < ray.maxt)
         for rows, _, _ in self._faces:
-            t, _, _, inside = _to_face(ray, rows)
+            t, _, inside = _to_face(ray, rows)
             blocked |= inside & (t >= 0) & (t < ray.maxt)
         return blocked & active
+
+    def describe(self, si: Any, ray: Any, hit: Any, face: Any) -> None:
+        """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one.
+
+        Parameters
+        ----------
+        si : of everything else; it is changed.
+        ray, hit, face : given to and returned by `nearest`.
+        """
+        import drjit as dr
+
+        u, v = hit.prim_uv
+        second = u + v > 1
+        n, shading, s, dp_du, dp_dv = si.n, si.sh_frame.n, si.sh_frame.s, si.dp_du, si.dp_dv
+        for number, ((_, triangle, _), told) in enumerate(zip(self._faces, self._surfaces, strict=True), start=1):
+            here = face == number
+
+            def chosen(name: str, told: dict[str, list[Any]] = told) -> Any:
+                return dr.select(second, told[name][1], told[name][0]) if len(told[name]) == 2 else told[name][0]
+
+            n, shading = dr.select(here, chosen("n"), n), dr.select(here, chosen("shading"), shading)
+            s = dr.select(here, chosen("s"), s)
+            dp_du, dp_dv = dr.select(here, chosen("dp_du"), dp_du), dr.select(here, chosen("dp_dv"), dp_dv)
+            origin, along_u, along_v = chosen("uv")
+            si.uv = dr.select(here, dr.fma(along_u, u, dr.fma(along_v, v, origin)), si.uv)
+            si.prim_index = dr.select(here, dr.select(second, triangle + 1, triangle), si.prim_index)
+        here = face != 0
+        si.n, si.sh_frame.n, si.sh_frame.s, si.dp_du, si.dp_dv = n, shading, s, dp_du, dp_dv
+        si.sh_frame.t = dr.select(here, dr.cross(shading, s), si.sh_frame.t)
+        si.t, si.p = dr.select(here, hit.t, si.t), dr.select(here, ray(hit.t), si.p)
+        si.shape = dr.select(here, hit.shape, si.shape)
+        si.wi = dr.select(here, si.sh_frame.to_local(-ray.d), si.wi)
 
     def _near(self, ray: Any) -> Any:
         """Whether a ray meets the ball around all, where there is one."""
         return self._mi.Bool(True) if self._around is None else meets_ball(ray, ray.maxt, self._around)
 
 
-def _faces(shape: Any) -> list[Face]:
-    """The faces of a mesh if they are all it is and not too many; else none."""
-    if not shape.is_mesh() or shape.face_count() > 2 * _MOST:
-        return []
-    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    return faces_of(vertices, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3))
+def _on_device(mi: Any, values: NDArray[np.float64]) -> list[Any]:
+    """Values of both triangles, [2, ...], or one where they are alike."""
+    kept = values[:1] if np.allclose(values[0], values[1], rtol=_SAME, atol=_SAME) else values
+    if values.ndim == 2:
+        return [mi.Vector3f(value) for value in kept]
+    return [tuple(mi.Point2f(row) for row in value) for value in kept]
 
 
 def _ball_around(mi: Any, box: Any, factor: float) -> tuple[Any, Any]:
@@ -198,19 +268,20 @@ def _to_ball(ray: Any, middle: Any, square: Any) -> Any:
     return dr.select(first >= 0, first, second)
 
 
-def _to_face(ray: Any, rows: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any, Any]:
+def _to_face(ray: Any, rows: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     """Distance along a ray to a face's plane, the place there, and whether it lies on the face.
 
     Where the ray runs along the plane they are not numbers, and it does not.
     """
     import drjit as dr
+    import mitsuba as mi
 
     (u_row, u_0), (v_row, v_0), (normal, height) = rows
     t = -(dr.dot(normal, ray.o) + height) * dr.rcp(dr.dot(normal, ray.d))
     point = dr.fma(ray.d, t, ray.o)
     u, v = dr.dot(u_row, point) + u_0, dr.dot(v_row, point) + v_0
     # not dr.minimum and dr.maximum: what those do about NaN takes time
-    return t, u, v, (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+    return t, mi.Point2f(u, v), (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
 
 
 def meets_ball(ray: Any, length: Any, ball: tuple[Any, Any]) -> Any:
