@@ -4,7 +4,8 @@
     python benchmarks/coherent.py --area
 
 (a) `mi.render` with `specfilm`, once per tick; (b) the exact mode; (c) the coherent mode. 346×260 pixels, 800 Hz. In
-all three Russian roulette is played from the sixteenth segment on. (c) alone sends paths to images of lamps in mirrors.
+all three Russian roulette is played from the sixteenth segment on. (c) alone sends paths to images of lamps in mirrors,
+and does not sample an even sky beside a lamp.
 
 (c) runs over two chunks of ticks, the second of which is timed; at quality 0.5, but glass at 2, for its caustics ask
 for 1700 rays a pixel at 1. Its error is the rms over pixels, in units of each one's own event noise (3 % of the
