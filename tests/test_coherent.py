@@ -352,22 +352,18 @@ def test_bound_of_the_audit():
     assert (1 - 0.01) ** least_checked(0.01) <= 0.01 < (1 - 0.01) ** (least_checked(0.01) - 1)
 
 
-@pytest.fixture
-def careless(monkeypatch):
-    """Refinement that is loosened until something is missed, and never refined further."""
+def test_the_audit_covers_the_true_fraction(monkeypatch):
+    """At least 95 of 100 audits of one run; a bound of 99 % confidence misses that with a chance of 5e-4."""
+    # loosened until something is missed, and never refined further
     monkeypatch.setattr(sketch, "_CHANGE", 4.0)
     monkeypatch.setattr(refinement, "_STEP_PX", 6.0)
     monkeypatch.setattr(refinement, "MOST_EXCEEDED", 0.99)
-
-
-def audited(seed, checks=300):
-    """One chunk of a turning star with the audit of its run, and the true fraction beyond the tolerance."""
-    source = CoherentFlux(hr.load_scene("rotating-star"), mono(32, 24), quality=0.5, seed=seed)
+    source = CoherentFlux(hr.load_scene("rotating-star"), mono(32, 24), quality=0.5, seed=7)
     pixels = source.sensor.layout.evs_pixel.ravel()
     work = Refinement(
-        source.adaptive, source._timeline, source.audit, pixels, *windows(33), source._event_unit(pixels), seed
+        source.adaptive, source._timeline, source.audit, pixels, *windows(33), source._event_unit(pixels), 0
     )
-    work._checks = checks
+    work._checks = 300
     settle, kept = work._settle, []
     work._settle = lambda chunk, drawn: (settle(chunk, drawn), kept.append(chunk))
     list(work.run())
@@ -377,30 +373,14 @@ def audited(seed, checks=300):
     off = (chunk.mean(window, place) - truth) / work._unit(truth.astype(np.float64), place)
     fraction = np.mean(np.abs(off) > source.audit.tolerance)
     assert 0.005 < fraction < 0.2, "nothing was missed, or everything: this shows nothing"
-    return source, work, chunk, fraction
-
-
-def test_the_audit_covers_the_true_fraction(careless):
-    """At least 95 of 100 audits of one run; a bound of 99 % confidence misses that with a chance of 5e-4."""
-    source, work, chunk, fraction = audited(7)
-    skipped = np.count_nonzero(~chunk.rendered)
     bounds = []
     for seed in range(100):
         audit = Audit(source.audit.tolerance)
-        audit.add(skipped, *work._check(chunk, np.random.default_rng(seed)))
+        audit.add(place.size, *work._check(chunk, np.random.default_rng(seed)))
         bounds.append(audit.bound)
     assert np.count_nonzero(np.array(bounds) >= fraction) >= 95
     # and no audit that says one would pass: the bound follows the fraction
     assert fraction < np.mean(bounds) < 5 * fraction
-
-
-@pytest.mark.slow
-def test_the_audit_covers_in_95_of_100_runs(careless):
-    """A hundred runs of seeds of their own, each with the audit it makes itself; false alarm as above."""
-    runs = [audited(seed) for seed in range(100)]
-    pairs = np.array([(source.audit.bound, fraction) for source, _, _, fraction in runs])
-    assert np.count_nonzero(pairs[:, 0] >= pairs[:, 1]) >= 95
-    assert pairs[:, 1].mean() < pairs[:, 0].mean() < 5 * pairs[:, 1].mean()
 
 
 class EdgeFlux:
