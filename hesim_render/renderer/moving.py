@@ -126,7 +126,7 @@ class MovingScene:
         nearest, face, chosen, ray_there = self._nearest(ray, poses, coherent, active)
         si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active & (face == 0))
         for number, part in enumerate([self._resting, *(group.part for group in self.groups)]):
-            if len(part):
+            if part.face_count:
                 part.describe(si, ray_there, nearest, dr.select(chosen == number, face, 0))
         if not poses:
             return si

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 _MOST = 8
 #: How far the corners of two triangles may be off those of a parallelogram, over its size.
 _FLAT = 1e-5
-#: How far directions on a face may differ from corner to corner.
+#: How far normals on a face may differ from corner to corner; and what else its triangles have, over its size.
 _SAME = 1e-5
 
 
@@ -150,7 +150,8 @@ class Part:
         held = [ball[:2] for ball in self._balls], [face[0] for face in self._faces], self._surfaces, self._around
         dr.make_opaque(held)
 
-    def __len__(self) -> int:
+    @property
+    def face_count(self) -> int:
         """Faces that are tried one by one."""
         return len(self._faces)
 
@@ -165,7 +166,7 @@ class Part:
         Returns
         -------
         hit : `PreliminaryIntersection3f`, its t infinite where there is none; on a face, with the place on that.
-        face : UInt32, 1 to `len`, and 0 for anything else.
+        face : UInt32, 1 to `face_count`, and 0 for anything else.
         """
         import drjit as dr
 
@@ -243,7 +244,8 @@ class Part:
 
 def _on_device(mi: Any, values: NDArray[np.float64]) -> list[Any]:
     """Values of both triangles, [2, ...], or one where they are alike."""
-    kept = values[:1] if np.allclose(values[0], values[1], rtol=_SAME, atol=_SAME) else values
+    alike = np.allclose(values[0], values[1], rtol=0, atol=_SAME * np.abs(values).max())
+    kept = values[:1] if alike else values
     if values.ndim == 2:
         return [mi.Vector3f(value) for value in kept]
     return [tuple(mi.Point2f(row) for row in value) for value in kept]

@@ -5,7 +5,8 @@ of n takes point π(j) of the sequence, π a random permutation, and each coordi
 (XOR) by random bits. Permutation and shifts are hashed from the number of the draw and four keys, which
 Philox4x32 gives with the counters (pixel on the full sensor, half). Each sample is uniform, so estimates
 are unbiased; the n samples of a half are stratified in every single dimension and jointly in those of one
-draw, unlike draws are independent, and so are the halves. (Owen scrambling in place of the shift was
+draw, unlike draws are independent, and so are the halves. (At the vertex of a path one point serves
+two ends that never meet in a product, see `next_vertex`.) (Owen scrambling in place of the shift was
 measured: 1.6 times the error at 16 samples, for the spectra are smooth.)
 
 Place in the pixel and instant are one draw: an edge that moves is a surface in those three dimensions,
