@@ -25,7 +25,7 @@ from hesim_render.calibrate import calibrate_{kind}
 start = time.perf_counter()
 calibrate_{kind}({folder!r}, {out!r}, {report!r})
 seconds = time.perf_counter() - start
-print(json.dumps([seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024]))
+print(json.dumps([seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6]))
 """
 
 
@@ -102,7 +102,7 @@ def main():
         inflating = [inflate(file) for file in files]
         aps, evs = run("aps", folder), run("evs", folder)
         frames = f"5 exposures x {given.frames} frames x 2 sets at {given.size}x{given.size}"
-        print(f"APS calibration, {frames}, with report: {aps[0]:.1f} s, {aps[1]:.0f} MB (bounds 20 s, 1024 MB)")
+        print(f"APS calibration, {frames}, with report: {aps[0]:.1f} s, {aps[1]:.0f} MB (bounds 20 s, 1000 MB)")
         print(f"  inflating the two files alone, one after the other: {sum(inflating):.1f} s")
         counts = f"{given.size}x{given.size}, 20000 ticks"
         print(f"EVS calibration, {counts}, with report: {evs[0]:.1f} s, {evs[1]:.0f} MB (bound 5 s)")

@@ -53,12 +53,15 @@ SENSOR = {
     "evs.contrast_threshold_off": 0.2,
 }
 #: How fast each scene has to move for about this share of its pixels, in per cent, to change. At 100 the star fills the
-#: picture and turns by half a period a tick; of the others, parts never change: it is the most they reach.
+#: picture and turns by half a period a tick, everything in the sweep is finely chequered, and the glass and what is
+#: around it stand in a finely chequered room that the camera turns in as well.
 SPEEDS = {
     "star": {3: 0.05, 10: 1.7, 25: 7.0, 100: 40.0},
-    "sweep": {3: 0.12, 10: 0.45, 25: 4.0, 100: 60.0},
-    "glass": {3: 0.15, 10: 1.0, 25: 5.0, 100: 60.0},
+    "sweep": {3: 0.12, 10: 0.45, 25: 4.0, 100: 8.0},
+    "glass": {3: 0.15, 10: 1.0, 25: 5.0, 100: 8.0},
 }
+#: Side of a check of the scenes in which everything changes; a pixel shows 5 mm of what is 2 m away.
+FINE_M = 0.013
 
 
 def star(speed: float) -> Scene:
@@ -71,20 +74,38 @@ def star(speed: float) -> Scene:
     return hr.load_scene("rotating-star", changes)
 
 
-def sweep(speed: float) -> Scene:
-    """A camera that goes past solids at several depths, at speed 1 by 1.8 m/s and 32° per second."""
+def swing(speed: float, pivot: list[float]) -> dict:
+    """A track of a camera, at speed 1 by 1.8 m/s and 32° per second."""
     half = round(5e5 / speed)
     keys = [
         {"t_us": 0, "translation_m": [-0.45, 0, 0], "rotation_axis": [0, 1, 0], "rotation_deg": -8},
         {"t_us": half, "translation_m": [0.45, 0.1, 0], "rotation_axis": [0, 1, 0], "rotation_deg": 8},
         {"t_us": 2 * half, "translation_m": [-0.45, 0, 0], "rotation_axis": [0, 1, 0], "rotation_deg": -8},
     ]
-    track = {"object": "camera", "pivot_m": [0, 0.62, 1.75], "repeat": True, "keyframes": keys}
-    return hr.load_scene("camera-sweep", {"motion": [track]})
+    return {"object": "camera", "pivot_m": pivot, "repeat": True, "keyframes": keys}
+
+
+def sweep(speed: float) -> Scene:
+    """A camera that goes past solids at several depths.
+
+    From the speed of 100 % on, all of it is chequered so finely that edges go through nearly every pixel.
+    """
+    scene = hr.load_scene("camera-sweep", {"motion": [swing(speed, [0, 0.62, 1.75])]})
+    if speed < SPEEDS["sweep"][100]:
+        return scene
+    spec = scene.spec.model_dump(exclude_unset=True)
+    for solid in spec["objects"]:
+        solid["reflectance"], solid["pattern"] = 0.7, 0.1
+        solid["pattern_count"] = [round(max(solid["size_m"]) / FINE_M)] * 2
+    return Scene(SceneSpec.model_validate(spec))
 
 
 def glass(speed: float) -> Scene:
-    """A glass ball, a rough-metal ball, a glossy box and a mirror, three of them moving on a chequered floor."""
+    """A glass ball, a rough-metal ball, a glossy box and a mirror, three of them moving on a chequered floor.
+
+    From the speed of 100 % on the checks are fine, there is a wall behind, and the camera turns.
+    """
+    everywhere = speed >= SPEEDS["glass"][100]
 
     def at(x: float, y: float, z: float, size: float) -> list[list[float]]:
         return [[size, 0, 0, x], [0, size, 0, y], [0, 0, size, z], [0, 0, 0, 1]]
@@ -92,7 +113,12 @@ def glass(speed: float) -> Scene:
     def grey(value: float) -> dict:
         return {"type": "uniform", "value": value}
 
-    checks = {"type": "checkerboard", "color0": grey(0.6), "color1": grey(0.2), "to_uv": at(0, 0, 0, 12.0)}
+    checks = {
+        "type": "checkerboard",
+        "color0": grey(0.6),
+        "color1": grey(0.2),
+        "to_uv": at(0, 0, 0, 2 / FINE_M if everywhere else 12.0),
+    }
     shapes = {
         "floor": {
             "type": "rectangle",
@@ -113,7 +139,11 @@ def glass(speed: float) -> Scene:
         "box": {
             "type": "cube",
             "to_world": at(0.05, 0.15, 0.45, 0.13),
-            "bsdf": {"type": "roughplastic", "diffuse_reflectance": grey(0.35), "alpha": 0.1},
+            "bsdf": {
+                "type": "roughplastic",
+                "diffuse_reflectance": {**checks, "to_uv": at(0, 0, 0, 12.0)} if everywhere else grey(0.35),
+                "alpha": 0.1,
+            },
         },
         "lamp": {
             "type": "rectangle",
@@ -132,6 +162,15 @@ def glass(speed: float) -> Scene:
         ]
         return {"object": name, "pivot_m": pivot, "repeat": True, "keyframes": keys}
 
+    motion = [
+        track("glass", [0.3, 0, 0.2], [-0.35, 0.25, 0.1]),
+        track("metal", [-0.2, 0, 0.1], [0.4, 0.25, -0.2]),
+        track("box", [0.3, 0, 0], [0.05, 0.15, 0.45]),
+    ]
+    if everywhere:
+        shapes["wall"] = {**shapes["floor"], "to_world": at(0, 0, -1.9, 2.0)}
+        shapes["rear wall"] = {**shapes["floor"], "to_world": at(0, 0, 2.6, -2.0)}
+        motion.append(swing(speed, [0, 0.7, 2.2]))
     spec = {
         "schema_version": 1,
         "name": "glass",
@@ -139,11 +178,7 @@ def glass(speed: float) -> Scene:
         "mitsuba": {"inline": shapes},
         "camera": {"origin_m": [0, 0.7, 2.2], "target_m": [0, 0.2, 0], "horizontal_fov_deg": 40},
         "max_depth": 6,
-        "motion": [
-            track("glass", [0.3, 0, 0.2], [-0.35, 0.25, 0.1]),
-            track("metal", [-0.2, 0, 0.1], [0.4, 0.25, -0.2]),
-            track("box", [0.3, 0, 0], [0.05, 0.15, 0.45]),
-        ],
+        "motion": motion,
     }
     return Scene(SceneSpec.model_validate(spec))
 
@@ -336,7 +371,7 @@ def compare(name: str, wanted: int, quality: float) -> None:
     error_a = reference.square_error(image, tick) ** 0.5
     per_second = 1e6 / TICK_US
     rendered = 1 - source.audit.skipped / (sensor.rows * sensor.cols * 2 * CHUNK)
-    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     print(
         f"{name:6s} {100 * share:5.1f} %  error {target**0.5:.3f} | "
         f"(a) {seconds_a * per_second:8.0f} s/s {spp_a:5d} spp {error_a:.3f} | "

@@ -12,8 +12,10 @@ import numpy as np
 from hesim_render.backend import jit
 from hesim_render.spectra import Spectrum
 
-#: Parts of a response's integral for which the first cell is tabled, so that the search starts next to its end.
-_BINS = 1024
+#: Parts of a response's integral for which the first cell is tabled: few of them hold more than the end of one cell.
+_BINS = 4096
+#: Marks the parts that do hold more.
+_SEVERAL = 1 << 31
 
 
 class WavelengthSampler:
@@ -41,7 +43,10 @@ class WavelengthSampler:
             share, more = (area / area[-1]).astype(np.float32), room - grid.size
             place = np.arange(_BINS + 1, dtype=np.float32) / _BINS
             start = np.clip(np.searchsorted(share, place, side="right") - 1, 0, grid.size - 2)
-            starts.append(np.stack([start[:-1], start[1:]], axis=1))
+            # where a part goes over into the next cell, 2 (never reached) where it does not
+            over = np.where(start[1:] > start[:-1], share[start[:-1] + 1], np.float32(2)).view(np.uint32)
+            first = start[:-1] | np.where(start[1:] > start[:-1] + 1, _SEVERAL, 0)
+            starts.append(np.append(np.stack([first, over], axis=1), [[start[-1], 0]], axis=0))
             ends = np.stack([x for values in (share, table, grid, 0 * grid) for x in (values[:-1], values[1:])], axis=1)
             cells.append(np.pad(ends, ((0, more), (0, 0)), mode="edge"))
             shares.append(np.pad(share[:-1], (0, more), constant_values=2.0))  # never reached
@@ -74,8 +79,15 @@ class WavelengthSampler:
         floats, uints = types.Float, types.UInt32
         base = filter_index * self._room
         places = [(u + k) * 0.25 for k in range(4)]
-        bins = [filter_index * _BINS + dr.minimum(uints(place * _BINS), _BINS - 1) for place in places]
-        low, high = zip(*(dr.gather(types.Array2u, self._starts, number) for number in bins), strict=True)
+        bins = [filter_index * (_BINS + 1) + dr.minimum(uints(place * _BINS), _BINS - 1) for place in places]
+        low, high = [], []
+        for place, number in zip(places, bins, strict=True):
+            first, over = dr.gather(types.Array2u, self._starts, number)
+            several = first >= _SEVERAL
+            first = (first & (_SEVERAL - 1)) + dr.select(dr.reinterpret_array(floats, over) <= place, uints(1), 0)
+            end = dr.gather(uints, self._starts, 2 * number + 2, several) & (_SEVERAL - 1)
+            low.append(first)
+            high.append(dr.select(several, end, first))
 
         def halve(low: list[Any], high: list[Any]) -> tuple[list[Any], list[Any]]:
             new_low, new_high = [], []
@@ -89,8 +101,8 @@ class WavelengthSampler:
         def unsure(low: list[Any], high: list[Any]) -> Any:
             return functools.reduce(operator.or_, (a < b for a, b in zip(low, high, strict=True)))
 
-        # one step nearly always; only in the tails does a bin hold many cells
-        low, _ = dr.while_loop((list(low), list(high)), unsure, halve, label="wavelengths")
+        # no step nearly always; only in the tails does a bin hold many cells
+        low, _ = dr.while_loop((low, high), unsure, halve, label="wavelengths")
         wavelengths = []
         for place, cell in zip(places, (base + a for a in low), strict=True):
             # one packet each: gathers of single numbers cost more than what is done with them
