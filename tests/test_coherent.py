@@ -254,6 +254,33 @@ def test_a_pair_does_not_depend_on_its_company():
         np.testing.assert_array_equal(getattr(together, field)[some], getattr(alone, field))
 
 
+def test_one_kernel_serves_lists_of_any_length_and_alignment():
+    import drjit as dr
+
+    scene = hr.load_scene("rotating-star")
+    exact = RenderedFlux(scene, mono(), samples=8, seed=1)
+    tracer = TimedTracer(scene, exact.sensor, 1, used_responses(exact.sensor))
+
+    def run(count, first):
+        pixel = np.arange(first, first + count, dtype=np.uint32)
+        times = np.zeros(count), np.full(count, 1000.0)
+        tracer.trace(pixel, *times, np.full(count, 8))
+        exact.mean_flux(pixel, *times)
+        tracer.motion_px(np.arange(first + count + 1, dtype=np.uint32)[first:], 0.0, 1000.0)
+
+    run(128, 0)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    try:
+        dr.kernel_history_clear()
+        for count, first in ((1, 0), (2, 1), (77, 3), (1000, 4), (3000, 5)):
+            run(count, first)
+        history = dr.kernel_history([dr.KernelType.JIT])
+    finally:
+        dr.set_flag(dr.JitFlag.KernelHistory, False)
+    assert len(history) >= 15, "nothing was run"
+    assert all(entry["cache_hit"] for entry in history)
+
+
 def test_quality_is_reached_and_costs_rays():
     scene, sensor = hr.load_scene("camera-sweep"), mono()
     pixels = np.arange(64 * 48, dtype=np.uint32)
@@ -500,7 +527,7 @@ def test_five_thousand_windows_keep_memory_and_compile_nothing():
     pixels = sensor.layout.evs_pixel.ravel()
     compiled, before = 0, 0.0
     for number, _ in enumerate(source.flux_of_windows(pixels, *windows(5000))):
-        if number == 1000:
+        if number == 64:  # two chunks
             dr.set_flag(dr.JitFlag.KernelHistory, True)
             dr.kernel_history_clear()
         elif number == 2000:  # the history itself takes memory

@@ -154,7 +154,7 @@ def test_same_seed_same_bits_in_any_order_chunk_or_crop():
     expected = [np.array(half) for half in whole.mean_flux(np.arange(count), begin, end)]
     assert np.ptp(expected[0]) > 0
     order = rng.permutation(count)[:2500]
-    other = RenderedFlux(scene, sensor, 8, 3, block_rays=(1 << 12,))
+    other = RenderedFlux(scene, sensor, 8, 3, block_rays=1 << 12)
     for source in (whole, other):
         shuffled = source.mean_flux(order, begin[order], end[order])
         for half, reference in zip(shuffled, expected, strict=True):
@@ -262,7 +262,7 @@ def test_darkness_is_exactly_zero():
 def test_progress_counts_every_ray():
     seen = []
     scene = hr.load_scene("flat-field")
-    flux_image(scene, mono(), 16, progress=seen.append, block_rays=(1 << 14, 1 << 12))
+    flux_image(scene, mono(), 16, progress=seen.append, block_rays=1 << 14)
     assert seen[-1] == 64 * 48 * 16 and seen == sorted(seen) and len(seen) == 3
 
 

@@ -74,7 +74,7 @@ class RenderedFlux:
     seed : of the run.
     max_motion_px : how far an object may move within a slice.
     progress : called with the number of rays traced so far, after each block.
-    block_rays : sizes of the work blocks, largest first.
+    block_rays : most rays that are traced at a time.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class RenderedFlux:
         *,
         max_motion_px: float = MAX_MOTION_PX,
         progress: Callable[[int], None] | None = None,
-        block_rays: tuple[int, ...] = BLOCK_RAYS,
+        block_rays: int = BLOCK_RAYS,
     ) -> None:
         if not max_motion_px > 0:
             raise RangeError("max_motion_px", max_motion_px, "a distance above 0")
@@ -166,4 +166,5 @@ class RenderedFlux:
 
         types = jit()
         total = self._wavelengths.total(dr.gather(types.UInt32, self._filter, pixel))
-        return [dr.mean(radiance) * total * dr.gather(types.Float, self._illumination, pixel)]
+        # not dr.mean, which has the number of lanes in the kernel: each new one would compile
+        return [dr.sum(radiance) / len(radiance) * total * dr.gather(types.Float, self._illumination, pixel)]

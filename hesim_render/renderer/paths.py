@@ -76,9 +76,7 @@ class PathIntegrator:
         self._lamps = [device_box(scene.mi, box) for box in lamps]
         self._images = LampImages.of(scene.mi, scene.static)
 
-    def sample(
-        self, sampler: Any, ray: Any, poses: Sequence[DevicePose], boxes: Boxes | None, active: Any
-    ) -> tuple[Any, Any]:
+    def sample(self, sampler: Any, ray: Any, poses: Sequence[DevicePose], boxes: Boxes | None) -> tuple[Any, Any]:
         """One path a lane.
 
         Parameters
@@ -97,12 +95,12 @@ class PathIntegrator:
 
         mi, scene = self._scene.mi, self._scene
         context = mi.BSDFContext()
-        depth, met = mi.UInt32(0), mi.UInt32(0)
+        depth, met = mi.UInt32(0), dr.zeros(mi.UInt32, dr.width(ray))
         throughput, radiance = mi.Spectrum(1.0), mi.Spectrum(0.0)
         stretch = mi.Float(1.0)  # of solid angle by refraction
         before = dr.zeros(mi.Interaction3f)
         before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
-        ray, active = mi.Ray3f(ray), mi.Bool(active)
+        ray, active = mi.Ray3f(ray), mi.Bool(True)
         most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
 
         def shine(si: Any, active: Any, before: Any, pdf: Any, delta: Any) -> Any:

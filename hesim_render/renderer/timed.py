@@ -13,7 +13,7 @@ from hesim_render.backend import jit
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paths import Boxes, PathIntegrator
-from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer
+from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer, spread_out
 from hesim_render.renderer.wavelengths import WavelengthSampler
 from hesim_render.rng import Stream, stream_key
 from hesim_render.scene import Scene
@@ -87,7 +87,7 @@ class TimedTracer(Tracer):
         seed: int,
         responses: dict[str, Spectrum],
         progress: Callable[[int], None] | None = None,
-        block_rays: tuple[int, ...] = BLOCK_RAYS,
+        block_rays: int = BLOCK_RAYS,
     ) -> None:
         import drjit as dr
 
@@ -140,7 +140,9 @@ class TimedTracer(Tracer):
             assert interval is not None
             types = jit()
             corners = np.concatenate([swept.swept, swept.present], axis=2)
-            tables = types.Float(corners.astype(np.float32).ravel()), types.UInt32(swept.told.astype(np.uint32).ravel())
+            # never one entry, which would be a constant in the kernel
+            told = np.append(swept.told.ravel(), False).astype(np.uint32)
+            tables = types.Float(corners.astype(np.float32).ravel()), types.UInt32(told)
             dr.make_opaque(*tables)
             lanes.append(interval)
         out = PairFlux(*(np.empty(pixel.size, dtype) for dtype in (np.float32, np.float32, np.float32, np.uint32)))
@@ -149,11 +151,9 @@ class TimedTracer(Tracer):
         first = 0
         while first < pixel.size:
             done = int(ends[first - 1]) if first else 0
-            rays = (int(ends[-1]) - done) * _PACKET
-            size = self._block_size(rays)
-            last = int(np.searchsorted(ends, done + size // _PACKET, side="right"))
+            last = int(np.searchsorted(ends, done + self._block_rays // _PACKET, side="right"))
             part = slice(first, last)
-            self._block([table[part] for table in lanes], packets[part], size, tables, out, part)
+            self._block([table[part] for table in lanes], packets[part], tables, out, part)
             self._report((int(ends[last - 1]) - done) * _PACKET)
             first = last
         return out
@@ -174,11 +174,10 @@ class TimedTracer(Tracer):
         local = [[types.Float(np.float32(track.local_us(t))) for track in tracks] for t in (begin_us, end_us)]
         for values in local:
             dr.make_opaque(*values)
-        room = self._block_rays[1] if len(self._block_rays) > 1 else self._block_rays[0]
         count = len(self.parts.groups)
-        for first in range(0, pixel.size, room):
-            part = pixel[first : first + room]
-            listed = types.UInt32(np.pad(part, (0, room - part.size), mode="edge"))
+        for first in range(0, pixel.size, self._block_rays):
+            part = pixel[first : first + self._block_rays]
+            listed = spread_out(types.UInt32, part, dr.arange(types.UInt32, part.size))
             row, column = self._row_and_col(listed)
             col = types.Float(column)
             middle = types.Float(0.5), types.Float(0.5)
@@ -194,42 +193,37 @@ class TimedTracer(Tracer):
             far = dr.sqrt(dr.square(place[0] - col) + dr.square(place[1] - types.Float(row)))
             far = dr.select(seen & dr.isfinite(far), far, 0.0)
             dr.eval(far, group)
-            out[first : first + part.size] = np.array(far)[: part.size]
-            who[first : first + part.size] = np.array(group)[: part.size]
+            out[first : first + part.size] = np.array(far)
+            who[first : first + part.size] = np.array(group)
         return out, who
 
-    def _block(
-        self, lanes: list[NDArray], packets: NDArray[np.int64], size: int, tables: Any, out: PairFlux, part: slice
-    ) -> None:
-        """Trace some pairs, packet after packet of `_PACKET` rays; the packets beyond them are masked."""
+    def _block(self, lanes: list[NDArray], packets: NDArray[np.int64], tables: Any, out: PairFlux, part: slice) -> None:
+        """Trace some pairs, packet after packet of `_PACKET` rays."""
         import drjit as dr
 
         types = jit()
-        room, used = size // _PACKET, int(packets.sum())
+        used = int(packets.sum())
         starts = np.cumsum(packets) - packets
         pair = np.repeat(np.arange(packets.size, dtype=np.uint32), packets)
         within = (np.arange(used) - np.repeat(starts, packets)).astype(np.uint32)
         half_rays = np.repeat((packets * (_PACKET // 2)).astype(np.uint32), packets)
 
         def by_ray(table: NDArray) -> Any:
-            kind = types.UInt32 if table.dtype == np.uint32 else types.Float
-            return dr.gather(kind, kind(np.pad(table, (0, room - used), mode="edge")), packet)
+            return spread_out(types.UInt32 if table.dtype == np.uint32 else types.Float, table, packet)
 
-        ray_index = dr.arange(types.UInt32, size)
+        ray_index = dr.arange(types.UInt32, used * _PACKET)
         packet = ray_index // _PACKET
-        active = packet < dr.opaque(types.UInt32, used)
         sample = by_ray(within) * _PACKET + ray_index - packet * _PACKET
         per_half = by_ray(half_rays)
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
         pixel, span, *rest = (by_ray(table[pair]) for table in lanes)
-        flux, met = self._rays_of(pixel, half, sample - half * per_half, per_half, span, rest, tables, active)
-        flux, met = dr.select(active, flux, 0.0), dr.select(active, met, 0)
+        flux, met = self._rays_of(pixel, half, sample - half * per_half, per_half, span, rest, tables)
         squares = flux * flux
         # the rays first, in one kernel; then sums within halves of packets, the smallest half there is
         dr.eval(flux, squares, met)
-        sums = np.array(dr.block_sum(flux, _PACKET // 2))[: 2 * used]
-        squares = np.array(dr.block_sum(squares, _PACKET))[:used]
-        bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, _PACKET))[:used]
+        sums = np.array(dr.block_sum(flux, _PACKET // 2))
+        squares = np.array(dr.block_sum(squares, _PACKET))
+        bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, _PACKET))
         rays = packets * _PACKET
         # a pair of one packet is half a then half b; longer ones have their first packets in half a
         halves = np.add.reduceat(sums.astype(np.float64), np.stack([2 * starts, 2 * starts + packets], axis=1).ravel())
@@ -241,7 +235,7 @@ class TimedTracer(Tracer):
         out.met[part] = np.bitwise_or.reduceat(bits, starts)
 
     def _rays_of(
-        self, pixel: Any, half: Any, sample: Any, per_half: Any, span: Any, rest: list[Any], tables: Any, active: Any
+        self, pixel: Any, half: Any, sample: Any, per_half: Any, span: Any, rest: list[Any], tables: Any
     ) -> tuple[Any, Any]:
         """Flux and bits of one ray per lane."""
         import drjit as dr
@@ -264,9 +258,10 @@ class TimedTracer(Tracer):
         which = dr.gather(types.UInt32, self._filter, pixel)
         bands = mi.UnpolarizedSpectrum(*self._wavelengths.sample(which, choice))
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
-        radiance, met = self._integrator.sample(sampler, primary, poses, boxes, active)
+        radiance, met = self._integrator.sample(sampler, primary, poses, boxes)
         scale = self._wavelengths.total(which) * dr.gather(types.Float, self._illumination, pixel)
-        return dr.mean(radiance) * scale, met
+        # not dr.mean, which has the number of lanes in the kernel: each new one would compile
+        return dr.sum(radiance) / len(radiance) * scale, met
 
 
 def _boxes_of(mi: Any, tables: Any, interval: Any, groups: int) -> Boxes:

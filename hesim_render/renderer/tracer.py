@@ -1,8 +1,8 @@
-"""Paths from mosaic pixels into the scene, in blocks of fixed size."""
+"""Paths from mosaic pixels into the scene, in blocks that bound memory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,24 @@ from hesim_render.scene import Scene
 from hesim_render.sensor import Sensor
 from hesim_render.spectra import Spectrum
 
-#: Work goes in blocks of these many rays: each new length compiles a kernel, and memory stays bounded.
-BLOCK_RAYS = (1 << 20, 1 << 17, 1 << 14)
+#: So many rays are traced at a time, for bounded memory.
+BLOCK_RAYS = 1 << 20
 
 #: (mosaic index, u in [0, 1)) → the four wavelengths of a ray, nm.
 Wavelengths = Callable[[Any, Any], list[Any]]
 #: (mosaic index, radiance at those four) → the quantities to average.
 Values = Callable[[Any, Any], list[Any]]
+
+
+def spread_out(kind: Any, table: NDArray, lane: Any) -> Any:
+    """Entries of a table on the host, by lane.
+
+    One kernel serves all lengths and places in memory: a table of one entry would be a constant in it, and one that
+    is read in order may be aligned or not. Both compile anew.
+    """
+    import drjit as dr
+
+    return dr.gather(kind, kind(np.append(table, table[-1:])), lane)
 
 
 class Tracer:
@@ -37,7 +48,7 @@ class Tracer:
     scene, sensor : what and through what.
     responses : spectra that the scene must cover.
     progress : called with the number of rays traced so far, after each block.
-    block_rays : sizes of the work blocks, largest first.
+    block_rays : most rays that are traced at a time.
 
     Attributes
     ----------
@@ -59,7 +70,7 @@ class Tracer:
         sensor: Sensor,
         responses: Mapping[str, Spectrum],
         progress: Callable[[int], None] | None,
-        block_rays: tuple[int, ...],
+        block_rays: int,
     ) -> None:
         import drjit as dr
 
@@ -86,10 +97,6 @@ class Tracer:
     def _index(self, row: Any, col: Any) -> Any:
         """Number of a pixel on the full sensor, whatever the region: what its random numbers follow."""
         return self._first_index + row * self._full_cols + col
-
-    def _block_size(self, rays: int) -> int:
-        """The largest block that is filled at least by half, else the smallest."""
-        return next((size for size in self._block_rays if 2 * rays > size), self._block_rays[-1])
 
     def _report(self, rays: int) -> None:
         self.rays_done += rays
@@ -122,15 +129,15 @@ class PixelTracer(Tracer):
         seed: int,
         responses: Mapping[str, Spectrum],
         progress: Callable[[int], None] | None = None,
-        block_rays: tuple[int, ...] = BLOCK_RAYS,
+        block_rays: int = BLOCK_RAYS,
     ) -> None:
         import drjit as dr
 
         if samples < 2 or samples % 2:
             raise RangeError("samples", samples, "an even number of rays per pixel, 2 or more")
-        if samples > block_rays[0]:
-            raise RangeError("samples", samples, f"at most {block_rays[0]} rays per pixel")
-        super().__init__(scene, sensor, responses, progress, tuple(size for size in block_rays if size >= samples))
+        if samples > block_rays:
+            raise RangeError("samples", samples, f"at most {block_rays} rays per pixel")
+        super().__init__(scene, sensor, responses, progress, block_rays)
         self.samples = samples
         self._posed_us: float | None = None
         self._key = dr.opaque(jit().UInt64, stream_key(seed, Stream.RENDER))
@@ -178,50 +185,38 @@ class PixelTracer(Tracer):
             local = self.camera.local_us(begin) if self.camera.repeat else begin - self.camera.knots_us[0]
             times = [np.broadcast_to(v, pixel.shape).astype(np.float32) for v in (local, end - begin)]
         parts: list[list[tuple[Any, Any]]] = []
-        for first, last, size in self._blocks(pixel.size):
-            spread = None if times is None else [values[first:last] for values in times]
-            parts.append(self._block(pixel[first:last], spread, size // self.samples, wavelengths, values))
-            self._report((last - first) * self.samples)
+        room = self._block_rays // self.samples
+        for first in range(0, pixel.size, room):
+            part = slice(first, first + room)
+            spread = None if times is None else [values[part] for values in times]
+            parts.append(self._block(pixel[part], spread, wavelengths, values))
+            self._report(pixel[part].size * self.samples)
         if len(parts) == 1:
             return parts[0]
         channels = range(len(parts[0]))
         return [(dr.concat([p[k][0] for p in parts]), dr.concat([p[k][1] for p in parts])) for k in channels]
 
-    def _blocks(self, count: int) -> Iterator[tuple[int, int, int]]:
-        """First and last pixel and the ray count of each block; the last one is padded."""
-        first = 0
-        while first < count:
-            size = self._block_size((count - first) * self.samples)
-            last = min(count, first + size // self.samples)
-            yield first, last, size
-            first = last
-
     def _block(
         self,
         pixels: NDArray[np.uint32],
         times: list[NDArray[np.float32]] | None,
-        room: int,
         wavelengths: Wavelengths,
         values: Values,
     ) -> list[tuple[Any, Any]]:
-        """Both halves of a few pixels; `room` pixels are traced, those beyond the list are masked."""
+        """Both halves of a few pixels."""
         import drjit as dr
 
         types = jit()
         count, per_half = pixels.size, self.samples // 2
 
-        def by_lane(table: NDArray, kind: Any) -> Any:
-            return dr.gather(kind, kind(np.pad(table, (0, room - count))), lane)
-
-        ray = dr.arange(types.UInt32, room * self.samples)
+        ray = dr.arange(types.UInt32, count * self.samples)
         lane = ray // self.samples
         place = ray - lane * self.samples
         half = dr.select(place >= per_half, types.UInt32(1), types.UInt32(0))
-        active = lane < dr.opaque(types.UInt32, count)
-        pixel = by_lane(pixels, types.UInt32)
-        spread = None if times is None else [by_lane(table, types.Float) for table in times]
-        quantities = self._rays_of(pixel, half, place - half * per_half, spread, active, wavelengths, values)
-        sums = [dr.block_sum(dr.select(active, quantity, 0.0), per_half) * (1 / per_half) for quantity in quantities]
+        pixel = spread_out(types.UInt32, pixels, lane)
+        spread = None if times is None else [spread_out(types.Float, table, lane) for table in times]
+        quantities = self._rays_of(pixel, half, place - half * per_half, spread, wavelengths, values)
+        sums = [dr.block_sum(quantity, per_half) * (1 / per_half) for quantity in quantities]
         dr.eval(*sums)
         index = dr.arange(types.UInt32, count) * 2
         halves = [(dr.gather(types.Float, s, index), dr.gather(types.Float, s, index + 1)) for s in sums]
@@ -234,7 +229,6 @@ class PixelTracer(Tracer):
         half: Any,
         sample: Any,
         spread: list[Any] | None,
-        active: Any,
         wavelengths: Wavelengths,
         values: Values,
     ) -> list[Any]:
@@ -252,5 +246,5 @@ class PixelTracer(Tracer):
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
         bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice))
         primary = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
-        radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary, active=active)
+        radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary)
         return values(pixel, radiance)
