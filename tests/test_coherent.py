@@ -268,17 +268,20 @@ def test_one_kernel_serves_lists_of_any_length_and_alignment():
         exact.mean_flux(pixel, *times)
         tracer.motion_px(np.arange(first + count + 1, dtype=np.uint32)[first:], 0.0, 1000.0)
 
-    run(128, 0)
+    def kernels(*lists):
+        dr.kernel_history_clear()
+        for count, first in lists:
+            run(count, first)
+        return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+    run(2000, 0)  # what is made once for a scene
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
-        dr.kernel_history_clear()
-        for count, first in ((1, 0), (2, 1), (77, 3), (1000, 4), (3000, 5)):
-            run(count, first)
-        history = dr.kernel_history([dr.KernelType.JIT])
+        known = kernels((128, 0))
+        assert len(known) >= 3
+        assert kernels((1, 0), (2, 1), (77, 3), (1000, 4), (3000, 5)) <= known
     finally:
         dr.set_flag(dr.JitFlag.KernelHistory, False)
-    assert len(history) >= 15, "nothing was run"
-    assert all(entry["cache_hit"] for entry in history)
 
 
 def test_quality_is_reached_and_costs_rays():
@@ -531,7 +534,9 @@ def test_five_thousand_windows_keep_memory_and_compile_nothing():
             dr.set_flag(dr.JitFlag.KernelHistory, True)
             dr.kernel_history_clear()
         elif number == 2000:  # the history itself takes memory
-            compiled = sum(not entry["cache_hit"] for entry in dr.kernel_history([dr.KernelType.JIT]))
+            # what is read from the disk would be compiled on another machine
+            history = dr.kernel_history([dr.KernelType.JIT])
+            compiled = sum(not entry["cache_hit"] or bool(entry["cache_disk"]) for entry in history)
             dr.set_flag(dr.JitFlag.KernelHistory, False)
         elif number == 2100:
             before = resident_mb()
