@@ -58,7 +58,7 @@ SENSOR = {
 SPEEDS = {
     "star": {3: 0.05, 10: 1.7, 25: 7.0, 100: 40.0},
     "sweep": {3: 0.12, 10: 0.45, 25: 4.0, 100: 8.0},
-    "glass": {3: 0.15, 10: 1.0, 25: 5.0, 100: 8.0},
+    "glass": {3: 0.15, 10: 1.0, 25: 6.5, 100: 8.0},
 }
 #: Side of a check of the scenes in which everything changes; a pixel shows 5 mm of what is 2 m away.
 FINE_M = 0.013
