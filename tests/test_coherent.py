@@ -426,7 +426,7 @@ def test_the_audit_covers_the_true_fraction(careless):
 
 @pytest.mark.slow
 def test_the_audit_covers_in_95_of_100_runs(careless):
-    """A hundred runs of seeds of their own, each with the audit it makes itself; false alarm as above."""
+    """A hundred runs of seeds of their own, each with the audit it makes itself; false alarm as above. Ten minutes."""
     bounds, fractions = np.empty((2, 100))
     for seed in range(100):
         source, _, _, fractions[seed] = audited(seed)
