@@ -54,7 +54,7 @@ SENSOR = {
 }
 #: How fast each scene has to move for about this share of its pixels, in per cent, to change. At 100 the star fills the
 #: picture and turns by half a period a tick, everything in the sweep is finely chequered, and the glass and what is
-#: around it stand in a finely chequered room that the camera turns in as well.
+#: around it stand between finely chequered walls, where the camera swings as well.
 SPEEDS = {
     "star": {3: 0.05, 10: 1.7, 25: 7.0, 100: 40.0},
     "sweep": {3: 0.12, 10: 0.45, 25: 4.0, 100: 8.0},
@@ -103,7 +103,7 @@ def sweep(speed: float) -> Scene:
 def glass(speed: float) -> Scene:
     """A glass ball, a rough-metal ball, a glossy box and a mirror, three of them moving on a chequered floor.
 
-    From the speed of 100 % on the checks are fine, there is a wall behind, and the camera turns.
+    From the speed of 100 % on the checks are fine, there are walls behind and opposite, and the camera swings.
     """
     everywhere = speed >= SPEEDS["glass"][100]
 
