@@ -32,6 +32,9 @@ class Stream(IntEnum):
     THRESHOLD_ON = 20
     THRESHOLD_OFF = 21
     RENDER_PILOT = 22
+    RENDER_ZOOM = 40
+    AUDIT = 41
+    AUDIT_PILOT = 42
 
 
 def stream_key(seed: int, stream: Stream) -> int:

@@ -21,6 +21,7 @@ from hesim_render.renderer._mitsuba import (
     spectrum_dict,
     transform,
 )
+from hesim_render.renderer.paint import Paint
 from hesim_render.renderer.targets import build_target
 from hesim_render.renderer.trajectory import Trajectory, rotation_about
 from hesim_render.specs.scene import MitsubaSpec, ObjectSpec, SceneSpec
@@ -31,6 +32,8 @@ _DEFAULT_MITSUBA_DEPTH = 8
 #: Segments from which on Russian roulette ends some paths. Mitsuba's default is 5; but a vector of lanes takes as long
 #: as its longest path, so that roulette saves little, and what it adds to the noise is a lot.
 _ROULETTE_DEPTH = 16
+#: Shapes that have no inside: they are seen from both sides.
+_OPEN_SHAPES = ("rectangle", "mesh")
 
 
 @dataclass
@@ -46,6 +49,7 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : of the groups that really move.
     is_dark : True where nothing emits.
+    paints : of all shapes but lamps, where all are matt and the light is direct; else None.
     """
 
     mi: Any
@@ -55,6 +59,7 @@ class BuiltScene:
     groups: dict[str, list[Movable]]
     trajectories: dict[str, Trajectory]
     is_dark: bool
+    paints: list[Paint] | None
 
     def pose(self, t_us: float) -> None:
         """Put every moving object at its pose of `t_us`."""
@@ -106,8 +111,9 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
         scene = _load_mitsuba(mi, spec, spec.mitsuba)
         integrator = _integrator(mi, scene, spec.max_depth)
         groups: dict[str, list[str]] = {}
+        paints = None
     else:
-        content, groups = _describe(mi, spec)
+        content, groups, paints = _describe(mi, spec)
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
         integrator = _path_tracer(mi, spec.max_depth or 2)
@@ -129,13 +135,15 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
         groups=movable,
         trajectories={name: trajectory for name, trajectory in trajectories.items() if trajectory.moves},
         is_dark=len(scene.emitters()) == 0,
+        paints=paints if (spec.max_depth or 2) == 2 else None,
     )
 
 
-def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]]]:
-    """Mitsuba's dictionary of a scene file, and which shape ids belong to each movable name."""
+def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
+    """Mitsuba's dictionary of a scene file, which shape ids belong to each movable name, and the shapes' paint."""
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
+    paints: list[Paint] = []
     if spec.target is not None:
         groups["target"] = []
         for number, piece in enumerate(build_target(spec.target)):
@@ -143,15 +151,24 @@ def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[
             bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
             content[name] = make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf)
             groups["target"].append(name)
+            paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
         content[name] = _object(mi, item, name, spec.folder)
         groups[item.name] = [name]
+        paints.append(_paint(item, name))
     try:
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
-    return content, groups
+    return content, groups, paints
+
+
+def _paint(item: ObjectSpec, name: str) -> Paint:
+    """What `_object` paints an object with."""
+    colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
+    u, v = item.pattern_count
+    return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
 
 
 def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
@@ -168,9 +185,8 @@ def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
             "color1": spectrum_dict(item.pattern.load()),
             "to_uv": transform(mi, scale),
         }
-    # seen from both sides where a shape has no inside
     bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
-    if item.shape in ("rectangle", "mesh"):
+    if item.shape in _OPEN_SHAPES:
         bsdf = {"type": "twosided", "material": bsdf}
     if item.shape == "sphere":
         to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))

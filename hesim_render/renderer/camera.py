@@ -34,10 +34,21 @@ class View:
     ----------
     camera_to_world : 4×4 rigid, at rest (before any motion of the camera).
     sensor : with the lens in use.
+    of_region : whether it was placed by the read-out region, so that another region sees another picture.
     """
 
     camera_to_world: NDArray[np.float64]
     sensor: Sensor
+    of_region: bool = False
+
+    @property
+    def followed_mm(self) -> tuple[float, float, float, float]:
+        """Part of the chip in which motion is followed, as `region_mm`: the same for all crops of one picture."""
+        if self.of_region:
+            return self.region_mm
+        geometry = self.sensor.spec.geometry
+        half_x, half_y = (count * geometry.pitch_um * 1e-3 / 2 for count in (geometry.cols, geometry.rows))
+        return -half_x, half_x, -half_y, half_y
 
     @property
     def region_mm(self) -> tuple[float, float, float, float]:
@@ -58,6 +69,25 @@ class View:
         left, _, top, _ = self.region_mm
         pitch = self.sensor.spec.geometry.pitch_um * 1e-3
         return np.stack([local[..., 0] * scale - left / pitch, -local[..., 1] * scale - top / pitch], axis=-1)
+
+    def project_on_sensor(
+        self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Column and row (pixels, fractional, of the full sensor) of world points [k, n, 3] through k poses.
+
+        Returns
+        -------
+        places : [k, n, 2]; points beside or behind the pupil are taken at a small positive depth.
+        px_per_m : [k, n], pixels for a metre across the axis there.
+        """
+        left, _, top, _ = self.region_mm
+        geometry = self.sensor.spec.geometry
+        pitch = geometry.pitch_um * 1e-3
+        own = self.project(points, camera_to_world)
+        local = (points - camera_to_world[..., None, :3, 3]) @ camera_to_world[..., :3, :3]
+        depth = np.maximum(-local[..., 2], 1e-3 + 0.02 * np.linalg.norm(local, axis=-1))
+        first = np.array([left / pitch + geometry.cols / 2, top / pitch + geometry.rows / 2])
+        return own + first, self.sensor.lens.image_distance_mm / depth / pitch
 
     def unproject(self, depth_m: NDArray[np.float64], camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """World points of a 5×5 grid over the picture, at each depth along the axis; [25 · depths, 3]."""
@@ -122,7 +152,7 @@ def _turned_to_region(view: View) -> View:
         return view
     turn = np.eye(4)
     turn[:3, :3] = rotation_about(axis, degrees(atan2(sine, -direction[2])))
-    return View(view.camera_to_world @ turn, view.sensor)
+    return View(view.camera_to_world @ turn, view.sensor, view.of_region)
 
 
 def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View:
@@ -145,7 +175,7 @@ def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View
         sensor = sensor.with_lens(f_number=camera.f_number, focal_length_mm=focal, focus_distance_m=focus_m)
         image_mm = sensor.lens.image_distance_mm
     distance_m = image_mm / needed / MM_PER_M
-    view = View(np.eye(4), sensor)
+    view = View(np.eye(4), sensor, of_region=True)
     left, right, top, bottom = view.region_mm
     view.camera_to_world[:3, 3] = [
         -(left + right) / 2 / image_mm * distance_m,
@@ -183,7 +213,8 @@ def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: Any = None) -
     away_m = float(np.linalg.norm(np.subtract(camera.origin_m, camera.target_m)))
     if camera.horizontal_fov_deg is not None:
         image_mm = _region_size_mm(sensor)[0] / 2 / tan(radians(camera.horizontal_fov_deg) / 2)
-        return _turned_to_region(View(matrix, _with_image_distance(sensor, camera, image_mm, away_m * MM_PER_M)))
+        placed = View(matrix, _with_image_distance(sensor, camera, image_mm, away_m * MM_PER_M), of_region=True)
+        return _turned_to_region(placed)
     focus_m = camera.focus_distance_m or away_m
     return View(
         matrix,
@@ -210,23 +241,25 @@ def _from_mitsuba(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: Any) -> View
     image_mm = min(width_mm / 2 / half_x, height_mm / 2 / half_y)
     matrix = to_world @ MITSUBA_AXES
     matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)  # a scale in to_world says nothing about the view
-    return _turned_to_region(View(matrix, _with_image_distance(sensor, CameraSpec(), image_mm, None)))
+    return _turned_to_region(View(matrix, _with_image_distance(sensor, CameraSpec(), image_mm, None), of_region=True))
 
 
 class RayFactory:
-    """Primary rays of mosaic pixels on the device: box aperture, Gaussian PSF, pinhole at the entrance pupil."""
+    """Primary rays of mosaic pixels on the device: box aperture, Gaussian PSF, pinhole at the entrance pupil.
+
+    Rows and columns are those of the full sensor, so that a crop's rays are the full sensor's to the bit.
+    """
 
     def __init__(self, view: View) -> None:
         import drjit as dr
 
         types = jit()
-        geometry, lens, layout = view.sensor.spec.geometry, view.sensor.lens, view.sensor.layout
+        geometry, lens = view.sensor.spec.geometry, view.sensor.lens
         pitch_mm = geometry.pitch_um * 1e-3
-        image_mm = lens.image_distance_mm
-        x, y = pixel_centres_mm(layout)
-        # tangents of the chief ray's angles; opaque, so that another crop or lens compiles nothing
-        self._first = dr.opaque(types.Float, float(x[0] / image_mm)), dr.opaque(types.Float, float(y[0] / image_mm))
-        self._step = dr.opaque(types.Float, float(pitch_mm / image_mm))
+        # opaque, so that another lens or sensor compiles nothing
+        self._middle = [dr.opaque(types.Float, (count - 1) / 2) for count in (geometry.cols, geometry.rows)]
+        #: Tangent of the chief ray's angle from one pixel to the next.
+        self._step = dr.opaque(types.Float, float(pitch_mm / lens.image_distance_mm))
         psf_um = view.sensor.spec.lens.psf_fwhm_um
         self.has_psf = psf_um > 0
         self._sigma_px = dr.opaque(types.Float, float(psf_um / _FWHM_PER_SIGMA / geometry.pitch_um))
@@ -238,7 +271,7 @@ class RayFactory:
 
         Parameters
         ----------
-        row, col : Dr.Jit Float, position in the region.
+        row, col : Dr.Jit Float, position on the full sensor.
         aperture : pair of Float in [0, 1), place inside the pixel.
         blur : pair of Float in [0, 1) for the PSF, or None.
         """
@@ -250,14 +283,9 @@ class RayFactory:
             radius = self._sigma_px * dr.sqrt(-2 * dr.log(1 - blur[0]))
             sine, cosine = dr.sincos(2 * dr.pi * blur[1])
             offset_x, offset_y = offset_x + radius * cosine, offset_y + radius * sine
-        x = self._first[0] + (col + offset_x) * self._step
-        y = self._first[1] + (row + offset_y) * self._step
+        # half-integers from the middle are exact in float32
+        x = (col - self._middle[0] + offset_x) * self._step
+        y = (row - self._middle[1] + offset_y) * self._step
         local = dr.normalize(types.Array3f(x, -y, -1.0))
         direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
         return types.Array3f(*self._origin), direction
-
-    def project(self, point: Any) -> tuple[Any, Any]:
-        """Column and row in the region of world points, the camera at rest; infinite or NaN behind it."""
-        away = [component - origin for component, origin in zip(point, self._origin, strict=True)]
-        x, y, z = (sum(self._rotation[k][axis] * away[k] for k in range(3)) for axis in range(3))
-        return (x / -z - self._first[0]) / self._step, (-y / -z - self._first[1]) / self._step

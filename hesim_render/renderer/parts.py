@@ -205,14 +205,22 @@ class Part:
             blocked |= inside & (t >= 0) & (t < ray.maxt)
         return blocked & active
 
-    def describe(self, si: Any, ray: Any, hit: Any, face: Any) -> None:
-        """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one.
+    def surface(self, hit: Any, face: Any, ray: Any, flags: Any, active: Any) -> Any:
+        """What a ray has met, `SurfaceInteraction3f` in the part's own frame; its t is infinite where that is nothing.
 
         Parameters
         ----------
-        si : of everything else; it is changed.
-        ray, hit, face : given to and returned by `nearest`.
+        hit, face : given by `nearest` for `ray`.
+        flags : `RayFlags` of what to know of it. Of faces all is known.
+        active : lanes in which anything is wanted.
         """
+        si = hit.compute_surface_interaction(ray, flags, active & (face == 0))
+        if self._faces:
+            self._describe_faces(si, ray, hit, face)
+        return si
+
+    def _describe_faces(self, si: Any, ray: Any, hit: Any, face: Any) -> None:
+        """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one."""
         import drjit as dr
 
         u, v = hit.prim_uv

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import degrees, radians
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -130,6 +130,22 @@ class DevicePose:
         return self.turn_to_rest(type(self.shift)(point) - self.shift)
 
 
+class Piece(NamedTuple):
+    """Part of the segment between two keyframes.
+
+    Parameters
+    ----------
+    segment : its number.
+    first, last : shares of it, 0 to 1.
+    length_us : of the part.
+    """
+
+    segment: int
+    first: float
+    last: float
+    length_us: float
+
+
 class Trajectory:
     """A track evaluated: pose(t) = translate(T(t)) · pivot + R(t) · (x − pivot).
 
@@ -177,16 +193,44 @@ class Trajectory:
         local = self.local_us(t_us)
         knots = self.knots_us - self.knots_us[0]
         segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
-        share = (local - knots[segment]) / (knots[segment + 1] - knots[segment])
+        return self.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
+
+    def within(self, segment: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Pose in the segments between two keyframes at a share of each, 0 to 1 with both ends; [..., 4, 4]."""
         turn = _axis_angle(self.arc_axis[segment], share * self.arc_rad[segment])
         rotation = rotation_matrix(_multiply(turn, self.start_rotation[segment]))
         start = self.translation_m[segment]
         translation = start + share[..., None] * (self.translation_m[segment + 1] - start)
-        pose = np.zeros((*local.shape, 4, 4))
+        pose = np.zeros((*share.shape, 4, 4))
         pose[..., :3, :3] = rotation
         pose[..., :3, 3] = translation + self.pivot_m - rotation @ self.pivot_m
         pose[..., 3, 3] = 1.0
         return pose
+
+    def pieces(self, begin_us: float, end_us: float) -> list[Piece]:
+        """What an interval has of the segments between keyframes, in order of time; no pose is left out.
+
+        A track that repeats jumps at its last keyframe, which is therefore the end of one piece and the begin of the
+        next. Of an interval of a period or more each segment comes once.
+        """
+        knots = self.knots_us - self.knots_us[0]
+        period = float(knots[-1])
+        if not self.repeat:
+            spans = [tuple(np.clip([begin_us, end_us], *self.knots_us[[0, -1]]) - self.knots_us[0])]
+        elif end_us - begin_us >= period:
+            spans = [(0.0, period)]
+        else:
+            first = float(self.local_us(begin_us))
+            last = first + end_us - begin_us
+            spans = [(first, last)] if last <= period else [(first, period), (0.0, last - period)]
+        found = []
+        for low, high in spans:
+            for segment in range(knots.size - 1):
+                a, b = max(low, knots[segment]), min(high, knots[segment + 1])
+                if a <= b:
+                    length = knots[segment + 1] - knots[segment]
+                    found.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
+        return found
 
     def pose_at(self, local_us: Any) -> DevicePose:
         """Pose of every lane at its own time.
