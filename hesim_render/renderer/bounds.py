@@ -7,12 +7,13 @@ goes along a straight line plus an arc of a circle. A chord is off its arc by ρ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import ceil, cos, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.renderer.trajectory import Piece, Trajectory
 from hesim_render.units import S_PER_US
 
 #: Largest turn between two instants at which an object's place is taken, and most of these in a piece.
@@ -33,27 +34,41 @@ def places(
     For each piece of the track between keyframes, the corners at its ends and some instants between, [k, n, 3], and how
     far any point may be from the straight line between two of these, m.
     """
-    found = []
+    found, radius = [], float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     for piece in trajectory.pieces(begin_us, end_us):
-        turn = abs(float(trajectory.arc_rad[piece.segment])) * (piece.last - piece.first)
-        steps = min(_MOST_STEPS, max(1, ceil(turn / _STEP_RAD)))
-        share = np.linspace(piece.first, piece.last, steps + 1)
+        share, margin = _instants(trajectory, piece, radius)
         poses = trajectory.within(np.full(share.size, piece.segment), share)
-        points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-        radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
-        found.append((points, radius * (1 - cos(min(turn / steps / 2, pi)))))
+        found.append((corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], margin))
     return found
 
 
 def stays_in(
-    corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float
+    corners: NDArray[np.float64], trajectory: Trajectory, spans_us: Sequence[tuple[float, float]]
 ) -> NDArray[np.float64]:
-    """Axis-parallel box [2, 3], m, in which an object stays during an interval; `corners` as in `places`."""
-    low, high = [], []
-    for points, margin in places(corners, trajectory, begin_us, end_us):
-        low.append(points.min(axis=(0, 1)) - margin)
-        high.append(points.max(axis=(0, 1)) + margin)
-    return np.stack([np.min(low, axis=0), np.max(high, axis=0)])
+    """Axis-parallel boxes [k, 2, 3], m, in which an object stays during each of k intervals; `corners` as in `places`."""
+    radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    segments, shares, margins, starts = [], [], [], []
+    for begin, end in spans_us:
+        starts.append(len(segments))
+        for piece in trajectory.pieces(begin, end):
+            share, margin = _instants(trajectory, piece, radius)
+            segments.append(np.full(share.size, piece.segment))
+            shares.append(share)
+            margins.append(np.full(share.size, margin))
+    poses = trajectory.within(np.concatenate(segments), np.concatenate(shares))
+    points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    margin = np.concatenate(margins)[:, None]
+    first = np.cumsum([0, *(share.size for share in shares)])[starts]
+    low = np.minimum.reduceat(points.min(axis=1) - margin, first, axis=0)
+    high = np.maximum.reduceat(points.max(axis=1) + margin, first, axis=0)
+    return np.stack([low, high], axis=1)
+
+
+def _instants(trajectory: Trajectory, piece: Piece, radius_m: float) -> tuple[NDArray[np.float64], float]:
+    """Shares of a piece at which an object is taken, and how far it may be from straight lines between them, m."""
+    turn = abs(float(trajectory.arc_rad[piece.segment])) * (piece.last - piece.first)
+    steps = min(_MOST_STEPS, max(1, ceil(turn / _STEP_RAD)))
+    return np.linspace(piece.first, piece.last, steps + 1), radius_m * (1 - cos(min(turn / steps / 2, pi)))
 
 
 def fastest_m_per_s(

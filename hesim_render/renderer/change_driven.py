@@ -22,7 +22,7 @@ from hesim_render.flux import Sample
 from hesim_render.renderer.changes import Plan, fill_in, plan
 from hesim_render.renderer.clock import MotionClock
 from hesim_render.renderer.flux import require_finite, used_responses
-from hesim_render.renderer.options import TUNING, Tuning
+from hesim_render.renderer.options import TUNING, Gain, Tuning
 from hesim_render.renderer.pairs import PairTracer, Windows
 from hesim_render.renderer.pilot import Pilot, take_pilot
 from hesim_render.renderer.sites import REACH, Sites
@@ -179,6 +179,7 @@ class ChangeDrivenFlux:
         tracer = self._tracer
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, tracer.least_distance_m)
         self._zoom = Zoom(self.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning)
+        self._gain = Gain(*(tuning.matt_gain if tracer.is_matt else tuning.path_gain))
         self.is_static = not self._tracer.parts.groups and self._tracer.camera is None
         self.counts = Counts()
         self._index = self.sensor.layout.full_index.ravel()
@@ -252,7 +253,7 @@ class ChangeDrivenFlux:
                 place, own = listed[band.place], window[band.place]
                 numbers = _of_own_row(band.sites, own, self.sensor.spec.geometry.cols)[None]
                 pilot, near = self._pilot(band, windows, numbers, still.span_us)
-                what = plan(pilot, band.sites, band.unit, self.quality, self._tuning, is_knot=role == "events")
+                what = plan(pilot, band.sites, band.unit, self.quality, self._gain, self._tuning, is_knot=role == "events")
                 flux, met = self._render(band, windows, own[None], what, still.span_us)
                 out.put(place, flux)
                 if still.span_us is not None:
@@ -273,7 +274,7 @@ class ChangeDrivenFlux:
         for band in self._bands(pixel, role):
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, near = self._pilot(band, windows, numbers, windows.span_us)
-            what = plan(pilot, band.sites, band.unit, self.quality, self._tuning, is_knot=role == "events")
+            what = plan(pilot, band.sites, band.unit, self.quality, self._gain, self._tuning, is_knot=role == "events")
             changing = near[band.sites.listed] if windows.size > 1 else np.ones(band.place.size, np.bool_)
             rays += int(np.sum(np.where(what.rendered, what.rays, 0)[-later:], dtype=np.int64))
             each = self._tuning.lone_pilot_rays if band.apart else self._tuning.pilot_rays
@@ -327,9 +328,10 @@ class ChangeDrivenFlux:
             np.where(lit, *pair) for pair in ((pilot.lit, pilot.hidden), (pilot.lit_scatter, pilot.hidden_scatter))
         )
         unit = self._noise.of("events" if self.sensor.spec.evs is not None else "any", index)(flux)
-        wanted = (tuning.ray_factor / quality * scatter / unit) ** (1 / tuning.ray_power)
+        wanted = self._gain.rays(scatter / (np.float32(quality) * unit))
         rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
-        times = np.clip(np.ceil((wanted / tuning.most_rays) ** (2 * tuning.ray_power)), 1, tuning.most_audit_times)
+        times = np.ceil((self._gain.error(scatter, rays) / (quality * unit)) ** 2)
+        times = np.clip(times, 1, tuning.most_audit_times)
         total = np.zeros(pixel.size)
         for repeat in range(int(times.max())):
             more = np.flatnonzero(times > repeat)
@@ -477,7 +479,7 @@ class _Blocks:
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, _ = source._pilot(band, windows, numbers, windows.span_us)
-            what = plan(pilot, band.sites, band.unit, source.quality, source._tuning, is_knot=True)
+            what = plan(pilot, band.sites, band.unit, source.quality, source._gain, source._tuning, is_knot=True)
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             flux, _ = source._render(band, windows, numbers, what, first=first)
             for values in flux.arrays[:2]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.renderer.options import Tuning
+from hesim_render.renderer.options import Gain, Tuning
 from hesim_render.renderer.pilot import Pilot, allocate
 from hesim_render.renderer.sites import Sites
 from hesim_render.renderer.wish import NoiseUnit
@@ -64,7 +64,7 @@ class Plan:
 
 
 def plan(
-    pilot: Pilot, sites: Sites, unit: NoiseUnit, quality: float, tuning: Tuning, is_knot: bool
+    pilot: Pilot, sites: Sites, unit: NoiseUnit, quality: float, gain: Gain, tuning: Tuning, is_knot: bool
 ) -> Plan:
     """From what the pilot shows of a block, or of one window.
 
@@ -72,6 +72,7 @@ def plan(
     ----------
     unit : what the noise of each site is worth, at its flux.
     quality : wanted error in these units.
+    gain : of stratified rays.
     is_knot : whether the first and the last window may be ends of blocks.
     """
     count, last = pilot.windows, pilot.windows - 1
@@ -96,7 +97,7 @@ def plan(
             out.rendered[1:last] |= longer(looked_at, 1)[1:last, sites.listed]
     for window in range(count):
         at_end = is_knot and window in (0, last)
-        part = allocate(pilot, window, sites, units, quality, tuning, at_end)
+        part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
         out.rays[window], out.lit[window], out.error[window] = part
     return out
 

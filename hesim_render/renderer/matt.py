@@ -27,8 +27,9 @@ from typing import Any
 import numpy as np
 
 from hesim_render.renderer import lights
+from hesim_render.renderer.boxes import Moment
 from hesim_render.renderer.irradiance import RectangleLight
-from hesim_render.renderer.moving import Moment, MovingScene
+from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paint import Paint
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectra import Spectrum, constant, integrate_product, summed

@@ -18,9 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
+from hesim_render.renderer.boxes import Moment, inverse_of, meets_box
 from hesim_render.renderer.builder import BuiltScene
+from hesim_render.renderer.fleet import Fleet
 from hesim_render.renderer.parts import Part
-from hesim_render.renderer.trajectory import DevicePose, Trajectory
+from hesim_render.renderer.tracks import DevicePose, Tracks
+from hesim_render.renderer.trajectory import Trajectory
+
+#: Objects in closed form that are tried one by one; more are tried in a loop, which takes the same kernel for any number.
+_FEW = 3
 
 
 class NeedsExactMode(SpecError):
@@ -43,20 +49,6 @@ class Group:
     part: Part
     trajectory: Trajectory
     corners: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Moment:
-    """When the rays of a kernel set out.
-
-    Parameters
-    ----------
-    local_us : of each group, time since its first keyframe as `Trajectory.pose_at` takes it; Dr.Jit Float per lane.
-    boxes : of each group, what it stays in meanwhile; from `device_box`.
-    """
-
-    local_us: Sequence[Any]
-    boxes: Sequence[tuple[Any, Any]]
 
 
 class Surface:
@@ -157,6 +149,19 @@ class MovingScene:
             )
             for name, shapes in parts.items()
         ]
+        self._sort_groups()
+
+    def _sort_groups(self) -> None:
+        """Which groups are tried one by one, and which in a loop."""
+        simple = [number for number, group in enumerate(self.groups) if group.part.form is not None]
+        together = simple if len(simple) > _FEW else []
+        self._single = [number for number in range(len(self.groups)) if number not in together]
+        self._fleet = None
+        if self.groups:
+            self._tracks = Tracks([group.trajectory for group in self.groups])
+        if together:
+            forms = [form for k in together if (form := self.groups[k].part.form) is not None]
+            self._fleet = Fleet(self.mi, forms, together, self._tracks)
 
     def intersect(self, ray: Any, moment: Moment, coherent: Any, active: Any, flags: Any = None) -> Surface:
         """The nearest surface of all parts.
@@ -178,17 +183,32 @@ class MovingScene:
             return Surface(mi, rest, None, mi.Bool(False))
         pose = DevicePose.none(mi.Vector3f)
 
-        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def take(closer: Any, found: Any, own: DevicePose, state: tuple[Any, ...]) -> tuple[Any, ...]:
             rest, *columns, shift = state
-            local.maxt = dr.minimum(local.maxt, rest.t)
-            hit, face = group.part.nearest(local, coherent, near)
-            closer = near & hit.is_valid()
-            found = group.part.surface(hit, face, local, flags, closer)
             columns = [dr.select(closer, a, b) for a, b in zip(own.columns, columns, strict=True)]
             return dr.select(closer, found, rest), *columns, dr.select(closer, own.shift, shift)
 
-        state = rest, *pose.columns, pose.shift
-        (rest, *columns, shift), met = self._visit_groups(ray, moment, active, rest.t, state, visit)
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            local.maxt = dr.minimum(local.maxt, state[0].t)
+            hit, face = group.part.nearest(local, coherent, near)
+            closer = near & hit.is_valid()
+            return take(closer, group.part.surface(hit, face, local, flags, closer), own, state)
+
+        resting = rest.t
+        state: tuple[Any, ...] = rest, *pose.columns, pose.shift
+        state, met = self._visit_groups(ray, moment, active, resting, state, visit)
+        if self._fleet is not None:
+            fleet = self._fleet
+            hit, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
+            met |= near
+
+            def describe(*state: Any) -> tuple[Any, ...]:
+                own = fleet.pose(number, moment)
+                found = hit.compute_surface_interaction(_at_rest(ray, own), flags, hit.is_valid())
+                return take(hit.is_valid(), found, own, state)
+
+            state = dr.if_stmt(state, hit.is_valid(), describe, lambda *state: state, label="moving surface")
+        rest, *columns, shift = state
         return Surface(mi, rest, DevicePose(tuple(columns), shift), met)
 
     def distance(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
@@ -200,8 +220,11 @@ class MovingScene:
             hit, _ = group.part.nearest(local, False, near)
             return (dr.select(near & hit.is_valid(), hit.t, state[0]),)
 
-        nearest = self._resting.nearest(ray, False, active)[0].t
-        (nearest,), met = self._visit_groups(ray, moment, active, nearest, (nearest,), visit)
+        resting = self._resting.nearest(ray, False, active)[0].t
+        (nearest,), met = self._visit_groups(ray, moment, active, resting, (resting,), visit)
+        if self._fleet is not None:
+            hit, _, near = self._fleet.nearest(ray, moment, dr.minimum(ray.maxt, nearest), active)
+            nearest, met = dr.select(hit.is_valid(), hit.t, nearest), met | near
         return nearest, met
 
     def resting_distance(self, ray: Any) -> Any:
@@ -216,13 +239,17 @@ class MovingScene:
 
         blocked = self._resting.blocks(ray, active)
         # what rests blocks the ray whatever moves
-        (blocked,), met = self._visit_groups(ray, moment, active & ~blocked, ray.maxt, (blocked,), visit)
+        free = active & ~blocked
+        (blocked,), met = self._visit_groups(ray, moment, free, ray.maxt, (blocked,), visit)
+        if self._fleet is not None:
+            others, near = self._fleet.blocks(ray, moment, free)
+            blocked, met = blocked | others, met | near
         return blocked, met
 
     def _visit_groups(
         self, ray: Any, moment: Moment, active: Any, length: Any, state: tuple[Any, ...], visit: Callable[..., Any]
     ) -> tuple[tuple[Any, ...], Any]:
-        """Let every group whose box the first `length` metres of a ray meet change a state.
+        """Let each group of those tried one by one, whose box the first `length` metres of a ray meet, change a state.
 
         Returns
         -------
@@ -231,16 +258,14 @@ class MovingScene:
         import drjit as dr
 
         met = self.mi.Bool(False)
-        if not self.groups:
-            return state, met
         inverse = inverse_of(ray.d)
-        for group, local_us, box in zip(self.groups, moment.local_us, moment.boxes, strict=True):
-            near = active & meets_box(ray, inverse, length, box)
+        for number in self._single:
+            near = active & meets_box(ray, inverse, length, moment.box(number))
             met |= near
 
-            def turn_to(*state: Any, group: Group = group, local_us: Any = local_us, near: Any = near) -> Any:
-                pose = group.trajectory.pose_at(local_us)
-                return visit(group, pose, _at_rest(ray, pose), near, state)
+            def turn_to(*state: Any, number: int = number, near: Any = near) -> Any:
+                pose = self._tracks.pose(number, moment.local_us(number))
+                return visit(self.groups[number], pose, _at_rest(ray, pose), near, state)
 
             state = dr.if_stmt(state, near, turn_to, lambda *state: state, label="moving group")
         return state, met
@@ -264,38 +289,6 @@ def spare_even_skies(mi: Any, emitters: Sequence[Any]) -> None:
             parameters = mi.traverse(emitter)
             parameters["sampling_weight"] = 0.0
             parameters.update()
-
-
-def device_box(mi: Any, corners: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Corners [2, 3] of an axis-parallel box for `meets_box`, somewhat widened: rounding must not take a rim."""
-    import drjit as dr
-
-    margin = 1e-4 * float(np.linalg.norm(corners[1] - corners[0]))
-    box = mi.Vector3f(corners[0] - margin), mi.Vector3f(corners[1] + margin)
-    dr.make_opaque(*box)
-    return box
-
-
-def inverse_of(direction: Any) -> Any:
-    """1 / d of each coordinate for `meets_box`; finite, for 0 · ∞ is nowhere."""
-    import drjit as dr
-
-    return dr.rcp(dr.select(abs(direction) < 1e-30, 1e-30, direction))
-
-
-def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
-    """Whether the first `length` metres of a ray meet a box; `inverse` is `inverse_of` its direction."""
-    import drjit as dr
-
-    one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
-    # not dr.minimum and dr.maximum: what those do about NaN takes most of the time
-    ordered = one < other
-    near, far = dr.select(ordered, one, other), dr.select(ordered, other, one)
-    enter, leave = near.x, far.x
-    for axis in ("y", "z"):
-        first, last = getattr(near, axis), getattr(far, axis)
-        enter, leave = dr.select(first > enter, first, enter), dr.select(last < leave, last, leave)
-    return (enter <= leave) & (leave >= 0) & (enter <= length)
 
 
 def path_traced(built: BuiltScene) -> bool:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True)
 class Tuning:
@@ -35,6 +38,7 @@ class Tuning:
     pilot_rays: int = 16
     lone_pilot_rays: int = 32
     zoom_rays: int = 256
+    zoom_room: float = 64.0
     zoom_margin_px: float = 1.0
     small_px: float = 8.0
     footprint_px: float = 1.25
@@ -46,8 +50,9 @@ class Tuning:
     huge_windows: int = 1
     least_rays: int = 8
     most_rays: int = 4096
-    ray_factor: float = 1.25
-    ray_power: float = 0.7
+    matt_gain: tuple[float, float] = (0.68, 0.70)
+    path_gain: tuple[float, float] = (0.46, 0.56)
+    margin: float = 1.25
     unseen_area: float = 1 / 32
     most_unseen_rays: int = 512
     bright_rays: float = 0.25
@@ -55,6 +60,28 @@ class Tuning:
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     most_audit_times: int = 8
+
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Standard error of n stratified rays over their scatter: factor · n^-power.
+
+    Parameters
+    ----------
+    factor, power : see above.
+    """
+
+    factor: float
+    power: float
+
+    def error(self, scatter: NDArray[np.float32], rays: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Expected standard error, in the unit of the scatter."""
+        return np.float32(self.factor) * scatter * rays.astype(np.float32) ** np.float32(-self.power)
+
+    def rays(self, scatter_over_error: NDArray[np.float32]) -> NDArray[np.float32]:
+        """So many that a wanted error is reached; any number, not yet a power of two."""
+        return (np.float32(self.factor) * scatter_over_error) ** np.float32(1 / self.power)
 
 
 TUNING = Tuning()

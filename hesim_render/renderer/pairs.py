@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from hesim_render.backend import jit
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.bounds import stays_in
 from hesim_render.renderer.matt import MattIntegrator
-from hesim_render.renderer.moving import Moment, MovingScene, device_box
+from hesim_render.renderer.boxes import Moment, box_rows
+from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paths import PathIntegrator
 from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer, spread_out
 from hesim_render.renderer.wavelengths import WavelengthSampler
@@ -26,6 +28,8 @@ from hesim_render.spectra import Spectrum
 #: Rays of a pair; one kernel serves all their numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
+#: Intervals for which boxes of moving objects are found, in one call.
+_MOST_BINS = 64
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,9 @@ class PilotFlux:
     Parameters
     ----------
     lit, hidden : mean flux, e⁻/s, float32.
-    lit_scatter, hidden_scatter : standard deviation of single rays, e⁻/s, float32.
+    lit_scatter, hidden_scatter : of single rays, e⁻/s, float32: fourth root of the mean fourth power of deviations. For
+        rays of which one half says one thing and one half another it is the standard deviation; where few say
+        something else it is more, as stratified rays gain less then.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
     """
@@ -128,6 +134,7 @@ class PairTracer(Tracer):
         else:
             depths = (_told(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
             self._integrator = PathIntegrator(self.parts, *depths, WavelengthSampler(self.sensor.responses))
+        self._boxes = lru_cache(maxsize=8)(self._boxes_in)
         layout = self.sensor.layout
         tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
         self._filter_tile = types.UInt32(tile.ravel())
@@ -233,7 +240,8 @@ class PairTracer(Tracer):
         row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, grid[1])
         col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, grid[0])
         middle = types.Float(0.5), types.Float(0.5)
-        origin, direction = self._rays.rays(types.Float(row.astype(np.float32)), types.Float(col.astype(np.float32)), middle, None)
+        place = [types.Float(values.astype(np.float32)) for values in (row, col)]
+        origin, direction = self._rays.rays(*place, middle, None)
         axis = -self.view.camera_to_world[:3, 2]
         if self.camera is not None:
             matrix = self.camera.matrix(t_us)
@@ -259,23 +267,35 @@ class PairTracer(Tracer):
         )
 
     def _moments(self, windows: Windows, span_us: tuple[float, float] | None) -> _Moments:
+        """Windows on the device, and the boxes in which objects stay in each, or in all of `span_us`."""
         import drjit as dr
 
-        types, mi = jit(), self.built.mi
-        groups = self.parts.groups
-        begin, end = span_us or windows.span_us
-        boxes = [device_box(mi, stays_in(group.corners, group.trajectory, begin, end)) for group in groups]
+        types, groups = jit(), self.parts.groups
         tracks = [group.trajectory for group in groups] + ([self.camera] if self.camera else [])
         # wrapped on the host in double precision: float32 µs would lose their fractions within seconds
-        local = [
+        times = [
             track.local_us(windows.begin_us) if track.repeat else windows.begin_us - track.knots_us[0]
             for track in tracks
         ]
-        rows = np.stack([windows.end_us - windows.begin_us, *local], axis=1).astype(np.float32)
-        # never one entry, which would be a constant in the kernel
-        table = types.Float(np.append(rows.ravel(), np.float32(0)))
-        dr.make_opaque(table)
-        return _Moments(table, rows.shape[1], boxes)
+        bins, spans = _bins(windows) if span_us is None else (np.zeros(windows.size, np.uint32), (span_us,))
+        boxes = self._boxes(spans)
+        # never one entry, which would be a constant in the kernel; rows of boxes are fetched by fours
+        tables = (
+            types.Float(np.append(table.astype(np.float32).ravel(), np.zeros(8, np.float32)))
+            for table in (
+                windows.end_us - windows.begin_us,
+                np.stack(times, axis=1) if times else np.empty(0),
+                box_rows(boxes) if groups else np.empty(0),
+            )
+        )
+        moments = _Moments(*tables, types.UInt32(np.append(bins, bins[-1:])), len(tracks), len(groups))
+        dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)
+        return moments
+
+    def _boxes_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
+        """Boxes in which each group stays in some intervals, [interval, group, 2, 3], m."""
+        found = [stays_in(group.corners, group.trajectory, spans_us) for group in self.parts.groups]
+        return np.stack(found, axis=1) if found else np.empty((len(spans_us), 0, 2, 3))
 
     def _trace_block(
         self,
@@ -307,6 +327,7 @@ class PairTracer(Tracer):
         flux = dr.select(lit != 0, if_lit, if_hidden)
         met = _bits(types.UInt32, met, used * _PACKET)
         dr.eval(flux, met)
+        self._sampler.rest()
         # sums within halves of packets, the smallest half there is
         sums = np.array(dr.block_sum(flux, _PACKET // 2))
         bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, _PACKET))
@@ -337,15 +358,19 @@ class PairTracer(Tracer):
         pixel, number = spread_out(types.UInt32, pixels, lane), spread_out(types.UInt32, window, lane)
         self._sampler.setup(key, pixel, types.UInt32(0), ray_index - lane * rays, rays, MOST_SAMPLES // 2)
         lit, hidden, unshadowed, met = self._rays_of(pixel, number, moments, footprint)
-        values = [lit, hidden, lit * lit, hidden * hidden, unshadowed]
         bits = _bits(types.UInt32, met, pixels.size * samples)
-        dr.eval(values, bits)
-        sums = [np.array(dr.block_sum(value, samples), np.float64) for value in values]
-        out.unshadowed[part] = sums[4] / samples
-        for mean, square, name in ((sums[0], sums[2], "lit"), (sums[1], sums[3], "hidden")):
-            mean /= samples
-            variance = np.maximum(square / samples - mean * mean, 0.0) * (samples / (samples - 1))
-            getattr(out, name)[part], getattr(out, f"{name}_scatter")[part] = mean, np.sqrt(variance)
+        dr.eval(lit, hidden, unshadowed, bits)
+        self._sampler.rest()
+        share = dr.opaque(types.Float, 1 / samples)
+        for values, name in ((lit, "lit"), (hidden, "hidden")):
+            mean = dr.block_sum(values, samples) * share
+            square = dr.square(values - dr.gather(types.Float, mean, lane))
+            fourth = dr.block_sum(square * square, samples) * share
+            # of the scene's own scatter these rays are a sample
+            scatter = dr.sqrt(dr.sqrt(fourth * (samples / (samples - 1))))
+            dr.eval(mean, scatter)
+            getattr(out, name)[part], getattr(out, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
+        out.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
         out.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, bits, samples))
 
     def _rays_of(self, pixel: Any, window: Any, moments: _Moments, footprint: Any) -> tuple[Any, Any, Any, Any]:
@@ -359,16 +384,15 @@ class PairTracer(Tracer):
         aperture = (aperture - 0.5) * footprint + 0.5
         blur = sampler.next_2d() if self._rays.has_psf else None
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
-        instant = moment * moments.entry(window, 0)
-        count = len(self.parts.groups)
-        local_us = [moments.entry(window, 1 + number) + instant for number in range(count)]
+        now = moments.at(window, moment)
         if self.camera is not None:
-            pose = self.camera.pose_at(moments.entry(window, 1 + count) + instant)
+            pose = self.camera.pose_at(now.local_us(len(self.parts.groups)))
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
-        tile_row, tile_col = row - row // self._tile_rows * self._tile_rows, col - col // self._tile_cols * self._tile_cols
+        tile_row = row - row // self._tile_rows * self._tile_rows
+        tile_col = col - col // self._tile_cols * self._tile_cols
         which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        return self._integrator.flux(sampler, primary, Moment(local_us, moments.boxes), which)
+        return self._integrator.flux(sampler, primary, now, which)
 
 
 @dataclass(frozen=True)
@@ -377,19 +401,37 @@ class _Moments:
 
     Parameters
     ----------
-    table : Float; a row for each window: its length, then the local time of each track at its begin, µs.
-    width : of a row.
-    boxes : see `Moment`.
+    length_us : Float, of each window.
+    times, boxes : see `Moment`; `bins`, UInt32, of each window.
+    tracks, groups : so many.
     """
 
-    table: Any
-    width: int
-    boxes: Sequence[tuple[Any, Any]]
+    length_us: Any
+    times: Any
+    boxes: Any
+    bins: Any
+    tracks: int
+    groups: int
 
-    def entry(self, window: Any, number: int) -> Any:
+    def at(self, window: Any, share: Any) -> Moment:
+        """A share of each lane's window."""
         import drjit as dr
 
-        return dr.gather(type(self.table), self.table, window * self.width + number)
+        instant = share * dr.gather(type(self.length_us), self.length_us, window)
+        where = dr.gather(type(self.bins), self.bins, window)
+        return Moment(instant, self.times, self.tracks, window, self.boxes, self.groups, where)
+
+
+def _bins(windows: Windows) -> tuple[NDArray[np.uint32], tuple[tuple[float, float], ...]]:
+    """Windows that lie near to each other in time, together: a number for each window, and an interval for each number."""
+    order = np.argsort(windows.begin_us, kind="stable")
+    number = np.empty(windows.size, np.uint32)
+    number[order] = np.arange(windows.size) * min(windows.size, _MOST_BINS) // windows.size
+    count = int(number.max()) + 1
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, number, windows.begin_us)
+    np.maximum.at(high, number, windows.end_us)
+    return number, tuple(zip(low.tolist(), high.tolist(), strict=True))
 
 
 def _bits(kind: Any, condition: Any, count: int) -> Any:

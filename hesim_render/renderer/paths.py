@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from hesim_render.renderer.images import Cones, LampImages
-from hesim_render.renderer.moving import Moment, MovingScene, Surface, device_box, inverse_of, meets_box
+from hesim_render.renderer.boxes import Moment, box_rows, inverse_of, meets_box
+from hesim_render.renderer.moving import MovingScene, Surface
 from hesim_render.renderer.wavelengths import WavelengthSampler
 
 #: Chance of going on, at most, where Russian roulette is played.
@@ -36,6 +37,8 @@ class PathIntegrator:
     def __init__(
         self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler
     ) -> None:
+        import drjit as dr
+
         self._scene, self._wavelengths = scene, wavelengths
         self._max_depth, self._roulette_depth = (
             depth if depth >= 0 else 1 << 30 for depth in (max_depth, roulette_depth)
@@ -43,7 +46,9 @@ class PathIntegrator:
         lamps = scene.lamp_boxes
         if len(lamps) > _MOST_LAMPS:
             lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
-        self._lamps = [device_box(scene.mi, box) for box in lamps]
+        mi = scene.mi
+        self._lamps = [(mi.Vector3f(row[:3]), mi.Vector3f(row[4:7])) for row in box_rows(lamps)]
+        dr.make_opaque(self._lamps)
         self._images = LampImages.of(scene.mi, scene.static)
 
     def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any]:

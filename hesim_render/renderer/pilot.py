@@ -8,15 +8,18 @@ same at all times: differences between two windows are changes of the scene, not
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.renderer.options import Tuning
+from hesim_render.renderer.options import Gain, Tuning
 from hesim_render.renderer.pairs import PairTracer, Windows
 from hesim_render.renderer.sites import REACH, Sites
 from hesim_render.rng import Stream
+
+#: Fluxes times this have fourth powers that float32 can hold.
+_SMALLER = np.float32(1e-4)
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,12 @@ class Closer:
     Parameters
     ----------
     place : [k], places among the sites.
-    lit_square, hidden_square : [k], squared scatter of single rays, (e⁻/s)².
+    lit_scatter, hidden_scatter : [k], e⁻/s.
     """
 
     place: NDArray[np.int64]
-    lit_square: NDArray[np.float32]
-    hidden_square: NDArray[np.float32]
+    lit_scatter: NDArray[np.float32]
+    hidden_scatter: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -41,15 +44,15 @@ class Pilot:
     Parameters
     ----------
     lit, hidden : mean flux by both estimates, e⁻/s.
-    lit_square, hidden_square : squared scatter of single rays in both, (e⁻/s)².
+    lit_scatter, hidden_scatter : of single rays in both, e⁻/s.
     unshadowed : flux if nothing hid any light, e⁻/s.
     closer : what more rays say of some sites, one entry a window; none where there were no more.
     """
 
     lit: NDArray[np.float32]
     hidden: NDArray[np.float32]
-    lit_square: NDArray[np.float32]
-    hidden_square: NDArray[np.float32]
+    lit_scatter: NDArray[np.float32]
+    hidden_scatter: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
     closer: list[Closer] = field(default_factory=list)
 
@@ -59,13 +62,13 @@ class Pilot:
 
     def flux_of(self, window: int) -> NDArray[np.float32]:
         """In one window, by the estimate that scatters less there, [site]."""
-        chosen = self.lit_square[window] <= self.hidden_square[window]
+        chosen = self.lit_scatter[window] <= self.hidden_scatter[window]
         return np.where(chosen, self.lit[window], self.hidden[window])
 
     @property
     def steady_flux(self) -> NDArray[np.float32]:
         """By one estimate at all times: what changes is the scene."""
-        chosen = self.lit_square.sum(axis=0) <= self.hidden_square.sum(axis=0)
+        chosen = self.lit_scatter.sum(axis=0) <= self.hidden_scatter.sum(axis=0)
         return np.where(chosen, self.lit, self.hidden)
 
 
@@ -77,7 +80,7 @@ def take_pilot(
     tuning: Tuning,
     apart: bool,
     span_us: tuple[float, float] | None,
-    small: Sequence[tuple[NDArray[np.int64], int]] = (),
+    small: Sequence[Sequence[tuple[NDArray[np.int64], int]]] = (),
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot.
 
@@ -97,24 +100,24 @@ def take_pilot(
     width = tuning.lone_footprint_px if apart else tuning.footprint_px
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width, span_us=span_us)
     near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
-    parts = [found.lit, found.hidden, np.square(found.lit_scatter), np.square(found.hidden_scatter), found.unshadowed]
+    parts = [found.lit, found.hidden, found.lit_scatter, found.hidden_scatter, found.unshadowed]
     pilot = Pilot(*(np.repeat(values[None], numbers.shape[0], axis=0) for values in parts))
     moving = np.flatnonzero(near)
     if numbers.shape[0] > 1 and moving.size:
         pixel, later = np.tile(sites.index[moving], numbers.shape[0] - 1), numbers[1:, moving]
         more = tracer.pilot(pixel, later.ravel(), windows, rays, width)
-        parts = [more.lit, more.hidden, np.square(more.lit_scatter), np.square(more.hidden_scatter), more.unshadowed]
-        arrays = pilot.lit, pilot.hidden, pilot.lit_square, pilot.hidden_square, pilot.unshadowed
+        parts = [more.lit, more.hidden, more.lit_scatter, more.hidden_scatter, more.unshadowed]
+        arrays = pilot.lit, pilot.hidden, pilot.lit_scatter, pilot.hidden_scatter, pilot.unshadowed
         for values, told in zip(arrays, parts, strict=True):
             values[1:, moving] = told.reshape(later.shape)
-    for window, (place, many) in enumerate(small):
-        if place.size == 0:
-            pilot.closer.append(Closer(place, np.empty(0, np.float32), np.empty(0, np.float32)))
-            continue
-        found = tracer.pilot(
-            sites.index[place], numbers[window, place], windows, many, width, Stream.RENDER_ZOOM
-        )
-        pilot.closer.append(Closer(place, np.square(found.lit_scatter), np.square(found.hidden_scatter)))
+    for window, looks in enumerate(small):
+        parts = [Closer(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))]
+        for place, many in looks:
+            if place.size:
+                own = numbers[window, place]
+                found = tracer.pilot(sites.index[place], own, windows, many, width, Stream.RENDER_ZOOM)
+                parts.append(Closer(place, found.lit_scatter, found.hidden_scatter))
+        pilot.closer.append(Closer(*(np.concatenate(values) for values in zip(*map(astuple, parts), strict=True))))
     return pilot, near
 
 
@@ -124,6 +127,7 @@ def allocate(
     sites: Sites,
     units: NDArray[np.float32],
     quality: float,
+    gain: Gain,
     tuning: Tuning,
     is_knot: bool,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32]]:
@@ -132,6 +136,8 @@ def allocate(
     Parameters
     ----------
     units : what the noise of each site is worth in each window, e⁻/s, [window, site].
+    quality : wanted error in these units.
+    gain : of stratified rays.
     is_knot : whether the window is the first or the last of its block. It is of two blocks, so that nothing in the
         windows beside it may count.
 
@@ -142,19 +148,19 @@ def allocate(
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
     flux, here = pilot.flux_of(window), sites.listed
     own, value = units[window][here], flux[here]
-    squares = [
-        np.float32(0.5) * (table[window][here] + sites.mean(table[window]))
-        for table in (pilot.lit_square, pilot.hidden_square)
-    ]
+    fourths = []
+    for table in (pilot.lit_scatter, pilot.hidden_scatter):
+        fourth = (table[window] * _SMALLER) ** 4
+        fourths.append(np.float32(0.5) * (fourth[here] + sites.mean(fourth)))
     if pilot.closer:
         closer = pilot.closer[window]
-        for square, told in zip(squares, (closer.lit_square, closer.hidden_square), strict=True):
+        for fourth, told in zip(fourths, (closer.lit_scatter, closer.hidden_scatter), strict=True):
             seen = np.zeros(sites.size, np.float32)
-            seen[closer.place] = told
-            np.maximum(square, seen[here], out=square)
+            seen[closer.place] = (told * _SMALLER) ** 4
+            np.maximum(fourth, seen[here], out=fourth)
     open_flux = pilot.unshadowed[window]
-    lit = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
-    scatter = np.sqrt(np.where(lit, *squares))
+    lit = (fourths[0] <= fourths[1]) & (2 * value >= open_flux[here])
+    scatter = np.sqrt(np.sqrt(np.where(lit, *fourths))) / _SMALLER
     # a part of what the next pixels show may reach into this one unseen
     around = np.stack([pilot.flux_of(number) for number in range(low, min(high, units.shape[0]))])
     highest, lowest = around.max(axis=0), around.min(axis=0)
@@ -163,15 +169,10 @@ def allocate(
     # some of the light that is hidden here may be seen, where it is seen near by
     lit_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
     brighter = np.maximum(sites.most(highest, 2) - value, np.where(lit_near, open_flux[here] - value, 0))
-    factor, power = np.float32(tuning.ray_factor), np.float32(1 / tuning.ray_power)
-
-    def needed(scatter: NDArray[np.float32]) -> NDArray[np.float32]:
-        return (factor / np.float32(quality) * scatter / own) ** power
-
-    for_unseen = np.maximum(needed(unseen), np.float32(tuning.bright_rays) * brighter / own)
-    wanted = needed(scatter) * np.float32(tuning.knot_factor if is_knot else 1.0)
+    wanted_error = np.float32(quality / tuning.margin) * own
+    for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
+    wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
     rays = np.left_shift(np.int16(1), bits)
-    error = factor * scatter * rays.astype(np.float32) ** np.float32(-tuning.ray_power)
-    return rays, lit, error
+    return rays, lit, gain.error(scatter, rays)

@@ -214,6 +214,7 @@ class PixelTracer(Tracer):
         quantities = self._rays_of(pixel, index, half, place - half * per_half, spread, wavelengths, values)
         sums = [dr.block_sum(quantity, per_half) * (1 / per_half) for quantity in quantities]
         dr.eval(*sums)
+        self._sampler.rest()
         first = dr.arange(types.UInt32, count) * 2
         halves = [(dr.gather(types.Float, s, first), dr.gather(types.Float, s, first + 1)) for s in sums]
         dr.eval(halves)

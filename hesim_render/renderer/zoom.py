@@ -82,7 +82,7 @@ class Zoom:
             size = np.maximum(np.minimum(outline.high, self._high) - np.maximum(outline.low, self._low), 0) + 2 * margin
             found.append((float(np.prod(size)), outline))
         found.sort(key=lambda entry: entry[0])
-        room = self._tuning.pilot_rays * float(np.prod(self._high - self._low))
+        room = self._tuning.zoom_room * float(np.prod(self._high - self._low))
         areas = np.cumsum([area for area, _ in found])
         rays = self._tuning.zoom_rays
         while rays > 2 * self._tuning.pilot_rays and not (areas.size and areas[-1] * rays <= room):
@@ -124,8 +124,8 @@ class Zoom:
 
     def sites(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, numbers: NDArray[np.int64]
-    ) -> list[tuple[NDArray[np.int64], int]]:
-        """Which pixels are looked at closer, and with how many rays, once for each row of `numbers`.
+    ) -> list[list[tuple[NDArray[np.int64], int]]]:
+        """Which pixels are looked at closer, and with how many rays, some at a time, for each row of `numbers`.
 
         Parameters
         ----------
@@ -138,21 +138,21 @@ class Zoom:
 
     def _sites_of(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, number: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], int]:
+    ) -> list[tuple[NDArray[np.int64], int]]:
         top, left = int(row.min()), int(col.min())
         shape = int(row.max()) - top + 1, int(col.max()) - left + 1
-        found, rays = np.zeros(row.size, np.bool_), self._tuning.zoom_rays
         begin, end = windows.begin_us[number], windows.end_us[number]
         # rows of a rolling shutter have windows of their own, of which many share one look at a little more
         step = np.maximum((end - begin) / _PARTS, 1.0)
         times = np.stack([np.floor(begin / step) * step, np.ceil(end / step) * step])
         looks, which = np.unique(times, axis=1, return_inverse=True)
+        found = []
         for look, (low, high) in enumerate(looks.T):
-            outlines, many = self._outlines(float(low), float(high))
+            outlines, rays = self._outlines(float(low), float(high))
             if outlines:
-                rays = min(rays, many)
-                found |= self._image(outlines, top, left, shape)[row - top, col - left] & (which.ravel() == look)
-        return np.flatnonzero(found), rays
+                inside = self._image(outlines, top, left, shape)[row - top, col - left]
+                found.append((np.flatnonzero(inside & (which.ravel() == look)), rays))
+        return found
 
     def _image(self, outlines: list[Outline], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
         """Pixels inside any outline, of a rectangle that begins at a row and column."""
