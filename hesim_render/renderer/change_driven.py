@@ -372,8 +372,8 @@ class ChangeDrivenFlux:
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         before, cols = self._tracer.rays_done, self.sensor.spec.geometry.cols
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
-        small = self._zoom.sites(row, col, windows, numbers)
-        found = take_pilot(self._tracer, band.sites, windows, numbers, self._tuning, band.apart, span_us, small)
+        closer = self._zoom.sites(row, col, windows, numbers)
+        found = take_pilot(self._tracer, band.sites, windows, numbers, self._tuning, band.apart, span_us, closer)
         self.counts.pilot_rays += self._tracer.rays_done - before
         return found
 

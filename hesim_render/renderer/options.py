@@ -21,7 +21,10 @@ class Tuning:
     pilot_rays : of each pixel in each window where its role's pixels lie next to each other; they tell whether it
         changes and how many rays it gets. Half as many: edges are seen in steps of an eighth.
     lone_pilot_rays : the same where they lie apart (event pixels of a hybrid tile), which have no neighbours to ask.
-    zoom_rays : of a pixel by which something small comes that the pilot could miss.
+    zoom_rays : of a pixel by which something comes that the pilot could miss, at most.
+    zoom_room, gloss_room : all these rays in a window, over the pixels of the picture, for small things and for others.
+    zoom_margin_px : around their outlines.
+    small_px : least extent, up to which a thing is small.
     footprint_px : width of the area in which the pilot's rays start: edges are noticed before they enter the pixel.
     tolerance : of a value's deviation, in wanted errors.
     change : of a pilot's flux that counts, in tolerances. Larger: what is filled in is further off; smaller: more
@@ -39,6 +42,7 @@ class Tuning:
     lone_pilot_rays: int = 32
     zoom_rays: int = 256
     zoom_room: float = 64.0
+    gloss_room: float = 16.0
     zoom_margin_px: float = 1.0
     small_px: float = 8.0
     footprint_px: float = 1.25

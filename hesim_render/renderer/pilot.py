@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.renderer.options import Gain, Tuning
-from hesim_render.renderer.pairs import PairTracer, Windows
+from hesim_render.renderer.pairs import PairTracer, PilotFlux, Windows
 from hesim_render.renderer.sites import REACH, Sites
+from hesim_render.renderer.zoom import Look
 from hesim_render.rng import Stream
 
 #: Fluxes times this have fourth powers that float32 can hold.
@@ -46,6 +47,7 @@ class Pilot:
     lit, hidden : mean flux by both estimates, e⁻/s.
     lit_scatter, hidden_scatter : of single rays in both, e⁻/s.
     unshadowed : flux if nothing hid any light, e⁻/s.
+    indirect : part of the flux that was scattered more than once, e⁻/s.
     closer : what more rays say of some sites, one entry a window; none where there were no more.
     """
 
@@ -54,6 +56,7 @@ class Pilot:
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
+    indirect: NDArray[np.float32]
     closer: list[Closer] = field(default_factory=list)
 
     @property
@@ -65,11 +68,17 @@ class Pilot:
         chosen = self.lit_scatter[window] <= self.hidden_scatter[window]
         return np.where(chosen, self.lit[window], self.hidden[window])
 
-    @property
-    def steady_flux(self) -> NDArray[np.float32]:
-        """By one estimate at all times: what changes is the scene."""
+    def steady_flux(self, sites: Sites) -> NDArray[np.float32]:
+        """By one estimate at all times: what changes is the scene.
+
+        Light that was scattered often has no edges, but few rays find it. It is taken from all pixels near by.
+        """
         chosen = self.lit_scatter.sum(axis=0) <= self.hidden_scatter.sum(axis=0)
-        return np.where(chosen, self.lit, self.hidden)
+        flux = np.where(chosen, self.lit, self.hidden)
+        if self.indirect.any():
+            for shown, indirect in zip(flux, self.indirect, strict=True):
+                shown += sites.blurred(indirect) - indirect
+        return flux
 
 
 def take_pilot(
@@ -80,7 +89,7 @@ def take_pilot(
     tuning: Tuning,
     apart: bool,
     span_us: tuple[float, float] | None,
-    small: Sequence[Sequence[tuple[NDArray[np.int64], int]]] = (),
+    closer: Sequence[Sequence[Look]] = (),
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot.
 
@@ -89,7 +98,7 @@ def take_pilot(
     numbers : of each site's windows, [window, site].
     apart : whether the pixels have no neighbours to ask.
     span_us : interval, with all windows in it, for which the second result is told; None for not at all.
-    small : of each window, sites that are looked at closer, and with how many rays; see `Zoom`.
+    closer : of each window, sites that are looked at closer; see `Zoom`.
 
     Returns
     -------
@@ -100,25 +109,33 @@ def take_pilot(
     width = tuning.lone_footprint_px if apart else tuning.footprint_px
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width, span_us=span_us)
     near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
-    parts = [found.lit, found.hidden, found.lit_scatter, found.hidden_scatter, found.unshadowed]
-    pilot = Pilot(*(np.repeat(values[None], numbers.shape[0], axis=0) for values in parts))
+    pilot = Pilot(*(np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found)))
     moving = np.flatnonzero(near)
     if numbers.shape[0] > 1 and moving.size:
         pixel, later = np.tile(sites.index[moving], numbers.shape[0] - 1), numbers[1:, moving]
         more = tracer.pilot(pixel, later.ravel(), windows, rays, width)
-        parts = [more.lit, more.hidden, more.lit_scatter, more.hidden_scatter, more.unshadowed]
-        arrays = pilot.lit, pilot.hidden, pilot.lit_scatter, pilot.hidden_scatter, pilot.unshadowed
-        for values, told in zip(arrays, parts, strict=True):
+        for values, told in zip(_tables(pilot), _tables(more), strict=True):
             values[1:, moving] = told.reshape(later.shape)
-    for window, looks in enumerate(small):
+    # large things first: a pixel may show something small as well
+    for window, looks in enumerate(closer):
         parts = [Closer(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))]
-        for place, many in looks:
-            if place.size:
-                own = numbers[window, place]
-                found = tracer.pilot(sites.index[place], own, windows, many, width, Stream.RENDER_ZOOM)
+        for look in sorted(looks, key=lambda look: look.is_small):
+            place = look.place
+            if not place.size:
+                continue
+            own = numbers[window, place]
+            found = tracer.pilot(sites.index[place], own, windows, look.rays, width, Stream.RENDER_ZOOM)
+            if look.is_small:
                 parts.append(Closer(place, found.lit_scatter, found.hidden_scatter))
+            else:
+                for values, told in zip(_tables(pilot), _tables(found), strict=True):
+                    values[window, place] = told
         pilot.closer.append(Closer(*(np.concatenate(values) for values in zip(*map(astuple, parts), strict=True))))
     return pilot, near
+
+
+def _tables(told: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
+    return told.lit, told.hidden, told.lit_scatter, told.hidden_scatter, told.unshadowed, told.indirect
 
 
 def allocate(

@@ -1,9 +1,10 @@
-"""Where the pilot looks closer: pixels through which something small comes that few rays could miss.
+"""Where the pilot looks closer: pixels through which something comes that few rays could miss.
 
 Sixteen rays miss what covers a fiftieth of a pixel seven times out of ten, and a spark or a glint can be hundreds of
-times as bright as what is around it. Objects whose outline takes little of the picture therefore get more pilot rays,
-and their pixels are rendered while they are there. Outlines hold for every instant of a window (`bounds`), and how many
-rays there are depends on the whole picture, not on the part of it that is read out.
+times as bright as what is around it. Small objects therefore get more pilot rays, and their pixels are rendered while
+they are there. Where surfaces may shine, so do large ones, with fewer rays, as many as there is room for. Outlines hold
+for every instant of a window (`bounds`), and how many rays there are depends on the whole picture, not on the part of
+it that is read out.
 """
 
 from __future__ import annotations
@@ -26,6 +27,22 @@ from hesim_render.renderer.trajectory import Trajectory
 _INSTANTS = 9
 #: Parts of a window to which its begin and its end are rounded away from its middle.
 _PARTS = 8
+
+
+@dataclass(frozen=True)
+class Look:
+    """A closer look at some places.
+
+    Parameters
+    ----------
+    place : [k], among those that were asked about.
+    rays : of each.
+    is_small : whether by something small.
+    """
+
+    place: NDArray[np.int64]
+    rays: int
+    is_small: bool
 
 
 @dataclass(frozen=True)
@@ -57,7 +74,7 @@ class Zoom:
     ----------
     view : the camera at rest; `camera` its track, if it moves.
     groups : what moves.
-    is_matt : whether all surfaces are: then only what is itself small needs a closer look.
+    is_matt : whether all surfaces are: then nothing large needs a closer look.
     tuning : constants.
     """
 
@@ -71,24 +88,29 @@ class Zoom:
         middle = np.array([geometry.cols / 2, geometry.rows / 2])
         self._low, self._high = np.array([left, top]) + middle, np.array([right, bottom]) + middle
 
-    def _outlines(self, begin_us: float, end_us: float) -> tuple[list[Outline], int]:
-        """Outlines in one window, and how many pilot rays a pixel in any of them gets; none where none pays."""
-        found: list[tuple[float, Outline]] = []
-        margin = self._tuning.zoom_margin_px
+    def _outlines(self, begin_us: float, end_us: float) -> list[tuple[list[Outline], int, bool]]:
+        """Outlines in one window, how many pilot rays a pixel in any of them gets, and whether they are small."""
+        found: dict[bool, list[tuple[float, Outline]]] = {True: [], False: []}
+        margin, tuning = self._tuning.zoom_margin_px, self._tuning
         for group in self._groups:
             extent, outline = self._outline(group, begin_us, end_us)
-            if outline is None or (self._is_matt and extent > self._tuning.small_px):
+            is_small = extent <= tuning.small_px
+            if outline is None or (self._is_matt and not is_small):
                 continue
             size = np.maximum(np.minimum(outline.high, self._high) - np.maximum(outline.low, self._low), 0) + 2 * margin
-            found.append((float(np.prod(size)), outline))
-        found.sort(key=lambda entry: entry[0])
-        room = self._tuning.zoom_room * float(np.prod(self._high - self._low))
-        areas = np.cumsum([area for area, _ in found])
-        rays = self._tuning.zoom_rays
-        while rays > 2 * self._tuning.pilot_rays and not (areas.size and areas[-1] * rays <= room):
-            rays //= 2
-        some = int(np.searchsorted(areas * rays, room, side="right"))
-        return [outline for _, outline in found[:some]], rays
+            found[is_small].append((float(np.prod(size)), outline))
+        looks = []
+        for is_small, entries in found.items():
+            entries.sort(key=lambda entry: entry[0])
+            room = (tuning.zoom_room if is_small else tuning.gloss_room) * float(np.prod(self._high - self._low))
+            areas = np.cumsum([area for area, _ in entries])
+            rays = tuning.zoom_rays
+            while rays > 2 * tuning.pilot_rays and not (areas.size and areas[-1] * rays <= room):
+                rays //= 2
+            some = int(np.searchsorted(areas * rays, room, side="right"))
+            if some:
+                looks.append(([outline for _, outline in entries[:some]], rays, is_small))
+        return looks
 
     def _outline(self, group: Group, begin_us: float, end_us: float) -> tuple[float, Outline | None]:
         """Least extent of an object in the image at an instant, pixels, and what it sweeps; None outside the picture."""
@@ -124,8 +146,8 @@ class Zoom:
 
     def sites(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, numbers: NDArray[np.int64]
-    ) -> list[list[tuple[NDArray[np.int64], int]]]:
-        """Which pixels are looked at closer, and with how many rays, some at a time, for each row of `numbers`.
+    ) -> list[list[Look]]:
+        """Which pixels are looked at closer, some at a time, for each row of `numbers`.
 
         Parameters
         ----------
@@ -138,7 +160,7 @@ class Zoom:
 
     def _sites_of(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, number: NDArray[np.int64]
-    ) -> list[tuple[NDArray[np.int64], int]]:
+    ) -> list[Look]:
         top, left = int(row.min()), int(col.min())
         shape = int(row.max()) - top + 1, int(col.max()) - left + 1
         begin, end = windows.begin_us[number], windows.end_us[number]
@@ -148,10 +170,9 @@ class Zoom:
         looks, which = np.unique(times, axis=1, return_inverse=True)
         found = []
         for look, (low, high) in enumerate(looks.T):
-            outlines, rays = self._outlines(float(low), float(high))
-            if outlines:
+            for outlines, rays, is_small in self._outlines(float(low), float(high)):
                 inside = self._image(outlines, top, left, shape)[row - top, col - left]
-                found.append((np.flatnonzero(inside & (which.ravel() == look)), rays))
+                found.append(Look(np.flatnonzero(inside & (which.ravel() == look)), rays, is_small))
         return found
 
     def _image(self, outlines: list[Outline], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
