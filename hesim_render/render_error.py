@@ -53,7 +53,9 @@ class ErrorMeter:
         error = np.abs(one - other) / 2 / noise((one + other) / 2, place)
         with np.errstate(divide="ignore"):
             bins = np.floor(_BINS * np.log10(error / _FIRST)) + 1
-        self._counts += np.bincount(np.clip(bins, 0, self._counts.size - 1).astype(np.int64), minlength=self._counts.size)
+        self._counts += np.bincount(
+            np.clip(bins, 0, self._counts.size - 1).astype(np.int64), minlength=self._counts.size
+        )
         self._square += float(np.sum(error * error))
         self._values += error.size
         self._pictures += 1

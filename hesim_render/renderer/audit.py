@@ -9,8 +9,6 @@ number of units the audit stops (`confidence`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,7 +23,7 @@ from hesim_render.renderer.notes import NotedFlux, Units
 #: Confidence of each stated bound.
 CONFIDENCE = 0.99
 #: What a run should have: share of values off by more than the tolerance, of signal events missed, of events too many.
-MOST_OFF, MOST_MISSED, MOST_EXTRA = 0.01, 0.02, 0.01
+MOST_OFF, MOST_MISSED, MOST_EXTRA = 0.02, 0.02, 0.01
 #: Deviation that counts, in wanted errors.
 TOLERANCE = 3.0
 #: Windows of a unit before those that are judged, these, and after them: an event may come one window early or late.
@@ -36,10 +34,10 @@ _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
 _STILL_PART = 0.25
 #: Wanted error of the reference over the sensor's noise, as a part of the run's quality.
 _REFERENCE = 0.5
-#: Units that are looked at before it is asked whether they are enough.
-_BATCH = 1024
+#: Units that are looked at before it is asked whether they are enough: at first, and later on.
+_LEAST_BATCH, _MOST_BATCH = 1024, 16384
 #: Rays of an audit at most: a part of the run's own, or so many if that is more.
-_PART, _RAYS = 0.25, 20_000_000
+_PART, _RAYS = 0.25, 30_000_000
 
 
 class AuditableFlux(SampledFlux, Protocol):
@@ -70,29 +68,45 @@ class AuditableFlux(SampledFlux, Protocol):
         ...
 
 
-@dataclass
 class _Tally:
-    """What units were seen to have, lists of arrays with one entry a unit.
+    """What units were seen to have, arrays [unit] in the random order in which they are looked at.
 
     Parameters
     ----------
-    weight : for how many units it stands; 0 where it was passed over.
-    off : share of values off by more than the tolerance, and `expected`, of those that the error which the run states
-        puts there by itself.
-    deviation : of every value, absolute, in units of noise; `deviation_weight`, for how many it stands.
-    events : what `compare` counted; `flips`, what it counts of the reference with the stated error on top.
+    units : so many.
+
+    Attributes
+    ----------
+    off : share of values off by more than the tolerance, times the number of units that this one stands for.
+    expected : the same of what the error which the run states puts there by itself.
+    events : what `compare` counted; `by_error`, what it counts of the reference with the stated error on top.
+    eventful : first so many of which all that have events in the run were looked at; `looked_at`, all.
     """
 
-    weight: list[NDArray[np.float64]] = field(default_factory=list)
-    off: list[NDArray[np.float64]] = field(default_factory=list)
-    expected: list[NDArray[np.float64]] = field(default_factory=list)
-    deviation: list[NDArray[np.float64]] = field(default_factory=list)
-    deviation_weight: list[NDArray[np.float64]] = field(default_factory=list)
-    events: list[Counted] = field(default_factory=list)
-    flips: list[Counted] = field(default_factory=list)
+    def __init__(self, units: int) -> None:
+        self.off, self.expected, self.by_error = (np.zeros(units) for _ in range(3))
+        self.events = Counted(*(np.zeros(units) for _ in range(5)))
+        self.has_event = np.zeros(units, np.bool_)
+        self.eventful = self.looked_at = 0
+        self._deviations: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
 
-    def counted(self, name: str) -> NDArray[np.float64]:
-        return np.concatenate([getattr(one, name) for one in self.events])
+    def note(self, place: NDArray[np.int64], deviation: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
+        """Deviations of some units, [window, unit], absolute, in units of noise, and how many each stands for."""
+        each = np.broadcast_to(place, deviation.shape), deviation, np.broadcast_to(weight, deviation.shape)
+        self._deviations.append(tuple(values.ravel() for values in each))  # type: ignore[arg-type]
+
+    def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Deviations and weights of all that were looked at, the least first."""
+        place, deviation, weight = (np.concatenate(values) for values in zip(*self._deviations, strict=True))
+        among = np.flatnonzero(place < self.looked_at)
+        order = among[np.argsort(deviation[among])]
+        return deviation[order], weight[order]
+
+    def rate(self, values: NDArray[np.float64]) -> float:
+        """Mean over units, of something that only events have."""
+        rare = values[: self.eventful][self.has_event[: self.eventful]].sum() / max(1, self.eventful)
+        other = values[: self.looked_at][~self.has_event[: self.looked_at]].sum() / max(1, self.looked_at)
+        return float(rare + other)
 
 
 class Audit:
@@ -133,10 +147,27 @@ class Audit:
         return found | self._verdict([found[name] for name in kinds])
 
     def _one(self, noted: list[Units], events: bool, room: float) -> dict[str, Any]:
-        """Of the event pixels, or of frames."""
-        begin, tally, result = self._source.rays_traced, _Tally(), dict[str, Any]()
-        for units in self._shuffled(noted):
-            self._look_at(units, events, tally)
+        """Of the event pixels, or of frames.
+
+        Units have one random order. In some first part of it, all are looked at that have an event in the run; they are
+        few, tell how many events there are, and only they can have one too many. In a first part of that, the others
+        are looked at as well: something may be off or missed in any of them.
+        """
+        begin, batches = self._source.rays_traced, self._batches(noted)
+        tally, result, seen = _Tally(sum(units.pixel.size for units in noted)), dict[str, Any](), 0
+        if events:
+            for batch in batches:
+                seen += 1
+                self._look_at(batch, tally, "eventful")
+                spent = self._source.rays_traced - begin
+                if spent > room / 2 or (
+                    self._event_bounds(tally)["extra_at_most"] <= MOST_EXTRA / 2 and spent > room / 8
+                ):
+                    break
+        for number, batch in enumerate(batches):
+            if events and number >= seen:
+                self._look_at(batch, tally, "eventful")
+            self._look_at(batch, tally, "calm" if events else "frames")
             result = self._bounds(tally, events)
             enough = result["off_at_most"] <= MOST_OFF and (
                 not result.get("true_events")
@@ -146,58 +177,75 @@ class Audit:
                 break
         return result
 
-    def _shuffled(self, noted: list[Units]) -> Iterator[Units]:
-        """All units in a random order, those of equal shape together, some at a time."""
-        which = [np.full(units.pixel.size, number) for number, units in enumerate(noted)]
-        place = [np.arange(units.pixel.size) for units in noted]
-        order = self._rng.permutation(sum(units.pixel.size for units in noted))
-        number, inside = np.concatenate(which)[order], np.concatenate(place)[order]
-        for first in range(0, order.size, _BATCH):
-            chosen, own = number[first : first + _BATCH], inside[first : first + _BATCH]
-            by_shape: dict[bytes, list[Units]] = {}
-            for one in np.unique(chosen):
-                units = noted[one]
-                by_shape.setdefault(units.core.tobytes(), []).append(units.at(own[chosen == one]))
-            yield from map(Units.joined, by_shape.values())
+    def _batches(self, noted: list[Units]) -> list[list[tuple[NDArray[np.int64], Units]]]:
+        """All units in a random order, more and more at a time, those of equal shape together, with their places in it."""
+        which = np.concatenate([np.full(units.pixel.size, number) for number, units in enumerate(noted)])
+        inside = np.concatenate([np.arange(units.pixel.size) for units in noted])
+        order, found, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
+        while first < order.size:
+            chosen = order[first : first + size]
+            by_shape: dict[bytes, list[tuple[NDArray[np.int64], Units]]] = {}
+            for one in np.unique(which[chosen]):
+                here = np.flatnonzero(which[chosen] == one)
+                units = noted[one].at(inside[chosen[here]])
+                by_shape.setdefault(units.core.tobytes(), []).append((first + here, units))
+            found.append(
+                [(np.concatenate([place for place, _ in parts]), Units.joined([units for _, units in parts]))
+                 for parts in by_shape.values()]
+            )  # fmt: skip
+            first, size = first + chosen.size, min(size + size // 2, _MOST_BATCH)
+        return found
 
-    def _look_at(self, units: Units, events: bool, tally: _Tally) -> None:
-        """Render some units again and count what is found."""
-        count, core = units.pixel.size, units.core
-        still = self._source.still_pixels(units.pixel) if events else np.zeros(count, np.bool_)
-        taken = np.flatnonzero(~still | (self._rng.random(count) < _STILL_PART))
-        weight = np.zeros(count)
-        weight[taken] = np.where(still[taken], 1 / _STILL_PART, 1.0)
-        some = units.at(taken)
-        reference = self._reference(some, still[taken], events)
-        unit = self._source.noise_unit(some.pixel, reference, events)
-        tolerance = TOLERANCE * self._quality
-        deviation = np.abs(some.flux - reference)[core] / unit[core]
-        off = np.zeros(count)
-        off[taken] = np.mean(deviation > tolerance, axis=0)
-        tally.weight.append(weight)
-        tally.off.append(weight * off)
-        tally.deviation.append(deviation.ravel())
-        tally.deviation_weight.append(np.broadcast_to(weight[taken], deviation.shape).ravel())
-        expected = np.zeros(count)
-        expected[taken] = np.mean(np.abs(some.difference[core]) > tolerance * unit[core], axis=0)
-        tally.expected.append(weight * expected)
+    def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: _Tally, which: str) -> None:
+        """Render some units again and count what is found: those with events, the others, or all of frames."""
+        for place, units in batch:
+            if which == "frames":
+                some, still = np.arange(place.size), np.zeros(place.size, np.bool_)
+            else:
+                has_event = self._has_event(units)
+                tally.has_event[place] = has_event
+                some = np.flatnonzero(has_event if which == "eventful" else ~has_event)
+                still = self._source.still_pixels(units.pixel[some])
+                taken = ~still | (self._rng.random(some.size) < _STILL_PART)
+                some, still = some[taken], still[taken]
+            if some.size:
+                self._count(units.at(some), place[some], still, which, tally)
+        count = sum(place.size for place, _ in batch)
+        if which == "eventful":
+            tally.eventful += count
+        else:
+            tally.looked_at += count
+
+    def _count(
+        self, units: Units, place: NDArray[np.int64], still: NDArray[np.bool_], which: str, tally: _Tally
+    ) -> None:
+        events, core, tolerance = which != "frames", units.core, TOLERANCE * self._quality
+        reference = self._reference(units, still, which)
+        unit = self._source.noise_unit(units.pixel, reference, events)[core]
+        deviation, weight = np.abs(units.flux - reference)[core] / unit, np.where(still, 1 / _STILL_PART, 1.0)
+        tally.off[place] = weight * np.mean(deviation > tolerance, axis=0)
+        tally.expected[place] = weight * np.mean(np.abs(units.difference[core]) > tolerance * unit, axis=0)
+        tally.note(place, deviation, weight)
         if events:
-            moving = ~still[taken]
-            part, other = some.at(moving), reference[:, moving]
-            place = taken[moving]
-            tally.events.append(_spread_out(self._compare(part, part.flux, other), place, count))
+            moving = np.flatnonzero(~still)
+            part, other = units.at(moving), reference[:, moving]
+            found = self._compare(part, part.flux, other)
+            for total, values in zip(vars(tally.events).values(), vars(found).values(), strict=True):
+                total[place[moving]] = values
             # what an error like the stated one does to the reference
-            tally.flips.append(_spread_out(self._compare(part, other + part.difference, other), place, count))
+            by_error = self._compare(part, other + part.difference, other)
+            tally.by_error[place[moving]] = by_error.missed + by_error.extra + by_error.flips
 
-    def _reference(self, units: Units, still: NDArray[np.bool_], events: bool) -> NDArray[np.float64]:
+    def _reference(self, units: Units, still: NDArray[np.bool_], which: str) -> NDArray[np.float64]:
         """Flux of units by other random numbers, [window, unit]; what is not needed is as the run has it."""
         needed = np.zeros(units.flux.shape, np.bool_)
         core = np.flatnonzero(units.core)
         needed[core] = True
-        if events:
+        if which == "calm" and core[0] > 0:
             # where the run has no event near by, only missed ones are asked for
-            needed[max(0, core[0] - 1)] |= ~still
-            needed |= self._has_event(units) & ~still
+            needed[core[0] - 1] |= ~still
+        elif which == "eventful":
+            needed[:] |= ~still
         reference = units.flux.copy()
         window, place = np.nonzero(needed)
         reference[needed] = self._source.reference_flux(
@@ -207,11 +255,14 @@ class Audit:
 
     def _has_event(self, units: Units) -> NDArray[np.bool_]:
         """Units in which the run itself may have an event, [unit]."""
-        if self._noise is None or self._noise.spec.reference == "last_event":
-            return np.ones(units.pixel.size, np.bool_)
-        change = np.diff(self._log(units.pixel, units.flux), axis=0)
+        assert self._noise is not None
+        signal = self._log(units.pixel, units.flux)
         on, off = self._thresholds(units.pixel)
-        return ((change > on) | (change < -off)).any(axis=0)
+        if self._noise.spec.reference == "previous_sample":
+            change = np.diff(signal, axis=0)
+            return ((change > on) | (change < -off)).any(axis=0)
+        # the level that its events start from is not known: with less than half a threshold there is none
+        return np.ptp(signal, axis=0) > 0.5 * np.minimum(on, off)
 
     def _log(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64]) -> NDArray[np.float64]:
         """ln x of event pixels, [window, unit]."""
@@ -241,11 +292,10 @@ class Audit:
         return compare_crossings(*arguments, _MOST_EVENTS["last_event"])
 
     def _bounds(self, tally: _Tally, events: bool) -> dict[str, Any]:
-        off, weight = np.concatenate(tally.off), np.concatenate(tally.deviation_weight)
-        deviation, most = np.concatenate(tally.deviation), 1 / _STILL_PART if events else 1.0
-        order = np.argsort(deviation)
-        cumulated = np.cumsum(weight[order])
-        parts = {name: deviation[order][np.searchsorted(cumulated, p * cumulated[-1])] for name, p in _PARTS.items()}
+        off, most = tally.off[: tally.looked_at], 1 / _STILL_PART if events else 1.0
+        deviation, weight = tally.deviations()
+        cumulated = np.cumsum(weight)
+        parts = {name: deviation[np.searchsorted(cumulated, p * cumulated[-1])] for name, p in _PARTS.items()}
         found: dict[str, Any] = {
             "units": int(off.size),
             "off": float(off.mean()),
@@ -254,32 +304,36 @@ class Audit:
             "deviation_noise": {
                 "rms": float(np.sqrt(np.sum(weight * deviation**2) / weight.sum())),
                 **{name: float(value) for name, value in parts.items()},
-                "largest": float(deviation.max()),
+                "largest": float(deviation[-1]),
             },
+            "off_by_stated_error_alone": float(tally.expected[: tally.looked_at].mean()),
         }
-        found["off_by_stated_error_alone"] = float(np.concatenate(tally.expected).mean())
         return found | self._event_bounds(tally) if events else found
 
     def _event_bounds(self, tally: _Tally) -> dict[str, Any]:
         """Of missed and extra events. Units in which nothing can move have neither."""
         assert self._noise is not None
-        most = float(_MOST_EVENTS[self._noise.spec.reference])
-        true, missed, count, extra = (
-            np.minimum(tally.counted(name), most) for name in ("true", "missed", "found", "extra")
-        )
+        most, counted = float(_MOST_EVENTS[self._noise.spec.reference]), tally.events
         each = 1 - (1 - CONFIDENCE) / 2
-        at_least = lower_bound(true / most, each)
-        total, others = max(float(true.sum()), 1e-300), max(float(count.sum()), 1e-300)
+        eventful = np.flatnonzero(tally.has_event[: tally.eventful])
+        known = np.zeros(tally.eventful)
+        known[eventful] = np.minimum(counted.true[eventful], most)
+        at_least = lower_bound(known / most, each)
+        missed = upper_bound(np.minimum(counted.missed[: tally.looked_at], most) / most, each)
+        own = (np.minimum(values[eventful], most) for values in (counted.extra, counted.found))
+        seen = bool(counted.true.any())
+        true = tally.rate(counted.true) if seen else np.inf
+        found = tally.rate(counted.found) or np.inf
         return {
-            "true_events": float(true.sum()),
-            "missed": float(missed.sum()) / total,
-            "missed_at_most": min(1.0, upper_bound(missed / most, each) / at_least) if at_least > 0 else 1.0,
+            "true_events": float(counted.true.sum()),
+            "missed": tally.rate(counted.missed) / true,
+            "missed_at_most": min(1.0, missed / at_least) if at_least > 0 else 1.0,
             "missed_wanted_at_most": MOST_MISSED,
-            "extra": float(extra.sum()) / others,
-            "extra_at_most": ratio_upper_bound(extra, count, most, CONFIDENCE),
+            "extra": tally.rate(counted.extra) / found,
+            "extra_at_most": ratio_upper_bound(*own, most, CONFIDENCE),
             "extra_wanted_at_most": MOST_EXTRA,
-            "flips": float(tally.counted("flips").sum()) / total,
-            "flips_by_stated_error": sum(float((one.missed + one.extra + one.flips).sum()) for one in tally.flips) / total,
+            "flips": tally.rate(counted.flips) / true,
+            "flips_by_stated_error": tally.rate(tally.by_error) / true,
         }
 
     def _verdict(self, parts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -305,12 +359,3 @@ def _rounded_down(value: float) -> float:
     """To two digits."""
     step = 10 ** (np.floor(np.log10(value)) - 1)
     return float(np.floor(value / step + 1e-9) * step)
-
-
-def _spread_out(counted: Counted, place: NDArray[np.int64], count: int) -> Counted:
-    """One entry for each of `count` units, 0 for those that are not at one of the places."""
-    found = {}
-    for name, values in vars(counted).items():
-        found[name] = np.zeros(count)
-        found[name][place] = values
-    return Counted(**found)

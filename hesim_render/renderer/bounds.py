@@ -71,9 +71,7 @@ def _instants(trajectory: Trajectory, piece: Piece, radius_m: float) -> tuple[ND
     return np.linspace(piece.first, piece.last, steps + 1), radius_m * (1 - cos(min(turn / steps / 2, pi)))
 
 
-def fastest_m_per_s(
-    corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float
-) -> float:
+def fastest_m_per_s(corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float) -> float:
     """Highest speed of any point of an object within an interval, m/s: |v| + ωρ of the fastest piece of its track."""
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     fastest = 0.0
@@ -88,5 +86,7 @@ def fastest_turn_rad_per_s(trajectory: Trajectory, begin_us: float, end_us: floa
     """Highest angular speed within an interval."""
     turns = [0.0]
     for segment in {piece.segment for piece in trajectory.pieces(begin_us, end_us) if piece.length_us > 0}:
-        turns.append(abs(float(trajectory.arc_rad[segment])) / (S_PER_US * float(np.diff(trajectory.knots_us)[segment])))
+        turns.append(
+            abs(float(trajectory.arc_rad[segment])) / (S_PER_US * float(np.diff(trajectory.knots_us)[segment]))
+        )
     return max(turns)

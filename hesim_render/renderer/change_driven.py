@@ -253,7 +253,9 @@ class ChangeDrivenFlux:
                 place, own = listed[band.place], window[band.place]
                 numbers = _of_own_row(band.sites, own, self.sensor.spec.geometry.cols)[None]
                 pilot, near = self._pilot(band, windows, numbers, still.span_us)
-                what = plan(pilot, band.sites, band.unit, self.quality, self._gain, self._tuning, is_knot=role == "events")
+                what = plan(
+                    pilot, band.sites, band.unit, self.quality, self._gain, self._tuning, is_knot=role == "events"
+                )
                 flux, met = self._render(band, windows, own[None], what, still.span_us)
                 out.put(place, flux)
                 if still.span_us is not None:
@@ -329,6 +331,7 @@ class ChangeDrivenFlux:
         )
         unit = self._noise.of("events" if self.sensor.spec.evs is not None else "any", index)(flux)
         wanted = self._gain.rays(scatter / (np.float32(quality) * unit))
+        wanted = np.maximum(wanted, pilot.unshadowed / (np.float32(tuning.audit_ray_weight * quality) * unit))
         rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
         times = np.ceil((self._gain.error(scatter, rays) / (quality * unit)) ** 2)
         times = np.clip(times, 1, tuning.most_audit_times)
@@ -358,9 +361,7 @@ class ChangeDrivenFlux:
         order, apart = np.argsort(index, kind="stable"), self._noise.is_apart(role)
         for first in range(0, order.size, _BAND_PIXELS):
             place = order[first : first + _BAND_PIXELS]
-            sites = (
-                Sites.alone(index[place]) if apart else Sites.around(index[place], geometry.rows, geometry.cols)
-            )
+            sites = Sites.alone(index[place]) if apart else Sites.around(index[place], geometry.rows, geometry.cols)
             yield _Band(place, sites, self._noise.of(role, sites.index), apart)
 
     def _pilot(

@@ -86,7 +86,11 @@ class Fleet:
                 def try_face(j: Any, t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
                     own, spot, inside = to_face(local, self._rows(j))
                     closer = near & inside & (own >= 0) & (own < t)
-                    t, which, place = dr.select(closer, own, t), dr.select(closer, j, which), dr.select(closer, spot, place)
+                    t, which, place = (
+                        dr.select(closer, own, t),
+                        dr.select(closer, j, which),
+                        dr.select(closer, spot, place),
+                    )
                     return j + 1, t, place, which, ball & ~closer, dr.select(closer, number, group)
 
                 state = first_ball, t, place, which, ball, group
@@ -177,9 +181,7 @@ class Fleet:
         first = code // 3
         along = code - 3 * first
         weights = dr.select(second, u + v - 1, 1 - u - v), dr.select(second, 1 - v, u), dr.select(second, 1 - u, v)
-        barycentric = [
-            dr.select(first == k, weights[0], dr.select(along == k, weights[1], weights[2])) for k in (1, 2)
-        ]
+        barycentric = [dr.select(first == k, weights[0], dr.select(along == k, weights[1], weights[2])) for k in (1, 2)]
         hit.prim_uv = mi.Point2f(*barycentric)
         hit.prim_index = mi.UInt32(triangle) + dr.select(second, mi.UInt32(1), mi.UInt32(0))
         return hit

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.schedule import BLOCK_INTERVALS, Block, Exposure
+from hesim_render.schedule import Block, Exposure
 
 #: Patches of so many pixels by side, and blocks spread over the run, in which rays are counted.
 _PATCHES, _SIDE, _BLOCKS = 6, 12, 3

@@ -93,4 +93,3 @@ def _edge(first: Any, second: Any, normal: Any) -> Any:
     length = dr.norm(across)
     angle = dr.atan2(length, dr.dot(first, second))
     return dr.select(length > 0, angle * dr.dot(across, normal) / length, 0.0)
-

@@ -15,7 +15,7 @@ from hesim_render.flux import Sample, SampledFlux
 from hesim_render.schedule import Block
 
 #: Units noted in a run, about.
-_UNITS = 60_000
+_UNITS = 200_000
 _BY_WINDOW = ("begin_us", "end_us", "flux", "difference", "error")
 
 
@@ -123,7 +123,9 @@ class NotedFlux:
             times = (np.broadcast_to(np.asarray(t, np.float64), (count,))[place][None] for t in (begin_us, end_us))
             flux, difference = _mean_and_difference(halves, place)
             self.frames.append(
-                Units(np.asarray(pixel)[place], *times, np.ones(1, np.bool_), flux[None], difference[None], 0 * flux[None])
+                Units(
+                    np.asarray(pixel)[place], *times, np.ones(1, np.bool_), flux[None], difference[None], 0 * flux[None]
+                )
             )
         return halves
 

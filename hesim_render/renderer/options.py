@@ -30,6 +30,7 @@ class Tuning:
     change : of a pilot's flux that counts, in tolerances. Larger: what is filled in is further off; smaller: more
         pixels are rendered.
     least_rays, most_rays : of a pair.
+    ray_weight : what a single ray of a pair brings at most, in wanted errors: others may see what no pilot ray saw.
     ray_factor, ray_power : rays are (factor · scatter/wanted error)^(1/power): the error of stratified rays falls
         faster than that of independent ones.
     unseen_area : part of a pixel's area in which the pilot may have missed what the next pixels show.
@@ -53,6 +54,7 @@ class Tuning:
     huge: float = 128.0
     huge_windows: int = 1
     least_rays: int = 8
+    ray_weight: float = 2.0
     most_rays: int = 4096
     matt_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
@@ -63,8 +65,8 @@ class Tuning:
     knot_factor: float = 2.0
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
+    audit_ray_weight: float = 0.4
     most_audit_times: int = 8
-
 
 
 @dataclass(frozen=True)

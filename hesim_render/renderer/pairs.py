@@ -14,8 +14,8 @@ from hesim_render import optics
 from hesim_render.backend import jit
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.bounds import stays_in
-from hesim_render.renderer.matt import MattIntegrator
 from hesim_render.renderer.boxes import Moment, box_rows
+from hesim_render.renderer.matt import MattIntegrator
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paths import PathIntegrator
 from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer, spread_out

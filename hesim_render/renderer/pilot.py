@@ -190,6 +190,7 @@ def allocate(
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
+    wanted = np.maximum(wanted, open_flux[here] / (np.float32(tuning.ray_weight * quality) * own))
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
     rays = np.left_shift(np.int16(1), bits)
     return rays, lit, gain.error(scatter, rays)

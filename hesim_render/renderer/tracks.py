@@ -89,7 +89,9 @@ class Tracks:
         rows, times, heads = [], [], []
         for track in trajectories:
             knots = track.knots_us - track.knots_us[0]
-            heads.append([sum(map(len, times)), sum(map(len, rows)), knots.size, knots[-1], track.repeat, *track.pivot_m])
+            heads.append(
+                [sum(map(len, times)), sum(map(len, rows)), knots.size, knots[-1], track.repeat, *track.pivot_m]
+            )
             # one row a segment, fetched as four packets of four: gathers of single numbers cost more than the poses
             columns = [
                 *(knots[:-1, None], 1 / np.diff(knots)[:, None], track.arc_rad[:, None] / 2, track.arc_axis),
@@ -126,8 +128,10 @@ class Tracks:
         segment = dr.binary_search(
             0,
             self._most - 1,
-            lambda i: (types.UInt32(i) < last)
-            & (dr.gather(types.Float, self._times, base + dr.minimum(types.UInt32(i) + 1, last)) <= local_us),
+            lambda i: (
+                (types.UInt32(i) < last)
+                & (dr.gather(types.Float, self._times, base + dr.minimum(types.UInt32(i) + 1, last)) <= local_us)
+            ),
         )
         place = 4 * (types.UInt32(first_row) + dr.minimum(types.UInt32(segment), last))
         row = [x for k in range(4) for x in dr.gather(types.Array4f, self._rows, place + k)]

@@ -22,7 +22,6 @@ from hesim_render.renderer.options import Tuning
 from hesim_render.renderer.pairs import Windows
 from hesim_render.renderer.trajectory import Trajectory
 
-
 #: Instants of a window at which an object is looked for where the camera moves as well.
 _INSTANTS = 9
 #: Parts of a window to which its begin and its end are rounded away from its middle.
