@@ -82,7 +82,7 @@ def plan(
         np.ones(shape, np.bool_), np.zeros(shape, np.int16), np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
     )
     if last > 1:
-        flux, least = pilot.steady_flux(sites), np.float32(tuning.change * tuning.tolerance * quality) * units
+        flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
         marked = changes(flux, least)
         great = changes(flux, np.float32(tuning.great) * least)
         huge = longer(changes(flux, np.float32(tuning.huge) * least), tuning.huge_windows)

@@ -128,7 +128,7 @@ class MattIntegrator:
         self._emitted = mi.Float(np.array([*emitted, [0.0] * len(responses)], np.float32).ravel())
         self._filters, self._colours = mi.UInt32(len(responses)), mi.UInt32(len(colours))
 
-    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any]:
         """One ray a lane.
 
         Parameters
@@ -142,7 +142,6 @@ class MattIntegrator:
         -------
         lit, hidden : Float, both estimates of the flux, e⁻/s.
         unshadowed : Float, the flux if nothing hid any light, e⁻/s.
-        indirect : Float, part of the flux that was scattered more than once, e⁻/s; None where there is none.
         met : Bool, whether the path came through the box of a moving object.
         """
         import drjit as dr
@@ -186,7 +185,7 @@ class MattIntegrator:
             lit = dr.fma(scale, dr.select(blocked, open_ - share, open_), lit)
             hidden = dr.fma(scale, dr.select(blocked, 0.0, share), hidden)
             unshadowed = dr.fma(scale, open_, unshadowed)
-        return lit, hidden, unshadowed, None, met
+        return lit, hidden, unshadowed, met
 
 
 class _Lamp:

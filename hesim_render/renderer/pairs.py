@@ -84,14 +84,12 @@ class PilotFlux:
         rays of which one half says one thing and one half another it is the standard deviation; where few say
         something else it is more, as stratified rays gain less then.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
-    indirect : part of the mean flux that was scattered more than once, e⁻/s, float32.
     met : see `PairFlux`.
     """
 
     lit: NDArray[np.float32]
     hidden: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
-    indirect: NDArray[np.float32]
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
     met: NDArray[np.bool_]
@@ -213,7 +211,7 @@ class PairTracer(Tracer):
         import drjit as dr
 
         count = pixel.size
-        out = PilotFlux(*(np.zeros(count, np.float32) for _ in range(6)), np.empty(count, np.bool_))
+        out = PilotFlux(*(np.zeros(count, np.float32) for _ in range(5)), np.empty(count, np.bool_))
         moments, key = self._moments(windows, span_us), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
         room = max(1, self._block_rays // samples)
@@ -222,7 +220,7 @@ class PairTracer(Tracer):
             self._pilot_block(pixel[part], window[part].astype(np.uint32), moments, key, samples, footprint, out, part)
             self._report((part.stop - first) * samples)
         scale = self._scale(pixel)
-        for values in (out.lit, out.hidden, out.unshadowed, out.indirect, out.lit_scatter, out.hidden_scatter):
+        for values in (out.lit, out.hidden, out.unshadowed, out.lit_scatter, out.hidden_scatter):
             values *= scale
         return out
 
@@ -325,7 +323,7 @@ class PairTracer(Tracer):
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
         pixel, window, lit = (spread_out(types.UInt32, table[pair], packet) for table in lanes)
         self._sampler.setup(key, pixel, half, sample - half * per_half, per_half, MOST_SAMPLES // 2)
-        if_lit, if_hidden, _, _, met = self._rays_of(pixel, window, moments, types.Float(1.0))
+        if_lit, if_hidden, _, met = self._rays_of(pixel, window, moments, types.Float(1.0))
         flux = dr.select(lit != 0, if_lit, if_hidden)
         met = _bits(types.UInt32, met, used * _PACKET)
         dr.eval(flux, met)
@@ -359,9 +357,9 @@ class PairTracer(Tracer):
         lane = ray_index // rays
         pixel, number = spread_out(types.UInt32, pixels, lane), spread_out(types.UInt32, window, lane)
         self._sampler.setup(key, pixel, types.UInt32(0), ray_index - lane * rays, rays, MOST_SAMPLES // 2)
-        lit, hidden, unshadowed, indirect, met = self._rays_of(pixel, number, moments, footprint)
+        lit, hidden, unshadowed, met = self._rays_of(pixel, number, moments, footprint)
         bits = _bits(types.UInt32, met, pixels.size * samples)
-        dr.eval(lit, hidden, unshadowed, indirect, bits)
+        dr.eval(lit, hidden, unshadowed, bits)
         self._sampler.rest()
         share = dr.opaque(types.Float, 1 / samples)
         for values, name in ((lit, "lit"), (hidden, "hidden")):
@@ -373,8 +371,6 @@ class PairTracer(Tracer):
             dr.eval(mean, scatter)
             getattr(out, name)[part], getattr(out, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
         out.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
-        if indirect is not None:
-            out.indirect[part] = np.array(dr.block_sum(indirect, samples) * share)
         out.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, bits, samples))
 
     def _rays_of(self, pixel: Any, window: Any, moments: _Moments, footprint: Any) -> tuple[Any, ...]:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.renderer.boxes import Moment, box_rows, inverse_of, meets_box
 from hesim_render.renderer.images import Cones, LampImages
+from hesim_render.renderer.boxes import Moment, box_rows, inverse_of, meets_box
 from hesim_render.renderer.moving import MovingScene, Surface
 from hesim_render.renderer.wavelengths import WavelengthSampler
 
@@ -22,7 +22,6 @@ from hesim_render.renderer.wavelengths import WavelengthSampler
 _ROULETTE_MOST = 0.95
 #: Lights that have boxes of their own to tell whether a ray may meet them; more share one.
 _MOST_LAMPS = 8
-
 
 class PathIntegrator:
     """Radiance along rays through a `MovingScene`, and what a pixel makes of it.
@@ -35,7 +34,9 @@ class PathIntegrator:
     wavelengths : which of them a ray carries, by the filter of its pixel.
     """
 
-    def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler) -> None:
+    def __init__(
+        self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler
+    ) -> None:
         import drjit as dr
 
         self._scene, self._wavelengths = scene, wavelengths
@@ -50,18 +51,19 @@ class PathIntegrator:
         dr.make_opaque(self._lamps)
         self._images = LampImages.of(scene.mi, scene.static)
 
-    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any]:
         """One ray a lane; see `MattIntegrator.flux`, of whose estimates there is only one here."""
         import drjit as dr
 
-        ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(*self._wavelengths.sample(filter_index, sampler.next_1d()))
-        radiance, direct, met = self.sample(sampler, ray, moment)
+        ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(
+            *self._wavelengths.sample(filter_index, sampler.next_1d())
+        )
+        radiance, met = self.sample(sampler, ray, moment)
         # not dr.mean, which has the number of lanes in the kernel: each new one would compile
-        share = self._wavelengths.total(filter_index) / len(radiance)
-        flux = dr.sum(radiance) * share
-        return flux, flux, flux, flux - dr.sum(direct) * share, met
+        flux = dr.sum(radiance) / len(radiance) * self._wavelengths.total(filter_index)
+        return flux, flux, flux, met
 
-    def sample(self, sampler: Any, ray: Any, moment: Moment) -> tuple[Any, Any, Any]:
+    def sample(self, sampler: Any, ray: Any, moment: Moment) -> tuple[Any, Any]:
         """One path a lane.
 
         Parameters
@@ -73,7 +75,6 @@ class PathIntegrator:
         Returns
         -------
         radiance : Spectrum, W m⁻² sr⁻¹ nm⁻¹.
-        direct : Spectrum, part of it that was scattered once at most; mirrors and panes do not scatter.
         met : Bool, whether any segment came through the box of a moving object.
         """
         import drjit as dr
@@ -82,8 +83,6 @@ class PathIntegrator:
         context = mi.BSDFContext()
         depth, met = mi.UInt32(0), mi.Bool(False)
         throughput, radiance = mi.Spectrum(1.0), mi.Spectrum(0.0)
-        # how often a path was scattered; at the second vertex after the first time `direct` is complete
-        scattered, direct = mi.UInt32(0), mi.Spectrum(0.0)
         stretch = mi.Float(1.0)  # of solid angle by refraction
         before = dr.zeros(mi.Interaction3f)
         before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
@@ -101,14 +100,11 @@ class PathIntegrator:
 
         def step(*state: Any) -> tuple[Any, ...]:
             """One vertex from which the path may go on; its last segment is left for after the loop."""
-            sampler, depth, met, throughput, radiance, scattered, direct, stretch, *state = state
-            before, before_pdf, before_delta, ray, active, _ = state
+            sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, _ = state
             surface = scene.intersect(ray, moment, depth == 0, active)
             si = surface.rest
             met |= surface.met
             radiance = dr.fma(throughput, shine(si, active, before, before_pdf, before_delta), radiance)
-            direct = dr.select(scattered == 1, radiance, direct)
-            scattered = dr.select(scattered == 1, 2, scattered)
 
             goes_on = active & si.is_valid()
             bsdf = si.bsdf()
@@ -155,7 +151,6 @@ class PathIntegrator:
             before_pdf = chosen.pdf
             before_delta = mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
             goes_on &= dr.any(throughput != 0)
-            scattered = dr.select(goes_on & ~before_delta & (scattered == 0), 1, scattered)
             depth = dr.select(si.is_valid(), depth + 1, depth)
 
             if self._max_depth > self._roulette_depth:
@@ -165,22 +160,21 @@ class PathIntegrator:
                 goes_on &= ~at_risk | (luck < survival)
             active = goes_on & (depth + 1 < most)
             left = goes_on & ~active
-            state = sampler, depth, met, throughput, radiance, scattered, direct, stretch
-            return *state, before, before_pdf, before_delta, ray, active, left
+            state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray
+            return *state, active, left
 
         left = active & (most <= 1)
         active &= most > 1
-        state = sampler, depth, met, throughput, radiance, scattered, direct, stretch
-        state = *state, before, before_pdf, before_delta, ray, active, left
+        state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, left
         if self._max_depth == 2:
             end = step(*state)  # the loop itself costs time
         else:
             end = dr.while_loop(state, lambda *values: values[-2], step, label="paths")
-        _, depth, met, throughput, radiance, scattered, direct, _, *before, ray, _, left = end
+        _, depth, met, throughput, radiance, _, *before, ray, _, left = end
 
         # the last segment matters only where it runs into light
         if not (scene.has_sky or self._lamps):
-            return radiance, dr.select(scattered == 2, direct, radiance), met
+            return radiance, met
         if not scene.has_sky:
             left &= self._near_lamps(ray)
         if self._lamps:
@@ -192,8 +186,7 @@ class PathIntegrator:
             si.wi, si.wavelengths = -ray.d, ray.wavelengths
         met |= left & near
         # the throughput of a path that has ended may be anything
-        radiance = dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance)
-        return radiance, dr.select(scattered == 2, direct, radiance), met
+        return dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance), met
 
     def _near_lamps(self, ray: Any) -> Any:
         """Whether a ray runs into the box around a light."""

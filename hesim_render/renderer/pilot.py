@@ -47,7 +47,6 @@ class Pilot:
     lit, hidden : mean flux by both estimates, e⁻/s.
     lit_scatter, hidden_scatter : of single rays in both, e⁻/s.
     unshadowed : flux if nothing hid any light, e⁻/s.
-    indirect : part of the flux that was scattered more than once, e⁻/s.
     closer : what more rays say of some sites, one entry a window; none where there were no more.
     """
 
@@ -56,7 +55,6 @@ class Pilot:
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
-    indirect: NDArray[np.float32]
     closer: list[Closer] = field(default_factory=list)
 
     @property
@@ -68,17 +66,11 @@ class Pilot:
         chosen = self.lit_scatter[window] <= self.hidden_scatter[window]
         return np.where(chosen, self.lit[window], self.hidden[window])
 
-    def steady_flux(self, sites: Sites) -> NDArray[np.float32]:
-        """By one estimate at all times: what changes is the scene.
-
-        Light that was scattered often has no edges, but few rays find it. It is taken from all pixels near by.
-        """
+    @property
+    def steady_flux(self) -> NDArray[np.float32]:
+        """By one estimate at all times: what changes is the scene."""
         chosen = self.lit_scatter.sum(axis=0) <= self.hidden_scatter.sum(axis=0)
-        flux = np.where(chosen, self.lit, self.hidden)
-        if self.indirect.any():
-            for shown, indirect in zip(flux, self.indirect, strict=True):
-                shown += sites.blurred(indirect) - indirect
-        return flux
+        return np.where(chosen, self.lit, self.hidden)
 
 
 def take_pilot(
@@ -135,7 +127,7 @@ def take_pilot(
 
 
 def _tables(told: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
-    return told.lit, told.hidden, told.lit_scatter, told.hidden_scatter, told.unshadowed, told.indirect
+    return told.lit, told.hidden, told.lit_scatter, told.hidden_scatter, told.unshadowed
 
 
 def allocate(

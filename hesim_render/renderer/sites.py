@@ -62,26 +62,18 @@ class Sites:
     def size(self) -> int:
         return self.index.size
 
-    def blurred(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Mean over the sites among each one's 3×3, of values [m]; [m].
-
-        Of sites at the rim that is another one for a crop; up to `REACH` - 1 from a listed pixel it is the same.
-        """
+    def mean(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean over the sites among each listed pixel's 3×3, of values [m]; [n]."""
         if self.shape is None:
-            return values
+            return values[self.listed]
         if not self._count:
             self._count.append(self._sum(np.ones(self.size, np.float32)))
         return self._sum(values) / self._count[0]
 
-    def mean(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The same of the listed pixels, [n]."""
-        return self.blurred(values)[self.listed]
-
     def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        assert self.cell is not None
         image = self._image(values, 1, np.float32(0))
         across = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
-        return (across[:-2] + across[1:-1] + across[2:]).ravel()[self.cell]
+        return self._at_listed(across[:-2] + across[1:-1] + across[2:])
 
     def most(self, values: NDArray, radius: int) -> NDArray:
         """Largest value within `radius` pixels of each listed one, diagonally too, of values [m]; [n]."""
