@@ -32,8 +32,9 @@ STRETCHES = {"previous_sample": (2, 1, 1), "last_event": (1, 8, 1)}
 _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
 #: Part of the units of pixels that nothing can come near which is rendered again; they count for more.
 _STILL_PART = 0.25
-#: Wanted error of the reference over the sensor's noise, as a part of the run's quality.
-_REFERENCE = 0.5
+#: Wanted error of the reference over the sensor's noise, as a part of the run's quality: of exposures a smaller one,
+#: as much moves meanwhile and rays gain less than is expected of them.
+_REFERENCE = {"eventful": 0.5, "calm": 0.5, "frames": 0.2}
 #: Units that are looked at before it is asked whether they are enough: at first, and later on.
 _LEAST_BATCH, _MOST_BATCH = 1024, 16384
 #: Rays of an audit at most: a part of the run's own, or so many if that is more.
@@ -249,7 +250,7 @@ class Audit:
         reference = units.flux.copy()
         window, place = np.nonzero(needed)
         reference[needed] = self._source.reference_flux(
-            units.pixel[place], units.begin_us[needed], units.end_us[needed], _REFERENCE * self._quality
+            units.pixel[place], units.begin_us[needed], units.end_us[needed], _REFERENCE[which] * self._quality
         )
         return reference
 

@@ -97,12 +97,16 @@ class _Band:
     sites : the pixels and their neighbours.
     unit : noise of the sites.
     apart : whether the pixels have no neighbours to ask.
+    pilot_rays : of each pixel in each window.
+    quality : wanted error in units of noise.
     """
 
     place: NDArray[np.int64]
     sites: Sites
     unit: NoiseUnit
     apart: bool
+    pilot_rays: int
+    quality: float
 
     @property
     def index(self) -> NDArray[np.uint32]:
@@ -254,7 +258,7 @@ class ChangeDrivenFlux:
                 numbers = _of_own_row(band.sites, own, self.sensor.spec.geometry.cols)[None]
                 pilot, near = self._pilot(band, windows, numbers, still.span_us)
                 what = plan(
-                    pilot, band.sites, band.unit, self.quality, self._gain, self._tuning, is_knot=role == "events"
+                    pilot, band.sites, band.unit, band.quality, self._gain, self._tuning, is_knot=role == "events"
                 )
                 flux, met = self._render(band, windows, own[None], what, still.span_us)
                 out.put(place, flux)
@@ -276,11 +280,10 @@ class ChangeDrivenFlux:
         for band in self._bands(pixel, role):
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, near = self._pilot(band, windows, numbers, windows.span_us)
-            what = plan(pilot, band.sites, band.unit, self.quality, self._gain, self._tuning, is_knot=role == "events")
+            what = plan(pilot, band.sites, band.unit, band.quality, self._gain, self._tuning, is_knot=role == "events")
             changing = near[band.sites.listed] if windows.size > 1 else np.ones(band.place.size, np.bool_)
             rays += int(np.sum(np.where(what.rendered, what.rays, 0)[-later:], dtype=np.int64))
-            each = self._tuning.lone_pilot_rays if band.apart else self._tuning.pilot_rays
-            rays += each * later * int(np.count_nonzero(changing))
+            rays += band.pilot_rays * later * int(np.count_nonzero(changing))
         self.counts, self._tracer.rays_done = counts, done
         return rays / pixel.size
 
@@ -358,11 +361,15 @@ class ChangeDrivenFlux:
     def _bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[_Band]:
         """The listed pixels, some rows at a time."""
         index, geometry = self._index[pixel], self.sensor.spec.geometry
-        order, apart = np.argsort(index, kind="stable"), self._noise.is_apart(role)
+        order, apart, tuning = np.argsort(index, kind="stable"), self._noise.is_apart(role), self._tuning
+        rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
+        quality = self.quality
+        if role == "any":
+            rays, quality = tuning.frame_pilot_rays, quality / tuning.frame_margin
         for first in range(0, order.size, _BAND_PIXELS):
             place = order[first : first + _BAND_PIXELS]
             sites = Sites.alone(index[place]) if apart else Sites.around(index[place], geometry.rows, geometry.cols)
-            yield _Band(place, sites, self._noise.of(role, sites.index), apart)
+            yield _Band(place, sites, self._noise.of(role, sites.index), apart, rays, quality)
 
     def _pilot(
         self,
@@ -372,9 +379,10 @@ class ChangeDrivenFlux:
         span_us: tuple[float, float] | None,
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         before, cols = self._tracer.rays_done, self.sensor.spec.geometry.cols
+        width = self._tuning.lone_footprint_px if band.apart else self._tuning.footprint_px
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         closer = self._zoom.sites(row, col, windows, numbers)
-        found = take_pilot(self._tracer, band.sites, windows, numbers, self._tuning, band.apart, span_us, closer)
+        found = take_pilot(self._tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer)
         self.counts.pilot_rays += self._tracer.rays_done - before
         return found
 
@@ -480,7 +488,7 @@ class _Blocks:
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, _ = source._pilot(band, windows, numbers, windows.span_us)
-            what = plan(pilot, band.sites, band.unit, source.quality, source._gain, source._tuning, is_knot=True)
+            what = plan(pilot, band.sites, band.unit, band.quality, source._gain, source._tuning, is_knot=True)
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             flux, _ = source._render(band, windows, numbers, what, first=first)
             for values in flux.arrays[:2]:

@@ -20,6 +20,7 @@ class Tuning:
     ----------
     pilot_rays : of each pixel in each window where its role's pixels lie next to each other; they tell whether it
         changes and how many rays it gets. Half as many: edges are seen in steps of an eighth.
+    frame_pilot_rays : of each frame pixel in each exposure.
     lone_pilot_rays : the same where they lie apart (event pixels of a hybrid tile), which have no neighbours to ask.
     zoom_rays : of a pixel by which something comes that the pilot could miss, at most.
     zoom_room, gloss_room : all these rays in a window, over the pixels of the picture, for small things and for others.
@@ -36,11 +37,13 @@ class Tuning:
     unseen_area : part of a pixel's area in which the pilot may have missed what the next pixels show.
     most_unseen_rays : that a pair gets for that.
     bright_rays : that a pair gets for each noise unit by which a pixel up to two away is brighter.
+    frame_margin : by which the wanted error of an exposure is smaller: much may move meanwhile, and rays gain less.
     knot_factor : times as many rays where a pair stands for the half of a block.
     """
 
     pilot_rays: int = 16
     lone_pilot_rays: int = 32
+    frame_pilot_rays: int = 64
     zoom_rays: int = 256
     zoom_room: float = 64.0
     gloss_room: float = 16.0
@@ -58,7 +61,7 @@ class Tuning:
     most_rays: int = 4096
     matt_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
-    margin: float = 1.25
+    frame_margin: float = 1.5
     unseen_area: float = 1 / 32
     most_unseen_rays: int = 512
     bright_rays: float = 0.25
@@ -66,7 +69,7 @@ class Tuning:
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 0.4
-    most_audit_times: int = 8
+    most_audit_times: int = 16
 
 
 @dataclass(frozen=True)

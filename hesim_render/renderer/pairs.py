@@ -80,9 +80,9 @@ class PilotFlux:
     Parameters
     ----------
     lit, hidden : mean flux, e⁻/s, float32.
-    lit_scatter, hidden_scatter : of single rays, e⁻/s, float32: fourth root of the mean fourth power of deviations. For
-        rays of which one half says one thing and one half another it is the standard deviation; where few say
-        something else it is more, as stratified rays gain less then.
+    lit_scatter, hidden_scatter : of single rays, e⁻/s, float32: root of the mean fourth power of deviations over their mean
+        square. For rays of which one half says one thing and one half another it is the standard deviation; where few
+        say something else it is more, as stratified rays gain less then.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
     """
@@ -361,13 +361,13 @@ class PairTracer(Tracer):
         bits = _bits(types.UInt32, met, pixels.size * samples)
         dr.eval(lit, hidden, unshadowed, bits)
         self._sampler.rest()
-        share = dr.opaque(types.Float, 1 / samples)
+        share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, samples / (samples - 1))
         for values, name in ((lit, "lit"), (hidden, "hidden")):
             mean = dr.block_sum(values, samples) * share
             square = dr.square(values - dr.gather(types.Float, mean, lane))
-            fourth = dr.block_sum(square * square, samples) * share
+            fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
             # of the scene's own scatter these rays are a sample
-            scatter = dr.sqrt(dr.sqrt(fourth * (samples / (samples - 1))))
+            scatter = dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
             dr.eval(mean, scatter)
             getattr(out, name)[part], getattr(out, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
         out.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)

@@ -19,7 +19,7 @@ from hesim_render.renderer.sites import REACH, Sites
 from hesim_render.renderer.zoom import Look
 from hesim_render.rng import Stream
 
-#: Fluxes times this have fourth powers that float32 can hold.
+#: Fluxes times this have squares that float32 can hold, with digits to spare.
 _SMALLER = np.float32(1e-4)
 
 
@@ -78,8 +78,8 @@ def take_pilot(
     sites: Sites,
     windows: Windows,
     numbers: NDArray[np.int64],
-    tuning: Tuning,
-    apart: bool,
+    rays: int,
+    width_px: float,
     span_us: tuple[float, float] | None,
     closer: Sequence[Sequence[Look]] = (),
 ) -> tuple[Pilot, NDArray[np.bool_]]:
@@ -88,7 +88,8 @@ def take_pilot(
     Parameters
     ----------
     numbers : of each site's windows, [window, site].
-    apart : whether the pixels have no neighbours to ask.
+    rays : of each site in each window.
+    width_px : of the area in which they start.
     span_us : interval, with all windows in it, for which the second result is told; None for not at all.
     closer : of each window, sites that are looked at closer; see `Zoom`.
 
@@ -97,15 +98,13 @@ def take_pilot(
     pilot : of all windows; where nothing comes near the rays, they are traced in the first one only.
     near : [site], whether a ray came near what moves within the interval; True where the camera moves.
     """
-    rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
-    width = tuning.lone_footprint_px if apart else tuning.footprint_px
-    found = tracer.pilot(sites.index, numbers[0], windows, rays, width, span_us=span_us)
+    found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
     near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
     pilot = Pilot(*(np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found)))
     moving = np.flatnonzero(near)
     if numbers.shape[0] > 1 and moving.size:
         pixel, later = np.tile(sites.index[moving], numbers.shape[0] - 1), numbers[1:, moving]
-        more = tracer.pilot(pixel, later.ravel(), windows, rays, width)
+        more = tracer.pilot(pixel, later.ravel(), windows, rays, width_px)
         for values, told in zip(_tables(pilot), _tables(more), strict=True):
             values[1:, moving] = told.reshape(later.shape)
     # large things first: a pixel may show something small as well
@@ -116,7 +115,7 @@ def take_pilot(
             if not place.size:
                 continue
             own = numbers[window, place]
-            found = tracer.pilot(sites.index[place], own, windows, look.rays, width, Stream.RENDER_ZOOM)
+            found = tracer.pilot(sites.index[place], own, windows, look.rays, width_px, Stream.RENDER_ZOOM)
             if look.is_small:
                 parts.append(Closer(place, found.lit_scatter, found.hidden_scatter))
             else:
@@ -157,19 +156,19 @@ def allocate(
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
     flux, here = pilot.flux_of(window), sites.listed
     own, value = units[window][here], flux[here]
-    fourths = []
+    squares = []
     for table in (pilot.lit_scatter, pilot.hidden_scatter):
-        fourth = (table[window] * _SMALLER) ** 4
-        fourths.append(np.float32(0.5) * (fourth[here] + sites.mean(fourth)))
+        square = (table[window] * _SMALLER) ** 2
+        squares.append(np.float32(0.5) * (square[here] + sites.mean(square)))
     if pilot.closer:
         closer = pilot.closer[window]
-        for fourth, told in zip(fourths, (closer.lit_scatter, closer.hidden_scatter), strict=True):
+        for square, told in zip(squares, (closer.lit_scatter, closer.hidden_scatter), strict=True):
             seen = np.zeros(sites.size, np.float32)
-            seen[closer.place] = (told * _SMALLER) ** 4
-            np.maximum(fourth, seen[here], out=fourth)
+            seen[closer.place] = (told * _SMALLER) ** 2
+            np.maximum(square, seen[here], out=square)
     open_flux = pilot.unshadowed[window]
-    lit = (fourths[0] <= fourths[1]) & (2 * value >= open_flux[here])
-    scatter = np.sqrt(np.sqrt(np.where(lit, *fourths))) / _SMALLER
+    lit = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
+    scatter = np.sqrt(np.where(lit, *squares)) / _SMALLER
     # a part of what the next pixels show may reach into this one unseen
     around = np.stack([pilot.flux_of(number) for number in range(low, min(high, units.shape[0]))])
     highest, lowest = around.max(axis=0), around.min(axis=0)
@@ -178,7 +177,7 @@ def allocate(
     # some of the light that is hidden here may be seen, where it is seen near by
     lit_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
     brighter = np.maximum(sites.most(highest, 2) - value, np.where(lit_near, open_flux[here] - value, 0))
-    wanted_error = np.float32(quality / tuning.margin) * own
+    wanted_error = np.float32(quality) * own
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
