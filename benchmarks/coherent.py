@@ -26,15 +26,15 @@ import resource
 import time
 
 import numpy as np
+from hesim_render.renderer.coherent import CoherentFlux
+from hesim_render.renderer.timed import TimedTracer
 
 import hesim_render as hr
 from hesim_render.renderer._mitsuba import mitsuba, spectrum_dict
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import place_camera
-from hesim_render.renderer.coherent import CoherentFlux
 from hesim_render.renderer.flux import RenderedFlux, used_responses
 from hesim_render.renderer.specfilm import camera_at, perspective_dict
-from hesim_render.renderer.timed import TimedTracer
 from hesim_render.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 

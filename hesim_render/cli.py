@@ -162,7 +162,7 @@ def simulate(
         clean=clean, without=without or (),
     )  # fmt: skip
     typer.echo(summary(recording))
-    if is_short_of_wish(recording.manifest["settings"]["render"].get("audit")):
+    if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
         raise typer.Exit(_NOT_MET)
 
 

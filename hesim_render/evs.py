@@ -79,7 +79,7 @@ class EvsStage:
             self._readout = EventReadout(noise.readout_max_events_per_s, noise.readout_buffer_events, rows)
 
     def state(self) -> dict[str, Any]:
-        """What the pixels remember, as plain values and NumPy arrays: a run goes on from there as if it had not stopped."""
+        """What the pixels remember, plain values and NumPy arrays: a run goes on from there as if it never stopped."""
         return saved(self)
 
     def resume(self, state: dict[str, Any]) -> None:
@@ -183,8 +183,10 @@ class _PreviousSample:
 class _LastEvent:
     """Keeps the level of each pixel's last event."""
 
-    STATE = ("_t_us", "_log", "_spread", "_level", "_reference")
-    STATE += ("_band_noise", "_photoreceptor", "_refractory", "_leak")
+    STATE: tuple[str, ...] = (
+        *("_t_us", "_log", "_spread", "_level", "_reference"),
+        *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
+    )
 
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         self._noise = noise

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.backend import jit
-from hesim_render.flux import FluxSource, Sample, SampledFlux
+from hesim_render.flux import AuditableFlux, FluxSource, Sample, SampledFlux
 from hesim_render.scene import Scene
 from hesim_render.schedule import CELL_US, Block
 from hesim_render.specs.light import LightSpec
@@ -298,9 +298,13 @@ class SampledFlickerFlux(FlickerFlux):
     # ---- for the audit, where the sources have what it takes ---------------------------------------
 
     @property
+    def _auditable(self) -> list[AuditableFlux]:
+        return [source for source in self.sources if isinstance(source, AuditableFlux)]
+
+    @property
     def rays_traced(self) -> int:
         """Of all sources."""
-        return sum(source.rays_traced for source in self.sources)
+        return sum(source.rays_traced for source in self._auditable)
 
     def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
         """None: light changes everywhere."""
@@ -308,7 +312,7 @@ class SampledFlickerFlux(FlickerFlux):
 
     def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
         """See `ChangeDrivenFlux.noise_unit`."""
-        return self.sources[0].noise_unit(pixel, flux, events)
+        return self._auditable[0].noise_unit(pixel, flux, events)
 
     def reference_flux(
         self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
@@ -317,7 +321,7 @@ class SampledFlickerFlux(FlickerFlux):
         if self._still is not None:
             asked, place = np.unique(pixel, return_inverse=True)
             zero = np.zeros(asked.size)
-            parts = [source.reference_flux(asked, zero, zero + 1.0, quality)[place] for source in self.sources]
+            parts = [source.reference_flux(asked, zero, zero + 1.0, quality)[place] for source in self._auditable]
             return np.sum([w * part for w, part in zip(self._weights(begin_us, end_us), parts, strict=True)], axis=0)
         spans, number = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
         bounds = [np.concatenate([[low], self._cuts_us(low, high), [high]]) for low, high in spans.T]
@@ -327,7 +331,7 @@ class SampledFlickerFlux(FlickerFlux):
         length = (end_us - begin_us)[pair]
         share = np.divide(high - low, length, out=np.ones_like(length), where=length > 0)
         total = np.zeros(pixel.size)
-        for source, weight in zip(self.sources, self._weights(low, high), strict=True):
+        for source, weight in zip(self._auditable, self._weights(low, high), strict=True):
             np.add.at(total, pair, share * weight * source.reference_flux(pixel[pair], low, high, quality))
         return total
 

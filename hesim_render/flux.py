@@ -94,3 +94,32 @@ class SampledFlux(FluxSource, Protocol):
         blocks : in order of time.
         """
         ...
+
+
+@runtime_checkable
+class AuditableFlux(SampledFlux, Protocol):
+    """A source whose values can be found again by other random numbers."""
+
+    @property
+    def rays_traced(self) -> int:
+        """So far."""
+        ...
+
+    def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
+        """Which pixels nothing that moves can come near at any time, [n], as far as that is known."""
+        ...
+
+    def reference_flux(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
+    ) -> NDArray[np.float64]:
+        """Mean Φ of each listed pixel in its own window, e⁻/s, by random numbers that the run has not.
+
+        Parameters
+        ----------
+        quality : wanted error over the sensor's noise.
+        """
+        ...
+
+    def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
+        """What one standard deviation of each pixel's noise is worth at a flux [..., n], e⁻/s."""
+        ...

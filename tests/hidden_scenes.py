@@ -1,6 +1,6 @@
 """Scenes whose changes are easily missed: things that are small, thin, fast, or there for a moment only.
 
-Nothing was tuned on them. The camera sees 0.8 m of the plane z = 0, 2 m away; lights and walls are matt but for the glint.
+Nothing was tuned on them. The camera sees 0.8 m of the plane z = 0, 2 m away; all is matt but for the glint.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def fast_ball() -> Scene:
 def crossing() -> Scene:
     """A plate, a ball and a box that cross before and behind each other, with their shadows."""
     objects = [
-        {"name": "plate", "shape": "rectangle", "size_m": [0.15, 0.25, 0], "position_m": [0, 0, 0.0], "reflectance": 0.5},
+        {"name": "plate", "shape": "rectangle", "size_m": [0.15, 0.25, 0], "position_m": [0, 0, 0], "reflectance": 0.5},
         {"name": "ball", "shape": "sphere", "size_m": [0.15] * 3, "position_m": [0, 0.05, 0.15], "reflectance": 0.9},
         {"name": "box", "shape": "box", "size_m": [0.1] * 3, "position_m": [0, -0.1, 0.1], "rotation_deg": 30,
          "reflectance": 0.1, "pattern": 0.8, "pattern_count": [4, 4]},

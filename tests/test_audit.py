@@ -196,9 +196,7 @@ def test_bound_of_a_ratio_covers_where_both_come_in_clusters():
 def ticks(run, reference, error=0.001):
     run, reference = (np.array(signal, float)[:, None] for signal in (run, reference))
     theta = np.array([0.2])
-    counted = compare_ticks(
-        run, reference, np.full(run.shape, error), (theta, theta), np.ones(len(run), np.bool_)
-    )
+    counted = compare_ticks(run, reference, np.full(run.shape, error), (theta, theta), np.ones(len(run), np.bool_))
     return {name: float(values[0]) for name, values in vars(counted).items()}
 
 

@@ -369,7 +369,9 @@ def test_windows_are_what_the_mean_over_each_would_be():
         np.testing.assert_allclose(seen[k], expected, rtol=2e-4)
     still = flickering_formula([Mains(50, 0.4, 70)], [Windows(1e5)])
     for k, sample in enumerate(still.flux_of_blocks(pixels, blocks)):
-        np.testing.assert_allclose(np.array(sample.half_a) / 1.01, product_mean(1e5, 0, begin[k] * 1e-6, end[k] * 1e-6), rtol=1e-5)
+        np.testing.assert_allclose(
+            np.array(sample.half_a) / 1.01, product_mean(1e5, 0, begin[k] * 1e-6, end[k] * 1e-6), rtol=1e-5
+        )
     assert [len(asked) for asked in still.sources[0].asked] == [3]
 
 

@@ -135,9 +135,7 @@ def test_a_pair_does_not_depend_on_its_company():
     number = np.arange(pixel.size)
     together = tracer.trace(pixel, number, Windows(begin, begin + 1000), samples, lit)
     some = rng.choice(pixel.size, 40, replace=False)
-    alone = tracer.trace(
-        pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), samples[some], lit[some]
-    )
+    alone = tracer.trace(pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), samples[some], lit[some])
     for field in ("half_a", "half_b", "met"):
         np.testing.assert_array_equal(getattr(together, field)[some], getattr(alone, field))
     pilot = tracer.pilot(pixel, number, Windows(begin, begin + 1000), 16, 1.25)

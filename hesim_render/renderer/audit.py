@@ -1,20 +1,20 @@
 """What a run is worth, measured: random pixels over stretches of time are rendered again, with other random numbers.
 
-The audit decides nothing about the picture. Its units are stretches of windows of one pixel (`notes`), drawn evenly over
-pixels and time, each independently of the others; of a sensor with a tick one window of a stretch is judged, so that
-nothing is counted twice that belongs together. They are rendered with random numbers of their own and so many rays
+The audit decides nothing about the picture. Its units are stretches of windows of one pixel (`notes`), drawn evenly
+over pixels and time, each independently of the others; of a sensor with a tick one window of a stretch is judged, so
+that nothing is counted twice that belongs together. They are rendered with random numbers of their own and so many rays
 that their error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for the whole run, at whatever
 number of units the audit stops (`confidence`).
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.flux import SampledFlux
+from hesim_render.flux import AuditableFlux
 from hesim_render.noise.evs import EvsNoise
 from hesim_render.renderer.compare import Counted, compare_crossings, compare_ticks
 from hesim_render.renderer.confidence import lower_bound, ratio_upper_bound, upper_bound
@@ -39,34 +39,6 @@ _REFERENCE = {"eventful": 0.5, "calm": 0.5, "frames": 0.2}
 _LEAST_BATCH, _MOST_BATCH = 1024, 16384
 #: Rays of an audit at most: a part of the run's own, or so many if that is more.
 _PART, _RAYS = 0.25, 30_000_000
-
-
-class AuditableFlux(SampledFlux, Protocol):
-    """A source whose values can be found again by other random numbers."""
-
-    @property
-    def rays_traced(self) -> int:
-        """So far."""
-        ...
-
-    def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
-        """Which pixels nothing that moves can come near at any time, [n], as far as that is known."""
-        ...
-
-    def reference_flux(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
-    ) -> NDArray[np.float64]:
-        """Mean Φ of each listed pixel in its own window, e⁻/s, by random numbers that the run has not.
-
-        Parameters
-        ----------
-        quality : wanted error over the sensor's noise.
-        """
-        ...
-
-    def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
-        """What one standard deviation of each pixel's noise is worth at a flux [..., n], e⁻/s."""
-        ...
 
 
 class _Tally:
@@ -179,7 +151,7 @@ class Audit:
         return result
 
     def _batches(self, noted: list[Units]) -> list[list[tuple[NDArray[np.int64], Units]]]:
-        """All units in a random order, more and more at a time, those of equal shape together, with their places in it."""
+        """All units in a random order, more and more at a time, those of equal shape together, with their places."""
         which = np.concatenate([np.full(units.pixel.size, number) for number, units in enumerate(noted)])
         inside = np.concatenate([np.arange(units.pixel.size) for units in noted])
         order, found, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
@@ -248,7 +220,7 @@ class Audit:
         elif which == "eventful":
             needed[:] |= ~still
         reference = units.flux.copy()
-        window, place = np.nonzero(needed)
+        place = np.nonzero(needed)[1]
         reference[needed] = self._source.reference_flux(
             units.pixel[place], units.begin_us[needed], units.end_us[needed], _REFERENCE[which] * self._quality
         )
@@ -261,9 +233,9 @@ class Audit:
         on, off = self._thresholds(units.pixel)
         if self._noise.spec.reference == "previous_sample":
             change = np.diff(signal, axis=0)
-            return ((change > on) | (change < -off)).any(axis=0)
+            return np.asarray(((change > on) | (change < -off)).any(axis=0))
         # the level that its events start from is not known: with less than half a threshold there is none
-        return np.ptp(signal, axis=0) > 0.5 * np.minimum(on, off)
+        return np.asarray(np.ptp(signal, axis=0) > 0.5 * np.minimum(on, off))
 
     def _log(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64]) -> NDArray[np.float64]:
         """ln x of event pixels, [window, unit]."""
@@ -321,7 +293,7 @@ class Audit:
         known[eventful] = np.minimum(counted.true[eventful], most)
         at_least = lower_bound(known / most, each)
         missed = upper_bound(np.minimum(counted.missed[: tally.looked_at], most) / most, each)
-        own = (np.minimum(values[eventful], most) for values in (counted.extra, counted.found))
+        part, whole = (np.minimum(values[eventful], most) for values in (counted.extra, counted.found))
         seen = bool(counted.true.any())
         true = tally.rate(counted.true) if seen else np.inf
         found = tally.rate(counted.found) or np.inf
@@ -331,7 +303,7 @@ class Audit:
             "missed_at_most": min(1.0, missed / at_least) if at_least > 0 else 1.0,
             "missed_wanted_at_most": MOST_MISSED,
             "extra": tally.rate(counted.extra) / found,
-            "extra_at_most": ratio_upper_bound(*own, most, CONFIDENCE),
+            "extra_at_most": ratio_upper_bound(part, whole, most, CONFIDENCE),
             "extra_wanted_at_most": MOST_EXTRA,
             "flips": tally.rate(counted.flips) / true,
             "flips_by_stated_error": tally.rate(tally.by_error) / true,

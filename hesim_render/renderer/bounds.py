@@ -1,4 +1,4 @@
-"""Where moving objects are at most: boxes and outlines that hold for every instant of an interval, not for samples of it.
+"""Where moving objects are at most: boxes and outlines that hold for every instant of an interval, not for samples.
 
 Between two keyframes an object's translation is linear and it turns at a constant speed, so that each of its points
 goes along a straight line plus an arc of a circle. A chord is off its arc by ρ (1 − cos δ/2) at most, ρ the radius and
@@ -45,9 +45,12 @@ def places(
 def stays_in(
     corners: NDArray[np.float64], trajectory: Trajectory, spans_us: Sequence[tuple[float, float]]
 ) -> NDArray[np.float64]:
-    """Axis-parallel boxes [k, 2, 3], m, in which an object stays during each of k intervals; `corners` as in `places`."""
+    """Axis-parallel boxes [k, 2, 3], m, in which an object stays during each of k intervals; see `places`."""
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
-    segments, shares, margins, starts = [], [], [], []
+    segments: list[NDArray[np.int64]] = []
+    shares: list[NDArray[np.float64]] = []
+    margins: list[NDArray[np.float64]] = []
+    starts: list[int] = []
     for begin, end in spans_us:
         starts.append(len(segments))
         for piece in trajectory.pieces(begin, end):
@@ -57,10 +60,10 @@ def stays_in(
             margins.append(np.full(share.size, margin))
     poses = trajectory.within(np.concatenate(segments), np.concatenate(shares))
     points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-    margin = np.concatenate(margins)[:, None]
+    wider = np.concatenate(margins)[:, None]
     first = np.cumsum([0, *(share.size for share in shares)])[starts]
-    low = np.minimum.reduceat(points.min(axis=1) - margin, first, axis=0)
-    high = np.maximum.reduceat(points.max(axis=1) + margin, first, axis=0)
+    low = np.minimum.reduceat(points.min(axis=1) - wider, first, axis=0)
+    high = np.maximum.reduceat(points.max(axis=1) + wider, first, axis=0)
     return np.stack([low, high], axis=1)
 
 

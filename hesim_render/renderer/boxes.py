@@ -16,7 +16,7 @@ class Moment:
     Parameters
     ----------
     instant_us : Float, since the begin of the ray's window.
-    times : Float table, `tracks` entries a window: local time of each track at its begin, µs. `window`, UInt32, the row.
+    times : Float table, `tracks` entries a window: local time of each track at its begin, µs; `window`, UInt32, which.
     boxes : Float table, 8 entries a group: low and high corner of the box that holds it, each with a number that means
         nothing; `bin`, UInt32, whose boxes hold for the ray's window, and `groups` of a bin.
     """

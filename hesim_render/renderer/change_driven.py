@@ -411,7 +411,7 @@ class ChangeDrivenFlux:
         todo = what.rendered.copy()
         if first is not None:
             todo[0] = False
-        window, place = np.nonzero(todo)
+        place = np.nonzero(todo)[1]
         before = self._tracer.rays_done
         got = self._tracer.trace(
             band.index[place], numbers[todo], windows, what.rays[todo], what.lit[todo], span_us=span_us
@@ -435,7 +435,7 @@ class ChangeDrivenFlux:
         for block in blocks:
             if pixels.size == 0 or self._is_dark:
                 flux = Flux.zeros(block.wanted.size, pixels.size)
-                alive = slice(None)
+                alive = np.arange(pixels.size)
                 base = Flux.zeros(1, pixels.size)
             else:
                 work = work or _Blocks(self, pixels, block)

@@ -33,7 +33,9 @@ class Fleet:
         import drjit as dr
 
         self._mi, self._tracks = mi, tracks
-        heads, balls, faces = [], [], []
+        heads: list[list[float]] = []
+        balls: list[Any] = []
+        faces: list[Any] = []
         for form, number in zip(forms, numbers, strict=True):
             heads.append([number, len(balls), len(balls) + len(form.balls), 0])
             heads.append([len(faces), len(faces) + len(form.faces), 0, 0])
@@ -191,4 +193,5 @@ def _number(mi: Any, shape: Any) -> int:
     """By which Dr.Jit knows a shape."""
     import drjit as dr
 
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+    number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+    return int(number[0])

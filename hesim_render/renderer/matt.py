@@ -14,8 +14,8 @@ irradiance (E[r] = e_k) and is seen or not (v = 1 or 0), which gives two unbiase
 
 Each pair of a pixel and a window takes the one that its pilot found less noisy.
 
-One path of the common estimator (Veach 1997) multiplies all of these; at the dark side of a penumbra its error was three
-times as large with more rays.
+One path of the common estimator (Veach 1997) multiplies all of these; at the dark side of a penumbra its error was
+three times as large with more rays.
 """
 
 from __future__ import annotations
@@ -114,17 +114,18 @@ class MattIntegrator:
         mi = self._scene.mi
         numbers = {}
         for name, shape in self._scene.shapes.items():
-            numbers[int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])] = rows.get(name, [0.0] * _ROW)
+            number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+            numbers[int(number[0])] = rows.get(name, [0.0] * _ROW)
         table = np.zeros((max(numbers, default=0) + 1, _ROW))
-        for number, row in numbers.items():
-            table[number] = row
+        for place, row in numbers.items():
+            table[place] = row
         reflected = [
             [[integrate_product(r, colour, level) / pi for colour in colours] for r in responses]
             for level in irradiances
         ]
         emitted = [[integrate_product(r, strength) for r in responses] for strength in strengths]
         self._rows = mi.Float(table.astype(np.float32).ravel())
-        self._reflected = mi.Float(np.array(reflected or [0.0], np.float32).ravel())
+        self._reflected = mi.Float(np.array(reflected or [[[0.0]]], np.float32).ravel())
         self._emitted = mi.Float(np.array([*emitted, [0.0] * len(responses)], np.float32).ravel())
         self._filters, self._colours = mi.UInt32(len(responses)), mi.UInt32(len(colours))
 
@@ -150,7 +151,8 @@ class MattIntegrator:
         surface = scene.intersect(ray, moment, True, mi.Bool(True), mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
         si, met = surface.rest, surface.met
         hit = si.is_valid()
-        first = 2 * dr.select(hit, dr.reinterpret_array(mi.UInt32, si.shape), 0)
+        which: Any = dr.reinterpret_array(mi.UInt32, si.shape)
+        first = 2 * dr.select(hit, which, 0)
         one, other, both, lamp = dr.gather(mi.Vector4f, self._rows, first)
         front = mi.Frame3f.cos_theta(si.wi) > 0
         colour = one

@@ -25,7 +25,7 @@ from hesim_render.renderer.parts import Part
 from hesim_render.renderer.tracks import DevicePose, Tracks
 from hesim_render.renderer.trajectory import Trajectory
 
-#: Objects in closed form that are tried one by one; more are tried in a loop, which takes the same kernel for any number.
+#: Objects in closed form that are tried one by one; more are tried in a loop, whose kernel serves any number.
 _FEW = 3
 
 

@@ -120,11 +120,13 @@ class NotedFlux:
         count = len(pixel)
         if count:
             place = self._rng.integers(0, count, self._of_frames)
-            times = (np.broadcast_to(np.asarray(t, np.float64), (count,))[place][None] for t in (begin_us, end_us))
+            begin, end = (np.broadcast_to(np.asarray(t, np.float64), (count,))[place][None] for t in (begin_us, end_us))
             flux, difference = _mean_and_difference(halves, place)
             self.frames.append(
                 Units(
-                    np.asarray(pixel)[place], *times, np.ones(1, np.bool_), flux[None], difference[None], 0 * flux[None]
+                    np.asarray(pixel)[place],
+                    *(begin, end, np.ones(1, np.bool_)),
+                    *(flux[None], difference[None], 0 * flux[None]),
                 )
             )
         return halves

@@ -80,9 +80,9 @@ class PilotFlux:
     Parameters
     ----------
     lit, hidden : mean flux, e⁻/s, float32.
-    lit_scatter, hidden_scatter : of single rays, e⁻/s, float32: root of the mean fourth power of deviations over their mean
-        square. For rays of which one half says one thing and one half another it is the standard deviation; where few
-        say something else it is more, as stratified rays gain less then.
+    lit_scatter, hidden_scatter : of single rays, e⁻/s, float32: root of the mean fourth power of deviations over their
+        mean square. For rays of which one half says one thing and one half another it is the standard deviation; where
+        few say something else it is more, as stratified rays gain less then.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
     """
@@ -132,8 +132,8 @@ class PairTracer(Tracer):
         if self.built.paints is not None:
             self._integrator = MattIntegrator(self.parts, self.built.paints, scene.spec.lights, self.sensor.responses)
         else:
-            depths = (_told(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
-            self._integrator = PathIntegrator(self.parts, *depths, WavelengthSampler(self.sensor.responses))
+            depth, roulette = (_told(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
+            self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
         self._boxes = lru_cache(maxsize=8)(self._boxes_in)
         layout = self.sensor.layout
         tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
@@ -211,7 +211,8 @@ class PairTracer(Tracer):
         import drjit as dr
 
         count = pixel.size
-        out = PilotFlux(*(np.zeros(count, np.float32) for _ in range(5)), np.empty(count, np.bool_))
+        lit, hidden, unshadowed, *scatters = (np.empty(count, np.float32) for _ in range(5))
+        out = PilotFlux(lit, hidden, unshadowed, scatters[0], scatters[1], np.empty(count, np.bool_))
         moments, key = self._moments(windows, span_us), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
         room = max(1, self._block_rays // samples)
@@ -240,8 +241,8 @@ class PairTracer(Tracer):
         row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, grid[1])
         col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, grid[0])
         middle = types.Float(0.5), types.Float(0.5)
-        place = [types.Float(values.astype(np.float32)) for values in (row, col)]
-        origin, direction = self._rays.rays(*place, middle, None)
+        rows, cols = (types.Float(values.astype(np.float32)) for values in (row, col))
+        origin, direction = self._rays.rays(rows, cols, middle, None)
         axis = -self.view.camera_to_world[:3, 2]
         if self.camera is not None:
             matrix = self.camera.matrix(t_us)
@@ -280,7 +281,7 @@ class PairTracer(Tracer):
         bins, spans = _bins(windows) if span_us is None else (np.zeros(windows.size, np.uint32), (span_us,))
         boxes = self._boxes(spans)
         # never one entry, which would be a constant in the kernel; rows of boxes are fetched by fours
-        tables = (
+        lengths, local, sides = (
             types.Float(np.append(table.astype(np.float32).ravel(), np.zeros(8, np.float32)))
             for table in (
                 windows.end_us - windows.begin_us,
@@ -288,7 +289,8 @@ class PairTracer(Tracer):
                 box_rows(boxes) if groups else np.empty(0),
             )
         )
-        moments = _Moments(*tables, types.UInt32(np.append(bins, bins[-1:])), len(tracks), len(groups))
+        numbers = types.UInt32(np.append(bins, bins[-1:]))
+        moments = _Moments(lengths, local, sides, numbers, len(tracks), len(groups))
         dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)
         return moments
 
@@ -423,7 +425,7 @@ class _Moments:
 
 
 def _bins(windows: Windows) -> tuple[NDArray[np.uint32], tuple[tuple[float, float], ...]]:
-    """Windows that lie near to each other in time, together: a number for each window, and an interval for each number."""
+    """Windows that lie near each other in time, together: a number for each window, an interval for each number."""
     order = np.argsort(windows.begin_us, kind="stable")
     number = np.empty(windows.size, np.uint32)
     number[order] = np.arange(windows.size) * min(windows.size, _MOST_BINS) // windows.size

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.renderer.images import Cones, LampImages
 from hesim_render.renderer.boxes import Moment, box_rows, inverse_of, meets_box
+from hesim_render.renderer.images import Cones, LampImages
 from hesim_render.renderer.moving import MovingScene, Surface
 from hesim_render.renderer.wavelengths import WavelengthSampler
 
@@ -22,6 +22,7 @@ from hesim_render.renderer.wavelengths import WavelengthSampler
 _ROULETTE_MOST = 0.95
 #: Lights that have boxes of their own to tell whether a ray may meet them; more share one.
 _MOST_LAMPS = 8
+
 
 class PathIntegrator:
     """Radiance along rays through a `MovingScene`, and what a pixel makes of it.
@@ -34,9 +35,7 @@ class PathIntegrator:
     wavelengths : which of them a ray carries, by the filter of its pixel.
     """
 
-    def __init__(
-        self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler
-    ) -> None:
+    def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler) -> None:
         import drjit as dr
 
         self._scene, self._wavelengths = scene, wavelengths
@@ -55,9 +54,7 @@ class PathIntegrator:
         """One ray a lane; see `MattIntegrator.flux`, of whose estimates there is only one here."""
         import drjit as dr
 
-        ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(
-            *self._wavelengths.sample(filter_index, sampler.next_1d())
-        )
+        ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(*self._wavelengths.sample(filter_index, sampler.next_1d()))
         radiance, met = self.sample(sampler, ray, moment)
         # not dr.mean, which has the number of lanes in the kernel: each new one would compile
         flux = dr.sum(radiance) / len(radiance) * self._wavelengths.total(filter_index)

@@ -100,7 +100,8 @@ def take_pilot(
     """
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
     near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
-    pilot = Pilot(*(np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found)))
+    lit, hidden, *others = (np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found))
+    pilot = Pilot(lit, hidden, others[0], others[1], others[2])
     moving = np.flatnonzero(near)
     if numbers.shape[0] > 1 and moving.size:
         pixel, later = np.tile(sites.index[moving], numbers.shape[0] - 1), numbers[1:, moving]

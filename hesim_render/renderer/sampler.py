@@ -116,8 +116,9 @@ def sampler_class(variant: str) -> Any:
             self.rest()
 
         def rest(self) -> None:
-            """Let go of a wavefront: what is left of one would change the next one's kernel, which then compiles anew."""
-            self.keys, self.sample, self.dimension = (), mi.UInt32(), mi.UInt32()
+            """Let go of a wavefront: what is left of one changes the next one's kernel, which then compiles anew."""
+            self.keys: Any = ()
+            self.sample, self.dimension = mi.UInt32(), mi.UInt32()
             self._mask: Any = 0
             self._bits = 0
 

@@ -71,7 +71,7 @@ class Sites:
         return self._sum(values) / self._count[0]
 
     def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        image = self._image(values, 1, np.float32(0))
+        image = self._image(values, 1, 0.0)
         across = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
         return self._at_listed(across[:-2] + across[1:-1] + across[2:])
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.backend import jit
 
@@ -86,11 +87,20 @@ class Tracks:
         import drjit as dr
 
         types = jit()
-        rows, times, heads = [], [], []
+        rows: list[NDArray[np.float64]] = []
+        times: list[NDArray[np.float64]] = []
+        heads: list[list[float]] = []
         for track in trajectories:
             knots = track.knots_us - track.knots_us[0]
             heads.append(
-                [sum(map(len, times)), sum(map(len, rows)), knots.size, knots[-1], track.repeat, *track.pivot_m]
+                [
+                    sum(t.size for t in times),
+                    sum(len(row) for row in rows),
+                    knots.size,
+                    knots[-1],
+                    track.repeat,
+                    *track.pivot_m,
+                ]
             )
             # one row a segment, fetched as four packets of four: gathers of single numbers cost more than the poses
             columns = [

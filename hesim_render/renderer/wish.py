@@ -73,7 +73,7 @@ class Noise:
     def _event_unit(self, position: NDArray[np.int64]) -> NoiseUnit:
         noise = self._sensor.evs
         seconds = np.float32(noise.spec.window_us * S_PER_US) * np.float32(self._power)
-        return lambda flux: noise.noise_equivalent_e(flux * seconds, position) / seconds
+        return lambda flux: (noise.noise_equivalent_e(flux * seconds, position) / seconds).astype(np.float32)
 
     def is_apart(self, role: Role) -> bool:
         """Whether the pixels of a role have no neighbours to ask: fewer than half of all pixels have it."""

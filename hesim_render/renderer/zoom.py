@@ -112,7 +112,7 @@ class Zoom:
         return looks
 
     def _outline(self, group: Group, begin_us: float, end_us: float) -> tuple[float, Outline | None]:
-        """Least extent of an object in the image at an instant, pixels, and what it sweeps; None outside the picture."""
+        """Least extent of an object in the image at an instant, pixels, and what it sweeps; None outside."""
         points, extents, wider = [], [], 0.0
         for corners, margin, pose in self._seen(group, begin_us, end_us):
             seen, px_per_m = self._view.project_on_sensor(corners, pose)
