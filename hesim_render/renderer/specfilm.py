@@ -50,15 +50,15 @@ def perspective_dict(mi: Any, view: View, camera_to_world: NDArray[np.float64], 
     """Mitsuba's perspective sensor over exactly the read-out region."""
     left, right, top, bottom = view.region_mm
     width, height = right - left, bottom - top
-    image_mm = view.sensor.lens.image_distance_mm
+    image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
     return {
         "type": "perspective",
         "fov": degrees(2 * atan(width / 2 / image_mm)),
         "fov_axis": "x",
         # Mitsuba counts the offset of the film's centre from the axis, in units of its size
-        "principal_point_offset_x": (left + right) / 2 / width,
-        "principal_point_offset_y": (top + bottom) / 2 / height,
-        "near_clip": 1e-4,
+        "principal_point_offset_x": ((left + right) / 2 - axis_x) / width,
+        "principal_point_offset_y": ((top + bottom) / 2 - axis_y) / height,
+        "near_clip": max(1e-4, view.near_m),
         "far_clip": 1e5,
         "to_world": transform(mi, camera_to_world @ MITSUBA_AXES),
         "sampler": {"type": "independent"},
