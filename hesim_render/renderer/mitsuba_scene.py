@@ -12,7 +12,7 @@ import numpy as np
 from hesim_render.errors import SpecError
 from hesim_render.renderer._mitsuba import as_spec_error, load_scene, switch_off, transform
 from hesim_render.renderer.mitsuba_camera import MitsubaCamera
-from hesim_render.renderer.plugins import Used, check_camera, exact_reason, set_depth, used_plugins
+from hesim_render.renderer.plugins import Used, check_camera, exact_reason, require_known, set_depth, used_plugins
 from hesim_render.specs.scene import MitsubaSpec, SceneSpec
 
 #: Path length for a scene without an integrator of its own.
@@ -59,7 +59,7 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
         with as_spec_error(*where):
             if source.file is not None:
                 return load_scene(mi, path, review)
-            own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {})
+            own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {}, spec.file)
             return load_scene(mi, {"type": "scene", **own}, review)
 
     moving = [track.object for track in spec.motion]
@@ -105,18 +105,27 @@ def path_tracer(mi: Any, depth: int) -> Any:
     return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": _ROULETTE_DEPTH})
 
 
-def _plugin_dict(mi: Any, node: Mapping[str, Any]) -> dict[str, Any]:
-    """A dictionary as YAML writes it: 4×4 lists become transforms, lists of numbers in spectra become text."""
+def _plugin_dict(
+    mi: Any, node: Mapping[str, Any], file: Path | None = None, key: str = "mitsuba.inline"
+) -> dict[str, Any]:
+    """A dictionary as YAML writes it: 4×4 lists become transforms, lists of numbers in spectra become text.
+
+    Parameters
+    ----------
+    file, key : where it stands.
+    """
     content: dict[str, Any] = {}
-    for key, value in node.items():
+    for name, value in node.items():
+        if name == "type":
+            require_known(value, file, key)
         if isinstance(value, Mapping):
-            content[key] = _plugin_dict(mi, value)
+            content[name] = _plugin_dict(mi, value, file, f"{key}.{name}")
         elif isinstance(value, list) and np.shape(value) == (4, 4):
-            content[key] = transform(mi, value)
-        elif isinstance(value, list) and key in ("wavelengths", "values"):
-            content[key] = ",".join(f"{float(v):.9g}" for v in value)
+            content[name] = transform(mi, value)
+        elif isinstance(value, list) and name in ("wavelengths", "values"):
+            content[name] = ",".join(f"{float(v):.9g}" for v in value)
         elif isinstance(value, mi.Bitmap):
-            content[key] = mi.Bitmap(value)  # a texture takes what is in it away: the next one would be black
+            content[name] = mi.Bitmap(value)  # a texture takes what is in it away: the next one would be black
         else:
-            content[key] = value
+            content[name] = value
     return content

@@ -126,6 +126,15 @@ _MADE: dict[str, tuple[str, str]] = {
     "VolumetricPathIntegrator": ("Integrator", "volpath"),
 }
 
+#: Kind of each plugin.
+_KINDS = {
+    name: kind
+    for table in (HONOURED, EXACT, OF_THE_SENSOR_FILE, REFUSED)
+    for kind, names in table.items()
+    for name in names
+}
+#: What a dictionary may name beside plugins.
+_BESIDE_PLUGINS = ("scene", "ref", "rgb", "spectrum")
 _THROUGH_MEDIA = ("volpath", "volpathmis")
 #: With these the path length may be set from outside.
 _HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
@@ -164,6 +173,18 @@ class Used:
         return f"{words.get(self.kind, self.kind.lower())} '{self.name}'"
 
 
+def require_known(name: Any, file: Path | None, key: str) -> None:
+    """Refuse a type in a dictionary that is no plugin of Mitsuba's: to look what it is Mitsuba would load it.
+
+    Raises
+    ------
+    SpecError
+        With its place.
+    """
+    if name not in _KINDS and name not in _BESIDE_PLUGINS:
+        raise SpecError(f"type {name!r} is no plugin of Mitsuba's that is known here", file=file, key=key)
+
+
 def used_plugins(mi: Any, state: Any, file: Path | None) -> list[Used]:
     """All plugins of a parsed scene, in order.
 
@@ -180,9 +201,11 @@ def used_plugins(mi: Any, state: Any, file: Path | None) -> list[Used]:
                 owners[node.props[key].index()].append(node)
     found: list[Used] = []
     for node, above in zip(nodes, owners, strict=True):
-        place, kind = _place(mi, state, node, file), node.type.name
-        if kind not in ("Scene", "Unknown"):
-            found.append(Used(kind, node.props.plugin_name(), node.props.id(), place, node, tuple(above)))
+        place, name = _place(mi, state, node, file), node.props.plugin_name()
+        # of what is written in Python a parsed dictionary does not tell the kind
+        kind = _KINDS.get(name, "Plugin") if node.type.name == "Unknown" else node.type.name
+        if kind != "Scene":
+            found.append(Used(kind, name, node.props.id(), place, node, tuple(above)))
         for key in node.props:
             if node.props.type(key) == types.Object:
                 inside = {**place, "key": ".".join(filter(None, (place.get("key"), key)))}
@@ -197,7 +220,7 @@ def _place(mi: Any, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
         return {"file": match["file"], "line": int(match["line"]), "key": own or None}
     match = _KEY.fullmatch(told)
     inside = "" if match is None or match["key"] == "root" else f".{match['key']}"
-    return {"file": file, "key": f"mitsuba{inside}"}
+    return {"file": file, "key": f"mitsuba.inline{inside}"}
 
 
 def _made(mi: Any, value: Any, place: Mapping[str, Any], owner: Any) -> Iterator[Used]:
