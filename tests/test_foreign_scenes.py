@@ -508,5 +508,5 @@ from hesim_render.scene import Scene
 shapes = {{"sky": {{"type": "envmap", "filename": r"{tmp_path / "sky.exr"}"}}}}
 print(len(build(mitsuba(), Scene.from_mitsuba(shapes).spec).scene.emitters()))
 """
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=180)
     assert child.stdout.strip() == "1", child.stderr

@@ -48,6 +48,7 @@ class BuiltScene:
     paints : of all shapes but lamps, where all are matt and the light is direct; else None.
     exact_because : why the scene needs the exact mode; None where it does not.
     camera : the Mitsuba scene's own, where it is used.
+    integrator_plugin : what a Mitsuba scene's integrator was made of; None where it was made before.
     """
 
     mi: Any
@@ -60,6 +61,7 @@ class BuiltScene:
     paints: list[Paint] | None
     exact_because: str | None = None
     camera: MitsubaCamera | None = None
+    integrator_plugin: dict[str, Any] | None = None
 
     def pose(self, t_us: float) -> None:
         """Put every moving object at its pose of `t_us`."""
@@ -107,10 +109,11 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
     """
     if responses:
         check_coverage(spec, responses)
-    because, camera = None, None
+    because, camera, plugin = None, None, None
     if spec.mitsuba is not None:
         loaded = load_mitsuba(mi, spec, spec.mitsuba)
         scene, integrator, because, camera = loaded.scene, loaded.integrator, loaded.exact_because, loaded.camera
+        plugin = loaded.integrator_plugin
         groups: dict[str, list[str]] = {}
         paints = None
     else:
@@ -145,6 +148,7 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
         paints=paints if (spec.max_depth or 2) == 2 else None,
         exact_because=because,
         camera=camera,
+        integrator_plugin=plugin,
     )
 
 

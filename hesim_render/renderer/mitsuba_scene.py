@@ -12,14 +12,22 @@ import numpy as np
 from hesim_render.errors import SpecError
 from hesim_render.renderer._mitsuba import as_spec_error, load_scene, switch_off, transform
 from hesim_render.renderer.mitsuba_camera import MitsubaCamera
-from hesim_render.renderer.plugins import Used, check_camera, exact_reason, require_known, set_depth, used_plugins
+from hesim_render.renderer.plugins import (
+    Used,
+    check_camera,
+    exact_reason,
+    integrator_plugin,
+    require_known,
+    set_depth,
+    used_plugins,
+)
 from hesim_render.specs.scene import MitsubaSpec, SceneSpec
 
 #: Path length for a scene without an integrator of its own.
 _DEFAULT_DEPTH = 8
 #: Segments from which on Russian roulette ends some paths. Mitsuba's default is 5; but a vector of lanes takes as long
 #: as its longest path, so that roulette saves little, and what it adds to the noise is a lot.
-_ROULETTE_DEPTH = 16
+_ROULETTE = {"rr_depth": 16}
 
 
 @dataclass(frozen=True)
@@ -30,12 +38,14 @@ class MitsubaScene:
     ----------
     scene : mitsuba.Scene.
     integrator : its own, or a path tracer where it has none.
+    integrator_plugin : what that was made of; None where it was made before.
     exact_because : why it needs the exact mode; None where it does not.
     camera : its first sensor, where there is one and the scene file has no camera.
     """
 
     scene: Any
     integrator: Any
+    integrator_plugin: dict[str, Any] | None
     exact_because: str | None
     camera: MitsubaCamera | None
 
@@ -65,9 +75,10 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
     moving = [track.object for track in spec.motion]
     reason: str | None = None
     camera: Used | None = None
+    plugin: dict[str, Any] | None = None
 
     def check(state: Any) -> None:
-        nonlocal reason, camera
+        nonlocal reason, camera, plugin
         if state.nodes[0].type != mi.ObjectType.Scene:
             raise SpecError("the Mitsuba file describes no scene", file=source.file or spec.file, key="mitsuba")
         found = used_plugins(mi, state, spec.file)
@@ -75,6 +86,7 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
         camera = check_camera(found) if spec.camera is None else None
         if spec.max_depth is not None:
             set_depth(found, spec.max_depth)
+        plugin = integrator_plugin(found, {"type": "path", "max_depth": spec.max_depth or _DEFAULT_DEPTH, **_ROULETTE})
 
     def check_and_switch_off(state: Any) -> None:
         check(state)
@@ -96,13 +108,14 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
         )
     if source.lit is not None or source.unlit or source.waveforms:
         scene = load(check_and_switch_off)
-    integrator = scene.integrator() or path_tracer(mi, spec.max_depth or _DEFAULT_DEPTH)
-    return MitsubaScene(scene, integrator, reason, None if camera is None else MitsubaCamera.of(mi, scene, camera))
+    integrator = scene.integrator() or mi.load_dict(plugin)
+    seen = None if camera is None else MitsubaCamera.of(mi, scene, camera)
+    return MitsubaScene(scene, integrator, plugin, reason, seen)
 
 
 def path_tracer(mi: Any, depth: int) -> Any:
     """Mitsuba's, for paths of so many segments."""
-    return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": _ROULETTE_DEPTH})
+    return mi.load_dict({"type": "path", "max_depth": depth, **_ROULETTE})
 
 
 def _plugin_dict(

@@ -33,9 +33,6 @@ HONOURED: dict[str, tuple[str, ...]] = {
         *("bitmap", "blackbody", "checkerboard", "d65", "irregular", "mesh_attribute", "rawconstant", "regular"),
         *("srgb", "uniform", "volume"),
     ),
-    # what they belong to asks for the exact mode
-    "Medium": ("heterogeneous", "homogeneous"),
-    "PhaseFunction": ("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase"),
     "Volume": ("constvolume", "gridvolume"),
 }
 
@@ -50,6 +47,10 @@ EXACT: dict[str, dict[str, str]] = {
         "instance": "it is a copy that has no surface of its own",
         "shapegroup": "its copies have no surface of their own",
     },
+    "Medium": dict.fromkeys(("heterogeneous", "homogeneous"), "light is followed through it"),
+    "PhaseFunction": dict.fromkeys(
+        ("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase"), "light is followed through a medium"
+    ),
 }
 
 #: The sensor file says this: pixels are boxes that integrate, with noise of their own.
@@ -326,6 +327,14 @@ def set_depth(found: Iterable[Used], depth: int) -> bool:
             raise used.refused(f"it has no path length, and the scene file asks for max_depth {depth}; use 'path'")
         return True
     return False
+
+
+def integrator_plugin(found: Iterable[Used], otherwise: dict[str, Any]) -> dict[str, Any] | None:
+    """A parsed scene's integrator as a dictionary, or another where it has none; None where it was made before."""
+    for used in found:
+        if used.kind == "Integrator":
+            return None if used.node is None else {"type": used.name, **dict(used.node.props.items())}
+    return otherwise
 
 
 def check_camera(found: Iterable[Used]) -> Used | None:

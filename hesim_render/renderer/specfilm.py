@@ -15,6 +15,7 @@ from hesim_render.renderer._mitsuba import spectrum_dict, transform, using_varia
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import MITSUBA_AXES, View, place_camera
 from hesim_render.renderer.flux import used_responses
+from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.scene import Scene
 from hesim_render.sensor import Sensor
@@ -109,6 +110,7 @@ def reference_flux(
         raise RangeError("repeats", repeats, "2 or more")
     if sensor.spec.lens.psf_fwhm_um > 0:
         raise SpecError("the reference estimator renders no lens PSF; set it to 0", key="lens.psf_fwhm_um")
+    scene, _ = in_absolute_light(scene)
     parts = [(1.0 if w is None else float(w.mean(t_us, t_us)), part) for w, part in light_parts(scene)]
     view: View | None = None
     renders = np.zeros(1)
