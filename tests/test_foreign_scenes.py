@@ -123,9 +123,8 @@ def test_each_plugin_that_mitsuba_brings_is_decided_about():
 
 def test_the_page_says_of_each_plugin_what_the_tables_say():
     text = DOCS.read_text(encoding="utf-8")
-    rows = re.findall(r"^\| ([^|]+) \| ([^|]*) \| ([^|]*) \| ([^|]*) \|$", text.split("### Plugins")[1], re.MULTILINE)[
-        2:
-    ]
+    table = text.split("### Plugins")[1]
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]*) \| ([^|]*) \| ([^|]*) \|$", table, re.MULTILINE)[1:]
     told = {}
     for _, *cells in rows:
         for how, cell in zip(("default", "exact", "refused"), cells, strict=True):
