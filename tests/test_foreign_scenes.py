@@ -31,6 +31,7 @@ def even(value):
     return {"type": "uniform", "value": value}
 
 
+REGULAR = {"type": "regular", "wavelength_min": 400, "wavelength_max": 700, "values": "1, 1"}
 GREY = {"type": "diffuse", "reflectance": even(0.5)}
 SKY = {"type": "constant", "radiance": even(1.0)}
 FLOOR = {"type": "rectangle", "bsdf": GREY}
@@ -265,6 +266,15 @@ def test_objects_that_were_made_before_are_looked_into():
     assert refusal({**ROOM, "ball": made}).startswith("mitsuba.inline.ball: BSDF 'polarizer': ")
     made = mi.load_dict({**BALL, "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}})
     assert refusal({**ROOM, "ball": made}).startswith("mitsuba.inline.ball: medium 'homogeneous': ")
+    eye = {"type": "perspective", "film": {"type": "hdrfilm"}}
+    for changes, message in (
+        ({"medium": {"type": "homogeneous"}}, "medium 'homogeneous': the camera stands in it"),
+        ({"type": "thinlens", "aperture_radius": 0.1}, "sensor 'thinlens': its depth of field"),
+        ({"film": {"type": "specfilm", "c": REGULAR}}, "film 'specfilm': its channels"),
+        ({"shutter_open": 0.0, "shutter_close": 1.0}, "its shutter_open"),
+    ):
+        text = refusal({**ROOM, "eye": mi.load_dict(eye | changes), "i": {"type": "volpath"}}, camera=False)
+        assert text.startswith("mitsuba.inline.eye: ") and message in text
     assert "integrator" in refusal({**ROOM, "i": mi.load_dict({"type": "prbvolpath"})})
     made = mi.load_dict({"type": "volpath", "max_depth": 3})
     assert "max_depth cannot be set" in refusal({**ROOM, "i": made}, max_depth=5)
@@ -311,6 +321,14 @@ def test_instances_take_the_exact_mode_and_look_like_what_they_copy(moving):
     if not moving:
         settings = hr.simulate(copied, sensor, duration_s=0.002).manifest["settings"]
         assert settings["mode"] == "exact" and "'shapegroup'" in settings["exact_because"]
+
+
+def test_a_texture_that_stays_in_space_needs_the_exact_mode_only_where_shapes_move():
+    stripes = {"type": "volume", "volume": {"type": "constvolume", "value": even(0.3)}}
+    shapes = {**ROOM, "ball": {**BALL, "bsdf": {"type": "diffuse", "reflectance": stripes}}}
+    assert default_flux(mitsuba_scene(shapes), mono(COLS, ROWS), 8).max() > 0
+    with pytest.raises(NeedsExactMode, match="texture 'volume': it stays where it is"):
+        default_flux(mitsuba_scene(shapes, [{"object": "ball", "keyframes": STEP}]), mono(COLS, ROWS))
 
 
 def test_shapes_that_cannot_move_say_so(tmp_path):
@@ -372,7 +390,6 @@ def camera(film=(64, 48), **more):
     return {"type": "perspective", "fov": 30, "to_world": look, "film": size, **more}
 
 
-REGULAR = {"type": "regular", "wavelength_min": 400, "wavelength_max": 700, "values": "1, 1"}
 SPOTS = {
     f"spot_{number}": {
         "type": "rectangle",
@@ -392,40 +409,39 @@ def mitsubas_own(shapes, spp=64):
 
 
 @pytest.mark.parametrize(
-    ("settings", "film"),
+    ("settings", "film", "more"),
     [
-        ({"principal_point_offset_x": 0.3, "principal_point_offset_y": -0.2}, {}),
-        ({}, {"crop_offset_x": 32, "crop_offset_y": 4, "crop_width": 32, "crop_height": 24}),
+        ({"principal_point_offset_x": 0.3, "principal_point_offset_y": -0.2}, {}, {}),
+        ({}, {"crop_offset_x": 32, "crop_offset_y": 4, "crop_width": 32, "crop_height": 24}, {}),
         (
             {"principal_point_offset_x": -0.1},
             {"crop_offset_x": 8, "crop_offset_y": 20, "crop_width": 32, "crop_height": 24},
+            {},
         ),
-        ({"fov_axis": "y"}, {}),
-        ({"near_clip": 1.9}, {}),
+        ({"fov_axis": "y"}, {}, {}),
+        ({"near_clip": 1.0}, {}, {"hidden": {**BALL, "center": [0, 0, 1.4], "radius": 0.2, "bsdf": GREY}}),
     ],
     ids=["principal point", "crop window", "both", "vertical field of view", "near clip"],
 )
-def test_settings_of_a_mitsuba_camera_are_seen_in_every_mode(settings, film):
-    own = camera(**settings)
+def test_settings_of_a_mitsuba_camera_are_seen_in_every_mode(settings, film, more):
+    own = camera(fov=60, **settings)
     own["film"] = {**own["film"], **film, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     rows, cols = film.get("crop_height", 48), film.get("crop_width", 64)
-    shapes = {**FIELD, "camera": own, "integrator": {"type": "path", "max_depth": 2}}
-    expected = mitsubas_own(shapes)
-    expected = expected / np.median(expected) * 0.1  # the floor's ρ
-    assert np.ptp(expected) > 0.5 and not np.allclose(expected, expected[::-1, ::-1], atol=0.1)
+    shapes = {**FIELD, **more, "camera": own, "integrator": {"type": "path", "max_depth": 2}}
+    expected = mitsubas_own(shapes) / np.mean(mitsubas_own({"sky": SKY, "camera": own}, 1))
+    assert np.ptp(expected) > 0.5
     scene = make_scene(mitsuba={"inline": shapes})
     sensor = mono(cols, rows, **{"lens__relative_illumination": "none"})
-    total = sensor.responses["clear"].integral()
-    reference = reference_flux(scene, sensor, 64, repeats=2).mosaic()[0]
     images = {
         "default": default_flux(scene, sensor, 64).mean(axis=0),
         "exact": exact_flux(scene, sensor, 64).mean(axis=0),
-        "reference": reference,
+        "reference": reference_flux(scene, sensor, 64, repeats=2).mosaic()[0],
     }
     for mode, image in images.items():
-        # inside of a spot or of the floor all are right but for noise; at edges 64 rays say how much of a pixel is seen
-        off = np.abs(image / total * 1.0 - expected)
-        assert np.quantile(off, 0.9) < 0.01 and off.mean() < 0.01, mode
+        # the least contrast is 0.1 to 0.9: only what is noisy there, a rim or a corner, may be off
+        off = np.abs(image / sensor.responses["clear"].integral() - expected)
+        assert (off > 0.1).mean() < 0.003, mode
+        assert off.mean() < 0.01, mode
 
 
 def test_the_fall_off_of_light_lies_about_the_principal_point():
@@ -467,7 +483,7 @@ def test_a_region_beside_the_chips_middle_shows_the_same_picture_about_its_middl
         ({"medium": {"type": "homogeneous"}}, "medium: medium 'homogeneous': the camera stands in it"),
         ({"far_clip": 1.5}, "far_clip is 1.5, and there are shapes up to 2 away"),
         (
-            {"film": {"type": "specfilm", "width": 64, "height": 48, "c": {**REGULAR}}},
+            {"film": {"type": "specfilm", "width": 64, "height": 48, "c": REGULAR}},
             "film: film 'specfilm': its channels",
         ),
     ],

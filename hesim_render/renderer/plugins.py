@@ -228,14 +228,7 @@ def _made(mi: Any, value: Any, place: Mapping[str, Any], owner: Any) -> Iterator
     """An object that was made before, and what is in it."""
     if not isinstance(value, mi.Object):
         return
-    items = list(mi.traverse(value).hierarchy)
-    # media are not among what Mitsuba tells of
-    shapes = [item for item in items if isinstance(item, mi.Shape)]
-    items += [medium for shape in shapes for medium in (shape.interior_medium(), shape.exterior_medium())]
-    items += [item.medium() for item in items if isinstance(item, mi.Sensor)]
-    for item in items:
-        if item is None:
-            continue
+    for item in mi.traverse(value).hierarchy:
         name = item.class_name()
         kinds = (mi.Integrator, mi.Sensor, mi.Shape, mi.Medium)
         kind = next((kind.__name__ for kind in kinds if isinstance(item, kind)), "")
