@@ -16,12 +16,16 @@ from hesim_render.renderer import plugins
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import place_camera
+from hesim_render.renderer.clock import STEP_PX, MotionClock
 from hesim_render.renderer.flux import RenderedFlux, used_responses
 from hesim_render.renderer.mitsuba_scene import _plugin_dict
 from hesim_render.renderer.moving import NeedsExactMode
 from hesim_render.renderer.pairs import PairTracer, Windows
 from hesim_render.renderer.specfilm import reference_flux
+from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.scene import Scene
+from hesim_render.schedule import CELL_US
+from hesim_render.specs.scene import TrackSpec
 
 COLS, ROWS = 16, 12
 DOCS = Path(__file__).parent.parent / "docs" / "scenes.md"
@@ -467,6 +471,30 @@ def test_a_region_beside_the_chips_middle_shows_the_same_picture_about_its_middl
         tangent = np.tan(np.radians(15)) * np.array([0.4, 0.2 * 48 / 64])
         middle = np.array([[0.1 + 2 * tangent[0], -2 * tangent[1], 0.0]])
         np.testing.assert_allclose(view.project(middle), [[32, 24]], atol=1e-4)
+        # and the way back, which the clock of a moving camera takes
+        spread = view.project(view.unproject(np.array([1.0, 3.0]), view.camera_to_world)).reshape(2, 5, 5, 2)
+        np.testing.assert_allclose(spread[..., 0], np.broadcast_to(np.linspace(0, 64, 5), (2, 5, 5)), atol=1e-6)
+        np.testing.assert_allclose(
+            spread[..., 1], np.broadcast_to(np.linspace(0, 48, 5)[:, None], (2, 5, 5)), atol=1e-6
+        )
+
+
+def test_a_turning_camera_is_followed_at_the_corner_that_is_farthest_from_its_axis():
+    shapes = {**FIELD, "camera": camera(fov=60, principal_point_offset_x=0.4)}
+    scene = make_scene(mitsuba={"inline": shapes})
+    built = build(mitsuba(), scene.spec)
+    view = place_camera(scene.spec, mono(64, 48), built.mitsuba_sensor())
+    place = view.camera_to_world[:3, 3].tolist()
+    # it turns about itself by 80° in 0.2 s
+    keys = [{"t_us": 0}, {"t_us": 200_000, "rotation_axis": (0, 1, 0), "rotation_deg": 80}]
+    turn = Trajectory(TrackSpec.model_validate({"object": "camera", "pivot_m": place, "keyframes": keys}))
+    instants = MotionClock(view, turn, [], lambda t: 1.0).instants_us(0, CELL_US)
+    # the picture reaches from 0.2 to 1.8 times its half width: x = tan α moves by 1 + x² + y² for a turn at most
+    half = np.tan(np.radians(30))
+    per_rad = 32 / half * (1 + (1.8 * half) ** 2 + (half * 48 / 64) ** 2)
+    moved_px = np.radians(80) / 0.2 * CELL_US * 1e-6 * per_rad
+    assert moved_px > 4 * STEP_PX
+    assert instants.size == 1 + np.ceil(moved_px / STEP_PX) + 1  # and the instant after the first keyframe
 
 
 @pytest.mark.parametrize(
@@ -519,6 +547,7 @@ import hesim_render as hr
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import place_camera
+from hesim_render.renderer.clock import STEP_PX, MotionClock
 from hesim_render.scene import Scene
 shapes = {{"sky": {{"type": "envmap", "filename": r"{tmp_path / "sky.exr"}"}}}}
 print(len(build(mitsuba(), Scene.from_mitsuba(shapes).spec).scene.emitters()))
