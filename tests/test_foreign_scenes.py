@@ -12,6 +12,7 @@ from rendering import make_scene, mitsuba_scene, mono
 
 import hesim_render as hr
 from hesim_render.errors import HesimError, SpecError
+from hesim_render.isp.develop import _illumination
 from hesim_render.renderer import plugins
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.builder import build
@@ -299,15 +300,17 @@ def test_emitters_and_shapes_that_are_not_rendered_are_refused_by_name():
 
 
 def instances(bsdf=GREY):
-    """Two small cubes, as copies of one, and written out."""
+    """Two small towers, as copies of one, and written out."""
     places = [np.diag([0.1, 0.1, 0.1, 1.0]), np.diag([0.05, 0.05, 0.05, 1.0])]
     places[0][:3, 3], places[1][:3, 3] = (-0.1, 0, 0.1), (0.15, 0.1, 0.05)
-    copies = {"group": {"type": "shapegroup", "cube": {"type": "cube", "bsdf": bsdf}}}
+    tall = np.diag([1.0, 1.0, 3.0, 1.0])
+    tall[2, 3] = 2.0
+    copies = {"group": {"type": "shapegroup", "cube": {"type": "cube", "to_world": tall.tolist(), "bsdf": bsdf}}}
     plain = {}
     for number, place in enumerate(places):
         matrix = place.tolist()
         copies[f"copy_{number}"] = {"type": "instance", "to_world": matrix, "of": {"type": "ref", "id": "group"}}
-        plain[f"copy_{number}"] = {"type": "cube", "to_world": matrix, "bsdf": bsdf}
+        plain[f"copy_{number}"] = {"type": "cube", "to_world": (place @ tall).tolist(), "bsdf": bsdf}
     return {**ROOM, **copies}, {**ROOM, **plain}
 
 
@@ -319,6 +322,11 @@ def test_instances_take_the_exact_mode_and_look_like_what_they_copy(moving):
     with pytest.raises(NeedsExactMode, match="shape 'shapegroup': its copies have no surface of their own"):
         default_flux(copied, sensor)
     found, expected = exact_flux(copied, sensor, 64), exact_flux(plain, sensor, 64)
+    if moving:  # the box in which its motion is followed is that of the copy, not of a unit cube
+        corners = build(mitsuba(), copied.spec).groups["copy_0"][0].corners
+        np.testing.assert_allclose(
+            [corners.min(axis=0), corners.max(axis=0)], [(-0.2, -0.1, 0), (0, 0.1, 0.6)], atol=1e-6
+        )
     # the same random numbers meet the same surfaces, but for rounding at their edges
     off = np.abs(found - expected) > 1e-3 * expected
     assert off.mean() < 0.02
@@ -457,8 +465,10 @@ def test_the_fall_off_of_light_lies_about_the_principal_point():
     y = ((np.arange(48) + 0.5) / 24 - 1) * 48 / 64
     tangent = np.tan(np.radians(30)) * np.hypot(x[None], y[:, None])
     np.testing.assert_allclose(image, (1 + tangent**2) ** -2, rtol=1e-4)
-    recorded = hr.simulate(scene, sensor, duration_s=0.002).manifest["lens"]["axis_mm"]
-    np.testing.assert_allclose(recorded, [-32 * 0.005, 0], atol=1e-9)
+    recording = hr.simulate(scene, sensor, duration_s=0.002)
+    np.testing.assert_allclose(recording.manifest["lens"]["axis_mm"], [-32 * 0.005, 0], atol=1e-7)
+    # and developing takes it out again
+    np.testing.assert_allclose(_illumination(recording), (1 + tangent**2) ** -2, rtol=1e-4)
 
 
 def test_a_region_beside_the_chips_middle_shows_the_same_picture_about_its_middle():
