@@ -47,10 +47,10 @@ EXACT: dict[str, dict[str, str]] = {
         "instance": "it is a copy that has no surface of its own",
         "shapegroup": "its copies have no surface of their own",
     },
-    "Medium": dict.fromkeys(("heterogeneous", "homogeneous"), "light is followed through it"),
-    "PhaseFunction": dict.fromkeys(
-        ("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase"), "light is followed through a medium"
-    ),
+    "Medium": {name: "light is followed through it" for name in ("heterogeneous", "homogeneous")},
+    "PhaseFunction": {
+        name: "it belongs to a medium" for name in ("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase")
+    },
 }
 
 #: The sensor file says this: pixels are boxes that integrate, with noise of their own.
@@ -89,9 +89,7 @@ REFUSED: dict[str, dict[str, str]] = {
         "batch": f"it is several cameras at once; {_CAMERA}",
         "flat_sensor": f"it has no picture; {_CAMERA}",
     },
-    "Film": {
-        "specfilm": "its channels would be a second sensor, and the responses are the sensor file's; use 'hdrfilm'",
-    },
+    "Film": {"specfilm": "its channels are responses, which the sensor file gives; use 'hdrfilm'"},
     "Emitter": {
         "directionalarea": "no path from the camera can find its light; use 'directional', 'spot' or 'projector'",
         "timed_sunsky": "its sun moves by a clock of its own; use 'sunsky' with the time of day that is meant",
@@ -100,7 +98,7 @@ REFUSED: dict[str, dict[str, str]] = {
     "BSDF": {name: _UNPOLARISED for name in ("circular", "measured_polarized", "polarizer", "retarder")},
 }
 
-#: Class names of objects that were made before they were put into a dictionary, where they matter here.
+#: Class names of objects that were made before they were put into a dictionary. (All written in Python share one.)
 _MADE: dict[str, tuple[str, str]] = {
     "AOVIntegrator": ("Integrator", "aov"),
     "BatchSensor": ("Sensor", "batch"),
@@ -117,7 +115,6 @@ _MADE: dict[str, tuple[str, str]] = {
     "ParticleTracerIntegrator": ("Integrator", "ptracer"),
     "PathIntegrator": ("Integrator", "path"),
     "PerspectiveCamera": ("Sensor", "perspective"),
-    "SamplingIntegrator": ("Integrator", "prb"),  # of all that are written in Python
     "ShapeGroupPlugin": ("Shape", "shapegroup"),
     "SpecFilm": ("Film", "specfilm"),
     "StokesIntegrator": ("Integrator", "stokes"),
@@ -170,8 +167,7 @@ class Used:
         return SpecError(f"{self}: {why}", **self.place)
 
     def __str__(self) -> str:
-        words = {"BSDF": "BSDF", "PhaseFunction": "phase function", "ReconstructionFilter": "reconstruction filter"}
-        return f"{words.get(self.kind, self.kind.lower())} '{self.name}'"
+        return f"{self.kind if self.kind == 'BSDF' else self.kind.lower()} '{self.name}'"
 
 
 def require_known(name: Any, file: Path | None, key: str) -> None:
@@ -187,13 +183,7 @@ def require_known(name: Any, file: Path | None, key: str) -> None:
 
 
 def used_plugins(mi: Any, state: Any, file: Path | None) -> list[Used]:
-    """All plugins of a parsed scene, in order.
-
-    Parameters
-    ----------
-    state : of Mitsuba's parser.
-    file : the scene file, for what stands in a dictionary within it.
-    """
+    """All plugins of a parsed scene, in order; `file` is the scene file, for a dictionary within it."""
     nodes, types = list(state.nodes), mi.Properties.Type
     owners: list[list[Any]] = [[] for _ in nodes]
     for node in nodes:
