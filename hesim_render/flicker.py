@@ -31,10 +31,12 @@ _WINDOW_STEPS = 8
 def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
     """The scene once for each different waveform, lit only by the lights that have it; first those without any.
 
-    Scenes without flicker are one part, themselves.
+    Scenes without flicker are one part, themselves. A level of a Mitsuba scene is of all its light: it has to be a
+    factor already (`in_absolute_light`).
     """
     own = scene.spec.mitsuba
     if own is not None:
+        assert not own.has_level
         return _mitsuba_parts(scene)
     lights = scene.spec.lights
     flickering = [_flicker(light.waveform) for light in lights]

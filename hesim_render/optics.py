@@ -23,11 +23,14 @@ class Lens:
     f_number : N.
     focal_length_mm : f.
     magnification : m (|m| counts); image distance is f (1 + |m|).
+    axis_mm : where the optical axis meets the chip, from the full sensor's centre: to the right and downwards in the
+        image (the principal point).
     """
 
     f_number: float
     focal_length_mm: float
     magnification: float
+    axis_mm: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(
@@ -61,7 +64,7 @@ class Lens:
 
 
 def pixel_centres_mm(layout: Layout) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Position of pixel centres on the chip from the optical axis (the full sensor's centre).
+    """Position of pixel centres on the chip from the full sensor's centre.
 
     Returns
     -------
@@ -86,7 +89,10 @@ def relative_illumination_at(
     """V(x) at the centres of pixels of the full sensor, in the shape of `row` and `col` together."""
     geometry, kind = spec.geometry, spec.lens.relative_illumination
     pitch_mm = geometry.pitch_um * 1e-3
-    x, y = ((place + 0.5 - count / 2) * pitch_mm for place, count in ((col, geometry.cols), (row, geometry.rows)))
+    x, y = (
+        (place + 0.5 - count / 2) * pitch_mm - axis
+        for place, count, axis in zip((col, row), (geometry.cols, geometry.rows), lens.axis_mm, strict=True)
+    )
     squared = x**2 + y**2
     if isinstance(kind, IlluminationTable):
         return np.interp(np.sqrt(squared), kind.image_height_mm, kind.relative).astype(np.float32)

@@ -35,6 +35,8 @@ class Stream(IntEnum):
     RENDER_ZOOM = 40
     AUDIT = 41
     AUDIT_PILOT = 42
+    LIGHT_LEVEL = 43
+    LIGHT_LEVEL_PILOT = 44
 
 
 def stream_key(seed: int, stream: Stream) -> int:

@@ -17,6 +17,7 @@ from hesim_render.renderer.audit import STRETCHES, Audit
 from hesim_render.renderer.change_driven import QUALITY, ChangeDrivenFlux
 from hesim_render.renderer.flux import RenderedFlux
 from hesim_render.renderer.forecast import Estimate, forecast
+from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.moving import NeedsExactMode
 from hesim_render.renderer.notes import NotedFlux
 from hesim_render.scene import Scene
@@ -89,7 +90,10 @@ def simulate(
     if quality is not None and (exact or samples is not None):
         raise RangeError("quality", quality, "no exact mode and no samples beside it: they are another way")
     aps, evs = noise_models(sensor, clean, without)
-    flux, settings = _source(scene, sensor, seed, quality, samples, exact, progress)
+    seen, level = in_absolute_light(scene)
+    flux, settings = _source(seen, sensor, seed, quality, samples, exact, progress)
+    if level is not None:
+        settings["light_level"] = level.as_dict()
     settings |= {"clean": clean, "without": list(without), "backend": backend.select().describe()}
     rendering = _change_driven_parts(flux)
     wanted = rendering[0].quality if rendering else None

@@ -54,7 +54,9 @@ class MotionClock:
         pitch_mm = geometry.pitch_um * 1e-3
         self._px_per_rad = lens.image_distance_mm / pitch_mm
         left, right, top, bottom = view.followed_mm
-        corner = np.array([max(-left, right), max(-top, bottom)]) / lens.image_distance_mm
+        axis_x, axis_y = lens.axis_mm
+        reach = max(axis_x - left, right - axis_x), max(axis_y - top, bottom - axis_y)
+        corner = np.array(reach) / lens.image_distance_mm
         #: 1/cos of the angle at which the farthest corner is seen.
         self._stretch = float(np.sqrt(1 + corner @ corner))
         self._speed_of = lru_cache(maxsize=1024)(self._per_metre)

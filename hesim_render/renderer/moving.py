@@ -99,11 +99,14 @@ class MovingScene:
     Raises
     ------
     NeedsExactMode
-        If a moving shape emits light, the scene's integrator is not Mitsuba's path tracer, or it hides lights.
+        If a moving shape emits light, a plugin of the scene asks for that mode, the scene's integrator is not Mitsuba's
+        path tracer, or it hides lights.
     """
 
     def __init__(self, built: BuiltScene) -> None:
         mi = built.mi
+        if built.exact_because is not None:
+            raise NeedsExactMode(built.exact_because)
         if not path_traced(built):
             name = built.integrator.class_name()
             raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")

@@ -92,7 +92,7 @@ class PathIntegrator:
             shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
             seen = mi.DirectionSample3f(scene.static, si, before)
             light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~delta)
-            share = dr.select(delta, 1.0, _power(pdf, light_pdf))
+            share = dr.select(delta, 1.0, power_heuristic(pdf, light_pdf))
             return dr.select(shines, light.eval(si, shines) * share, 0.0)
 
         def step(*state: Any) -> tuple[Any, ...]:
@@ -135,7 +135,7 @@ class PathIntegrator:
                 pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
                 chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
             value = si.to_world_mueller(value, -towards, si.wi)
-            share = dr.select(seen.delta, 1.0, _power(seen.pdf, pdf))
+            share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, pdf))
             radiance = dr.fma(throughput, dr.select(clear, value * weight * share, 0.0), radiance)
 
             # the way the surface sends the path on
@@ -216,7 +216,7 @@ def _redirected(
     return dr.select(mixed > 0, weight, 0.0)
 
 
-def _power(a: Any, b: Any) -> Any:
+def power_heuristic(a: Any, b: Any) -> Any:
     """Power heuristic of exponent 2: the weight of the strategy with density `a`."""
     import drjit as dr
 

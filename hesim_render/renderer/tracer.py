@@ -13,6 +13,7 @@ from hesim_render.errors import RangeError
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import RayFactory, place_camera
+from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.sampler import sampler_class
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.rng import Stream, stream_key
@@ -76,6 +77,7 @@ class Tracer:
 
         mi, types = mitsuba(), jit()
         self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
+        scene, _ = in_absolute_light(scene)
         self.built = build(mi, scene.spec, responses)
         self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
         self.sensor = self.view.sensor
