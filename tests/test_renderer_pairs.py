@@ -144,12 +144,11 @@ def test_a_pair_does_not_depend_on_its_company():
         np.testing.assert_array_equal(getattr(pilot, field)[some], getattr(alone, field))
 
 
-@pytest.mark.parametrize("depth", [2, 4])
-def test_one_kernel_serves_lists_of_any_length_and_alignment(depth):
+def test_one_kernel_serves_lists_of_any_length_and_alignment():
     """From three pairs on."""
     import drjit as dr
 
-    scene = hr.load_scene("rotating-star", {"max_depth": depth})
+    scene = hr.load_scene("rotating-star")
     tracer = pair_tracer(scene, mono(), 1)
     every = tracer.sensor.layout.full_index.ravel()
 
