@@ -73,10 +73,10 @@ def rays_of(pilot, quality=0.5, unit=0.03):
 def test_rays_follow_scatter_quality_and_what_is_near_by():
     calm = np.ones(9)
     rays, lit, error = rays_of(pilot_of(calm, np.zeros(9)))
-    # one ray may bring two wanted errors at most: 1 / (2 · 0.5 · 0.03) = 33
-    assert rays.tolist() == [32] * 9 and lit.all() and np.all(error == 0)
+    # one ray may bring one wanted error at most: 1 / (0.5 · 0.03) = 67
+    assert rays.tolist() == [64] * 9 and lit.all() and np.all(error == 0)
     scatter = np.zeros(9)
-    scatter[4] = 0.9
+    scatter[4] = 1.5
     rays, _, error = rays_of(pilot_of(calm, scatter))
     assert rays[4] > rays[3] > rays[1] and rays[4] >= 128
     # half of the mean over neighbours counts, so that the wish is met with something to spare for rounding
@@ -86,10 +86,10 @@ def test_rays_follow_scatter_quality_and_what_is_near_by():
     bright = np.ones(9)
     bright[6] = 30.0
     rays, _, _ = rays_of(pilot_of(bright, np.zeros(9)))
-    assert rays[4] > 128 and rays[2] == 32  # two pixels off the edge of something bright; four off
+    assert rays[4] > 128 and rays[2] == 64  # two pixels off the edge of something bright; four off
     seen_closer = Closer(np.array([4]), np.array([2.0], np.float32), np.array([2.0], np.float32))
     rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), closer=[seen_closer]))
-    assert rays[4] > 256 and rays[2] == 32
+    assert rays[4] > 256 and rays[2] == 64
 
 
 def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():

@@ -57,7 +57,7 @@ class Tuning:
     huge: float = 128.0
     huge_windows: int = 1
     least_rays: int = 8
-    ray_weight: float = 2.0
+    ray_weight: float = 1.0
     most_rays: int = 4096
     matt_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)

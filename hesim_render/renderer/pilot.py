@@ -108,22 +108,37 @@ def take_pilot(
         more = tracer.pilot(pixel, later.ravel(), windows, rays, width_px)
         for values, told in zip(_tables(pilot), _tables(more), strict=True):
             values[1:, moving] = told.reshape(later.shape)
-    # large things first: a pixel may show something small as well
-    for window, looks in enumerate(closer):
-        parts = [Closer(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))]
-        for look in sorted(looks, key=lambda look: look.is_small):
-            place = look.place
-            if not place.size:
-                continue
-            own = numbers[window, place]
-            found = tracer.pilot(sites.index[place], own, windows, look.rays, width_px, Stream.RENDER_ZOOM)
-            if look.is_small:
-                parts.append(Closer(place, found.lit_scatter, found.hidden_scatter))
-            else:
-                for values, told in zip(_tables(pilot), _tables(found), strict=True):
-                    values[window, place] = told
-        pilot.closer.append(Closer(*(np.concatenate(values) for values in zip(*map(astuple, parts), strict=True))))
+    pilot.closer.extend(_look_closer(tracer, sites, windows, numbers, pilot, width_px, closer))
     return pilot, near
+
+
+def _look_closer(
+    tracer: PairTracer,
+    sites: Sites,
+    windows: Windows,
+    numbers: NDArray[np.int64],
+    pilot: Pilot,
+    width_px: float,
+    closer: Sequence[Sequence[Look]],
+) -> list[Closer]:
+    """What more rays say: of large things it takes the pilot's place, of small ones it is returned for each window."""
+    looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
+    nothing = Closer(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+    parts = [[nothing] for _ in closer]
+    # large things first: a pixel may show something small as well
+    for is_small, rays in sorted({(look.is_small, look.rays) for _, look in looks}):
+        alike = [(window, look.place) for window, look in looks if (look.is_small, look.rays) == (is_small, rays)]
+        place = np.concatenate([places for _, places in alike])
+        window = np.concatenate([np.full(places.size, window) for window, places in alike])
+        told = tracer.pilot(sites.index[place], numbers[window, place], windows, rays, width_px, Stream.RENDER_ZOOM)
+        if not is_small:
+            for values, found in zip(_tables(pilot), _tables(told), strict=True):
+                values[window, place] = found
+            continue
+        for number in np.unique(window):
+            own = window == number
+            parts[number].append(Closer(place[own], told.lit_scatter[own], told.hidden_scatter[own]))
+    return [Closer(*map(np.concatenate, zip(*map(astuple, each), strict=True))) for each in parts]
 
 
 def _tables(told: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
