@@ -1,9 +1,9 @@
 """Random scenes by seed, written as scene files: what nobody thought of is in them. No constant was tuned on any.
 
 The camera is 2 m before the plane z = 0, of which it sees 0.8 m. 1 to 20 shapes move, or some of them; they are as
-small as a twentieth of a pixel and as large as a third of the picture, and go from a pixel in a second to 25 pixels in the
-12.5 ms of a run. Half of the scenes have matt solids under this project's own lights, half are Mitsuba's, with glass
-and metal.
+small as a twentieth of a pixel and as large as a third of the picture, and go from a pixel in a second to 25 pixels
+in the 12.5 ms of a run. Half of the scenes have matt solids under this project's own lights, half are Mitsuba's, with
+glass and metal.
 """
 
 from __future__ import annotations
