@@ -13,6 +13,7 @@ import numpy as np
 
 from hesim_render.renderer.boxes import Moment, inverse_of, meets_box
 from hesim_render.renderer.parts import SimpleForm, to_ball, to_face
+from hesim_render.renderer.tables import table
 from hesim_render.renderer.tracks import DevicePose, Tracks
 
 #: Entries of a row of the tables of balls and of faces.
@@ -45,8 +46,8 @@ class Fleet:
                 codes = [3 * first + second for first, second, _ in face.order]
                 faces.append([*face.to_uvh.ravel(), _number(mi, shape), face.triangle, *codes])
         self._heads = mi.UInt32(np.array(heads, np.uint32).ravel())
-        self._balls = mi.Float(np.array([*balls, [0.0] * _BALL], np.float32).ravel())
-        self._faces = mi.Float(np.array([*faces, [0.0] * _FACE], np.float32).ravel())
+        self._balls = table(mi.Float, np.array([*balls, [0.0] * _BALL], np.float32))
+        self._faces = table(mi.Float, np.array([*faces, [0.0] * _FACE], np.float32))
         self._count = mi.UInt32(len(forms))
         dr.make_opaque(self._heads, self._balls, self._faces, self._count)
 

@@ -31,6 +31,7 @@ from hesim_render.renderer.boxes import Moment
 from hesim_render.renderer.irradiance import RectangleLight
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paint import Paint
+from hesim_render.renderer.tables import table
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectra import Spectrum, constant, integrate_product, summed
 
@@ -116,15 +117,15 @@ class MattIntegrator:
         for name, shape in self._scene.shapes.items():
             number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
             numbers[int(number[0])] = rows.get(name, [0.0] * _ROW)
-        table = np.zeros((max(numbers, default=0) + 1, _ROW))
+        rows_of = np.zeros((max(numbers, default=0) + 1, _ROW))
         for place, row in numbers.items():
-            table[place] = row
+            rows_of[place] = row
         reflected = [
             [[integrate_product(r, colour, level) / pi for colour in colours] for r in responses]
             for level in irradiances
         ]
         emitted = [[integrate_product(r, strength) for r in responses] for strength in strengths]
-        self._rows = mi.Float(table.astype(np.float32).ravel())
+        self._rows = table(mi.Float, rows_of.astype(np.float32))
         self._reflected = mi.Float(np.array(reflected or [[[0.0]]], np.float32).ravel())
         self._emitted = mi.Float(np.array([*emitted, [0.0] * len(responses)], np.float32).ravel())
         self._filters, self._colours = mi.UInt32(len(responses)), mi.UInt32(len(colours))

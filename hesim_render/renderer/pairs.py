@@ -18,7 +18,8 @@ from hesim_render.renderer.boxes import Moment, box_rows
 from hesim_render.renderer.matt import MattIntegrator
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paths import PathIntegrator
-from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer, spread_out
+from hesim_render.renderer.tables import spread_out, table
+from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer
 from hesim_render.renderer.wavelengths import WavelengthSampler
 from hesim_render.rng import Stream, stream_key
 from hesim_render.scene import Scene
@@ -282,8 +283,8 @@ class PairTracer(Tracer):
         boxes = self._boxes(spans)
         # never one entry, which would be a constant in the kernel; rows of boxes are fetched by fours
         lengths, local, sides = (
-            types.Float(np.append(table.astype(np.float32).ravel(), np.zeros(8, np.float32)))
-            for table in (
+            table(types.Float, np.append(values.astype(np.float32).ravel(), np.zeros(8, np.float32)))
+            for values in (
                 windows.end_us - windows.begin_us,
                 np.stack(times, axis=1) if times else np.empty(0),
                 box_rows(boxes) if groups else np.empty(0),
@@ -323,7 +324,7 @@ class PairTracer(Tracer):
         sample = spread_out(types.UInt32, within, packet) * _PACKET + ray_index - packet * _PACKET
         per_half = spread_out(types.UInt32, half_rays, packet)
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
-        pixel, window, lit = (spread_out(types.UInt32, table[pair], packet) for table in lanes)
+        pixel, window, lit = (spread_out(types.UInt32, values[pair], packet) for values in lanes)
         self._sampler.setup(key, pixel, half, sample - half * per_half, per_half, MOST_SAMPLES // 2)
         if_lit, if_hidden, _, met = self._rays_of(pixel, window, moments, types.Float(1.0))
         flux = dr.select(lit != 0, if_lit, if_hidden)

@@ -15,6 +15,7 @@ from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import RayFactory, place_camera
 from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.sampler import sampler_class
+from hesim_render.renderer.tables import spread_out
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.rng import Stream, stream_key
 from hesim_render.scene import Scene
@@ -28,17 +29,6 @@ BLOCK_RAYS = 1 << 20
 Wavelengths = Callable[[Any, Any], list[Any]]
 #: (mosaic index, radiance at those four) → the quantities to average.
 Values = Callable[[Any, Any], list[Any]]
-
-
-def spread_out(kind: Any, table: NDArray, lane: Any) -> Any:
-    """Entries of a table on the host, by lane.
-
-    One kernel serves all lengths and places in memory: a table of one entry would be a constant in it, and one that
-    is read in order may be aligned or not. Both compile anew.
-    """
-    import drjit as dr
-
-    return dr.gather(kind, kind(np.append(table, table[-1:])), lane)
 
 
 class Tracer:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.backend import jit
+from hesim_render.renderer.tables import table
 
 if TYPE_CHECKING:
     from hesim_render.renderer.trajectory import Trajectory
@@ -110,7 +111,7 @@ class Tracks:
             rows.append(np.hstack(columns))
             times.append(knots)
         self._heads, self._rows, self._times = (
-            types.Float(np.concatenate(table).astype(np.float32).ravel()) for table in (heads, rows, times)
+            table(types.Float, np.concatenate(values).astype(np.float32)) for values in (heads, rows, times)
         )
         #: Steps in which the segment of a time is found; a power of two, so that tracks alike in length share a kernel.
         self._most = 1 << max(0, max(map(len, rows)) - 1).bit_length()
