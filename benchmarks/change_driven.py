@@ -9,10 +9,11 @@
 
 (c) is judged in random pixels, each in a tick of its own, drawn from all ticks, the first ones too: half of the pairs
 evenly, half of those pixels that change. The truth is `WindowReference`: Mitsuba's cameras and films, averaged over
-instants; its error is asked to be a fifth of the wish, and printed. Errors are in units of each pixel's own event noise:
-rms, median, 95 % and 99 % quantiles of the true ones beside those that the run states for the same pairs. Events are
-those of some changing pixels in all ticks. A missed event is one of the reference that exceeds its threshold by more
-than three stated standard errors and that no event of the run in the tick before, that tick or the tick after is like.
+instants; its error is asked to be a fifth of the wish, and printed. Errors are in units of each pixel's own event
+noise: rms, median, 95 % and 99 % quantiles of the true ones beside those that the run states for the same pairs. Events
+are those of some changing pixels in all ticks. A missed event is one of the reference that exceeds its threshold by
+more than three stated standard errors and that no event of the run in the tick before, that tick or the tick after is
+like.
 
 (a) and (b) get as many samples as bring their noise to the true rms of (c) over all pixels, and one tick of each is
 timed at that number. Nothing moves within a picture of (a), nor do objects within a slice of (b), which is not held
@@ -421,7 +422,8 @@ def compare(name: str, wanted: int, quality: float, options: argparse.Namespace)
     _, seconds_a = specfilm_tick(scene, sensor, spp_a, tick)
     print(
         f"   at the same rms: (a) {seconds_a * per_second:.0f} s/s with {spp_a} spp, "
-        f"(b) {seconds_b * per_second:.0f} s/s with {spp_b} spp; a/c {seconds_a / run.seconds_per_tick:.1f}  b/c {seconds_b / run.seconds_per_tick:.1f}",
+        f"(b) {seconds_b * per_second:.0f} s/s with {spp_b} spp; "
+        f"a/c {seconds_a / run.seconds_per_tick:.1f}  b/c {seconds_b / run.seconds_per_tick:.1f}",
         flush=True,
     )
 
