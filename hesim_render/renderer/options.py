@@ -70,7 +70,7 @@ class Tuning:
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 0.4
-    most_audit_times: int = 16
+    most_audit_times: int = 8
 
 
 @dataclass(frozen=True)
