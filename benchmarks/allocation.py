@@ -20,7 +20,7 @@ from change_driven import SCENES, SENSOR, SPEEDS
 import hesim_render as hr
 from hesim_render.renderer.camera import place_camera
 from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.renderer.pairs import Windows
+from hesim_render.renderer.windows import Windows
 from hesim_render.rng import Stream
 
 RAYS = (16, 64, 256, 1024)

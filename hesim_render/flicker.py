@@ -317,13 +317,20 @@ class SampledFlickerFlux(FlickerFlux):
         return self._auditable[0].noise_unit(pixel, flux, events)
 
     def reference_flux(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        quality: float,
+        events: bool,
     ) -> NDArray[np.float64]:
         """See `ChangeDrivenFlux.reference_flux`."""
         if self._still is not None:
             asked, place = np.unique(pixel, return_inverse=True)
             zero = np.zeros(asked.size)
-            parts = [source.reference_flux(asked, zero, zero + 1.0, quality)[place] for source in self._auditable]
+            parts = [
+                source.reference_flux(asked, zero, zero + 1.0, quality, events)[place] for source in self._auditable
+            ]
             return np.sum([w * part for w, part in zip(self._weights(begin_us, end_us), parts, strict=True)], axis=0)
         spans, number = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
         bounds = [np.concatenate([[low], self._cuts_us(low, high), [high]]) for low, high in spans.T]
@@ -334,7 +341,7 @@ class SampledFlickerFlux(FlickerFlux):
         share = np.divide(high - low, length, out=np.ones_like(length), where=length > 0)
         total = np.zeros(pixel.size)
         for source, weight in zip(self._auditable, self._weights(low, high), strict=True):
-            np.add.at(total, pair, share * weight * source.reference_flux(pixel[pair], low, high, quality))
+            np.add.at(total, pair, share * weight * source.reference_flux(pixel[pair], low, high, quality, events))
         return total
 
 

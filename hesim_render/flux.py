@@ -110,13 +110,18 @@ class AuditableFlux(SampledFlux, Protocol):
         ...
 
     def reference_flux(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        quality: float,
+        events: bool,
     ) -> NDArray[np.float64]:
         """Mean Φ of each listed pixel in its own window, e⁻/s, by random numbers that the run has not.
 
         Parameters
         ----------
-        quality : wanted error over the sensor's noise.
+        quality : wanted error over the sensor's noise, that of events or of exposures.
         """
         ...
 

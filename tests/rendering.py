@@ -8,7 +8,8 @@ from scipy import constants
 
 import hesim_render as hr
 from hesim_render.renderer.flux import RenderedFlux, used_responses
-from hesim_render.renderer.pairs import PairTracer, Windows
+from hesim_render.renderer.pairs import PairTracer
+from hesim_render.renderer.windows import Windows
 from hesim_render.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 

@@ -45,7 +45,7 @@ class Given:
     def noise_unit(self, pixel, flux, events):
         return UNIT * flux
 
-    def reference_flux(self, pixel, begin_us, end_us, quality):
+    def reference_flux(self, pixel, begin_us, end_us, quality, events):
         self.rays_traced += self.rays_each * pixel.size
         return self.truth[np.rint(end_us / TICK_US).astype(int) - 1, pixel]
 

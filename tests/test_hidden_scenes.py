@@ -14,7 +14,7 @@ from rendering import pair_tracer
 
 import hesim_render as hr
 from hesim_render.renderer.compare import compare_ticks
-from hesim_render.renderer.pairs import Windows
+from hesim_render.renderer.windows import Windows
 
 TICKS, TICK_US, WINDOW_US, COLS, ROWS, QUALITY = 18, 1250, 1000, 40, 30, 0.5
 

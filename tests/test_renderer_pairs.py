@@ -11,9 +11,9 @@ import hesim_render as hr
 from hesim_render.renderer import moving
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.flux import RenderedFlux
-from hesim_render.renderer.pairs import Windows
 from hesim_render.renderer.parts import meets_ball
 from hesim_render.renderer.sampler import sampler_class
+from hesim_render.renderer.windows import Windows
 
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
 LAMP = {

@@ -1,10 +1,10 @@
 """What a run is worth, measured: random pixels over stretches of time are rendered again, with other random numbers.
 
-The audit decides nothing about the picture. Its units are stretches of windows of one pixel (`notes`), drawn evenly
-over pixels and time, each independently of the others; of a sensor with a tick one window of a stretch is judged, so
-that nothing is counted twice that belongs together. They are rendered with random numbers of their own and so many rays
-that their error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for the whole run, at whatever
-number of units the audit stops (`confidence`).
+The audit decides nothing about the picture. Its units are stretches of windows of one pixel (`notes`): as many in
+each stretch of time, of pixels that are drawn independently of each other; of a sensor with a tick one window of a
+stretch is judged, so that nothing is counted twice that belongs together. They are rendered with random numbers of
+their own and so many rays that their error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for
+the whole run, at whatever number of units the audit stops (`confidence`).
 """
 
 from __future__ import annotations
@@ -32,9 +32,8 @@ STRETCHES = {"previous_sample": (2, 1, 1), "last_event": (1, 8, 1)}
 _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
 #: Part of the units of pixels that nothing can come near which is rendered again; they count for more.
 _STILL_PART = 0.25
-#: Wanted error of the reference over the sensor's noise, as a part of the run's quality: of exposures a smaller one,
-#: as much moves meanwhile and rays gain less than is expected of them.
-_REFERENCE = {"eventful": 0.5, "calm": 0.5, "frames": 0.2}
+#: Wanted error of the reference over the sensor's noise, as a part of the run's quality.
+_REFERENCE = 0.5
 #: Units that are looked at before it is asked whether they are enough: at first, and later on.
 _LEAST_BATCH, _MOST_BATCH = 256, 16384
 #: Rays of an audit at most: a part of the run's own, or so many if that is more.
@@ -222,7 +221,10 @@ class Audit:
         reference = units.flux.copy()
         place = np.nonzero(needed)[1]
         reference[needed] = self._source.reference_flux(
-            units.pixel[place], units.begin_us[needed], units.end_us[needed], _REFERENCE[which] * self._quality
+            units.pixel[place],
+            *(units.begin_us[needed], units.end_us[needed]),
+            _REFERENCE * self._quality,
+            events=which != "frames",
         )
         return reference
 

@@ -23,12 +23,13 @@ from hesim_render.renderer.changes import Plan, fill_in, plan
 from hesim_render.renderer.clock import MotionClock
 from hesim_render.renderer.flux import require_finite, used_responses
 from hesim_render.renderer.options import TUNING, Gain, Tuning
-from hesim_render.renderer.pairs import PairTracer, Windows
+from hesim_render.renderer.pairs import PairTracer
 from hesim_render.renderer.pilot import Pilot, take_pilot
-from hesim_render.renderer.sites import REACH, Sites
+from hesim_render.renderer.retrace import traced_again
+from hesim_render.renderer.sites import REACH, Sites, of_own_row, turns
+from hesim_render.renderer.windows import Windows
 from hesim_render.renderer.wish import Noise, NoiseUnit, Role
 from hesim_render.renderer.zoom import Zoom
-from hesim_render.rng import Stream
 from hesim_render.scene import Scene
 from hesim_render.schedule import Block
 from hesim_render.sensor import Sensor
@@ -250,12 +251,12 @@ class ChangeDrivenFlux:
         span, number = np.unique(np.stack([begin[waiting], end[waiting]]), axis=1, return_inverse=True)
         windows, number = Windows(span[0], span[1]), number.ravel()
         # a pixel's neighbours have the window of their own row: where a row has several, one after the other
-        turn = _turns(pixel[waiting] // self.sensor.cols, number)
+        turn = turns(pixel[waiting] // self.sensor.cols, number)
         for k in range(int(turn.max(initial=-1)) + 1):
             listed, window = waiting[turn == k], number[turn == k]
             for band in self._bands(pixel[listed], role):
                 place, own = listed[band.place], window[band.place]
-                numbers = _of_own_row(band.sites, own, self.sensor.spec.geometry.cols)[None]
+                numbers = of_own_row(band.sites, own, self.sensor.spec.geometry.cols)[None]
                 pilot, near = self._pilot(band, windows, numbers, still.span_us)
                 what = plan(
                     pilot, band.sites, band.unit, band.quality, self._gain, self._tuning, is_knot=role == "events"
@@ -314,38 +315,25 @@ class ChangeDrivenFlux:
         return unit(flux.astype(np.float32)).astype(np.float64)
 
     def reference_flux(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        quality: float,
+        events: bool,
     ) -> NDArray[np.float64]:
         """Mean Φ of each listed pixel in its own window, e⁻/s, by random numbers that nothing else has.
 
         Parameters
         ----------
-        quality : wanted error over the sensor's noise.
+        quality : wanted error over the sensor's noise, that of events or of exposures.
         """
         if self._is_dark or pixel.size == 0:
             return np.zeros(pixel.size)
         tuning, index = self._tuning, self._index[pixel]
-        span, window = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
-        windows, window = Windows(span[0], span[1]), window.ravel()
-        pilot = self._tracer.pilot(index, window, windows, tuning.audit_pilot_rays, 1.0, Stream.AUDIT_PILOT)
-        lit = (pilot.lit_scatter <= pilot.hidden_scatter) & (2 * pilot.lit >= pilot.unshadowed)
-        flux, scatter = (
-            np.where(lit, *pair) for pair in ((pilot.lit, pilot.hidden), (pilot.lit_scatter, pilot.hidden_scatter))
-        )
-        unit = self._noise.of("events" if self.sensor.spec.evs is not None else "any", index)(flux)
-        wanted = self._gain.rays(scatter / (np.float32(quality) * unit))
-        wanted = np.maximum(wanted, pilot.unshadowed / (np.float32(tuning.audit_ray_weight * quality) * unit))
-        rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
-        times = np.ceil((self._gain.error(scatter, rays) / (quality * unit)) ** 2)
-        times = np.clip(times, 1, tuning.most_audit_times)
-        total = np.zeros(pixel.size)
-        for repeat in range(int(times.max())):
-            more = np.flatnonzero(times > repeat)
-            got = self._tracer.trace(
-                index[more], window[more], windows, rays[more], lit[more], Stream.AUDIT, repeat=repeat
-            )
-            total[more] += got.mean
-        return total / times
+        unit = self._noise.of("events" if events else "any", index)
+        wanted = quality if events else quality / tuning.frame_margin
+        return traced_again(self._tracer, index, begin_us, end_us, unit, wanted, self._gain, tuning)
 
     def _still_pixels(self, role: Role) -> _Still:
         if role not in self._kept:
@@ -498,21 +486,3 @@ class _Blocks:
         self._time = float(block.begin_us[-1]), float(block.end_us[-1])
         self._last = Flux(*(values[-1:].copy() for values in out.arrays))
         return out
-
-
-def _turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:
-    """How many other windows of its row come before each pair's, [n]."""
-    pairs, inverse = np.unique(np.stack([row.astype(np.int64), window.astype(np.int64)]), axis=1, return_inverse=True)
-    if pairs.shape[1] == 0:
-        return np.empty(0, np.int64)
-    starts = np.flatnonzero(np.diff(pairs[0], prepend=pairs[0][0] - 1))
-    rank = np.arange(pairs.shape[1]) - np.repeat(starts, np.diff(starts, append=pairs.shape[1]))
-    return rank[inverse.ravel()]
-
-
-def _of_own_row(sites: Sites, window: NDArray[np.integer], cols: int) -> NDArray[np.int64]:
-    """Window of each site: that of the listed pixels of its row, or of the nearest row that has any."""
-    row, listed = sites.index.astype(np.int64) // cols, sites.index[sites.listed].astype(np.int64) // cols
-    rows, first = np.unique(listed, return_index=True)
-    nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, row)
-    return window[first[nearest]].astype(np.int64)

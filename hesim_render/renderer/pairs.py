@@ -14,13 +14,13 @@ from hesim_render import optics
 from hesim_render.backend import jit
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.bounds import stays_in
-from hesim_render.renderer.boxes import Moment, box_rows
 from hesim_render.renderer.matt import MattIntegrator
 from hesim_render.renderer.moving import MovingScene
 from hesim_render.renderer.paths import PathIntegrator
-from hesim_render.renderer.tables import spread_out, table
+from hesim_render.renderer.tables import spread_out
 from hesim_render.renderer.tracer import BLOCK_RAYS, Tracer
 from hesim_render.renderer.wavelengths import WavelengthSampler
+from hesim_render.renderer.windows import Moments, Windows
 from hesim_render.rng import Stream, stream_key
 from hesim_render.scene import Scene
 from hesim_render.sensor import Sensor
@@ -29,30 +29,6 @@ from hesim_render.spectra import Spectrum
 #: Rays of a pair; one kernel serves all their numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
-#: Intervals for which boxes of moving objects are found, in one call.
-_MOST_BINS = 64
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Windows of time.
-
-    Parameters
-    ----------
-    begin_us, end_us : [w], µs.
-    """
-
-    begin_us: NDArray[np.float64]
-    end_us: NDArray[np.float64]
-
-    @property
-    def size(self) -> int:
-        return self.begin_us.size
-
-    @property
-    def span_us(self) -> tuple[float, float]:
-        """Begin of the first and end of the last."""
-        return float(self.begin_us.min()), float(self.end_us.max())
 
 
 @dataclass(frozen=True)
@@ -186,9 +162,11 @@ class PairTracer(Tracer):
             self._trace_block(lanes, packets[part], moments, key, out, part)
             self._report((int(ends[last - 1]) - done) * _PACKET)
             first = last
+        # the lit estimate of a pixel that is dark after all may fall below nothing; no flux does
+        below = np.minimum(out.mean, 0)
         scale = self._scale(pixel)
-        out.half_a[:] *= scale
-        out.half_b[:] *= scale
+        out.half_a[:] = scale * (out.half_a - below)
+        out.half_b[:] = scale * (out.half_b - below)
         return out
 
     def pilot(
@@ -268,32 +246,11 @@ class PairTracer(Tracer):
             self.radiance_scale
         )
 
-    def _moments(self, windows: Windows, span_us: tuple[float, float] | None) -> _Moments:
+    def _moments(self, windows: Windows, span_us: tuple[float, float] | None) -> Moments:
         """Windows on the device, and the boxes in which objects stay in each, or in all of `span_us`."""
-        import drjit as dr
-
-        types, groups = jit(), self.parts.groups
+        groups = self.parts.groups
         tracks = [group.trajectory for group in groups] + ([self.camera] if self.camera else [])
-        # wrapped on the host in double precision: float32 µs would lose their fractions within seconds
-        times = [
-            track.local_us(windows.begin_us) if track.repeat else windows.begin_us - track.knots_us[0]
-            for track in tracks
-        ]
-        bins, spans = _bins(windows) if span_us is None else (np.zeros(windows.size, np.uint32), (span_us,))
-        boxes = self._boxes(spans)
-        # never one entry, which would be a constant in the kernel; rows of boxes are fetched by fours
-        lengths, local, sides = (
-            table(types.Float, np.append(values.astype(np.float32).ravel(), np.zeros(8, np.float32)))
-            for values in (
-                windows.end_us - windows.begin_us,
-                np.stack(times, axis=1) if times else np.empty(0),
-                box_rows(boxes) if groups else np.empty(0),
-            )
-        )
-        numbers = types.UInt32(np.append(bins, bins[-1:]))
-        moments = _Moments(lengths, local, sides, numbers, len(tracks), len(groups))
-        dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)
-        return moments
+        return Moments.of(windows, span_us, tracks, len(groups), self._boxes)
 
     def _boxes_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
         """Boxes in which each group stays in some intervals, [interval, group, 2, 3], m."""
@@ -304,7 +261,7 @@ class PairTracer(Tracer):
         self,
         lanes: Sequence[NDArray[np.uint32]],
         packets: NDArray[np.int64],
-        moments: _Moments,
+        moments: Moments,
         key: Any,
         out: PairFlux,
         part: slice,
@@ -345,7 +302,7 @@ class PairTracer(Tracer):
         self,
         pixels: NDArray[np.uint32],
         window: NDArray[np.uint32],
-        moments: _Moments,
+        moments: Moments,
         key: Any,
         samples: int,
         footprint: Any,
@@ -376,7 +333,7 @@ class PairTracer(Tracer):
         out.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
         out.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, bits, samples))
 
-    def _rays_of(self, pixel: Any, window: Any, moments: _Moments, footprint: Any) -> tuple[Any, ...]:
+    def _rays_of(self, pixel: Any, window: Any, moments: Moments, footprint: Any) -> tuple[Any, ...]:
         """What an integrator's `flux` returns of one ray per lane, on the optical axis's scale."""
         import drjit as dr
 
@@ -396,45 +353,6 @@ class PairTracer(Tracer):
         which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
         return self._integrator.flux(sampler, primary, now, which)
-
-
-@dataclass(frozen=True)
-class _Moments:
-    """Windows on the device.
-
-    Parameters
-    ----------
-    length_us : Float, of each window.
-    times, boxes : see `Moment`; `bins`, UInt32, of each window.
-    tracks, groups : so many.
-    """
-
-    length_us: Any
-    times: Any
-    boxes: Any
-    bins: Any
-    tracks: int
-    groups: int
-
-    def at(self, window: Any, share: Any) -> Moment:
-        """A share of each lane's window."""
-        import drjit as dr
-
-        instant = share * dr.gather(type(self.length_us), self.length_us, window)
-        where = dr.gather(type(self.bins), self.bins, window)
-        return Moment(instant, self.times, self.tracks, window, self.boxes, self.groups, where)
-
-
-def _bins(windows: Windows) -> tuple[NDArray[np.uint32], tuple[tuple[float, float], ...]]:
-    """Windows that lie near each other in time, together: a number for each window, an interval for each number."""
-    order = np.argsort(windows.begin_us, kind="stable")
-    number = np.empty(windows.size, np.uint32)
-    number[order] = np.arange(windows.size) * min(windows.size, _MOST_BINS) // windows.size
-    count = int(number.max()) + 1
-    low, high = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(low, number, windows.begin_us)
-    np.maximum.at(high, number, windows.end_us)
-    return number, tuple(zip(low.tolist(), high.tolist(), strict=True))
 
 
 def _bits(kind: Any, condition: Any, count: int) -> Any:

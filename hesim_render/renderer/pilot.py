@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.renderer.options import Gain, Tuning
-from hesim_render.renderer.pairs import PairTracer, PilotFlux, Windows
+from hesim_render.renderer.pairs import PairTracer, PilotFlux
 from hesim_render.renderer.sites import REACH, Sites
+from hesim_render.renderer.windows import Windows
 from hesim_render.renderer.zoom import Look
 from hesim_render.rng import Stream
 

@@ -102,3 +102,21 @@ class Sites:
     def _at_listed(self, image: NDArray) -> NDArray:
         assert self.cell is not None
         return image.ravel()[self.cell[self.listed]]
+
+
+def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:
+    """How many other windows of its row come before each pair's, [n]."""
+    pairs, inverse = np.unique(np.stack([row.astype(np.int64), window.astype(np.int64)]), axis=1, return_inverse=True)
+    if pairs.shape[1] == 0:
+        return np.empty(0, np.int64)
+    starts = np.flatnonzero(np.diff(pairs[0], prepend=pairs[0][0] - 1))
+    rank = np.arange(pairs.shape[1]) - np.repeat(starts, np.diff(starts, append=pairs.shape[1]))
+    return rank[inverse.ravel()]
+
+
+def of_own_row(sites: Sites, window: NDArray[np.integer], cols: int) -> NDArray[np.int64]:
+    """Window of each site: that of the listed pixels of its row, or of the nearest row that has any."""
+    row, listed = sites.index.astype(np.int64) // cols, sites.index[sites.listed].astype(np.int64) // cols
+    rows, first = np.unique(listed, return_index=True)
+    nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, row)
+    return window[first[nearest]].astype(np.int64)

@@ -19,8 +19,8 @@ from hesim_render.renderer.bounds import places
 from hesim_render.renderer.camera import View
 from hesim_render.renderer.moving import Group
 from hesim_render.renderer.options import Tuning
-from hesim_render.renderer.pairs import Windows
 from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.renderer.windows import Windows
 
 #: Instants of a window at which an object is looked for where the camera moves as well.
 _INSTANTS = 9
