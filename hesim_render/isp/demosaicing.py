@@ -1,8 +1,7 @@
 """All colours at every pixel, from any tile: Bayer, Quad-Bayer, RGBW, with or without holes.
 
-The guide is the channel with most samples (green, or white). It is predicted from all samples around
-(`kriging`), and along columns and along rows alone; where the picture varies much less along one of the two,
-that prediction is taken. Every other channel is a local linear function of the guide plus a residual interpolated from
+The guide is the channel with most samples (green, or white), predicted from the samples around under the priors that
+hold there (`guide`). Every other channel is a local linear function of the guide plus a residual interpolated from
 its own samples (residual interpolation, Kiku et al., ICIP 2013), its slope found by ridge regression
 towards 1. Work is done on the square root of the signal, in which noise is even and edges overshoot less.
 """
@@ -18,12 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError
 from hesim_render.isp import kriging
+from hesim_render.isp.guide import predict_guide
 from hesim_render.transfer import ROOT_TOE
 
-#: Contrast of activity along rows and columns, |H - V| / (H + V), where direction begins to count and is sure.
-_UNSURE, _SURE = 0.2, 0.5
-#: Activity that counts as none, square-root units.
-_QUIET = 0.01
 #: Ridge of the regression on the guide, square-root units squared.
 _RIDGE = 1e-3
 _BAND_BLOCKS = 8
@@ -60,11 +56,10 @@ def demosaic(raw: NDArray[np.float32], tile: ArrayLike, method: str = "guided") 
     if method == "linear" or channels == 1:
         estimates = [_linear(planes, block, channel) for channel in range(channels)]
     else:
-        guide = int(np.argmax(np.bincount(block[block >= 0])))
-        vertical = _direction(encoded, np.shape(tile), block.shape)
-        green = _guide(planes, block, guide, vertical)
+        most = int(np.argmax(np.bincount(block[block >= 0])))
+        green = predict_guide(planes, block, most)
         estimates = [
-            green if channel == guide else _guided(planes, green, block, channel) for channel in range(channels)
+            green if channel == most else _guided(planes, green, block, channel) for channel in range(channels)
         ]
     out = np.empty((channels, *shape), dtype=np.float32)
     for channel, estimate in enumerate(estimates):
@@ -180,77 +175,6 @@ def _linear(planes: NDArray[np.float32], block: NDArray, channel: int) -> NDArra
 
     def work(rows: slice) -> None:
         out[rows_of, cols_of, rows] = kriging.apply(planes, weights, rows)
-
-    in_bands(out.shape[2], work, _BAND_BLOCKS)
-    return out
-
-
-def _direction(image: NDArray[np.float32], tile: Sequence[int], block: tuple[int, int]) -> NDArray[np.float32]:
-    """How surely the picture runs along columns (1) or rows (-1), on cells of 2×2 px that cover whole blocks.
-
-    From differences over one tile, which compare like with like, summed over 6×6 px.
-    """
-    whole = (-(-size // period) * period for size, period in zip(image.shape, block, strict=True))
-    rows, cols = (size + size % 2 for size in whole)
-    across, down = _cell_activity(image, tile[1], 1, rows, cols), _cell_activity(image, tile[0], 0, rows, cols)
-    contrast = (across - down) / (across + down + np.float32(_QUIET * 36))
-    size = np.clip((np.abs(contrast) - np.float32(_UNSURE)) / np.float32(_SURE - _UNSURE), 0, 1)
-    return np.copysign(size, contrast)
-
-
-def _cell_activity(image: NDArray[np.float32], period: int, axis: int, rows: int, cols: int) -> NDArray[np.float32]:
-    """Sums of |differences| over one period along `axis`, centred, over 3×3 cells."""
-    before, after = period // 2, period - period // 2
-    cells = np.zeros((rows // 2 + 2, cols // 2 + 2), dtype=np.float32)
-    height, width = image.shape
-
-    def work(part: slice) -> None:
-        top, bottom = 2 * part.start, min(2 * part.stop, height)
-        wide = np.zeros((2 * (part.stop - part.start), cols), dtype=np.float32)
-        if axis == 1:
-            inner = wide[: bottom - top, before : width - after]
-            np.subtract(image[top:bottom, period:], image[top:bottom, :-period], out=inner)
-        else:
-            first, last = max(top, before), min(bottom, height - after)
-            if last > first:
-                inner = wide[first - top : last - top, :width]
-                np.subtract(image[first + after : last + after], image[first - before : last - before], out=inner)
-        np.abs(wide, out=wide)
-        lines = wide[0::2] + wide[1::2]
-        np.add(lines[:, 0::2], lines[:, 1::2], out=cells[1 + part.start : 1 + part.stop, 1:-1])
-
-    in_bands(rows // 2, work)
-    lines = cells[:-2] + cells[1:-1] + cells[2:]
-    return lines[:, :-2] + lines[:, 1:-1] + lines[:, 2:]
-
-
-def _guide(
-    planes: NDArray[np.float32], block: NDArray, channel: int, vertical: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """The guide at every position: measured, or predicted along the direction in which the picture runs."""
-    known, wanted = _targets(block, channel)
-    key, targets = _as_key(block), tuple(wanted)
-    weights = np.concatenate(
-        [
-            kriging.stencil(key, channel, targets),
-            kriging.line_stencil(key, channel, targets, 0),
-            kriging.line_stencil(key, channel, targets, 1),
-        ]
-    )
-    bh, bw = block.shape
-    out = np.empty((bh, bw, planes.shape[1] - 2, planes.shape[2] - 2), dtype=np.float32)
-    for row, col in known:
-        out[row, col] = planes[row * bw + col, 1:-1, 1:-1]
-
-    def work(rows: slice) -> None:
-        freely, by_column, by_row = np.split(kriging.apply(planes, weights, rows), 3)
-        for k, (row, col) in enumerate(wanted):
-            cell_rows = (np.arange(rows.start, rows.stop) * bh + row) // 2
-            cell_cols = (np.arange(out.shape[3]) * bw + col) // 2
-            # a slice where blocks have even width: it is read much faster than an index array
-            sure = vertical[cell_rows][:, slice(col // 2, None, bw // 2) if bw % 2 == 0 else cell_cols]
-            own = freely[k] + np.maximum(sure, 0) * (by_column[k] - freely[k])
-            out[row, col, rows] = own + np.maximum(-sure, 0) * (by_row[k] - freely[k])
 
     in_bands(out.shape[2], work, _BAND_BLOCKS)
     return out
