@@ -64,6 +64,7 @@ def photographs():
     return {k: v[: v.shape[0] // 4 * 4, : v.shape[1] // 4 * 4] / 255 for k, v in found.items()}
 
 
+@functools.cache
 def patterns():
     """What is hard for a mosaic: grey detail up to half the Nyquist frequency, saturated diagonals, text, edges."""
     plate = zone_plate()
