@@ -143,6 +143,16 @@ def test_flat_fields_keep_their_mean_and_lose_their_noise(name):
         assert error.std() < sigma / 5
 
 
+def test_noise_of_long_waves_is_reduced_too():
+    """Means over 16×16 px, many patches of a pass: 0.088 DN before, 0.062 after the passes over patches alone."""
+    signal = mosaic_of(4 + 3 * (np.arange(320) > 160)[None, :, None] + np.zeros((320, 320, 3)), EIGER)
+    noise = noise_of(EIGER)
+    valid = np.tile(np.array(EIGER) >= 0, (80, 80))
+    found = denoise(np.where(valid, noisy(signal, noise), 0), EIGER, noise, 959.0, [2.0, 1.0, 1.5])
+    error = np.where(valid, found - signal, 0).reshape(20, 16, 20, 16).sum(axis=(1, 3)) / (16 * 12)
+    assert error.std() < 0.055
+
+
 @pytest.mark.parametrize("name", ["bayer", "eiger"])
 def test_edges_stay_and_pictures_gain(name):
     tile = np.array(TILES[name])

@@ -10,7 +10,6 @@ whole blocks, so that colours meet their own and the basis serves any tile, with
 
 from __future__ import annotations
 
-import functools
 import threading
 from dataclasses import dataclass
 
@@ -118,19 +117,12 @@ def _features(coefficients: NDArray[np.float32], is_noisy: bool) -> NDArray[np.f
     return found
 
 
-@functools.lru_cache(maxsize=8)
-def _offsets() -> NDArray[np.int64]:
-    """Of the patches looked at: the own one first, then the nearer ones."""
-    around = np.arange(-_REACH, _REACH + 1)
-    found = np.stack(np.meshgrid(around, around, indexing="ij"), axis=-1).reshape(-1, 2)
-    return found[np.argsort((found**2).sum(axis=1), kind="stable")]
-
-
 def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:
-    """Flat indices of the patches most like each of those of rows `inside`, [patch, member]; it itself is one."""
+    """Flat indices of the patches most like each of those of rows `inside` (it counts itself), [patch, member]."""
     height, width = features.shape[:2]
     count = inside.stop - inside.start
-    offsets = _offsets()
+    reach = range(-_REACH, _REACH + 1)
+    offsets = np.array([(dy, dx) for dy in reach for dx in reach])
     distance = np.full((count, width, len(offsets)), np.inf, dtype=np.float32)
     for k, (dy, dx) in enumerate(offsets):
         top, bottom = max(inside.start, -dy), min(inside.stop, height - dy)
@@ -140,7 +132,6 @@ def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:
         difference = features[top:bottom, left:right] - features[top + dy : bottom + dy, left + dx : right + dx]
         into = distance[top - inside.start : bottom - inside.start, left:right, k]
         np.einsum("rcf,rcf->rc", difference, difference, out=into)
-    distance[..., 0] = -1
     members = min(_ALIKE, min(_REACH + 1, height) * min(_REACH + 1, width))
     flat = distance.reshape(count * width, -1)
     nearest = np.argpartition(flat, members - 1, axis=1)[:, :members]
