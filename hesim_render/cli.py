@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
@@ -321,15 +322,25 @@ def isp(
     recording: Annotated[Path, typer.Argument(help="folder of a recording")],
     out: Annotated[Path | None, typer.Option(help="folder of the pictures; default NAME-pictures beside it")] = None,
     pipeline: Annotated[Path | None, typer.Option(help="YAML file that changes the steps (docs/isp.md)")] = None,
+    no_denoise: Annotated[bool, typer.Option("--no-denoise", help="leave noise and row offsets as they are")] = False,
+    calibration: Annotated[
+        Path | None, typer.Option(help="calibration.yaml of a calibrated sensor, for its maps")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Develop the RAW frames of a recording into pictures."""
-    from hesim_render.isp import develop_recording, load_pipeline
+    from hesim_render.isp import DENOISED_PICTURE, develop_recording, load_pipeline
+    from hesim_render.isp.develop import MARKER
 
-    steps = None if pipeline is None else load_pipeline(pipeline)
+    steps = DENOISED_PICTURE if pipeline is None else load_pipeline(pipeline)
+    if no_denoise:
+        steps = steps.without("denoise")
     with progress_bar(f"developing {recording}") as progress:
-        folder = develop_recording(recording, out, steps, progress, overwrite)
+        folder = develop_recording(recording, out, steps, progress, overwrite, calibration)
     typer.echo(f"pictures in {folder}")
+    noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
+    if noise is not None and noise["maps"] == "unknown":
+        typer.echo("the maps of the sensor's calibration are not in a recording: --calibration FILE takes them out")
 
 
 @app.command()

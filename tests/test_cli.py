@@ -327,3 +327,11 @@ def test_isp_develops_a_recording(capsys, tmp_path):
     assert len(pictures) == 1 and Image.open(pictures[0]).size == (96, 64)
     assert "exists" in fails(capsys, "isp", recording)
     assert "not a recording" in fails(capsys, "isp", tmp_path)
+    assert call(capsys, "isp", recording, "--no-denoise", "--out", tmp_path / "plain")[0] == 0
+    steps = [
+        json.loads((tmp_path / k / "isp.json").read_text())["pipeline"]["steps"] for k in ("rec-pictures", "plain")
+    ]
+    assert [len([s for s in some if s["step"] == "denoise"]) for some in steps] == [1, 0]
+    smooth, plain = (np.asarray(Image.open(tmp_path / k / "000000.png")) for k in ("rec-pictures", "plain"))
+    assert not np.array_equal(smooth, plain)
+    assert "has no calibration" in fails(capsys, "isp", recording, "--calibration", "c.yaml", "--overwrite")

@@ -1,33 +1,24 @@
 """Pipelines from files, the camera's two directions, and pictures of recordings."""
 
-import json
-
 import numpy as np
 import pytest
 import recordings
-import tifffile
 from isp_images import PAPER_BALANCE, PAPER_MATRIX, QUAD, captured, images, mosaic_of, psnr
-from PIL import Image
 
 from hesim_render import transfer
-from hesim_render.errors import OutputError, RangeError, SpecError
+from hesim_render.errors import RangeError, SpecError
 from hesim_render.isp import (
-    DEFAULT,
-    PICTURE,
     Camera,
     Pipeline,
     balance,
     colour,
     demosaic,
     develop,
-    develop_recording,
     levels,
     load_camera,
     load_pipeline,
     process,
-    tone,
 )
-from hesim_render.recording import Recording
 
 CAMERA = """
 channels: [R, G, B]
@@ -157,6 +148,12 @@ steps:
         ("[{step: demosaic}, {step: sharpen}]", "sharpen"),
         ("[{step: demosaic, kernel: 3}]", "unknown key"),
         ("[{step: demosaic}, {step: exposure, gain: -1}]", "greater than 0"),
+        ("[{step: denoise}, {step: demosaic}]", "denoise must come after black_level"),
+        (
+            "[{step: black_level}, {step: white_balance}, {step: denoise}, {step: demosaic}]",
+            "nothing but fill in between",
+        ),
+        ("[{step: black_level}, {step: denoise, strength: -1}, {step: demosaic}]", "greater than or equal to 0"),
     ],
 )
 def test_wrong_pipelines_are_explained(tmp_path, steps, message):
@@ -201,80 +198,3 @@ def test_chart_steps_balance_and_correct():
     np.testing.assert_allclose(report["white_balance"], PAPER_BALANCE, rtol=0.005)
     # nominal sRGB values against ISO 17321-1 reflectances: another chart, so not near zero
     assert report["mean_delta_e_2000"] < 3
-
-
-# -- recordings --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("sensor", ["eiger", "gen2", "mipi-hybridevs", "davis346", "reference-bayer", "reference-mono"])
-def test_every_shipped_sensor_is_developed(sensor):
-    recording = recordings.make(sensor)
-    picture = process(recording.frames[0], recording.mosaic)
-    assert picture.shape == (96, 128, 3) and picture.dtype == np.uint8
-    assert picture.std() > 10
-    if recording.mosaic.is_mono:
-        np.testing.assert_array_equal(picture[..., 0], picture[..., 2])
-
-
-def test_develop_recording_writes_pictures_and_how(tmp_path):
-    recordings.make("eiger", tmp_path / "rec", frames=3)
-    seen = []
-    out = develop_recording(tmp_path / "rec", progress=lambda *step: seen.append(step))
-    assert out == tmp_path / "rec-pictures"
-    assert sorted(path.name for path in out.iterdir()) == ["000000.png", "000001.png", "000002.png", "isp.json"]
-    assert seen == [(k, 3, "pictures") for k in (1, 2, 3)]
-    about = json.loads((out / "isp.json").read_text())
-    assert [step["step"] for step in about["pipeline"]["steps"]] == [item.step for item in PICTURE.steps]
-    gains = [picture["exposure_gain"] for picture in about["pictures"]]
-    assert gains[0] == gains[1] == gains[2]
-    recording = Recording.load(tmp_path / "rec")
-    again = develop(recording.frames[0], recording.mosaic, PICTURE, exposure_gain=gains[0]).image
-    np.testing.assert_array_equal(np.asarray(Image.open(out / "000000.png")), again)
-    with pytest.raises(OutputError, match="exists"):
-        develop_recording(tmp_path / "rec")
-    develop_recording(tmp_path / "rec", overwrite=True)
-
-
-def test_sixteen_bit_pictures_are_tiff(tmp_path):
-    recordings.make("mipi-hybridevs", tmp_path / "rec", frames=1)
-    chain = Pipeline.of(*[item.step for item in DEFAULT.steps[:-1]], {"step": "encode", "depth": 16})
-    out = develop_recording(tmp_path / "rec", tmp_path / "pictures", chain)
-    picture = tifffile.imread(out / "000000.tif")
-    assert picture.dtype == np.uint16 and picture.shape == (96, 128, 3)
-    eight = process(Recording.load(tmp_path / "rec").frames[0], Recording.load(tmp_path / "rec").mosaic)
-    assert np.abs(picture / 257.0 - eight).max() <= 0.55
-
-
-def test_lens_shading_of_a_recording_takes_its_own_lens(tmp_path):
-    recordings.make("eiger", tmp_path / "rec", frames=1)
-    steps = ["black_level", "lens_shading", "white_balance", "demosaic"]
-    out = develop_recording(tmp_path / "rec", tmp_path / "shaded", Pipeline.of(*steps))
-    recording = Recording.load(tmp_path / "rec")
-    plain = process(recording.frames[0], recording.mosaic, Pipeline.of("black_level", "white_balance", "demosaic"))
-    spec = recording.manifest["sensor"]["spec"]
-    y, x = (np.mgrid[0:96, 0:128] - np.array([47.5, 63.5])[:, None, None]) * spec["geometry"]["pitch_um"] * 1e-3
-    lens = recording.manifest["lens"]
-    cos4 = (1 + (x**2 + y**2) / (lens["focal_length_mm"] * (1 + lens["magnification"])) ** 2) ** -2
-    # the demosaic is not linear, so only nearly the same as shading its result; highlights are held
-    unheld = plain.max(-1) < 0.9
-    np.testing.assert_allclose(
-        tifffile.imread(out / "000000.tif")[unheld], (plain / cos4[..., None])[unheld], atol=1e-3
-    )
-
-
-def test_an_interrupted_run_leaves_nothing(tmp_path):
-    recordings.make("eiger", tmp_path / "rec", frames=2)
-
-    def stop(done, total, what):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        develop_recording(tmp_path / "rec", progress=stop)
-    assert [path.name for path in tmp_path.iterdir()] == ["rec"]
-
-
-def test_automatic_exposure_reaches_white():
-    recording = recordings.make("reference-bayer")
-    linear = process(recording.frames[0], recording.mosaic, Pipeline.of(*PICTURE.model_dump()["steps"][:-1]))
-    assert np.percentile(linear[::2, ::2].max(-1), 99.5) == pytest.approx(0.95, rel=1e-3)
-    assert tone.auto_gain(linear) == pytest.approx(1, rel=1e-3)

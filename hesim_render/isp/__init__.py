@@ -1,17 +1,21 @@
 """From RAW frames to pictures: plain functions, one per step, and a pipeline that is a list of steps.
 
-Uses neither the renderer nor Dr.Jit, so that it works on frames of real sensors too.
+Does not use the renderer, so that it works on frames of real sensors too. Dr.Jit only draws the maps of a simulated
+device anew, for the noise reduction of its recordings.
 """
 
 from hesim_render.camera import Camera, load_camera
 from hesim_render.isp.demosaicing import demosaic, remosaic
 from hesim_render.isp.develop import develop_recording
-from hesim_render.isp.pipeline import DEFAULT, PICTURE, Pipeline, develop, load_pipeline, process
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.pipeline import DEFAULT, DENOISED_PICTURE, PICTURE, Pipeline, develop, load_pipeline, process
 
 __all__ = [
     "DEFAULT",
+    "DENOISED_PICTURE",
     "PICTURE",
     "Camera",
+    "FrameNoise",
     "Pipeline",
     "demosaic",
     "develop",

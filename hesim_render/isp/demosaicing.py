@@ -1,8 +1,7 @@
 """All colours at every pixel, from any tile: Bayer, Quad-Bayer, RGBW, with or without holes.
 
-The guide is the channel with most samples (green, or white). It is predicted from all samples around
-(`kriging`), and along columns and along rows alone; where the picture varies much less along one of the two,
-that prediction is taken. Every other channel is a local linear function of the guide plus a residual interpolated from
+The guide is the channel with most samples (green, or white), predicted from the samples around under the priors that
+hold there (`guide`). Every other channel is a local linear function of the guide plus a residual interpolated from
 its own samples (residual interpolation, Kiku et al., ICIP 2013), its slope found by ridge regression
 towards 1. Work is done on the square root of the signal, in which noise is even and edges overshoot less.
 """
@@ -18,15 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError
 from hesim_render.isp import kriging
+from hesim_render.isp.blocks import BAND_BLOCKS, block_of, bordered, join, split
+from hesim_render.isp.guide import predict_guide
 from hesim_render.transfer import ROOT_TOE
 
-#: Contrast of activity along rows and columns, |H - V| / (H + V), where direction begins to count and is sure.
-_UNSURE, _SURE = 0.2, 0.5
-#: Activity that counts as none, square-root units.
-_QUIET = 0.01
 #: Ridge of the regression on the guide, square-root units squared.
 _RIDGE = 1e-3
-_BAND_BLOCKS = 8
 
 
 def demosaic(raw: NDArray[np.float32], tile: ArrayLike, method: str = "guided") -> NDArray[np.float32]:
@@ -47,7 +43,7 @@ def demosaic(raw: NDArray[np.float32], tile: ArrayLike, method: str = "guided") 
     RangeError
         If the tile has no samples, the frame is smaller than a tile, or `method` is unknown.
     """
-    block, shape = _block_of(tile), np.shape(raw)
+    block, shape = block_of(tile), np.shape(raw)
     if method not in ("guided", "linear"):
         raise RangeError("demosaic method", method, "guided or linear")
     if len(shape) != 2 or shape[0] < np.shape(tile)[0] or shape[1] < np.shape(tile)[1]:
@@ -56,19 +52,20 @@ def demosaic(raw: NDArray[np.float32], tile: ArrayLike, method: str = "guided") 
     if channels == 1 and (block >= 0).all():
         return np.asarray(raw, dtype=np.float32)[..., None]
     encoded = np.asarray(raw, dtype=np.float32) if method == "linear" else _encoded(raw)
-    planes = _split(encoded, block.shape)
+    planes = split(encoded, block.shape)
     if method == "linear" or channels == 1:
         estimates = [_linear(planes, block, channel) for channel in range(channels)]
     else:
-        guide = int(np.argmax(np.bincount(block[block >= 0])))
-        vertical = _direction(encoded, np.shape(tile), block.shape)
-        green = _guide(planes, block, guide, vertical)
+        most = int(np.argmax(np.bincount(block[block >= 0])))
+        green = predict_guide(planes, block, most)
         estimates = [
-            green if channel == guide else _guided(planes, green, block, channel) for channel in range(channels)
+            green if channel == most else _guided(planes, green, block, channel) for channel in range(channels)
         ]
     out = np.empty((channels, *shape), dtype=np.float32)
     for channel, estimate in enumerate(estimates):
-        _join(estimate, out[channel], square=method != "linear")
+        join(estimate, out[channel])
+    if method != "linear":
+        in_bands(shape[0], lambda rows: _decode(out[:, rows]))
     return np.moveaxis(out, 0, -1)
 
 
@@ -93,17 +90,6 @@ def remosaic(raw: NDArray[np.float32], tile: ArrayLike, target: ArrayLike = ((0,
     return out
 
 
-def _block_of(tile: ArrayLike) -> NDArray[np.int64]:
-    """The tile repeated until it measures at least 4×4: blocks of that size are worked on at once."""
-    given = np.atleast_2d(np.asarray(tile, dtype=np.int64))
-    if given.ndim != 2 or given.size == 0 or given.max() < 0:
-        raise RangeError("tile", np.asarray(tile).tolist(), "rows of channel numbers with at least one >= 0")
-    missing = sorted(set(range(int(given.max()))) - set(given.ravel().tolist()))
-    if missing:
-        raise RangeError("tile", given.tolist(), f"channel numbers without gaps ({missing[0]} does not occur)")
-    return np.tile(given, [-(-4 // size) for size in given.shape])
-
-
 def _encoded(raw: NDArray) -> NDArray[np.float32]:
     out = np.empty(raw.shape, dtype=np.float32)
 
@@ -116,48 +102,10 @@ def _encoded(raw: NDArray) -> NDArray[np.float32]:
     return out
 
 
-def _split(image: NDArray[np.float32], block: tuple[int, int]) -> NDArray[np.float32]:
-    """Planes [block position, block row, block col] with a border of one block on each side.
-
-    The border repeats the outermost whole block, so that every colour stays in its place.
-    """
-    rows, cols = (_padded_index(size, period) for size, period in zip(image.shape, block, strict=True))
-    padded_rows, padded_cols = rows.size // block[0], cols.size // block[1]
-    planes = np.empty((*block, padded_rows, padded_cols), dtype=np.float32)
-
-    def work(part: slice) -> None:
-        band = image[rows[part.start * block[0] : part.stop * block[0]]][:, cols]
-        planes[:, :, part] = band.reshape(-1, block[0], padded_cols, block[1]).transpose(1, 3, 0, 2)
-
-    in_bands(padded_rows, work, _BAND_BLOCKS)
-    return planes.reshape(-1, padded_rows, padded_cols)
-
-
-def _padded_index(size: int, period: int) -> NDArray[np.int64]:
-    """Indices into a line of `size` with a block before and whole blocks up to one block behind its end."""
-    index = np.arange(-period, -(-size // period) * period + period)
-    index[index < 0] += period
-    over = index - size + 1
-    index -= np.where(over > 0, -(-over // period) * period, 0)
-    return np.where(index < 0, np.arange(index.size) % max(1, min(size, period)), index)
-
-
-def _join(planes: NDArray[np.float32], out: NDArray[np.float32], square: bool) -> None:
-    """Planes [block row, block col position …] back into an image, decoded."""
-    bh, bw, block_rows, block_cols = planes.shape
-    cols = out.shape[1]
-
-    def work(part: slice) -> None:
-        band = planes[:, :, part]
-        if square:
-            band = np.maximum(band, 0)
-            band *= band
-            band -= np.float32(ROOT_TOE)
-        image = band.transpose(2, 0, 3, 1).reshape(-1, block_cols * bw)
-        rows = slice(part.start * bh, min(part.stop * bh, out.shape[0]))
-        out[rows] = image[: rows.stop - rows.start, :cols]
-
-    in_bands(block_rows, work, _BAND_BLOCKS)
+def _decode(roots: NDArray[np.float32]) -> None:
+    np.maximum(roots, 0, out=roots)
+    np.multiply(roots, roots, out=roots)
+    roots -= np.float32(ROOT_TOE)
 
 
 def _targets(block: NDArray, channel: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -181,83 +129,8 @@ def _linear(planes: NDArray[np.float32], block: NDArray, channel: int) -> NDArra
     def work(rows: slice) -> None:
         out[rows_of, cols_of, rows] = kriging.apply(planes, weights, rows)
 
-    in_bands(out.shape[2], work, _BAND_BLOCKS)
+    in_bands(out.shape[2], work, BAND_BLOCKS)
     return out
-
-
-def _direction(image: NDArray[np.float32], tile: Sequence[int], block: tuple[int, int]) -> NDArray[np.float32]:
-    """How surely the picture runs along columns (1) or rows (-1), on cells of 2×2 px that cover whole blocks.
-
-    From differences over one tile, which compare like with like, summed over 6×6 px.
-    """
-    whole = (-(-size // period) * period for size, period in zip(image.shape, block, strict=True))
-    rows, cols = (size + size % 2 for size in whole)
-    across, down = _cell_activity(image, tile[1], 1, rows, cols), _cell_activity(image, tile[0], 0, rows, cols)
-    contrast = (across - down) / (across + down + np.float32(_QUIET * 36))
-    size = np.clip((np.abs(contrast) - np.float32(_UNSURE)) / np.float32(_SURE - _UNSURE), 0, 1)
-    return np.copysign(size, contrast)
-
-
-def _cell_activity(image: NDArray[np.float32], period: int, axis: int, rows: int, cols: int) -> NDArray[np.float32]:
-    """Sums of |differences| over one period along `axis`, centred, over 3×3 cells."""
-    before, after = period // 2, period - period // 2
-    cells = np.zeros((rows // 2 + 2, cols // 2 + 2), dtype=np.float32)
-    height, width = image.shape
-
-    def work(part: slice) -> None:
-        top, bottom = 2 * part.start, min(2 * part.stop, height)
-        wide = np.zeros((2 * (part.stop - part.start), cols), dtype=np.float32)
-        if axis == 1:
-            inner = wide[: bottom - top, before : width - after]
-            np.subtract(image[top:bottom, period:], image[top:bottom, :-period], out=inner)
-        else:
-            first, last = max(top, before), min(bottom, height - after)
-            if last > first:
-                inner = wide[first - top : last - top, :width]
-                np.subtract(image[first + after : last + after], image[first - before : last - before], out=inner)
-        np.abs(wide, out=wide)
-        lines = wide[0::2] + wide[1::2]
-        np.add(lines[:, 0::2], lines[:, 1::2], out=cells[1 + part.start : 1 + part.stop, 1:-1])
-
-    in_bands(rows // 2, work)
-    lines = cells[:-2] + cells[1:-1] + cells[2:]
-    return lines[:, :-2] + lines[:, 1:-1] + lines[:, 2:]
-
-
-def _guide(
-    planes: NDArray[np.float32], block: NDArray, channel: int, vertical: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """The guide at every position: measured, or predicted along the direction in which the picture runs."""
-    known, wanted = _targets(block, channel)
-    key, targets = _as_key(block), tuple(wanted)
-    weights = np.concatenate(
-        [
-            kriging.stencil(key, channel, targets),
-            kriging.line_stencil(key, channel, targets, 0),
-            kriging.line_stencil(key, channel, targets, 1),
-        ]
-    )
-    bh, bw = block.shape
-    out = np.empty((bh, bw, planes.shape[1] - 2, planes.shape[2] - 2), dtype=np.float32)
-    for row, col in known:
-        out[row, col] = planes[row * bw + col, 1:-1, 1:-1]
-
-    def work(rows: slice) -> None:
-        freely, by_column, by_row = np.split(kriging.apply(planes, weights, rows), 3)
-        for k, (row, col) in enumerate(wanted):
-            cell_rows = (np.arange(rows.start, rows.stop) * bh + row) // 2
-            cell_cols = (np.arange(out.shape[3]) * bw + col) // 2
-            # a slice where blocks have even width: it is read much faster than an index array
-            sure = vertical[cell_rows][:, slice(col // 2, None, bw // 2) if bw % 2 == 0 else cell_cols]
-            own = freely[k] + np.maximum(sure, 0) * (by_column[k] - freely[k])
-            out[row, col, rows] = own + np.maximum(-sure, 0) * (by_row[k] - freely[k])
-
-    in_bands(out.shape[2], work, _BAND_BLOCKS)
-    return out
-
-
-def _bordered(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.pad(planes, ((0, 0), (1, 1), (1, 1)), mode="edge")
 
 
 def _guided(
@@ -267,7 +140,7 @@ def _guided(
     known, wanted = _targets(block, channel)
     bh, bw = block.shape
     samples = [planes[row * bw + col, 1:-1, 1:-1] for row, col in known]
-    slope, offset = (_bordered(plane[None]) for plane in _regression([guide[place] for place in known], samples))
+    slope, offset = (bordered(plane[None]) for plane in _regression([guide[place] for place in known], samples))
     spread = kriging.bilinear_stencil((bh, bw), tuple(float(k) for k in np.mean(known, axis=0)))
     out = np.empty_like(guide)
     residual = np.empty((len(known), *guide.shape[2:]), dtype=np.float32)
@@ -279,17 +152,17 @@ def _guided(
         for k, position in enumerate(known):
             np.subtract(samples[k][rows], out[(*position, rows)], out=residual[k, rows])
 
-    in_bands(guide.shape[2], predict, _BAND_BLOCKS)
-    bordered = _bordered(residual)
+    in_bands(guide.shape[2], predict, BAND_BLOCKS)
+    around = bordered(residual)
     weights = kriging.lone_stencil((bh, bw), tuple(known), tuple(wanted))
 
     def correct(rows: slice) -> None:
-        for (row, col), beyond in zip(wanted, kriging.apply(bordered, weights, rows), strict=True):
+        for (row, col), beyond in zip(wanted, kriging.apply(around, weights, rows), strict=True):
             out[row, col, rows] += beyond
         for k, position in enumerate(known):
             out[(*position, rows)] = samples[k][rows]
 
-    in_bands(guide.shape[2], correct, _BAND_BLOCKS)
+    in_bands(guide.shape[2], correct, BAND_BLOCKS)
     return out
 
 

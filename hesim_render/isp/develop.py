@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from hesim_render import manifest as manifests
 from hesim_render.camera import Camera
 from hesim_render.errors import RangeError, SpecError
-from hesim_render.isp.pipeline import PICTURE, Pipeline, develop
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.pipeline import DENOISED_PICTURE, Pipeline, develop
 from hesim_render.layout import Layout
 from hesim_render.optics import Lens, relative_illumination
 from hesim_render.output import OutputFolder, output_errors
@@ -28,18 +29,23 @@ def develop_recording(
     pipeline: Pipeline | None = None,
     progress: Callable[[int, int, str], None] | None = None,
     overwrite: bool = False,
+    calibration: str | Path | None = None,
 ) -> Path:
     """Write a picture of every frame of a recording, and ``isp.json`` with how they were made.
 
     Depth 8 gives PNG; depth 16, and float32 where there is no encode step or it says ``float``, give TIFF. An
-    automatic exposure is measured on the middle frame and kept for all, so that a sequence does not flicker.
+    automatic exposure is measured on the middle frame and kept for all, so that a sequence does not flicker. Noise is
+    reduced by the model and the maps of the sensor that made the recording; what was switched off there is not looked
+    for, so that frames without noise stay as they are.
 
     Parameters
     ----------
     out : folder to write; default beside the recording, its name with ``-pictures``.
-    pipeline : default `PICTURE`.
+    pipeline : default `DENOISED_PICTURE`; `PICTURE` is the same without noise reduction.
     progress : called with (done, total, what).
     overwrite : replace an earlier folder of pictures.
+    calibration : the ``calibration.yaml`` of a calibrated sensor, whose maps the recording does not hold; without it
+        row offsets are estimated from the frames.
 
     Returns
     -------
@@ -48,24 +54,30 @@ def develop_recording(
     Raises
     ------
     SpecError
-        If it is no recording, or has no frames.
+        If it is no recording, or has no frames, or the calibration is not that of its sensor.
     OutputError
         If the pictures cannot be written.
     """
     recording = Recording.load(folder)
     if recording.path is None or len(recording.frames) == 0:
         raise SpecError("the recording has no frames", file=str(folder))
-    chain = pipeline or PICTURE
+    chain = pipeline or DENOISED_PICTURE
     camera = Camera.of(recording.mosaic)
+    noise = None
+    if any(item.step == "denoise" for item in chain.steps):
+        noise = FrameNoise.of_recording(recording.manifest, calibration)
+    elif calibration is not None:
+        raise RangeError("calibration", str(calibration), "none, as no step of the pipeline reduces noise")
     target = OutputFolder(out or recording.path.with_name(f"{recording.path.name}-pictures"), MARKER, overwrite)
     illumination = _illumination(recording) if any(item.step == "lens_shading" for item in chain.steps) else None
     total = len(recording.frames)
     try:
         gain, entries = None, []
         if any(item.step == "exposure" and item.auto for item in chain.steps):
-            gain = develop(recording.frames[total // 2], camera, chain, illumination=illumination).exposure_gain
+            middle = recording.frames[total // 2]
+            gain = develop(middle, camera, chain, illumination=illumination, noise=noise).exposure_gain
         for number, frame in enumerate(recording.frames):
-            done = develop(frame, camera, chain, illumination=illumination, exposure_gain=gain)
+            done = develop(frame, camera, chain, illumination=illumination, exposure_gain=gain, noise=noise)
             name = f"{number:06d}.png" if done.image.dtype == np.uint8 else f"{number:06d}.tif"
             with output_errors(target.target):
                 write_picture(target.path / name, done.image)
@@ -77,6 +89,7 @@ def develop_recording(
             "recording": recording.path.name,
             "pipeline": chain.model_dump(mode="json", exclude_none=True),
             "camera": camera.model_dump(mode="json"),
+            "noise": None if noise is None else noise.describe(),
             "software": manifests.software_versions(),
             "pictures": entries,
         }

@@ -2,9 +2,9 @@
 
 Universal co-kriging (Wackernagel, Multivariate Geostatistics, 3rd ed. 2003, ch. 23-24), which is the linear
 minimum-mean-square demosaicing of Trussell and Hartley (IEEE TIP 11, 2002) with the constraint that planes
-of any colour come out exactly. The prior says two things of pictures: nearby samples are alike,
+of any colour come out exactly. A prior says two things of pictures: nearby samples are alike,
 cov = exp(-distance / length), and colours go together, cov(colour a, colour b) = cov · (1 + colour · [a = b]).
-It needs no training data and knows any tile, with holes.
+`Prior` has others beside that one. No training data is needed, and any tile will do, with holes.
 
 A stencil is an array of weights [output, input position in the block, block row - 1 … + 1, block col - 1 … + 1].
 """
@@ -12,48 +12,110 @@ A stencil is an array of weights [output, input position in the block, block row
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 #: Correlation length, px; pictures have no scale of their own, and between 10 and 100 px results hardly change.
 LENGTH_PX = 24.0
+#: How many times longer the correlation is along a direction than across it.
+ELONGATION = 6.0
+#: Correlation length of a picture that is smooth on the scale of a pixel, px.
+SMOOTH_PX = 1.5
 #: Variance of the differences of colours over the variance of what they share, after white balance.
 COLOUR = 0.06
 #: Variance of noise over that of the picture; keeps the equations well posed, smooths next to nothing.
 NOISE = 1e-3
 #: Samples farther than this from the block take no part, px.
 REACH_PX = 4
+#: OpenBLAS multiplies matrices of up to this many products on the calling thread; the bands of a frame are threads
+#: already, and threads of its own would only wait for each other.
 _ONE_THREAD = 1 << 18
+_PIECE = 64
 
 Block = tuple[tuple[int, ...], ...]
 
 
-def _solve(
-    at: NDArray, channel: NDArray, to: NDArray, to_channel: NDArray, scale: NDArray, colour: float
-) -> NDArray[np.float64]:
-    """Kriging weights [sample, target] of samples at `at` [n, 2] for targets at `to` [m, 2]."""
-    names = np.unique(channel)
+@dataclass(frozen=True)
+class Prior:
+    """What is taken to be likely of a picture.
 
-    def covariance(a: NDArray, ca: NDArray, b: NDArray, cb: NDArray) -> NDArray:
-        distance = np.hypot(*(a[:, None] - b[None]).transpose(2, 0, 1))
-        return np.exp(-distance / LENGTH_PX) * (1 + colour * (ca[:, None] == cb[None]))
+    Parameters
+    ----------
+    colour : variance of the differences of colours over that of what they share.
+    angle : direction in which the picture changes least, radians from the rows towards the columns; None for none.
+    line : predict from the target's own column (0) or row (1) alone; None from all around.
+    smooth : no detail below `SMOOTH_PX` (a Matérn covariance of order 3/2) instead of detail of all sizes.
+    grey : all colours are the same, in the mean too.
+    """
 
-    def planes(points: NDArray, c: NDArray) -> NDArray:
-        own = (c[:, None] == names).astype(np.float64)
-        shift = (points - to.mean(axis=0)) / scale
-        used = [np.ones(len(points)), *(shift[:, k] for k in range(2) if np.ptp(at[:, k]) > 0)]
-        return np.concatenate([own * term[:, None] for term in used], axis=1)
+    colour: float = COLOUR
+    angle: float | None = None
+    line: int | None = None
+    smooth: bool = False
+    grey: bool = False
 
-    drift = planes(at, channel)
-    n, p = drift.shape
-    system = np.zeros((n + p, n + p))
-    system[:n, :n] = covariance(at, channel, at, channel) + NOISE * np.eye(n)
-    system[:n, n:], system[n:, :n] = drift, drift.T
-    right = np.vstack([covariance(at, channel, to, to_channel), planes(to, to_channel).T])
-    # least squares: on a sparse tile the samples in reach may not determine every plane
-    return np.linalg.lstsq(system, right, rcond=1e-10)[0][:n]
+    def told_apart(self, channel: NDArray) -> NDArray:
+        """Channels, all the same where they cannot differ."""
+        return np.zeros_like(channel) if self.grey else channel
+
+    def covariance(self, dy: NDArray, dx: NDArray, same: NDArray) -> NDArray[np.float64]:
+        """Of samples so far apart, px; `same` says where they have the same colour."""
+        shared = own = np.exp(-np.hypot(dy, dx) / LENGTH_PX)
+        if self.smooth:
+            far = np.hypot(dy, dx) / SMOOTH_PX
+            shared = (1 + far) * np.exp(-far)
+        elif self.angle is not None:
+            along = dx * np.cos(self.angle) + dy * np.sin(self.angle)
+            across = dy * np.cos(self.angle) - dx * np.sin(self.angle)
+            shared = np.exp(-np.hypot(along / ELONGATION, across) * np.sqrt(ELONGATION) / LENGTH_PX)
+        return shared + self.colour * own * same
+
+
+#: Nothing known of direction, colours as in most pictures.
+ISOTROPIC = Prior()
+
+
+class _Equations:
+    """The kriging equations of samples at `at` [n, 2], with planes of every colour as drift, and their inverse."""
+
+    def __init__(self, at: NDArray, channel: NDArray, prior: Prior, scale: NDArray) -> None:
+        self._at, self._channel, self._prior = at, prior.told_apart(channel), prior
+        self._names = np.unique(self._channel)
+        self._moves = [axis for axis in range(2) if np.ptp(at[:, axis]) > 0]
+        self._centre, self._scale = at.mean(axis=0), scale
+        drift = self._planes(at, self._channel)
+        n, p = drift.shape
+        system = np.zeros((n + p, n + p))
+        system[:n, :n] = self._covariance(at, self._channel) + NOISE * np.eye(n)
+        system[:n, n:], system[n:, :n] = drift, drift.T
+        self.inverse = _inverse(system)[:n]
+
+    def _covariance(self, at: NDArray, channel: NDArray) -> NDArray[np.float64]:
+        dy, dx = (self._at[:, None] - at[None]).transpose(2, 0, 1)
+        return self._prior.covariance(dy, dx, self._channel[:, None] == channel[None])
+
+    def _planes(self, at: NDArray, channel: NDArray) -> NDArray[np.float64]:
+        own = (channel[:, None] == self._names).astype(np.float64)
+        shift = (at - self._centre) / self._scale
+        return np.concatenate([own, *(own * shift[:, axis, None] for axis in self._moves)], axis=1)
+
+    def weights(self, at: NDArray, channel: NDArray) -> NDArray[np.float64]:
+        """Of each sample for targets at `at` [m, 2], [n, m]."""
+        told = self._prior.told_apart(channel)
+        return self.inverse @ np.vstack([self._covariance(at, told), self._planes(at, told).T])
+
+
+def _inverse(system: NDArray) -> NDArray[np.float64]:
+    """Of a symmetric matrix; the pseudo-inverse where, on a sparse tile, the samples do not determine every plane."""
+    try:
+        inverse = np.linalg.inv(system)
+    except np.linalg.LinAlgError:
+        inverse = np.zeros_like(system)
+    if np.abs(system @ inverse - np.eye(len(system))).max() < 1e-6:
+        return inverse
+    return np.linalg.pinv(system, rcond=1e-10, hermitian=True)
 
 
 def _window(block: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -67,36 +129,61 @@ def _window(block: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     return index, np.stack([y, x], axis=1).astype(np.float64), channel
 
 
-@functools.lru_cache(maxsize=64)
-def stencil(tile: Block, channel: int, targets: tuple[tuple[int, int], ...]) -> NDArray[np.float32]:
-    """Weights for one channel at positions of the block, from all samples around."""
+@functools.lru_cache(maxsize=512)
+def _equations(tile: Block, prior: Prior, line: int | None) -> tuple[NDArray[np.int64], NDArray, NDArray, _Equations]:
+    """Index, place and channel of a block's samples, all or on one line of a prior of lines, and their equations."""
     block = np.array(tile)
     index, at, seen = _window(block)
-    to = np.array(targets, dtype=np.float64)
-    weights = np.zeros((len(targets), block.size * 9))
-    weights[:, index] = _solve(at, seen, to, np.full(len(targets), channel), np.array(block.shape), COLOUR).T
-    return weights.reshape(len(targets), block.size, 3, 3).astype(np.float32)
+    if line is not None and prior.line is not None:
+        on = at[:, 1 - prior.line] == line
+        index, at, seen = index[on], at[on], seen[on]
+    return index, at, seen, _Equations(at, seen, prior, np.array(block.shape))
 
 
-@functools.lru_cache(maxsize=64)
-def line_stencil(tile: Block, channel: int, targets: tuple[tuple[int, int], ...], along: int) -> NDArray[np.float32]:
-    """Weights from the samples of the target's own column (`along` 0) or row (1) alone.
+def _known_from(
+    tile: Block, prior: Prior, channel: int, place: tuple[int, int], least: int
+) -> tuple[NDArray[np.int64], NDArray, NDArray, _Equations]:
+    """What a place is predicted from: its line, where the prior has lines and the channel occurs there often enough."""
+    if prior.line is not None:
+        line = np.array(tile)[:, place[1]] if prior.line == 0 else np.array(tile)[place[0]]
+        if np.count_nonzero(line >= 0 if prior.grey else line == channel) * 3 > least:
+            return _equations(tile, prior, place[1 - prior.line])
+    return _equations(tile, replace(prior, line=None), None)
 
-    A line on which the channel does not occur gets the weights of `stencil`.
+
+@functools.lru_cache(maxsize=256)
+def stencil(
+    tile: Block, channel: int, targets: tuple[tuple[int, int], ...], prior: Prior = ISOTROPIC
+) -> NDArray[np.float32]:
+    """Weights for one channel at positions of the block, from all samples around.
+
+    With a prior of lines, a target on whose line the channel does not occur gets the weights from all around.
     """
     block = np.array(tile)
-    index, at, seen = _window(block)
-    weights = stencil(tile, channel, targets).reshape(len(targets), -1).astype(np.float64)
+    weights = np.zeros((len(targets), block.size * 9))
     for k, target in enumerate(targets):
-        line = at[:, 1 - along] == target[1 - along]
-        if not (seen[line] == channel).any():
-            continue
-        to = np.array([target], dtype=np.float64)
-        weights[k] = 0
-        weights[k, index[line]] = _solve(
-            at[line], seen[line], to, np.array([channel]), np.array(block.shape), COLOUR
-        )[:, 0]  # fmt: skip
+        index, _, _, equations = _known_from(tile, prior, channel, target, 0)
+        weights[k, index] = equations.weights(np.array([target], dtype=np.float64), np.array([channel]))[:, 0]
     return weights.reshape(len(targets), block.size, 3, 3).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=256)
+def residual_stencil(tile: Block, prior: Prior = ISOTROPIC) -> NDArray[np.float32]:
+    """Weights that give how far each sample of the block is from what the others say it should be.
+
+    Leave-one-out residuals of kriging in closed form (Dubrule, Math. Geology 15, 1983): with the inverse B of the
+    kriging matrix, r_i = Σ_j B_ij y_j / B_ii. One output for each position of the block that has a sample.
+    """
+    block = np.array(tile)
+    places = np.argwhere(block >= 0)
+    weights = np.zeros((len(places), block.size * 9))
+    for k, place in enumerate(places):
+        index, at, _, equations = _known_from(tile, prior, int(block[tuple(place)]), tuple(place), 1)
+        own = int(np.flatnonzero((at == place).all(axis=1))[0])
+        inverse = equations.inverse[own, : len(at)]
+        if inverse[own] > 1e-9:
+            weights[k, index] = inverse / inverse[own]
+    return weights.reshape(len(places), block.size, 3, 3).astype(np.float32)
 
 
 @functools.lru_cache(maxsize=64)
@@ -106,12 +193,9 @@ def lone_stencil(
     """Weights from samples of one kind at these positions of each block; inputs are numbered as in `samples`."""
     block = np.full(shape, -1)
     block[tuple(np.array(samples).T)] = 0
-    index, at, seen = _window(block)
-    to = np.array(targets, dtype=np.float64)
-    dense = np.zeros((len(targets), block.size * 9))
-    dense[:, index] = _solve(at, seen, to, np.zeros(len(targets), dtype=int), np.array(shape), 0.0).T
+    dense = stencil(tuple(map(tuple, block.tolist())), 0, targets, Prior(colour=0.0))
     kept = [row * shape[1] + col for row, col in samples]
-    return dense.reshape(len(targets), block.size, 3, 3)[:, kept].astype(np.float32)
+    return dense[:, kept]
 
 
 @functools.lru_cache(maxsize=64)
@@ -126,30 +210,46 @@ def bilinear_stencil(shape: tuple[int, int], centre: tuple[float, float]) -> NDA
     return np.einsum("ia,jb->ijab", rows, cols).reshape(-1, 1, 3, 3).astype(np.float32)
 
 
-def apply(planes: NDArray[np.float32], weights: NDArray[np.float32], rows: slice) -> NDArray[np.float32]:
+@dataclass(frozen=True)
+class Taps:
+    """A stencil made ready: where it reads (position, block row, block col), and weights [output, reading]."""
+
+    reads: tuple[tuple[int, int, int], ...]
+    matrix: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, weights: NDArray[np.float32]) -> Taps:
+        reads = np.argwhere(np.abs(weights).max(axis=0) > 0)
+        return cls(tuple((int(p), int(y), int(x)) for p, y, x in reads), np.ascontiguousarray(weights[:, *reads.T]))
+
+
+def apply(
+    planes: NDArray[np.float32], stencil: Taps | NDArray[np.float32], rows: slice, cols: slice | None = None
+) -> NDArray[np.float32]:
     """A stencil at block rows `rows` of planes [position, block row, block col] with one block of border.
+
+    Parameters
+    ----------
+    rows, cols : count without the border; all columns by default.
 
     Returns
     -------
-    float32 [output, row, col] : `rows` counts without the border.
+    float32 [output, row, col].
     """
-    count, cols = rows.stop - rows.start, planes.shape[2] - 2
-    used: Sequence[tuple[int, int, int]] = [tuple(k) for k in np.argwhere(np.abs(weights).max(axis=0) > 0)]
-    matrix = np.ascontiguousarray([weights[:, p, dy, dx] for p, dy, dx in used]).T
-    size = count * cols
-    # OpenBLAS multiplies matrices of up to this many products on the calling thread; the bands are threads already,
-    # and threads of its own would only wait for each other
-    width = max(16, _ONE_THREAD // matrix.size // 16 * 16)
-    pieces = -(-size // width)
-    around = np.empty((len(used), pieces * width), dtype=np.float32)
-    for k, (position, dy, dx) in enumerate(used):
-        part = around[k, :size].reshape(count, cols)
-        part[:] = planes[position, rows.start + dy : rows.start + dy + count, dx : dx + cols]
-    around[:, size:] = 0
-    out = np.empty((len(weights), pieces * width), dtype=np.float32)
-    np.matmul(
-        matrix,
-        around.reshape(len(used), pieces, width).transpose(1, 0, 2),
-        out=out.reshape(len(weights), pieces, width).transpose(1, 0, 2),
-    )
-    return out[:, :size].reshape(-1, count, cols)
+    taps = stencil if isinstance(stencil, Taps) else Taps.of(stencil)
+    cols = slice(0, planes.shape[2] - 2) if cols is None else cols
+    height, width = rows.stop - rows.start, cols.stop - cols.start
+    size, count = height * width, len(taps.reads)
+    pieces = -(-size // _PIECE)
+    line = np.zeros(pieces * _PIECE, dtype=np.float32)
+    image, cut = line[:size].reshape(height, width), line.reshape(pieces, _PIECE)
+    around = np.empty((pieces, count, _PIECE), dtype=np.float32)
+    for k, (position, dy, dx) in enumerate(taps.reads):
+        image[:] = planes[position, rows.start + dy : rows.stop + dy, cols.start + dx : cols.stop + dx]
+        around[:, k] = cut
+    out = np.empty((len(taps.matrix), pieces * _PIECE), dtype=np.float32)
+    together = max(1, _ONE_THREAD // (count * _PIECE))
+    for first in range(0, len(out), together):
+        some = slice(first, first + together)
+        np.matmul(taps.matrix[some], around, out=out[some].reshape(-1, pieces, _PIECE).transpose(1, 0, 2))
+    return out[:, :size].reshape(-1, height, width)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,8 @@ from pydantic import Field, model_validator
 from hesim_render.camera import Camera
 from hesim_render.errors import RangeError
 from hesim_render.frame import Frame
-from hesim_render.isp.steps import ON_MOSAIC, Demosaic, Development, Encode, Step
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.steps import BEFORE_DENOISE, ON_MOSAIC, Demosaic, Denoise, Development, Encode, Step
 from hesim_render.mosaic import Mosaic
 from hesim_render.specs.files import Strict, load_yaml, validate
 
@@ -20,8 +22,8 @@ from hesim_render.specs.files import Strict, load_yaml, validate
 class Pipeline(Strict):
     """Steps in the order in which they are done; a step may be left out, and some may stand more than once.
 
-    Steps on the mosaic (black_level, fill, lens_shading, white_balance) come before the one demosaic, the others
-    after it; encode, if there is one, comes last.
+    Steps on the mosaic (black_level, fill, denoise, lens_shading, white_balance) come before the one demosaic, the
+    others after it; encode, if there is one, comes last. Before denoise stand black_level and, if need be, fill.
     """
 
     schema_version: Literal[1] = 1
@@ -41,12 +43,20 @@ class Pipeline(Strict):
                 raise ValueError(f"steps: {item.step} must come {side} demosaic")
             if isinstance(item, Encode) and k != len(names) - 1:
                 raise ValueError("steps: encode must come last")
+            if isinstance(item, Denoise):
+                before = self.steps[:k]
+                if "black_level" not in names[:k] or not all(isinstance(other, BEFORE_DENOISE) for other in before):
+                    raise ValueError("steps: denoise must come after black_level, with nothing but fill in between")
         return self
 
     @classmethod
     def of(cls, *steps: str | dict[str, Any]) -> Pipeline:
         """A pipeline of step names, or of dictionaries as in a file."""
         return cls.model_validate({"steps": [{"step": item} if isinstance(item, str) else item for item in steps]})
+
+    def without(self, step: str) -> Pipeline:
+        """The same without steps of a name."""
+        return self.model_copy(update={"steps": [item for item in self.steps if item.step != step]})
 
 
 #: Colours as the camera's description has them, no exposure of its own: what an inverse pipeline undoes.
@@ -55,6 +65,9 @@ DEFAULT = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix
 PICTURE = Pipeline.of(
     "black_level", "white_balance", "demosaic", "colour_matrix", {"step": "exposure", "auto": True}, "encode"
 )
+
+#: The same for frames whose sensor's noise is known: its maps taken out, its noise reduced.
+DENOISED_PICTURE = Pipeline.of("black_level", "denoise", *PICTURE.model_dump()["steps"][1:])
 
 
 def load_pipeline(file: str | Path) -> Pipeline:
@@ -100,13 +113,17 @@ def develop(
     *,
     illumination: NDArray[np.float32] | None = None,
     exposure_gain: float | None = None,
+    noise: FrameNoise | None = None,
 ) -> Development:
     """As `process`; the result also says what steps found out (`Development.report`).
+
+    What is measured on a chart is measured on the linear data without denoise, also where that step is there.
 
     Parameters
     ----------
     illumination : relative illumination [row, col], for a lens_shading step without figures.
     exposure_gain : for an automatic exposure, instead of measuring the frame.
+    noise : of the sensor, for a denoise step; a `Frame` says its exposure itself.
     """
     camera = mosaic if isinstance(mosaic, Camera) else Camera.of(mosaic)
     raw = np.asarray(frame_or_raw.raw if isinstance(frame_or_raw, Frame) else frame_or_raw)
@@ -117,9 +134,31 @@ def develop(
         raise RangeError("type of the RAW frame", str(raw.dtype), "numbers")
     if raw.dtype.kind == "f" and not np.isfinite(raw).all():
         raise RangeError("RAW frame", "NaN or infinite values", "finite DN")
-    state = Development(raw, camera, tile, illumination, exposure_gain)
-    for item in (pipeline or DEFAULT).steps:
+    if noise is not None and isinstance(frame_or_raw, Frame):
+        noise = noise.at(frame_or_raw.exposure_us)
+    state = Development(raw, camera, tile, illumination, exposure_gain, noise)
+    chain = pipeline or DEFAULT
+    for item in _charts_measured(state, chain):
         item.run(state)
     if state.image.shape[-1] == 1:  # a mono camera without a matrix step
         state.image = np.repeat(state.image, 3, axis=-1)
     return state
+
+
+def _charts_measured(state: Development, chain: Pipeline) -> list[Step]:
+    """The steps; where there is a denoise, those with a chart have what is measured without it."""
+    charts = [k for k, item in enumerate(chain.steps) if getattr(item, "method", None) == "chart"]
+    steps = list(chain.steps)
+    if not charts or not any(isinstance(item, Denoise) for item in steps):
+        return steps
+    linear = replace(state)
+    for k, item in enumerate(steps[: charts[-1] + 1]):
+        if isinstance(item, Denoise):
+            continue
+        item.run(linear)
+        if k in charts:
+            found = linear.report or {}
+            result = {"gains": found["white_balance"]} if item.step == "white_balance" else {"matrix": found["matrix"]}
+            steps[k] = item.model_copy(update={"method": "given", **result})
+    state.report = linear.report
+    return steps

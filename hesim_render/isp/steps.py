@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
 from hesim_render.camera import Camera
-from hesim_render.errors import SpecError
+from hesim_render.errors import RangeError, SpecError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
 from hesim_render.isp.demosaicing import demosaic
+from hesim_render.isp.denoise import denoise
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.rows import row_offsets
 from hesim_render.specs.files import Strict
 from hesim_render.transfer import Depth, Transfer, encode
 
@@ -31,6 +34,8 @@ class Development:
     tile : channel numbers of the mosaic as it is now (holes get filled).
     illumination : relative illumination of the lens [row, col], where it is known.
     exposure_gain : gain of an automatic exposure, kept so that all frames of a recording get the same.
+    noise : of the sensor at this frame's exposure, where it is known.
+    span_dn : white less black level of the image, once black is at 0 and white at 1.
     report : what steps found out (gains, ΔE2000).
     """
 
@@ -39,6 +44,8 @@ class Development:
     tile: NDArray[np.int64]
     illumination: NDArray[np.float32] | None = None
     exposure_gain: float | None = None
+    noise: FrameNoise | None = None
+    span_dn: float | None = None
     report: dict[str, Any] | None = None
 
     def note(self, **found: Any) -> None:
@@ -92,6 +99,7 @@ class BlackLevel(Strict):
         white = state.camera.white_level_dn if self.white_level_dn is None else self.white_level_dn
         rows, pixels = (None if m is None else m.load() for m in (self.row_map, self.pixel_map))
         state.image = levels.black_level(state.image, black, white, rows, pixels)
+        state.span_dn = white - black
 
 
 class Fill(Strict):
@@ -108,6 +116,36 @@ class Fill(Strict):
         if self.event_pixels and not np.array_equal(filled, state.tile):
             state.image = fill.fill_positions(state.image, state.tile, filled)
             state.tile = filled
+
+
+class Denoise(Strict):
+    """The sensor's maps taken out, row offsets without a map estimated, and `denoise.denoise`, by its noise model.
+
+    `strength` multiplies the standard deviation of the noise; at 0 only maps and rows are corrected. `row_std_dn` is
+    the standard deviation over rows of offsets without a map, by default what the noise model says.
+    """
+
+    step: Literal["denoise"]
+    strength: float = Field(1.0, ge=0, le=4)
+    row_std_dn: float | None = Field(None, ge=0)
+
+    def run(self, state: Development) -> None:
+        noise, span = state.noise, state.span_dn
+        if noise is None or span is None:
+            raise SpecError("no noise model is known here; give one, or leave the step out", key="denoise")
+        if noise.beta.shape[:2] != state.tile.shape:
+            raise RangeError("tile of the noise model", noise.beta.shape[:2], f"the camera's {state.tile.shape}")
+        saturated = state.image >= 1
+        signal = noise.corrected(state.image * np.float32(span))
+        row_std_dn = noise.row_std_dn if self.row_std_dn is None else self.row_std_dn
+        if row_std_dn > 0:
+            offsets = row_offsets(signal, state.tile, noise, row_std_dn)
+            state.note(row_offsets_rms_dn=float(np.sqrt(np.mean(offsets**2))))
+            signal -= offsets[:, None]
+        if self.strength > 0 and not noise.is_clean:
+            signal = denoise(signal, state.tile, noise.times(self.strength), span, state.camera.white_balance)
+        # what is clipped has no offset: it stays white
+        state.image = np.where(saturated, np.maximum(signal / np.float32(span), 1), signal / np.float32(span))
 
 
 class LensShading(Strict):
@@ -267,6 +305,7 @@ class Encode(Strict):
 Step = Annotated[
     BlackLevel
     | Fill
+    | Denoise
     | LensShading
     | WhiteBalance
     | Demosaic
@@ -278,4 +317,6 @@ Step = Annotated[
     Field(discriminator="step"),
 ]
 #: Where a step may stand: on the mosaic (before the demosaic) or on the picture (after it).
-ON_MOSAIC = (BlackLevel, Fill, LensShading, WhiteBalance)
+ON_MOSAIC = (BlackLevel, Fill, Denoise, LensShading, WhiteBalance)
+#: Steps between which and the RAW data the noise is what the sensor's model says.
+BEFORE_DENOISE = (BlackLevel, Fill)

@@ -1,0 +1,182 @@
+"""Noise out of blocks of samples by comparing each patch with the patches that look like it.
+
+A patch is 2×2 neighbouring blocks. In a basis fitted to its tile (the principal axes of pictures under the prior of
+`kriging`), its coefficients are compared with those of the patches around; the mean and the spread of the 16 that are
+nearest say how much of each coefficient is picture. That is the collaborative filtering of Dabov et al. (BM3D, IEEE TIP
+16, 2007; on mosaics Danielyan et al. 2009) with the statistics of Lebrun, Buades and Morel (non-local Bayes, SIAM J.
+Imaging Sci. 6, 2013): a first pass with thresholds, a second as a Wiener filter that knows the first. Patches move by
+whole blocks, so that colours meet their own and the basis serves any tile, with holes.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.bands import in_bands
+from hesim_render.isp.kriging import ISOTROPIC
+
+#: Patches that are taken for alike, and how far they are looked for, blocks.
+_ALIKE, _REACH = 16, 4
+#: Coefficients that are compared, the largest of pictures first; in the first pass only where they stand out of noise.
+_COMPARED, _STANDS_OUT = 16, 1.5
+#: A mean is taken for picture from so many of its own standard deviations on.
+_THRESHOLD = 2.7
+#: Share of a patch's own deviation, beside the spread over its group, in what the second pass takes for picture.
+_OWN = 0.5
+#: Added to the variance that is left in a patch before patches are weighed by it.
+_LEAST_LEFT = 1.0
+_BAND_ROWS, _AT_ONCE = 16, 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Samples in blocks, each of standard deviation 1.
+
+    Parameters
+    ----------
+    values : float32 [block row, block col, sample].
+    at : [sample, 2], place of each in its block (row, col), px.
+    size : rows and columns of a block, px.
+    channel : of each sample.
+    amplitude : signal of each sample, relative: what white is in units of its noise.
+    """
+
+    values: NDArray[np.float32]
+    at: NDArray[np.float64]
+    size: tuple[int, int]
+    channel: NDArray[np.int64]
+    amplitude: NDArray[np.float64]
+
+    def basis(self) -> NDArray[np.float32]:
+        """Principal axes of a patch of pictures, [sample of 2×2 blocks, axis], the largest first."""
+        corners = [(i, j) for i in range(2) for j in range(2)]
+        at = np.concatenate([self.at + np.array(corner) * self.size for corner in corners])
+        channel, amplitude = np.tile(self.channel, 4), np.tile(self.amplitude, 4)
+        dy, dx = (at[:, None] - at[None]).transpose(2, 0, 1)
+        covariance = ISOTROPIC.covariance(dy, dx, channel[:, None] == channel[None])
+        _, axes = np.linalg.eigh(covariance * amplitude[:, None] * amplitude)
+        return np.ascontiguousarray(axes[:, ::-1], dtype=np.float32)
+
+
+def one_pass(
+    blocks: Blocks, pilot: NDArray[np.float32] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """One pass over all patches.
+
+    Parameters
+    ----------
+    pilot : values of an earlier pass, which the second pass takes for the picture; None for the first pass.
+
+    Returns
+    -------
+    float32 [block row, block col, sample], sums of estimates, and [block row, block col], their weights.
+    """
+    values, basis = blocks.values, blocks.basis()
+    patch_rows, patch_cols = values.shape[0] - 1, values.shape[1] - 1
+    total, weight = np.zeros_like(values), np.zeros(values.shape[:2], dtype=np.float32)
+    lock = threading.Lock()  # neighbouring bands share a row of blocks: two summands, whose order does not matter
+
+    def work(rows: slice) -> None:
+        halo = slice(max(rows.start - _REACH, 0), min(rows.stop + _REACH, patch_rows))
+        noisy = _coefficients(values, basis, halo)
+        clean = None if pilot is None else _coefficients(pilot, basis, halo)
+        inside = slice(rows.start - halo.start, rows.stop - halo.start)
+        alike = _alike(_features(noisy if clean is None else clean, clean is None), inside)
+        estimate, weights = _estimate(noisy, clean, alike, inside.start * patch_cols)
+        patches = (estimate @ basis.T).reshape(rows.stop - rows.start, patch_cols, 4, -1)
+        patches *= weights.reshape(patches.shape[:2])[..., None, None]
+        part = np.zeros((len(patches) + 1, *values.shape[1:]), dtype=np.float32)
+        shares = np.zeros(part.shape[:2], dtype=np.float32)
+        for corner, (i, j) in enumerate(np.ndindex(2, 2)):
+            part[i : i + len(patches), j : j + patch_cols] += patches[:, :, corner]
+            shares[i : i + len(patches), j : j + patch_cols] += weights.reshape(patches.shape[:2])
+        with lock:
+            total[rows.start : rows.stop + 1] += part
+            weight[rows.start : rows.stop + 1] += shares
+
+    in_bands(patch_rows, work, _BAND_ROWS)
+    return total, weight
+
+
+def _coefficients(values: NDArray[np.float32], basis: NDArray[np.float32], rows: slice) -> NDArray[np.float32]:
+    """Of the patches that begin in `rows`, [row, col, axis]."""
+    above, below = values[rows], values[rows.start + 1 : rows.stop + 1]
+    corners = [half[:, j : half.shape[1] - 1 + j] for half in (above, below) for j in range(2)]
+    return np.concatenate(corners, axis=2) @ basis
+
+
+def _features(coefficients: NDArray[np.float32], is_noisy: bool) -> NDArray[np.float32]:
+    """What patches are compared by, [row, col, feature]."""
+    found = coefficients[..., :_COMPARED].copy()
+    if is_noisy:
+        found[..., 1:][np.abs(found[..., 1:]) < _STANDS_OUT] = 0
+    return found
+
+
+def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:
+    """Flat indices of the patches most like each of those of rows `inside` (it counts itself), [patch, member]."""
+    height, width = features.shape[:2]
+    count = inside.stop - inside.start
+    reach = range(-_REACH, _REACH + 1)
+    offsets = np.array([(dy, dx) for dy in reach for dx in reach])
+    distance = np.full((count, width, len(offsets)), np.inf, dtype=np.float32)
+    for k, (dy, dx) in enumerate(offsets):
+        top, bottom = max(inside.start, -dy), min(inside.stop, height - dy)
+        left, right = max(0, -dx), min(width, width - dx)
+        if top >= bottom or left >= right:
+            continue
+        difference = features[top:bottom, left:right] - features[top + dy : bottom + dy, left + dx : right + dx]
+        into = distance[top - inside.start : bottom - inside.start, left:right, k]
+        np.einsum("rcf,rcf->rc", difference, difference, out=into)
+    members = min(_ALIKE, min(_REACH + 1, height) * min(_REACH + 1, width))
+    flat = distance.reshape(count * width, -1)
+    nearest = np.argpartition(flat, members - 1, axis=1)[:, :members]
+    own = np.arange(inside.start * width, inside.stop * width)
+    return own[:, None] + (offsets @ np.array([width, 1]))[nearest]
+
+
+def _estimate(
+    noisy: NDArray[np.float32], clean: NDArray[np.float32] | None, alike: NDArray[np.int64], first: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Coefficients without noise of the patches from `first` on, [patch, axis], and weights [patch]."""
+    size = noisy.shape[2]
+    noisy, clean = noisy.reshape(-1, size), None if clean is None else clean.reshape(-1, size)
+    out = np.empty((len(alike), size), dtype=np.float32)
+    weights = np.empty(len(alike), dtype=np.float32)
+    members = float(alike.shape[1])
+    for begin in range(0, len(alike), _AT_ONCE):
+        part = slice(begin, min(begin + _AT_ONCE, len(alike)))
+        own = noisy[first + part.start : first + part.stop]
+        mean, square = _moments(noisy, alike[part])
+        if clean is None:
+            spread = (square - mean * mean) * np.float32(members / max(members - 1, 1))
+            of_mean = (np.abs(mean) > _THRESHOLD / members**0.5).astype(np.float32)
+            of_rest = np.maximum(spread - 1, 0) / np.maximum(spread, np.float32(1e-6))
+        else:
+            picture, square = _moments(clean, alike[part])
+            spread = np.maximum(square - picture * picture, 0)
+            away = clean[first + part.start : first + part.stop] - picture
+            signal = spread + np.float32(_OWN) * (away * away - spread)
+            of_mean = picture * picture
+            of_mean /= of_mean + 1 / members
+            of_rest = signal / (signal + 1)
+        out[part] = of_mean * mean + of_rest * (own - mean)
+        left = np.einsum("pc,pc->p", of_rest, of_rest) + np.einsum("pc,pc->p", of_mean, of_mean) / members
+        weights[part] = 1 / (np.float32(_LEAST_LEFT) + left)
+    return out, weights
+
+
+def _moments(coefficients: NDArray[np.float32], alike: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
+    """Mean and mean square over the members, [patch, axis]."""
+    total = np.zeros((len(alike), coefficients.shape[1]), dtype=np.float32)
+    squares = np.zeros_like(total)
+    for member in alike.T:
+        values = coefficients[member]
+        total += values
+        np.multiply(values, values, out=values)
+        squares += values
+    return total / np.float32(alike.shape[1]), squares / np.float32(alike.shape[1])

@@ -1,0 +1,167 @@
+"""Noise reduction on the mosaic, before the demosaic, by the sensor's own noise model.
+
+The signal goes through a transform under which its noise is even (`stabilise`), then through two passes of
+`collaborate`, each over patches from whole blocks and from half a block on. Noise of long waves, which patches of this
+size cannot tell from picture, is taken out of the means of blocks, an image of their own with less noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
+
+from hesim_render.isp import collaborate, kriging
+from hesim_render.isp.blocks import block_of, bordered, join, split
+from hesim_render.isp.collaborate import Blocks
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.stabilise import Stabiliser
+
+#: Below which wave lengths the means of blocks leave the result alone: standard deviation of a Gaussian, blocks.
+_LONG_BLOCKS = 2.0
+
+
+def denoise(
+    signal_dn: NDArray[np.float32], tile: ArrayLike, noise: FrameNoise, top_dn: float, balance: Sequence[float]
+) -> NDArray[np.float32]:
+    """A mosaic with less temporal noise.
+
+    Parameters
+    ----------
+    signal_dn : [row, col], DN above black, without what maps know (`FrameNoise.corrected`).
+    tile : channel of each position, -1 where there is no value.
+    noise : of the sensor; its tile has the shape of `tile`.
+    top_dn : signal at which pixels saturate; samples there are kept.
+    balance : gain of each channel that makes white equal in all.
+
+    Returns
+    -------
+    float32 [row, col], DN above black.
+    """
+    channels = np.asarray(tile)
+    stabilisers = _stabilisers(noise, channels, top_dn)
+    stable = _each(signal_dn, channels.shape, stabilisers, Stabiliser.forward)
+    clean = _reduced(stable, channels, 1 / np.sqrt(np.asarray(balance, dtype=np.float64)))
+    out = _each(clean, channels.shape, stabilisers, Stabiliser.backward)
+    return np.where(signal_dn >= top_dn, signal_dn, out)
+
+
+def _stabilisers(noise: FrameNoise, tile: NDArray, top_dn: float) -> dict[tuple[int, int], Stabiliser]:
+    """The transform of each position of the tile; positions of one noise share theirs."""
+    made: dict[tuple[float, float, float], Stabiliser] = {}
+    found = {}
+    for row, col in np.argwhere(tile >= 0):
+        law = noise.variance((int(row), int(col)))
+        if law not in made:
+            made[law] = Stabiliser(*law, top_dn)
+        found[int(row), int(col)] = made[law]
+    return found
+
+
+def _each(
+    image: NDArray[np.float32],
+    shape: tuple[int, ...],
+    stabilisers: dict[tuple[int, int], Stabiliser],
+    way: Callable[[Stabiliser, NDArray[np.float32]], NDArray[np.float32]],
+) -> NDArray[np.float32]:
+    """`Stabiliser.forward` or `backward` of every position's own transform."""
+    if len(set(stabilisers.values())) == 1:
+        return way(next(iter(stabilisers.values())), image)
+    out = np.zeros_like(image)
+    for (row, col), stabiliser in stabilisers.items():
+        part = (slice(row, None, shape[0]), slice(col, None, shape[1]))
+        out[part] = way(stabiliser, np.ascontiguousarray(image[part]))
+    return out
+
+
+def _reduced(stable: NDArray[np.float32], tile: NDArray, amplitude: NDArray) -> NDArray[np.float32]:
+    """The mosaic less noise of standard deviation 1."""
+    pilot = _over_phases(stable, None, tile, amplitude)
+    fine = _over_phases(stable, pilot, tile, amplitude)
+    return fine + _long_waves(stable, fine, tile, amplitude)
+
+
+def _over_phases(
+    stable: NDArray[np.float32], pilot: NDArray[np.float32] | None, tile: NDArray, amplitude: NDArray
+) -> NDArray[np.float32]:
+    """Mean of the estimates of patches that begin at whole blocks and of those that begin in the middle of blocks."""
+    block = block_of(tile)
+    total, weight = np.zeros_like(stable), np.zeros_like(stable)
+    for part in range(2):
+        top, left = (part * (size // 2) for size in block.shape)
+        if stable.shape[0] <= top or stable.shape[1] <= left:
+            continue
+        turned = np.roll(block, (-top, -left), axis=(0, 1))
+        blocks = _blocks(stable[top:, left:], turned, amplitude)
+        known = None if pilot is None else _blocks(pilot[top:, left:], turned, amplitude).values
+        sums, shares = collaborate.one_pass(blocks, known)
+        for image, values in ((total, sums), (weight, np.broadcast_to(shares[..., None], sums.shape))):
+            image[top:, left:] += _image(values, turned, image[top:, left:].shape)
+    return np.where(weight > 0, total / np.maximum(weight, np.float32(1e-12)), stable)
+
+
+def _blocks(stable: NDArray[np.float32], block: NDArray, amplitude: NDArray) -> Blocks:
+    places = np.argwhere(block >= 0)
+    planes = split(np.ascontiguousarray(stable), block.shape)[block.ravel() >= 0]
+    values = np.ascontiguousarray(planes.transpose(1, 2, 0))
+    channel = block[block >= 0]
+    return Blocks(values, places.astype(np.float64), block.shape, channel, amplitude[channel])
+
+
+def _image(values: NDArray[np.float32], block: NDArray, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Blocks with their border as an image; 0 where the tile has no value."""
+    inner = values[1:-1, 1:-1]
+    planes = np.zeros((*block.shape, *inner.shape[:2]), dtype=np.float32)
+    planes[block >= 0] = inner.transpose(2, 0, 1)
+    out = np.empty(shape, dtype=np.float32)
+    join(planes, out)
+    return out
+
+
+def _long_waves(
+    stable: NDArray[np.float32], fine: NDArray[np.float32], tile: NDArray, amplitude: NDArray
+) -> NDArray[np.float32]:
+    """What the means of blocks, freed of noise, have beyond those of a result, as an image."""
+    block = block_of(tile)
+    channels = [np.flatnonzero(block.ravel() == c) for c in range(block.max() + 1)]
+    roots = np.sqrt([len(own) for own in channels]).astype(np.float32)
+
+    def means(image: NDArray[np.float32]) -> NDArray[np.float32]:
+        planes = split(image, block.shape)[:, 1:-1, 1:-1]
+        return np.stack([planes[own].mean(axis=0) for own in channels])
+
+    clean = _reduced_means(means(stable) * roots[:, None, None], block.shape, amplitude * roots)
+    clean /= roots[:, None, None]
+    out = np.zeros_like(fine)
+    spread = kriging.bilinear_stencil(block.shape, tuple((size - 1) / 2 for size in block.shape))
+    for channel, rest in enumerate(clean - means(fine)):
+        smooth = bordered(gaussian_filter(rest, _LONG_BLOCKS, mode="nearest")[None])
+        planes = kriging.apply(smooth, spread, slice(0, rest.shape[0])).reshape(*block.shape, *rest.shape)
+        planes *= (block == channel)[:, :, None, None]
+        everywhere = np.empty_like(out)
+        join(planes, everywhere)
+        out += everywhere
+    return out
+
+
+def _reduced_means(means: NDArray[np.float32], pitch_px: tuple[int, ...], amplitude: NDArray) -> NDArray[np.float32]:
+    """Means [channel, row, col] of blocks `pitch_px` apart, less noise of standard deviation 1."""
+    square = np.zeros((2, 2), dtype=np.int64)
+    places = np.argwhere(square >= 0)
+    count = len(means)
+    blocks = Blocks(
+        np.concatenate([split(mean, square.shape) for mean in means]).transpose(1, 2, 0).copy(),
+        np.tile(places * np.array(pitch_px, dtype=np.float64), (count, 1)),
+        (2 * pitch_px[0], 2 * pitch_px[1]),
+        np.repeat(np.arange(count), len(places)),
+        np.repeat(amplitude, len(places)),
+    )
+    known = None
+    for _ in range(2):
+        sums, shares = collaborate.one_pass(blocks, known)
+        known = sums / shares[..., None]
+    assert known is not None
+    parts = np.split(known, count, axis=2)
+    return np.stack([_image(part, square, means.shape[1:]) for part in parts])

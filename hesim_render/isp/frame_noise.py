@@ -1,0 +1,220 @@
+"""What is known of the noise of a sensor's frames: its variance against the signal, and its fixed maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.bands import in_bands
+from hesim_render.errors import RangeError, SpecError
+from hesim_render.layout import Layout
+from hesim_render.noise.aps import ADC_VARIANCE_DN2, APS_TERMS, ApsNoise
+from hesim_render.specs.calibration import NoiseFile, read_calibration, read_maps
+from hesim_render.specs.sensor import SensorSpec
+from hesim_render.units import S_PER_US
+
+Map = float | NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameNoise:
+    """Noise of frames over the region read out, in the calibrated form (`hesim_render.noise.aps`).
+
+    Parameters
+    ----------
+    beta : [tile_row, tile_col, 6], temporal variance before the ADC over 1, I, t, I², I t, t²; DN and s.
+    exposure_us : exposure of the frame, µs.
+    residual_dn2 : variance beside it, DN²: what no term of `beta` has, and pixel offsets of which there is no map.
+    response_std : relative spread of responses of which there is no map.
+    row_std_dn : standard deviation over rows of offsets of which there is no map, DN.
+    offset_dn : N_FP less the black level, [row, col], DN; 0 where it is not known.
+    dark_dn_per_s : N_DP, mean signal of the dark current, [row, col] or a number, DN/s.
+    response : relative response of each pixel, [row, col] or 1.
+    """
+
+    beta: NDArray[np.float64]
+    exposure_us: float
+    residual_dn2: float = 0.0
+    response_std: float = 0.0
+    row_std_dn: float = 0.0
+    offset_dn: Map = 0.0
+    dark_dn_per_s: Map = 0.0
+    response: Map = 1.0
+
+    def __post_init__(self) -> None:
+        if self.beta.ndim != 3 or self.beta.shape[2] != 6 or not np.isfinite(self.beta).all():
+            raise RangeError("shape of beta", self.beta.shape, "(tile_row, tile_col, 6) of finite numbers")
+
+    @classmethod
+    def of_sensor(
+        cls, spec: SensorSpec, layout: Layout, off: frozenset[str] = frozenset(), maps: bool = True
+    ) -> FrameNoise:
+        """Of a sensor file's frame pixels.
+
+        Parameters
+        ----------
+        off : noise terms that are switched off (`APS_TERMS`).
+        maps : take the device's maps as known; else what they would tell counts as noise.
+
+        Raises
+        ------
+        SpecError
+            If the sensor has no frame pixels, or its measured maps cannot be read.
+        """
+        if spec.aps is None:
+            raise SpecError(f"sensor {spec.name!r} has no frame pixels")
+        aps = spec.aps
+        model = ApsNoise(aps, layout, spec.device_seed, off)
+        common: dict[str, Any] = {
+            "beta": np.array(model.to_polynomial(), dtype=np.float64),
+            "exposure_us": float(aps.exposure_us),
+            "residual_dn2": 0.0 if "residual" in off else aps.residual_noise_dn**2,
+        }
+        gain = aps.system_gain_dn_per_e
+        if not maps:
+            common["residual_dn2"] += 0.0 if "dsnu" in off else (gain * aps.dsnu_e) ** 2
+            return cls(
+                **common,
+                response_std=0.0 if "prnu" in off else aps.prnu_rel,
+                row_std_dn=0.0 if "row" in off else aps.row_offset_std_dn,
+                dark_dn_per_s=0.0 if "dark_current" in off else gain * aps.dark_current_now_e_per_s,
+            )
+        fixed = model.fixed_pattern
+        return cls(
+            **common,
+            offset_dn=_map(fixed.offset_dn, 1.0, -aps.black_level_dn),
+            dark_dn_per_s=_map(fixed.dark_e_per_s, gain, 0.0),
+            response=fixed.response,
+        )
+
+    @classmethod
+    def of_recording(cls, manifest: Mapping[str, Any], calibration: str | Path | None = None) -> FrameNoise:
+        """Of the sensor that made a recording, less the terms that were switched off.
+
+        Parameters
+        ----------
+        manifest : of the recording.
+        calibration : the ``calibration.yaml`` of a calibrated sensor, whose maps a recording does not hold; without
+            it the maps are taken as unknown.
+
+        Raises
+        ------
+        SpecError
+            If the calibration is not the one that the sensor had.
+        """
+        spec = SensorSpec.model_validate(manifest["sensor"]["spec"])
+        settings, roi = manifest.get("settings", {}), manifest["roi"]
+        without = (name.removeprefix("aps.") for name in settings.get("without", ()) if name.startswith("aps."))
+        off = frozenset(APS_TERMS) if settings.get("clean") else frozenset(without)
+        known = spec.noise is None
+        if calibration is not None:
+            spec, known = _with_calibration(spec, Path(calibration)), True
+        return cls.of_sensor(spec, Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"]), off, known)
+
+    @classmethod
+    def of_calibration(cls, file: str | Path, exposure_us: float) -> FrameNoise:
+        """Of frames of a real sensor, as ``calibrate aps`` found it; for the region that was captured.
+
+        Raises
+        ------
+        SpecError
+            If the file is no calibration of frames.
+        """
+        path = Path(file)
+        data = read_calibration(path)
+        maps = read_maps(path, "aps", data, ("n_row", "n_blc", "n_dp"))
+        try:
+            beta = np.array([[[b or 0.0 for b in cell] for cell in row] for row in data["aps"]["beta"]])
+            offset, dark = maps["n_row"][:, None] + maps["n_blc"], maps["n_dp"]
+        except (KeyError, TypeError) as error:
+            raise SpecError(f"is not as 'calibrate aps' writes it; it lacks {error}", file=path) from None
+        return cls(beta, exposure_us, offset_dn=offset.astype(np.float32), dark_dn_per_s=dark.astype(np.float32))
+
+    def at(self, exposure_us: float) -> FrameNoise:
+        """The same sensor at another exposure."""
+        return replace(self, exposure_us=float(exposure_us))
+
+    def times(self, factor: float) -> FrameNoise:
+        """With standard deviations multiplied by a factor; the maps stay."""
+        return replace(
+            self,
+            beta=self.beta * factor**2,
+            residual_dn2=self.residual_dn2 * factor**2,
+            response_std=self.response_std * factor,
+        )
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether there is nothing to smooth: no temporal noise, no pixel pattern without a map."""
+        return not (self.beta.any() or self.residual_dn2 or self.response_std)
+
+    def describe(self) -> dict[str, Any]:
+        """What is known, as plain values."""
+        known = any(isinstance(values, np.ndarray) for values in (self.offset_dn, self.dark_dn_per_s, self.response))
+        unknown = self.row_std_dn > 0 or self.response_std > 0
+        return {
+            "maps": "unknown" if unknown else "known" if known else "none",
+            "row_std_dn": self.row_std_dn,
+            "clean": self.is_clean and not self.row_std_dn,
+        }
+
+    def variance(self, position: tuple[int, int]) -> tuple[float, float, float]:
+        """a, b, c of the variance a + b I + c I² at a position of the tile, DN²; rounding to whole DN included."""
+        b0, b1, b2, b3, b4, b5 = self.beta[position]
+        t = self.exposure_us * S_PER_US
+        constant = b0 + b2 * t + b5 * t * t + self.residual_dn2 + ADC_VARIANCE_DN2
+        return float(constant), float(b1 + b4 * t), float(b3 + self.response_std**2)
+
+    def corrected(self, signal_dn: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A frame without what its sensor's maps say, DN.
+
+        Parameters
+        ----------
+        signal_dn : [row, col], DN above the black level.
+
+        Raises
+        ------
+        RangeError
+            If the maps are of another size.
+        """
+        t = np.float32(self.exposure_us * S_PER_US)
+        maps = [_fitting(name, getattr(self, name), signal_dn.shape) for name in
+                ("offset_dn", "dark_dn_per_s", "response")]  # fmt: skip
+        out = np.empty(signal_dn.shape, dtype=np.float32)
+
+        def work(rows: slice) -> None:
+            offset, dark, response = (part[rows] for part in maps)
+            np.subtract(signal_dn[rows], offset, out=out[rows])
+            out[rows] -= dark * t
+            out[rows] /= np.maximum(response, np.float32(0.1))  # a dead pixel stays dark
+
+        in_bands(signal_dn.shape[0], work)
+        return out
+
+
+def _map(values: Map, factor: float, shift: float) -> Map:
+    """values · factor + shift, in float32 where it is a map."""
+    if isinstance(values, np.ndarray):
+        return values * np.float32(factor) + np.float32(shift)
+    return values * factor + shift
+
+
+def _fitting(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    array = np.asarray(values, dtype=np.float32)
+    if array.ndim and array.shape != shape:
+        raise RangeError(f"shape of the map {name}", array.shape, f"{shape}, that of the frame")
+    return np.broadcast_to(array, shape)
+
+
+def _with_calibration(spec: SensorSpec, path: Path) -> SensorSpec:
+    """A recording's sensor with the place of its calibration, which its manifest does not hold."""
+    if spec.noise is None:
+        raise SpecError("the recording's sensor has no calibration: its maps follow from its device seed", file=path)
+    here = NoiseFile(file=path.name, sha256=spec.noise.sha256, folder=path.parent)
+    here.read()
+    return spec.model_copy(update={"noise": here})
