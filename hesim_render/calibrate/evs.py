@@ -10,24 +10,16 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.aps import describe
 from hesim_render.calibrate.captures import CaptureSet, read_captures
-from hesim_render.calibrate.event_counts import StaticCapture, bad_event_pixels, read_static
-from hesim_render.calibrate.event_dispersion import Dispersion, dispersion
+from hesim_render.calibrate.event_cells import PixelCounts, PixelThresholds, pool_events
+from hesim_render.calibrate.event_counts import StaticCapture, read_static
+from hesim_render.calibrate.event_defects import EventDefects, bad_event_pixels, bad_in_steps, classify
+from hesim_render.calibrate.event_dispersion import Dispersion, dispersion_in_time, static_mismatch
 from hesim_render.calibrate.event_estimate import NO_FIT, EventFit, fit_events, with_mismatch_error
-from hesim_render.calibrate.event_model import (
-    Law,
-    threshold_over_noise,
-)
-from hesim_render.calibrate.event_pool import PooledEvents, pool_events
+from hesim_render.calibrate.event_model import Law
 from hesim_render.calibrate.event_starts import multi_start
 from hesim_render.calibrate.moments import Progress
-from hesim_render.calibrate.thresholds import (
-    Steps,
-    Thresholds,
-    fit_thresholds,
-    groups_of_like_threshold,
-    read_steps,
-    why_not,
-)
+from hesim_render.calibrate.steps import Steps, read_steps
+from hesim_render.calibrate.thresholds import Thresholds, fit_thresholds, why_not
 from hesim_render.errors import SpecError
 
 #: A difference of log-likelihood that decides between the shot laws; below it the paper's stands.
@@ -39,27 +31,34 @@ _LAWS: tuple[Law, Law] = ("linear", "sqrt")
 class EvsCalibration:
     """What the counts tell; `fits` are per tile position, `together` pools them all.
 
-    `group`, `relative` and `residual` are as of `groups_of_like_threshold`; None and the mismatch without S-curves.
+    Attributes
+    ----------
+    known : each pixel's thresholds as far as they were measured.
+    plain : counts of all positions, without that.
+    mismatch, mismatch_error, mismatch_limit : the last where the first is 0.
     """
 
     static: StaticCapture
-    bad: NDArray[np.bool_]
+    defects: EventDefects
     theta_v: float
-    pooled: PooledEvents
+    known: PixelThresholds
+    plain: PixelCounts
     together: EventFit
     fits: list[EventFit]
     other_law: EventFit
-    spread: Dispersion
+    dispersion: Dispersion
     mismatch: float
     mismatch_error: float
-    group: NDArray[np.intp] | None
-    relative: NDArray[np.float64] | None
-    residual: float
+    mismatch_limit: float
     thresholds: Thresholds | None
     steps: Steps | None
     thresholds_reason: str
     starts: NDArray[np.float64]
     starts_standard_error: NDArray[np.float64]
+
+    @property
+    def bad(self) -> NDArray[np.bool_]:
+        return self.defects.bad
 
 
 def calibrate_evs(
@@ -130,65 +129,68 @@ def analyse(
         raise SpecError(
             "more than half of the event pixels are outliers; check n_trials and signal_dn", file=captures.folder
         )
-    pooled = pool_events(static, good)
     _check_brightness(static, good, captures)
-    tell("fitting", 0.3)
-    laws = _fit_laws(pooled, theta_v, 0.0, None)
-    spread = _spread(pooled, theta_v, 0.0, laws)
-    if spread.mismatch > 0:
-        laws = _fit_laws(pooled, theta_v, spread.mismatch, None, laws)
-        spread = _spread(pooled, theta_v, spread.mismatch, laws)
-    steps = read_steps(captures, good) if captures.has("evs_steps") else None
-    reason = "no contrast steps (evs_steps.npz) were captured" if steps is None else why_not(steps) or ""
-    mismatch, mismatch_error = spread.mismatch, float(np.sqrt(max(spread.common_error, spread.difference_error)))
-    thresholds = None
-    # What the fits of A … D see: all pixels of a brightness together, or apart by threshold where it was measured.
-    sorted_pool, residual, residual_error, group, relative = pooled, mismatch, mismatch_error, None, None
-    for _ in range(2):
-        # The fit needs the mismatch, the contrast in volts needs the fit.
-        laws = _fit_laws(sorted_pool, theta_v, residual, spread, laws)
-        law: Law = "sqrt" if _advantage(laws, spread) > DECISIVE else "linear"
-        if steps is not None and not reason:
-            step = step_in_ln(captures, steps, laws[law])
-            if step is None:
-                reason = "contrast is of the signal, and the static data do not tell the A/B that turns it into voltage"
-                break
-            thresholds = fit_thresholds(steps, step, good)
-            residual, residual_error = mismatch, mismatch_error = thresholds.mismatch, thresholds.mismatch_error
-            if mismatch > 0:
-                spread = _spread(pooled, theta_v, mismatch, _fit_laws(pooled, theta_v, mismatch, None, laws))
-                group, relative, residual = groups_of_like_threshold(thresholds, good)
-                sorted_pool = pool_events(static, good, None, group, relative)
-                residual_error = mismatch_error * residual / mismatch
-    laws = _fit_laws(sorted_pool, theta_v, residual, spread, laws)
-    _check_fit(laws[law], captures)
-    best = with_mismatch_error(laws[law], sorted_pool.together(), theta_v, residual, residual_error, spread)
+    tell("fitting", 0.2)
+    shape = static.signal_dn.shape
+    plain = pool_events(static, good, PixelThresholds.unknown(shape, 0.0))
+    laws = _fit_laws(plain, theta_v, None)
+    steps, thresholds, reason = None, None, "no contrast steps (evs_steps.npz) were captured"
+    if captures.has("evs_steps"):
+        tell("contrast steps", 0.3)
+        steps = read_steps(captures, good)
+        thresholds, reason = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
+        more = np.zeros(shape, bool) if thresholds is None else bad_in_steps(steps, thresholds, good)
+        if more.any():
+            bad, good = bad | more, good & ~more
+            steps = read_steps(captures, good)
+            plain = pool_events(static, good, PixelThresholds.unknown(shape, 0.0))
+            thresholds, reason = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
+    tell("fitting", 0.4)
+    if thresholds is None:
+        mismatch, error, limit = static_mismatch(plain, laws[_likelier(laws)], theta_v)
+    else:
+        mismatch, error, limit = thresholds.mismatch, thresholds.mismatch_error, thresholds.mismatch_limit
+    pixels = averaged = pool_events(static, good, PixelThresholds.unknown(shape, mismatch))
+    if mismatch > 0 or not np.array_equal(plain.signal_dn, averaged.signal_dn):
+        laws = _fit_laws(averaged, theta_v, laws)
+    law = _likelier(laws)
+    fit, known = laws[law], PixelThresholds.unknown(shape, mismatch)
+    # the fit needs the thresholds, the contrast in volts needs the fit
+    for _ in range(2 if steps is not None and thresholds is not None else 0):
+        assert steps is not None
+        thresholds, reason = _measured_thresholds(captures, steps, fit, good)
+        if thresholds is None:
+            break
+        mismatch, error, limit = thresholds.mismatch, thresholds.mismatch_error, thresholds.mismatch_limit
+        known = thresholds.of_pixels()
+        pixels = pool_events(static, good, known)
+        fit = fit_events(pixels, theta_v, law, _again(fit))
+    _check_fit(fit, captures)
+    best = with_mismatch_error(fit, pixels, theta_v, error / mismatch if mismatch else 0.0)
     tell("fitting positions", 0.6)
     fits = [
-        fit_events(sorted_pool.position(k), theta_v, law, residual, spread, best.parameters, best.free)
-        for k in range(len(pooled.pixels))
+        fit_events(pool_events(static, good, known, k), theta_v, law, best.parameters, best.free)
+        for k in range(static.tile[0] * static.tile[1])
     ]
     if thresholds is not None and steps is not None and captures.spec.contrast_of == "signal":
         thresholds = _with_conversion_error(thresholds, steps.signal_dn, best)
-    if group is not None and relative is not None:
-        sampling = float(relative[group[good]].std() / np.sqrt(good.sum()))
-        best, *fits = (_with_sampling_error(fit, sampling) for fit in (best, *fits))
+    if thresholds is not None:
+        best, *fits = (_with_sampling_error(fit, thresholds, good) for fit in (best, *fits))
     tell("200 starts", 0.8)
-    starts, errors = multi_start(pooled.together(), best, theta_v, mismatch, seed)
+    starts, errors = multi_start(averaged, best, theta_v, seed)
     return EvsCalibration(
         static=static,
-        bad=bad,
+        defects=classify(static, bad, steps),
         theta_v=theta_v,
-        pooled=pooled,
+        known=known,
+        plain=averaged,
         together=best,
         fits=fits,
         other_law=laws["linear" if law == "sqrt" else "sqrt"],
-        spread=spread,
+        dispersion=dispersion_in_time(pixels, best, theta_v),
         mismatch=mismatch,
-        mismatch_error=mismatch_error,
-        group=group,
-        relative=relative,
-        residual=residual,
+        mismatch_error=error,
+        mismatch_limit=limit,
         thresholds=thresholds,
         steps=steps,
         thresholds_reason=reason,
@@ -197,25 +199,36 @@ def analyse(
     )
 
 
-def _fit_laws(
-    pooled: PooledEvents,
-    theta_v: float,
-    mismatch: float,
-    spread: Dispersion | None,
-    before: dict[Law, EventFit] | None = None,
-) -> dict[Law, EventFit]:
-    """Both shot laws fitted to all positions together, from where a fit `before` ended if it kept A to D."""
-    # ρ and λ begin at 0: whether they are needed is tested anew
-    symmetric = np.array([1, 1, 1, 1, 0, 0])
-    starts = {law: fit.parameters * symmetric for law, fit in (before or {}).items() if all(fit.free[:4])}
-    return {law: fit_events(pooled.together(), theta_v, law, mismatch, spread, starts.get(law)) for law in _LAWS}
+def _measured_thresholds(
+    captures: CaptureSet, steps: Steps, fit: EventFit, good: NDArray[np.bool_]
+) -> tuple[Thresholds | None, str]:
+    """Thresholds from the steps, or why they do not tell them."""
+    step = step_in_ln(captures, steps, fit)
+    if step is None:
+        return None, "contrast is of the signal, and the static data do not tell the A/B that turns it into voltage"
+    reason = why_not(steps)
+    return (None, reason) if reason else (fit_thresholds(steps, step, good), "")
 
 
-def _spread(pooled: PooledEvents, theta_v: float, mismatch: float, laws: dict[Law, EventFit]) -> Dispersion:
-    """Over-dispersion of the counts about the law that describes them better."""
-    fit = max(laws.values(), key=lambda fit: fit.log_likelihood)
-    u, _ = threshold_over_noise(fit.parameters, pooled.counts.signal_dn, theta_v, fit.law)
-    return dispersion(pooled, u, mismatch)
+def _fit_laws(pixels: PixelCounts, theta_v: float, before: dict[Law, EventFit] | None) -> dict[Law, EventFit]:
+    """Both shot laws fitted to all positions together, from where a fit `before` ended."""
+    starts = {law: _again(fit) for law, fit in (before or {}).items()}
+    return {law: fit_events(pixels, theta_v, law, starts.get(law)) for law in _LAWS}
+
+
+def _again(fit: EventFit) -> NDArray[np.float64]:
+    """Where a fit of like data begins; ρ and λ begin at 0: whether they are needed is tested anew."""
+    return fit.whole * np.array([1, 1, 1, 1, 0, 0])
+
+
+def _likelier(laws: dict[Law, EventFit]) -> Law:
+    """The sqrt law where it describes the counts decisively better; else the paper's."""
+    return "sqrt" if advantage(laws["sqrt"], laws["linear"]) > DECISIVE else "linear"
+
+
+def advantage(one: EventFit, other: EventFit) -> float:
+    """Log-likelihood of one fit above another's, in units of the scatter of the counts."""
+    return (one.log_likelihood - other.log_likelihood) / min(max(one.design_effect, other.design_effect), 1e3)
 
 
 def _check_brightness(static: StaticCapture, good: NDArray[np.bool_], captures: CaptureSet) -> None:
@@ -238,20 +251,27 @@ def _check_brightness(static: StaticCapture, good: NDArray[np.bool_], captures: 
 
 def _check_fit(fit: EventFit, captures: CaptureSet) -> None:
     """No parameters are given where they mean nothing."""
-    if fit.pearson_chi2 > NO_FIT * fit.dof:
+    if fit.goodness.per_dof > NO_FIT:
         raise SpecError(
-            f"neither shot law describes these counts (χ²/dof is {fit.pearson_chi2 / fit.dof:.3g} at best); check that "
+            f"neither shot law describes these counts (χ²/dof is {fit.goodness.per_dof:.3g} at best); check that "
             "signal_dn is the clean signal of a scene that stands still, and that n_trials counts every tick",
             file=captures.folder / "evs_static.npz",
         )
 
 
-def _with_sampling_error(fit: EventFit, relative: float) -> EventFit:
-    """Adds what the mean of the measured thresholds lacks: relative to that of these pixels, not of all such."""
-    change = np.zeros(6)
-    change[:2] = fit.values[:2] * relative
-    change = np.where(fit.free, change, 0.0)
-    return replace(fit, covariance=fit.covariance + np.outer(change, change))
+def _with_sampling_error(fit: EventFit, thresholds: Thresholds, good: NDArray[np.bool_]) -> EventFit:
+    """Adds what the mean of the measured thresholds lacks: they are relative to that of these pixels, not of all such.
+
+    A and B go with the mean of both polarities, ρ with their difference.
+    """
+    on, off = (values[good].astype(np.float64) for values in (thresholds.pixel_on, thresholds.pixel_off))
+    scale = thresholds.mismatch**2 / max((on.var() + off.var()) / 2, 1e-30)  # without the estimates' own noise
+    covariance = fit.covariance.copy()
+    both, apart = (min(scale, 1.0) * float(np.var((on + sign * off) / 2)) / on.size for sign in (1, -1))
+    change = np.where(fit.free, np.array([*fit.values[:2], 0, 0, 0, 0]), 0.0)
+    covariance += both * np.outer(change, change)
+    covariance[4, 4] += apart if fit.free[4] else 0.0
+    return replace(fit, covariance=covariance)
 
 
 def _with_conversion_error(thresholds: Thresholds, signal_dn: float, fit: EventFit) -> Thresholds:
@@ -267,16 +287,6 @@ def _with_conversion_error(thresholds: Thresholds, signal_dn: float, fit: EventF
     change = np.zeros(4)
     change[:2] = np.array([1, -1]) * (1 / x0 - 1 / (x0 * np.exp(step)))
     return replace(thresholds, covariance=thresholds.covariance + variance * np.outer(change, change))
-
-
-def _advantage(laws: dict[Law, EventFit], spread: Dispersion) -> float:
-    """Log-likelihood of the sqrt law above the linear one, in units of the scatter of the counts."""
-    dispersed = max(
-        laws["linear"].pearson_chi2 / max(laws["linear"].dof, 1),
-        laws["sqrt"].pearson_chi2 / max(laws["sqrt"].dof, 1),
-        1.0,
-    )
-    return (laws["sqrt"].log_likelihood - laws["linear"].log_likelihood) / min(dispersed, 20.0)
 
 
 def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.float64] | None:
@@ -296,7 +306,6 @@ def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray
     values = []
     for _ in range(samples):
         weight = rng.poisson(1.0, good.shape)
-        pooled = pool_events(result.static, good, weight, result.group, result.relative).together()
-        again = fit_events(pooled, result.theta_v, fit.law, result.residual, result.spread, fit.parameters, fit.free)
-        values.append(again.values[:4])
+        pixels = pool_events(result.static, good & (weight > 0), result.known, None, weight)
+        values.append(fit_events(pixels, result.theta_v, fit.law, fit.parameters, fit.free).values[:4])
     return np.std(values, axis=0, ddof=1)
