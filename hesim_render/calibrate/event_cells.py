@@ -64,7 +64,9 @@ class Cells:
         """At most so many cells of each polarity: neighbours in brightness together. For searches, not for results."""
         order = np.lexsort((self.signal_dn, self.polarity))
         pixels = self.pixels[order]
-        rank = np.concatenate([np.arange(n) * min(most / n, 1.0) for n in np.unique(self.polarity, return_counts=True)[1]])
+        rank = np.concatenate(
+            [np.arange(n) * min(most / n, 1.0) for n in np.unique(self.polarity, return_counts=True)[1]]
+        )
         _, group = np.unique(np.stack([self.polarity[order], np.floor(rank)]), axis=1, return_inverse=True)
         total = np.bincount(group, pixels)
 

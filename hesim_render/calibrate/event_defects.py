@@ -11,15 +11,14 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import binom, poisson
 
 from hesim_render.calibrate.event_counts import StaticCapture
+from hesim_render.calibrate.event_medians import LEAST_EVENTS, by_group, density, like_brightness, middle_and_spread, spread_of_thresholds
 from hesim_render.calibrate.steps import Steps
 from hesim_render.calibrate.thresholds import Thresholds, totals_of
 
 #: Chance with which a good pixel's count may be called bad, and the part of the spread allowed for.
-_CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 5.5, 0.06
-#: Pixels of like brightness that are compared with each other.
-_GROUP = 200
-#: Least events of a count whose threshold is taken from it.
-_LEAST_EVENTS = 10.0
+_CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06
+#: Fewest pixels from which the spread of a difference is taken.
+_FEWEST = 200
 #: Standard errors by which counts of one pixel differ where it does not stay as it is.
 _SIGMAS = 6.0
 
@@ -57,80 +56,20 @@ def bad_event_pixels(static: StaticCapture) -> NDArray[np.bool_]:
     """Pixels [row, col] whose counts no threshold within the spread of the others could give.
 
     Pixels are compared with those of like brightness. The spread of thresholds is taken from quartiles, so that bad
-    pixels do not widen it. A pixel is bad where a threshold 5.5 spreads (6 % at least) away would give its count with
+    pixels do not widen it. A pixel is bad where a threshold 6 spreads (6 % at least) away would give its count with
     a chance below 1e-7, or where its two thresholds differ by so much.
     """
     known = np.isfinite(static.signal_dn)
     bad = ~known
+    spread = spread_of_thresholds(static, known)
+    reach = max(_LEAST_REACH, _SPREADS * spread)
     for signal, *both in static.sessions:
-        group = _like_brightness(signal[known])
-        middle, spread = _middle_and_spread([counts[known] for counts in both], group, static.trials)
-        reach = max(_LEAST_REACH, _SPREADS * spread)
+        group = like_brightness(signal[known])
+        middle, _ = middle_and_spread([counts[known] for counts in both], group, static.trials, spread)
         for u, counts in zip(middle, both, strict=True):
             bad[known] |= _out_of_reach(counts[known], group, static.trials, u, reach)
         bad[known] |= _apart([counts[known] for counts in both], group, static.trials, middle)
     return bad
-
-
-def _like_brightness(signal: NDArray) -> NDArray[np.intp]:
-    """Number of each pixel's group of like brightness, of `_GROUP` pixels or more."""
-    order = np.argsort(signal, kind="stable")
-    size = max(_GROUP, signal.size // 300)
-    group = np.empty(signal.size, np.intp)
-    group[order] = np.minimum(np.arange(signal.size) // size, max(signal.size // size - 1, 0))
-    return group
-
-
-def _middle_and_spread(
-    both: list[NDArray], group: NDArray[np.intp], trials: int
-) -> tuple[list[NDArray[np.float64]], float]:
-    """u of the median threshold of each group, for ON and OFF, and the relative spread of thresholds."""
-    size = int(group.max()) + 1
-    order = np.argsort(group, kind="stable")
-    starts = np.searchsorted(group[order], np.arange(size + 1))
-    quantiles, means = [], []
-    for counts in both:
-        sorted_counts = counts[order]
-        parts = [sorted_counts[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
-        quantiles.append(np.array([np.quantile(part, [0.16, 0.5, 0.84]) for part in parts]))
-        # without the highest hundredth, where the bad ones are
-        means.append(np.array([part[part <= np.quantile(part, 0.99)].mean() for part in parts]))
-    spreads = []
-    for q in quantiles:
-        enough = q[:, 0] >= _LEAST_EVENTS
-        if enough.any():
-            low, middle, high = (-ndtri((q[enough, k] + 0.5) / (trials + 1)) for k in range(3))
-            usable = middle > 0.02
-            own = q[enough, 1] / trials * (1 - q[enough, 1] / trials) / trials / _density(middle) ** 2
-            spreads.append((((low - high) / 2)[usable] ** 2 - own[usable]) / middle[usable] ** 2)
-    values = np.concatenate(spreads) if spreads else np.empty(0)
-    if values.size:
-        spread = float(np.sqrt(max(np.median(values), 0.0)))
-    else:
-        spread = _spread_of_few_events(both, group, means, trials)
-    middles = []
-    for q, mean in zip(quantiles, means, strict=True):
-        v = -ndtri(np.clip((mean + 0.5) / (trials + 1), 1e-300, 0.5))
-        from_mean = v / np.sqrt(np.maximum(1 - (spread * v) ** 2, 0.05))
-        from_median = -ndtri((q[:, 1] + 0.5) / (trials + 1))
-        middles.append(np.where(q[:, 1] >= _LEAST_EVENTS, from_median, from_mean))
-    return middles, spread
-
-
-def _density(u: NDArray) -> NDArray[np.float64]:
-    return np.exp(-0.5 * u * u) / np.sqrt(2 * np.pi)
-
-
-def _spread_of_few_events(both: list[NDArray], group: NDArray, means: list[NDArray], trials: int) -> float:
-    """Spread of thresholds from the variance of counts beyond counting, without the highest hundredth."""
-    top, bottom = 0.0, 0.0
-    for counts, mean in zip(both, means, strict=True):
-        middle = mean[group]
-        kept = counts <= np.quantile(counts, 0.99)
-        u = -ndtri(np.clip((middle[kept] + 0.5) / (trials + 1), 1e-300, 0.5))
-        top += float(np.sum((counts[kept] - middle[kept]) ** 2 - middle[kept]))
-        bottom += float(np.sum((trials * _density(u) * u) ** 2))
-    return float(np.sqrt(max(top / max(bottom, 1e-300), 0.0)))
 
 
 def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reach: float) -> NDArray[np.bool_]:
@@ -148,13 +87,13 @@ def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reac
 def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArray]) -> NDArray[np.bool_]:
     """Pixels whose thresholds of ON and OFF differ from each other as those of no other do."""
     found = np.zeros(group.shape, bool)
-    enough = np.all([counts >= _LEAST_EVENTS for counts in both], axis=0)
+    enough = np.all([counts >= LEAST_EVENTS for counts in both], axis=0)
     rate = [(counts[enough] + 0.5) / (trials + 1) for counts in both]
     t = [-ndtri(r) for r in rate]
-    noise = sum(r * (1 - r) / trials / np.maximum(_density(x), 1e-12) ** 2 for r, x in zip(rate, t, strict=True))
+    noise = sum(r * (1 - r) / trials / np.maximum(density(x), 1e-12) ** 2 for r, x in zip(rate, t, strict=True))
     u = (middle[0] + middle[1])[group[enough]] / 2
     usable = u > 0.3
-    if usable.sum() < _GROUP:
+    if usable.sum() < _FEWEST:
         return found
     difference = (t[0] - t[1] - (middle[0] - middle[1])[group[enough]])[usable] / u[usable]
     own = np.sqrt(noise[usable]) / u[usable]
@@ -220,13 +159,9 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
 def _usual_most(signal: NDArray, counts: NDArray, bad: NDArray[np.bool_]) -> NDArray[np.float64]:
     """For each bad pixel, what only a thousandth of the good pixels of its brightness exceed."""
     good = ~bad & np.isfinite(signal)
-    group = _like_brightness(signal[good])
-    order = np.argsort(group, kind="stable")
-    parts = np.split(counts[good][order], np.searchsorted(group[order], np.arange(1, int(group.max()) + 1)))
-    most = np.array([np.quantile(part, 0.999) for part in parts])
-    light = np.array([part.max() for part in np.split(signal[good][order], np.searchsorted(
-        group[order], np.arange(1, int(group.max()) + 1)
-    ))])  # fmt: skip
+    group = like_brightness(signal[good])
+    most = np.array([np.quantile(part, 0.999) for part in by_group(counts[good], group)])
+    light = np.array([part.max() for part in by_group(signal[good], group)])
     # a pixel whose brightness is not known is compared with the busiest
     here = np.where(np.isfinite(signal[bad]), signal[bad], np.inf)
     place = np.minimum(np.searchsorted(light, here), most.size - 1)

@@ -6,20 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
-from scipy.special import ndtr, ndtri
+from scipy.optimize import minimize
+from scipy.special import log_ndtr, ndtr, ndtri
 
+from hesim_render.calibrate.estimate import Spread
 from hesim_render.calibrate.event_cells import PixelCounts
 from hesim_render.calibrate.event_estimate import EventFit
+from hesim_render.calibrate.event_medians import Typical
 from hesim_render.calibrate.event_model import log_probability, probability_variance, threshold_over_noise
 
 #: Largest scatter of thresholds, as a part of that of counting, beside which the scatter in time is seen.
 _CLEAR = 0.3
-#: Counts looked at for the mismatch, and groups of pixels left out in turn for its error.
-_MOST_COUNTS, _GROUPS = 12_000, 16
-#: Thresholds of the mixture, in standard deviations; between them the counts' own law is smooth.
-_NODES = np.linspace(-6.0, 6.0, 241)
-_LARGEST_MISMATCH = 0.6
+#: Counts looked at for the mismatch, and the fewest that tell it.
+_MOST_COUNTS, _FEWEST_COUNTS = 12_000, 200
+#: Of the quadrature over thresholds.
+_NODES, _WEIGHTS = np.polynomial.hermite.hermgauss(15)
+_NO_MISMATCH, _LARGEST_MISMATCH = 1e-4, 0.6
+#: Relative step of a numerical slope; deviation in ln of a group's middle threshold that is held against nothing.
+_STEP, _HOLD = 1e-4, 0.3
 #: Twice the gain of ln L from which a mismatch is significant (a chance of 6e-5).
 _SIGNIFICANT = 16.0
 
@@ -75,73 +79,109 @@ def _ratio(residual: NDArray, counting: NDArray, thresholds: NDArray) -> tuple[f
     return max(mean, 0.0), error
 
 
-def static_mismatch(pixels: PixelCounts, fit: EventFit, theta_v: float) -> tuple[float, float, float]:
+def static_mismatch(pixels: PixelCounts, typical: Typical) -> Spread:
     """Relative spread of thresholds from how counts of pixels of one brightness are distributed.
 
-    Maximum likelihood over the mixture of binomial laws that normal thresholds give, with the mean rate held at that
-    of the fit: u = v/√(1 − m² v²), v = −Q⁻¹ of the mean rate. The error is that of a jackknife over groups of pixels.
-
-    Returns
-    -------
-    m, its standard error, and an upper limit of 95 %; 0, NaN and the limit where it is not significant.
+    Maximum likelihood over the mixture of binomial laws that normal thresholds give, of m and of the middle threshold
+    of each group of counts alike; the error is taken from how the pixels' efficient scores scatter.
     """
-    cells = pixels.cells
-    rate = np.exp(log_probability(fit.parameters, cells, theta_v, fit.law)[0])
-    events, cell, coarse, group = _sample(pixels, cells.trials * rate)
-    if events.size < 200:
-        return 0.0, float("nan"), float("nan")
-    mean = np.bincount(coarse, cells.trials * rate[cell])
-    found = np.bincount(coarse, events)
-    ratio = found / np.maximum(mean, 1e-30)
-    v = -ndtri(np.minimum(rate, 0.499))
-    largest = min(_LARGEST_MISMATCH, 0.97 / float(v[cell].max()))
-    key, row = np.unique(np.stack([cell, events.astype(np.intp)]), axis=1, return_inverse=True)
-    weight = np.bincount(row).astype(np.float64)
-
-    def log_likelihood(m: float, scale: NDArray, counted: NDArray) -> float:
-        at = key[0]
-        here = -ndtri(np.minimum(np.bincount(row, scale[coarse]) / np.bincount(row) * rate[at], 0.499))
-        u = here / np.sqrt(np.maximum(1 - (m * here) ** 2, 1e-3))
-        p = np.clip(ndtr(-u[:, None] * (1 + m * _NODES)), 1e-300, 1 - 1e-15)
-        exponent = key[1][:, None] * np.log(p) + (cells.trials - key[1])[:, None] * np.log1p(-p)
-        top = exponent.max(axis=1)
-        mixed = np.exp(exponent - top[:, None]) @ np.exp(-0.5 * _NODES**2)
-        return float(counted @ (top + np.log(mixed)))
-
-    def best(scale: NDArray, counted: NDArray, bracket: tuple[float, float]) -> float:
-        return float(
-            minimize_scalar(
-                lambda m: -log_likelihood(m, scale, counted), bounds=bracket, method="bounded", options={"xatol": 1e-4}
-            ).x
-        )
-
-    m = best(ratio, weight, (0.0, largest))
-    top = log_likelihood(m, ratio, weight)
-    if 2 * (top - log_likelihood(0.0, ratio, weight)) < _SIGNIFICANT:
-        line = np.linspace(m, largest, 40)
-        over = [top - log_likelihood(x, ratio, weight) > 1.92 for x in line]
-        return 0.0, float("nan"), float(line[int(np.argmax(over))] if any(over) else largest)
-    left = []
-    for k in range(_GROUPS):
-        out = group == k
-        counted = weight - np.bincount(row[out], minlength=weight.size)
-        scale = (found - np.bincount(coarse[out], events[out], ratio.size)) / np.maximum(
-            mean - np.bincount(coarse[out], cells.trials * rate[cell[out]], ratio.size), 1e-30
-        )
-        left.append(best(scale, counted, (0.7 * m, min(1.4 * m, largest))))
-    error = float(np.sqrt((_GROUPS - 1) * np.var(left)))
-    return m, error, m + 2 * error
+    mixture = _Mixture.of(pixels, typical)
+    if mixture.pixel.size < _FEWEST_COUNTS:
+        return Spread(0.0, float("nan"), float("nan"))
+    top, m, scale = mixture.maximum(float(np.clip(typical.spread, 0.01, 0.4)))
+    information, error = mixture.information(m, scale)
+    without, _, _ = mixture.maximum(_NO_MISMATCH, fixed=True)
+    if 2 * (top - without) < _SIGNIFICANT:
+        return Spread(0.0, float("nan"), m + 2 / float(np.sqrt(max(information, 1.0))))
+    return Spread(m, error, m + 2 * error)
 
 
-def _sample(
-    pixels: PixelCounts, expected: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Counts of a sample of pixels: the count, its cell, its place among coarse groups of rate, and its group."""
-    rows, pixel = np.nonzero(expected[pixels.cell] >= 1.0)
-    step = 1 + rows.size // _MOST_COUNTS
-    order = np.random.default_rng(0).permutation(rows.size)[:: step]
-    rows, pixel = rows[order], pixel[order]
-    cell = pixels.cell[rows, pixel]
-    level = np.floor(2 * np.log2(np.maximum(expected[cell], 1e-3))).astype(np.intp)
-    _, coarse = np.unique(np.stack([rows, level]), axis=1, return_inverse=True)
-    return pixels.counts[rows, pixel], cell, coarse, pixel % _GROUPS
+@dataclass(frozen=True)
+class _Mixture:
+    """Counts of a sample of pixels, each a mixture of binomial laws over its threshold; arrays [count].
+
+    Attributes
+    ----------
+    u, events : u of the median threshold at the pixel's brightness, and its events of `trials`.
+    group, pixel : of counts whose middle threshold is fitted together; of the pixel.
+    """
+
+    u: NDArray[np.float64]
+    events: NDArray[np.float64]
+    group: NDArray[np.intp]
+    pixel: NDArray[np.intp]
+    trials: int
+
+    @classmethod
+    def of(cls, pixels: PixelCounts, typical: Typical) -> _Mixture:
+        """A sample of the counts of which more than one event is expected."""
+        u = np.stack([
+            typical.threshold_over_noise(k, pixels.single(k).signal_dn) for k in range(len(pixels.counts))
+        ])  # fmt: skip
+        rows, pixel = np.nonzero(pixels.cells.trials * ndtr(-u) >= 1.0)
+        kept = np.random.default_rng(0).permutation(rows.size)[:_MOST_COUNTS]
+        rows, pixel = rows[kept], pixel[kept]
+        level = np.array([typical.group(k, pixels.single(k).signal_dn) for k in range(len(pixels.counts))])[rows, pixel]
+        _, group = np.unique(np.stack([rows, level]), axis=1, return_inverse=True)
+        return cls(u[rows, pixel], pixels.counts[rows, pixel], group, pixel, pixels.cells.trials)
+
+    def log_likelihood(self, m: float, scale: NDArray) -> NDArray[np.float64]:
+        """Of each count, without the constant: the mean over thresholds by Gauss–Hermite about the likeliest one.
+
+        Nodes at fixed thresholds would not do: the count of a low threshold is known far better than they are apart.
+        """
+        u, k, n = self.u * scale[self.group], self.events, self.trials
+        own = (k + 0.5) / (n + 1)
+        middle = -ndtri(own)
+        told = (u * m) ** 2 * n * np.exp(-middle * middle) / (2 * np.pi * own * (1 - own))
+        z, width = np.clip((middle / u - 1) / m * told / (1 + told), -12, 12), np.ones_like(u)
+        for _ in range(4):
+            t = u * (1 + m * np.clip(z, -12, 12))
+            q = np.clip(ndtr(-t), 1e-300, 1 - 1e-15)
+            slope = np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi)
+            information = (u * m) ** 2 * n * slope**2 / (q * (1 - q)) + 1
+            step = u * m * slope * (n * q - k) / (q * (1 - q)) - z
+            z, width = np.clip(z + np.clip(step / information, -2, 2), -12, 12), 1 / np.sqrt(information)
+        terms = np.empty((_NODES.size, u.size))
+        for row, node in zip(terms, _NODES, strict=True):
+            at = z + np.sqrt(2) * width * node
+            log_q, log_rest = log_ndtr(-u * (1 + m * at)), log_ndtr(u * (1 + m * at))
+            row[:] = k * log_q + (n - k) * log_rest - 0.5 * at * at + node * node
+        top = terms.max(axis=0)
+        return top + np.log(_WEIGHTS @ np.exp(terms - top)) + np.log(width)
+
+    def maximum(self, m: float, fixed: bool = False) -> tuple[float, float, NDArray[np.float64]]:
+        """Largest ln L, and where: m and the scale of each group's middle threshold."""
+        size = int(self.group.max()) + 1
+
+        def negative(values: NDArray) -> tuple[float, NDArray]:
+            m, scale = float(np.exp(values[0])), np.exp(values[1:])
+            here = self.log_likelihood(m, scale)
+            of_m = 0.0 if fixed else float(np.sum(self.log_likelihood(m * (1 + _STEP), scale) - here)) / _STEP
+            of_s = np.bincount(self.group, self.log_likelihood(m, scale * (1 + _STEP)) - here, size) / _STEP
+            # a weak hold on groups of few counts
+            slope = np.concatenate([[of_m], of_s - values[1:] / _HOLD**2])
+            return float(-here.sum() + 0.5 * np.sum((values[1:] / _HOLD) ** 2)), -slope
+
+        bounds = [(np.log(_NO_MISMATCH), np.log(_LARGEST_MISMATCH)), *[(-1.0, 1.0)] * size]
+        start = np.concatenate([[np.log(m)], np.zeros(size)])
+        found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+        return -float(found.fun), float(np.exp(found.x[0])), np.exp(found.x[1:])
+
+    def information(self, m: float, scale: NDArray) -> tuple[float, float]:
+        """Information of m, the groups' thresholds being fitted, and the standard error of m."""
+        h, k = 0.02 * m, 0.01
+        table = {
+            (i, j): self.log_likelihood(m + i * h, scale * (1 + j * k))
+            for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))
+        }
+        of_m, of_s = (table[1, 0] - table[-1, 0]) / (2 * h), (table[0, 1] - table[0, -1]) / (2 * k)
+        mm = (2 * table[0, 0] - table[1, 0] - table[-1, 0]) / h**2
+        ss = (2 * table[0, 0] - table[0, 1] - table[0, -1]) / k**2
+        both = (table[1, 1] + table[-1, -1] - 2 * table[0, 0]) / (h * k)
+        cross, own = (np.bincount(self.group, v) for v in (-(mm * h / k + ss * k / h + both) / 2, ss))
+        part = cross / (np.maximum(own, 0.0) + 1 / _HOLD**2)
+        information = float(mm.sum() - part @ cross)
+        # all counts of a pixel together: its two thresholds may go together
+        of_pixel = np.bincount(self.pixel, of_m - part[self.group] * of_s)
+        return information, float(np.sqrt(of_pixel @ of_pixel)) / max(information, 1e-9)

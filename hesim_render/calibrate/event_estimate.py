@@ -22,6 +22,10 @@ from hesim_render.calibrate.event_model import (
 
 #: Least eigenvalue of a scaled information matrix that tells all its parameters apart.
 _SINGULAR = 1e-9
+#: Times that the scatter and the fit follow from each other.
+_REWEIGHTED = 4
+#: Cells of a polarity in which counts of widely spread thresholds are compared with a law.
+_NORMAL = 24
 #: χ²/dof above which standard errors are widened by its root.
 POOR_FIT = 2.0
 #: χ²/dof above which the model does not describe the counts at all.
@@ -43,9 +47,9 @@ class EventFit:
     parameters : [6] as `event_model.PARAMETERS`. free : [6], which were fitted.
     whole : [6], the parameters of the fit of A to D, before any was given up.
     values : [6], A, B, C, D, ρ, λ. covariance : [6, 6] of them, from how the pixels' scores scatter.
-    design_effect : variance of A … D, on the average, over that of binomial counts of pixels all alike.
+    design_effect : variance of A … D, on the average, over that of counts that scatter as the model says.
     reasons : why A, B, C or D is not identifiable, by name.
-    log_likelihood : binomial, without the constant.
+    log_likelihood : without constants.
     goodness : χ² of the counts by brightness.
     """
 
@@ -69,42 +73,36 @@ def fit_events(
     pixels: PixelCounts,
     theta_v: float,
     law: Law,
-    start: NDArray | None = None,
+    start: NDArray,
     asymmetry: tuple[bool, ...] | None = None,
 ) -> EventFit:
     """Fit A, B, C, D (and ρ, λ where the counts call for them).
 
     Parameters that the data do not tell are dropped in the order D, C, A; the rest is fitted again.
     ρ and λ are kept where a likelihood-ratio test rejects their absence at 1e-3. Where thresholds spread, the
-    counts are weighed with the scatter that follows (quasi-likelihood).
+    counts are weighed with the scatter that follows (quasi-likelihood), else the likelihood is binomial.
 
     Parameters
     ----------
-    start, asymmetry : from a fit of more data: its parameters, and its choice of free parameters.
+    start : [6], as `event_model.PARAMETERS`.
+    asymmetry : from a fit of more data, its choice of free parameters.
     """
     cells = pixels.cells
-    spread = bool(np.any(cells.spread > 0))
-    begin = _best_start(cells, theta_v, law) if start is None else start.copy()
-    variance: NDArray | None = None
+    begin = start.copy()
     reasons: dict[str, str] = {}
     free = [True] * 4 + ([False, False] if asymmetry is None else list(asymmetry[4:]))
     whole: NDArray | None = None
     while True:
-        eta, fisher, _ = maximise(cells, begin[None], theta_v, law, free)
-        whole = eta[0].copy() if whole is None else whole
+        eta, fisher, variance = _fit(cells, begin, theta_v, law, free)
+        whole = eta.copy() if whole is None else whole
         if asymmetry is None:
-            eta, fisher, free = _test_asymmetry(pixels, eta, fisher, theta_v, law, free)
-        likelihood = float(log_likelihood(cells, log_probability(eta[0], cells, theta_v, law)[0]))
-        if spread:
-            for _ in range(2):
-                variance = cell_variance(cells, eta[0], theta_v, law)
-                eta, fisher, _ = maximise(cells, eta, theta_v, law, free, variance)
-        covariance, mixed = _covariance(fisher[0])
+            eta, fisher, free = _test_asymmetry(pixels, eta, fisher, theta_v, law, free, variance)
+        covariance, mixed = _covariance(fisher)
         # Where the data tell only a combination, none of its members is identified, though some stay in the fit.
         reasons |= {
             "ABCD"[k]: "the static capture tells only a combination of parameters; " + _CAPTURE[k] for k in mixed
         }
-        weak = _weakest(eta[0], covariance, free, cells)
+        weak = _weakest(eta, covariance, free, cells)
         if weak is None:
             break
         name, index, reason = weak
@@ -112,51 +110,90 @@ def fit_events(
             name, index, reason = "A", 0, reasons["A"]
         reasons.setdefault(name, reason)
         free[index] = False
-        begin = _without(eta[0], index)
+        begin = _without(eta, index)
         if index == 2 and free[3]:
             reasons["D"], free[3], begin[3] = "it has no effect without C", False, 0.0
     mask = np.array(free)
-    measured = sandwich(pixels, eta[0], theta_v, law, free, variance)
-    values, natural_covariance = natural(eta[0], measured)
-    plain = _covariance(maximise(cells, eta, theta_v, law, free)[1][0])[0]
+    measured = sandwich(pixels, eta, theta_v, law, free, variance)
+    values, natural_covariance = natural(eta, measured)
     used = np.flatnonzero(mask[:4])
-    effect = float(np.mean(np.diag(measured)[used] / np.maximum(np.diag(plain)[used], 1e-300))) if used.size else 1.0
-    fit = goodness(pixels, eta[0], theta_v, law, int(mask.sum()))
-    if fit.chi2 > POOR_FIT * fit.dof:
+    effect = float(np.mean(np.diag(measured)[used] / np.maximum(np.diag(covariance)[used], 1e-300))) if used.size else 1
+    fit = goodness(pixels, eta, theta_v, law, int(mask.sum()))
+    if fit.per_dof > POOR_FIT:
         # The counts scatter about the model more than they should: no error may be smaller than that scatter.
-        natural_covariance = natural_covariance * (fit.chi2 / fit.dof)
+        natural_covariance = natural_covariance * fit.per_dof
+    likelihood = _log_likelihood(cells, eta, theta_v, law, variance)
     return EventFit(
-        law, eta[0], whole, tuple(free), values, natural_covariance, max(effect, 1.0), reasons, likelihood, fit
+        law, eta, whole, tuple(free), values, natural_covariance, max(effect, 1.0), reasons, likelihood, fit
     )  # fmt: skip
 
 
-def _best_start(cells: Cells, theta_v: float, law: Law) -> NDArray[np.float64]:
-    """Where the likeliest of several searches for A, B, C and D ends: from one start alone it may be a side hill."""
-    few = cells.coarser()
-    tried, _, _ = search(few, start_values(few, theta_v, law), theta_v, law, [True] * 4 + [False] * 2)
-    likelihood = log_likelihood(few, log_probability(tried, few, theta_v, law)[0])
-    return tried[int(np.nanargmax(likelihood))]
+def _fit(
+    cells: Cells, begin: NDArray, theta_v: float, law: Law, free: list[bool]
+) -> tuple[NDArray, NDArray, NDArray | None]:
+    """Parameters [6], information [6, 6] and, where thresholds spread, the variance the cells were weighed with."""
+    eta, variance = begin[None], None
+    for _ in range(_REWEIGHTED if np.any(cells.spread > 0) else 1):
+        if np.any(cells.spread > 0):
+            variance = cell_variance(cells, eta[0], theta_v, law)
+        eta, fisher, _ = maximise(cells, eta, theta_v, law, free, variance)
+    return eta[0], fisher[0], variance
+
+
+def _log_likelihood(cells: Cells, eta: NDArray, theta_v: float, law: Law, variance: NDArray | None) -> float:
+    """Of the events: binomial, or where thresholds spread normal with the scatter that follows; without constants."""
+    if variance is not None and np.ptp(cells.relative) == 0:
+        cells = cells.coarser(_NORMAL)  # sums of many pixels, whose law is near a normal one
+    log_p, _ = log_probability(eta, cells, theta_v, law)
+    if variance is None:
+        return float(log_likelihood(cells, log_p))
+    own = cell_variance(cells, eta, theta_v, law)
+    return -0.5 * float(np.sum((cells.events - cells.total * np.exp(log_p)) ** 2 / own + np.log(own)))
+
+
+def best_start(typical: Cells, theta_v: float, law: Law) -> tuple[NDArray[np.float64], float, float]:
+    """Where the likeliest of several searches for A, B, C and D ends: from one start alone it may be a side hill.
+
+    Returns
+    -------
+    Parameters [6], ln L, and the scatter about them over that of counting.
+    """
+    tried, _, _ = search(typical, start_values(typical, theta_v, law), theta_v, law, [True] * 4 + [False] * 2)
+    log_p = log_probability(tried, typical, theta_v, law)[0]
+    likelihood = log_likelihood(typical, log_p)
+    best = int(np.nanargmax(likelihood))
+    expected = typical.total * np.exp(log_p[best])
+    scatter = float(np.mean((typical.events - expected) ** 2 / np.maximum(expected, 1e-9)))
+    return tried[best], float(likelihood[best]), max(scatter, 1.0)
 
 
 def _test_asymmetry(
-    pixels: PixelCounts, eta: NDArray, fisher: NDArray, theta_v: float, law: Law, free: list[bool]
-) -> tuple[NDArray, NDArray, list[bool]]:
-    """Add ρ, then λ, where the likelihood gains enough for the parameter added (1e-3, scaled by over-dispersion)."""
+    pixels: PixelCounts, eta: NDArray, fisher: NDArray, theta_v: float, law: Law, free: list[bool],
+    variance: NDArray | None,
+) -> tuple[NDArray, NDArray, list[bool]]:  # fmt: skip
+    """Add ρ, then λ, where the fit gains enough for the parameter added (1e-3, scaled by over-dispersion)."""
     cells = pixels.cells
+    enough = float(chi2_law.isf(1e-3, 1))
+
+    def misfit(parameters: NDArray) -> float:
+        log_p, _ = log_probability(parameters, cells, theta_v, law)
+        if variance is None:
+            return -2 * float(log_likelihood(cells, log_p))
+        return float(np.sum((cells.events - cells.total * np.exp(log_p)) ** 2 / variance))
+
     for index in (4, 5):
         if free[index]:
             continue
         wider = list(free)
         wider[index] = True
-        tried, information, _ = maximise(cells, eta, theta_v, law, wider)
-        both = np.stack([tried[0], eta[0]])
-        after, before = log_likelihood(cells, log_probability(both, cells, theta_v, law)[0])
-        if after - before <= float(chi2_law.isf(1e-3, 1)) / 2:
+        tried, information, _ = maximise(cells, eta[None], theta_v, law, wider, variance)
+        gain = misfit(eta) - misfit(tried[0])
+        if gain <= enough:
             continue
-        measured = sandwich(pixels, tried[0], theta_v, law, wider, None)[index, index]
+        measured = sandwich(pixels, tried[0], theta_v, law, wider, variance)[index, index]
         dispersed = max(1.0, float(measured / np.maximum(_covariance(information[0])[0][index, index], 1e-300)))
-        if after - before > float(chi2_law.isf(1e-3, 1)) / 2 * dispersed:
-            eta, fisher, free = tried, information, wider
+        if gain > enough * dispersed:
+            eta, fisher, free = tried[0], information[0], wider
     return eta, fisher, free
 
 
@@ -191,8 +228,8 @@ def _better_without(
     values = []
     for index in (one, other):
         kept = [ok and k != index for k, ok in enumerate(free)]
-        fitted, _, _ = maximise(cells, _without(eta[0], index)[None], theta_v, law, kept)
-        values.append(float(log_likelihood(cells, log_probability(fitted[0], cells, theta_v, law)[0])))
+        fitted, _, variance = _fit(cells, _without(eta, index), theta_v, law, kept)
+        values.append(_log_likelihood(cells, fitted, theta_v, law, variance))
     return values[0] > values[1]
 
 

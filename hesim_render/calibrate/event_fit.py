@@ -16,6 +16,8 @@ from hesim_render.calibrate.event_cells import Cells, PixelCounts
 from hesim_render.calibrate.event_model import Law, log_likelihood, log_probability
 
 _ROUNDS = 300
+#: A search whose ln L rises by less in so many rounds has come to where it will.
+_PATIENCE, _PROGRESS = 25, 1e-4
 #: ln of the factors of C that a search tries first.
 _REACH_OF_C = np.linspace(-3.0, 3.0, 25)
 _LEAST = np.array([0.0, -30.0, 0.0, -np.inf, -0.95, 0.0])
@@ -46,7 +48,7 @@ def _threshold_over_noise(cells: Cells, some: NDArray[np.intp]) -> float:
 
 
 def search(
-    cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequence[bool]
+    cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """`maximise` from starts that may be far off.
 
@@ -54,7 +56,7 @@ def search(
     for good. So least squares of u, the Q⁻¹ of each cell's rate, comes first: it is linear in A and B, and C is the
     best of many about the start's; D stays.
     """
-    return maximise(cells, _approach(cells, start, theta_v, law, free), theta_v, law, free)
+    return maximise(cells, _approach(cells, start, theta_v, law, free), theta_v, law, free, variance)
 
 
 def _approach(cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequence[bool]) -> NDArray[np.float64]:
@@ -111,14 +113,21 @@ def maximise(
     active = np.arange(len(eta))
     damping = np.full(len(eta), 1e-3)
     value, score, information = _evaluate(cells, eta, theta_v, law, mask, variance, True)
-    for _ in range(_ROUNDS):
+    before = value
+    for round_ in range(_ROUNDS):
+        if round_ % _PATIENCE == _PATIENCE - 1:
+            if np.all(value - before < _PROGRESS):
+                break  # far out in a valley without end, where only a combination of parameters is told
+            before = value
         now = eta[active]
         plain = _solve(now, score, information, 0.0)
         done = np.sum(plain * score, axis=1) < 1e-8
         if np.any(done):
             converged[active[done]] = True
             keep = ~done
-            active, damping, value, score, information = (v[keep] for v in (active, damping, value, score, information))
+            active, damping, value, before, score, information = (
+                v[keep] for v in (active, damping, value, before, score, information)
+            )
             if active.size == 0:
                 break
             now = eta[active]

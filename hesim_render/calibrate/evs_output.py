@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.captures import CaptureSet
 from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.event_analysis import DECISIVE, EvsCalibration
 from hesim_render.calibrate.event_cells import Cells, PixelThresholds, pool_events
 from hesim_render.calibrate.event_counts import StaticCapture
 from hesim_render.calibrate.event_estimate import EventFit
 from hesim_render.calibrate.event_model import both_probabilities
-from hesim_render.calibrate.evs import DECISIVE, EvsCalibration, advantage
 from hesim_render.calibrate.thresholds import curve
 
 _FIGURE_PX = 320
@@ -26,7 +26,8 @@ _MODEL = (
 
 def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | None) -> dict[str, Any]:
     """The section ``evs``; a parameter the data do not tell is null, with its reason."""
-    fit, other, spread, thresholds = result.together, result.other_law, result.dispersion, result.thresholds
+    fit, spread, thresholds = result.together, result.dispersion, result.thresholds
+    other = "sqrt" if fit.law == "linear" else "linear"
     tile = result.static.tile
     theta = not_identifiable(result.thresholds_reason)
     section: dict[str, Any] = {
@@ -36,8 +37,8 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
         "shot_law": fit.law,
         "shot_law_log_likelihood": {
             fit.law: fit.log_likelihood,
-            other.law: other.log_likelihood,
-            "decisive": bool(abs(advantage(fit, other)) > DECISIVE and fit.identified("C")),
+            other: fit.log_likelihood - result.advantage,
+            "decisive": bool(abs(result.advantage) > DECISIVE and fit.identified("C")),
         },
         **_parameters(fit),
         "positions": [
@@ -54,7 +55,9 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
             "theta_on": estimated(thresholds.theta_on, error[0], "ln"),
             "theta_off": estimated(thresholds.theta_off, error[1], "ln"),
         }
-    section["threshold_mismatch"] = _mismatch(result)
+    section["threshold_mismatch"] = result.mismatch.described() | {
+        "from": "static counts" if thresholds is None else "steps"
+    }
     rho, leak = fit.values[4:]
     error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
     absent = "not significant (likelihood ratio at 1e-3): the model without it is kept"
@@ -102,14 +105,6 @@ def _parameters(fit: EventFit) -> dict[str, Any]:
         else not_identifiable(fit.reasons.get(name, "not told by the data"))
         for k, name in enumerate("ABCD")
     }
-
-
-def _mismatch(result: EvsCalibration) -> dict[str, Any]:
-    where = "steps" if result.thresholds is not None else "static counts"
-    if result.mismatch > 0:
-        return estimated(result.mismatch, result.mismatch_error, "relative std") | {"from": where}
-    note = "the pixels scatter no more than counting makes them"
-    return {"value": 0.0, "upper_limit": result.mismatch_limit, "from": where, "note": note}
 
 
 def _gauge(result: EvsCalibration) -> dict[str, Any]:
@@ -165,9 +160,9 @@ def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, 
     figures["figure_rates"] = _rates(result.plain.cells)
     top = float(figures["figure_rates"][:, 0].max())
     line = np.unique(np.concatenate([np.linspace(0, top, 150), np.geomspace(1e-4 * top, top, 150)]))
-    on, off = both_probabilities(fit.parameters, line, result.theta_v, fit.law, result.mismatch)
+    on, off = both_probabilities(fit.parameters, line, result.theta_v, fit.law, result.mismatch.value)
     figures["figure_rates_fit"] = np.stack([line, on, off], axis=1)
-    unknown = PixelThresholds.unknown(good.shape, result.mismatch)
+    unknown = PixelThresholds.unknown(good.shape, result.mismatch.value)
     figures["figure_position_rates"] = np.concatenate(
         [
             np.column_stack([np.full(len(rates), k), rates])
@@ -177,7 +172,7 @@ def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, 
     )
     figures["figure_position_fits"] = np.stack(
         [
-            np.mean(both_probabilities(one.parameters, line, result.theta_v, one.law, result.mismatch), axis=0)
+            np.mean(both_probabilities(one.parameters, line, result.theta_v, one.law, result.mismatch.value), axis=0)
             for one in result.fits
         ]
     )

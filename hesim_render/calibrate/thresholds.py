@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from hesim_render.calibrate.estimate import Spread
 from hesim_render.calibrate.event_cells import PixelThresholds
 from hesim_render.calibrate.steps import GROUPS, Steps
 
@@ -37,8 +38,7 @@ class Thresholds:
     ----------
     theta_on, theta_off : mean thresholds. width : s at S = 0. slope : κ, relative change of s per θ of contrast.
     covariance : [4, 4] of (θ₊, θ₋, s, κ).
-    mismatch, mismatch_error : relative std over pixels of the threshold of one polarity, 0 where not significant.
-    mismatch_limit : upper limit of 95 % where it is not.
+    spread : relative std over pixels of the threshold of one polarity.
     mismatch_on, mismatch_off : of either polarity.
     noise : σ_n at S = θ₊ and S = −θ₋, and its standard error.
     pixel_on, pixel_off : [row, col], threshold of each pixel relative to the mean (with its own noise).
@@ -51,9 +51,7 @@ class Thresholds:
     width: float
     slope: float
     covariance: NDArray[np.float64]
-    mismatch: float
-    mismatch_error: float
-    mismatch_limit: float
+    spread: Spread
     mismatch_on: float
     mismatch_off: float
     noise: tuple[float, float]
@@ -117,7 +115,9 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
     error = np.sqrt(np.diag(covariance))
     both, both_error = squares.mean(), float(np.sqrt(covariance[4:6, 4:6].sum())) / 2
     mismatch = float(np.sqrt(both)) if both > _SIGMAS * both_error else 0.0
-    each = [float(np.sqrt(v)) if mismatch and v > _SIGMAS * e else 0.0 for v, e in zip(squares, error[4:6], strict=True)]
+    each = [
+        float(np.sqrt(v)) if mismatch and v > _SIGMAS * e else 0.0 for v, e in zip(squares, error[4:6], strict=True)
+    ]
     noise = found[6]
     pixel = [
         _of_pixel(values, sign, sign * step, total, steps.trials, m)
@@ -129,9 +129,11 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
         width=float(values[2]),
         slope=float(values[3]),
         covariance=covariance[:4, :4],
-        mismatch=mismatch,
-        mismatch_error=both_error / (2 * mismatch) if mismatch else float("nan"),
-        mismatch_limit=float(np.sqrt(max(both, 0.0) + 2 * both_error)),
+        spread=Spread(
+            mismatch,
+            both_error / (2 * mismatch) if mismatch else float("nan"),
+            float(np.sqrt(max(both, 0.0) + 2 * both_error)),
+        ),
         mismatch_on=each[0],
         mismatch_off=each[1],
         noise=(float(noise), float(error[6])),
@@ -184,9 +186,7 @@ class _Sums:
         return np.array([*values, *squares, np.sqrt(max(float(np.mean(left)), 0.0))])
 
 
-def _fit_curves(
-    rates: list[NDArray], step: NDArray, n: float, start: NDArray | None
-) -> NDArray[np.float64]:
+def _fit_curves(rates: list[NDArray], step: NDArray, n: float, start: NDArray | None) -> NDArray[np.float64]:
     """(θ₊, θ₋, s, κ) of the pooled curves."""
     if start is None:
         half = [float(np.interp(0.5, *_increasing(r, s))) for r, s in zip(rates, (step, -step), strict=True)]
