@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,8 @@ from hesim_render.flux import FluxSource, SampledFlux
 from hesim_render.frame import Frame
 from hesim_render.noise.aps import APS_TERMS, ApsNoise
 from hesim_render.noise.evs import EVS_TERMS, EvsNoise
-from hesim_render.schedule import Exposure, exposures, ticks_us
+from hesim_render.render_error import ErrorMeter
+from hesim_render.schedule import CELL_US, Block, Exposure, exposures, instant_blocks, tick_blocks, ticks_us
 from hesim_render.sensor import Sensor
 from hesim_render.units import S_PER_US
 
@@ -73,8 +75,15 @@ class Capture:
     flux : where Φ comes from.
     sensor : region and lens as `flux` uses them.
     aps, evs : noise models, from `noise_models`.
-    duration_us : length of the run.
+    duration_us : end of the run.
     seed : of all temporal noise.
+    begin_us : begin of the run. Frames and comparisons are at the same times whenever it begins; frames belong to the
+        run in which they end.
+    pixels : what the event pixels remember of the run before, its `pixel_state`: together both are one run.
+
+    Attributes
+    ----------
+    errors : of the render, for frames and for events.
     """
 
     def __init__(
@@ -85,9 +94,11 @@ class Capture:
         evs: EvsNoise | None,
         duration_us: int,
         seed: int,
+        begin_us: int = 0,
+        pixels: dict[str, Any] | None = None,
     ) -> None:
         self._flux, self._sensor, self._aps, self._seed = flux, sensor, aps, seed
-        self._duration_us = duration_us
+        self._begin_us, self._duration_us = begin_us, duration_us
         layout = sensor.layout
         # the source as frame and as event pixels see it: one, but where crosstalk is off for one of them
         sources = {n.crosstalk: with_crosstalk(flux, layout.shape, n.crosstalk) for n in (aps, evs) if n is not None}
@@ -99,17 +110,44 @@ class Capture:
         self._aps_pixel = np.flatnonzero(layout.aps_mask).astype(np.uint32) if aps is not None else none
         self._aps_row = self._aps_pixel // layout.cols
         self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else none
-        self._exposures = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
+        every = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
+        self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
         self._stage = EvsStage(evs, seed) if evs is not None else None
-        self._samples = self._evs_samples() if evs is not None else np.empty(0, np.int64)
+        if self._stage is not None and pixels is not None:
+            self._stage.resume(pixels)
+        self._pixel_state: dict[str, Any] = {}
         self._event_flux = EventFlux(self._evs_pixel.size)
+        self.errors = {"frames": ErrorMeter(), "events": ErrorMeter()}
 
     @property
-    def event_windows(self) -> tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.float64]]:
-        """Event pixels, and begin and end of each of their windows, µs."""
-        length = self._stage.noise.spec.window_us if self._stage is not None else 0
-        ends = self._samples.astype(np.float64)
-        return self._evs_pixel, ends - length, ends
+    def event_pixels(self) -> NDArray[np.uint32]:
+        """Mosaic indices in the order of the event grid."""
+        return self._evs_pixel
+
+    @property
+    def pixel_state(self) -> dict[str, Any]:
+        """What the event pixels remember at the end of the run, for one that goes on; plain values, NumPy arrays."""
+        return self._pixel_state
+
+    def event_blocks(self) -> Iterator[Block]:
+        """Windows in which a source that implements `SampledFlux` is asked for event pixels."""
+        if self._stage is None:
+            return
+        spec = self._stage.noise.spec
+        if spec.reference == "previous_sample":
+            yield from tick_blocks(spec, self._begin_us, self._duration_us)
+            return
+        source, begin = self._event_source, self._stage.t_us
+        assert isinstance(source, SampledFlux)
+        if begin is None:
+            begin = self._begin_us + spec.window_us
+            start, end = np.array([[self._begin_us], [begin]], np.float64)
+            yield Block(start, end, np.ones(1, np.bool_))
+        # up to the first instant that is not before the end: events before the end come with it
+        cell = self._duration_us // CELL_US * CELL_US
+        instants = source.instants_us(cell, cell + CELL_US)
+        beyond = int(instants[np.searchsorted(instants, self._duration_us)])
+        yield from instant_blocks(source.instants_us, spec.window_us, begin, beyond)
 
     @property
     def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:
@@ -126,16 +164,18 @@ class Capture:
         """Events lost in the sensor's read-out so far."""
         return self._stage.dropped if self._stage is not None else 0
 
-    def _evs_samples(self) -> NDArray[np.int64]:
-        """Times at which the event pixels are sampled: the sensor's ticks, or the source's own pace."""
-        assert self._stage is not None
+    def _slice_samples(self) -> NDArray[np.int64]:
+        """Times at which event pixels are sampled where the source is not asked for blocks: ticks, or its own pace."""
+        if self._stage is None:
+            return np.empty(0, np.int64)
         spec = self._stage.noise.spec
         if spec.reference == "previous_sample":
-            return ticks_us(spec, self._duration_us)
-        inner = np.rint(self._flux.sample_times_us(0, self._duration_us)).astype(np.int64)
-        first = np.array([spec.window_us], dtype=np.int64)
-        times = np.unique(np.concatenate([first, inner, [self._duration_us]]))
-        return times[(times >= spec.window_us) & (times <= self._duration_us)]
+            times = ticks_us(spec, self._duration_us)
+            return times[times > self._begin_us]
+        inner = np.rint(self._flux.sample_times_us(self._begin_us, self._duration_us)).astype(np.int64)
+        first = self._begin_us + spec.window_us
+        times = np.unique(np.concatenate([[first], inner, [self._duration_us]]))
+        return times[(times >= first) & (times <= self._duration_us)]
 
     def run(self, progress: Progress | None = None) -> Iterator[Frame | NDArray]:
         """Frames and blocks of events (`EVENT_DTYPE`), each kind in order of time."""
@@ -145,10 +185,11 @@ class Capture:
         if isinstance(self._event_source, SampledFlux):
             yield from self._run_sampled(self._event_source, progress)
             return
-        edges = self._flux.slice_edges_us(0, self._duration_us)
-        bounds = np.concatenate([[0.0], edges, [float(self._duration_us)]])
+        begin = min([float(self._begin_us), *(float(exposure.start_us) for exposure in self._exposures)])
+        edges = self._flux.slice_edges_us(begin, self._duration_us)
+        bounds = np.concatenate([[begin], edges, [float(self._duration_us)]])
         waiting, open_frames = list(self._exposures), []
-        window = _Window()
+        window = _Window(self._slice_samples())
         for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
             while waiting and waiting[0].start_us < end:
                 open_frames.append(self._open(waiting.pop(0)))
@@ -186,7 +227,7 @@ class Capture:
         if self._stage is None:
             return
         self._event_flux.add(event_a, event_b)
-        for t_us in self._samples:
+        for t_us in self._slice_samples():
             yield self._step(event_a, event_b, int(t_us))
             if progress is not None:
                 progress(float(t_us), self._duration_us, "simulated µs")
@@ -195,14 +236,21 @@ class Capture:
         """A source without slices: all event samples in one go, each frame in one piece when its time has come."""
         waiting = list(self._exposures)
         if self._stage is not None:
-            halves = source.flux_of_windows(*self.event_windows)
-            for t_us, (half_a, half_b) in zip(self._samples, halves, strict=True):
+            times: deque[int] = deque()
+            samples = source.flux_of_blocks(self._evs_pixel, _noting(self.event_blocks(), times))
+            for sample in samples:
+                t_us = times.popleft()
                 while waiting and waiting[0].end_us <= t_us:
                     yield self._whole_frame(waiting.pop(0))
-                self._event_flux.add(half_a, half_b)
-                yield self._step(half_a, half_b, int(t_us))
+                if t_us > self._duration_us:
+                    self._pixel_state = self._stage.state()
+                else:
+                    self._event_flux.add(sample.half_a, sample.half_b)
+                events = self._step(sample.half_a, sample.half_b, t_us)
+                yield events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
                 if progress is not None:
-                    progress(float(t_us), self._duration_us, "simulated µs")
+                    progress(min(t_us, self._duration_us), self._duration_us, "simulated µs")
+            self._pixel_state = self._pixel_state or self._stage.state()
         for exposure in waiting:
             yield self._whole_frame(exposure)
             if progress is not None and self._stage is None:
@@ -210,7 +258,7 @@ class Capture:
 
     def _whole_frame(self, exposure: Exposure) -> Frame:
         frame = self._open(exposure)
-        self._expose(frame, 0.0, float(self._duration_us))
+        self._expose(frame, -np.inf, np.inf)
         return self._read_out(frame)
 
     def _static_flux(self, source: FluxSource, *lists: NDArray[np.uint32]) -> Iterator[tuple[Any, Any]]:
@@ -255,8 +303,8 @@ class Capture:
         if self._stage is None:
             return
         length = self._stage.noise.spec.window_us
-        while window.next < len(self._samples):
-            t_us = int(self._samples[window.next])
+        while window.next < len(window.ends_us):
+            t_us = int(window.ends_us[window.next])
             first, last = max(t_us - length, begin_us), min(t_us, end_us)
             if t_us - length >= end_us:
                 return
@@ -272,6 +320,12 @@ class Capture:
     def _step(self, half_a: Any, half_b: Any, t_us: int) -> NDArray:
         assert self._stage is not None
         seconds = self._stage.noise.spec.window_us * S_PER_US
+        noise = self._sensor.evs
+        self.errors["events"].add(
+            half_a * seconds,
+            half_b * seconds,
+            lambda electrons, which: noise.noise_equivalent_e(electrons, noise.layout.evs_position.ravel()[which]),
+        )
         return self._stage.step((half_a + half_b) * (0.5 * seconds), t_us)
 
     def _read_out(self, frame: _OpenFrame) -> Frame:
@@ -284,6 +338,10 @@ class Capture:
         exposure = frame.exposure
         count = layout.rows * layout.cols
         index = types.UInt32(self._aps_pixel)
+        noise = self._sensor.aps
+        self.errors["frames"].add(
+            frame.half_a, frame.half_b, lambda signal, _: noise.noise_equivalent_e(signal, exposure.exposure_us)
+        )
         mean = 0.5 * (frame.half_a + frame.half_b)
         signal = dr.zeros(types.Float, count)
         dr.scatter(signal, mean, index)
@@ -328,9 +386,10 @@ class EventFlux:
 
 
 class _Window:
-    """Mean flux of the event window being filled, and which sample it belongs to."""
+    """Mean flux of the event window being filled, and which of all samples it belongs to."""
 
-    def __init__(self) -> None:
+    def __init__(self, ends_us: NDArray[np.int64]) -> None:
+        self.ends_us = ends_us
         self.next = 0
         self.half_a: Any = 0.0
         self.half_b: Any = 0.0
@@ -341,6 +400,13 @@ class _Window:
     def reset(self) -> None:
         self.next += 1
         self.half_a = self.half_b = 0.0
+
+
+def _noting(blocks: Iterable[Block], times: deque[int]) -> Iterator[Block]:
+    """The same blocks; the ends of their wanted windows are appended to `times`."""
+    for block in blocks:
+        times.extend(np.rint(block.end_us[block.wanted]).astype(np.int64).tolist())
+        yield block
 
 
 def _take(array: Any, index: NDArray) -> Any:

@@ -13,7 +13,15 @@ import typer
 from hesim_render import __version__
 from hesim_render.errors import HesimError, RangeError
 from hesim_render.output import check_target, discard_unfinished, output_errors
-from hesim_render.terminal import Interrupts, parse_exposures, parse_roi, progress_bar, split_overrides, summary
+from hesim_render.terminal import (
+    Interrupts,
+    is_short_of_wish,
+    parse_exposures,
+    parse_roi,
+    progress_bar,
+    split_overrides,
+    summary,
+)
 
 if TYPE_CHECKING:
     from hesim_render.recording import Recording
@@ -46,6 +54,7 @@ Without = Annotated[
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace what is there")]
 
+_NOT_MET = 3  # a recording is there, but worse than the quality that was asked for
 _INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
@@ -140,7 +149,10 @@ def simulate(
     without: Without = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Render a scene and record it: RAW frames, events and their ground truth."""
+    """Render a scene and record it: RAW frames, events and their ground truth.
+
+    Ends with status 3 where the audit finds that the recording is worse than --quality asks for.
+    """
     _check_duration(duration)
     scene_changes, sensor_changes = split_overrides(set_ or [])
     recording = _simulate(
@@ -150,6 +162,8 @@ def simulate(
         clean=clean, without=without or (),
     )  # fmt: skip
     typer.echo(summary(recording))
+    if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
+        raise typer.Exit(_NOT_MET)
 
 
 @app.command()
@@ -366,7 +380,10 @@ def _simulate(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point. Exit status 0; 2 with one line on stderr where the user can help it; 130 when interrupted."""
+    """Entry point. Exit status 0; 2 with one line on stderr where the user can help it; 130 when interrupted.
+
+    3 where a recording is complete, but worse than the quality that was asked for.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with Interrupts() as interrupts:
         try:

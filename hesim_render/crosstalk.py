@@ -8,14 +8,15 @@ falls into its own exposure, also with a rolling shutter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.backend import jit
-from hesim_render.flux import FluxSource, SampledFlux
+from hesim_render.flux import FluxSource, Sample, SampledFlux
+from hesim_render.schedule import Block
 
 
 def mixed(image: NDArray, part: float) -> NDArray:
@@ -108,14 +109,17 @@ class CrosstalkFlux:
 class SampledCrosstalkFlux(CrosstalkFlux):
     """The same of a source that is asked for many windows at once; implements `SampledFlux`."""
 
-    def flux_of_windows(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
-    ) -> Iterator[tuple[Any, Any]]:
-        """See `SampledFlux.flux_of_windows`."""
+    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
+        """See `SampledFlux.instants_us`."""
+        assert isinstance(self._flux, SampledFlux)
+        return self._flux.instants_us(begin_us, end_us)
+
+    def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
+        """See `SampledFlux.flux_of_blocks`."""
         types = jit()
         sites = self._sites(np.asarray(pixel, dtype=np.int64).ravel())
         asked, place = np.unique(sites, return_inverse=True)
         index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
         assert isinstance(self._flux, SampledFlux)
-        for halves in self._flux.flux_of_windows(asked.astype(np.uint32), begin_us, end_us):
-            yield self._mix(halves, index)
+        for sample in self._flux.flux_of_blocks(asked.astype(np.uint32), blocks):
+            yield Sample(*self._mix((sample.half_a, sample.half_b), index))

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.backend import jit
 from hesim_render.errors import RangeError
 from hesim_render.events import EVENT_DTYPE, no_events
-from hesim_render.noise.arrays import take
+from hesim_render.noise.arrays import restore, saved, take
 from hesim_render.noise.evs import EvsNoise
 from hesim_render.noise.normal import normal_pair
 from hesim_render.noise.photoreceptor import Photoreceptor
@@ -66,6 +66,8 @@ class EvsStage:
     a read-out limit, see `EventReadout`.
     """
 
+    STATE = ("_mode", "_t_us", "_readout")
+
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         self.noise = noise
         mode = _PreviousSample if noise.spec.reference == "previous_sample" else _LastEvent
@@ -75,6 +77,19 @@ class EvsStage:
         if noise.readout_max_events_per_s is not None:
             rows = noise.layout.evs_shape[0]
             self._readout = EventReadout(noise.readout_max_events_per_s, noise.readout_buffer_events, rows)
+
+    def state(self) -> dict[str, Any]:
+        """What the pixels remember, plain values and NumPy arrays: a run goes on from there as if it never stopped."""
+        return saved(self)
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go on from a `state` of a stage of the same sensor, region, terms and seed."""
+        restore(self, state)
+
+    @property
+    def t_us(self) -> int | None:
+        """Time of the last sample; None before the first."""
+        return self._t_us
 
     @property
     def dropped(self) -> int:
@@ -114,6 +129,8 @@ class EvsStage:
 
 class _PreviousSample:
     """Compares successive samples."""
+
+    STATE = ("_t_us", "_level", "_variance", "_photoreceptor")
 
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         self._noise, self._seed = noise, seed
@@ -165,6 +182,11 @@ class _PreviousSample:
 
 class _LastEvent:
     """Keeps the level of each pixel's last event."""
+
+    STATE: tuple[str, ...] = (
+        *("_t_us", "_log", "_spread", "_level", "_reference"),
+        *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
+    )
 
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         self._noise = noise

@@ -3,21 +3,23 @@
 Light adds up: Φ(t) = Σ w(t)·Φ_w, where Φ_w is the flux with only the lights of waveform w lit at their mean level and
 all others dark, and w has the time mean 1. While the geometry stands still each Φ_w is rendered once and the
 mean over an interval is exact: Φ_w times the mean of w, in closed form. Where something moves, the mean of a
-product is taken as the product of the means over pieces of time in which the image moves half a pixel or less,
-or ln w departs from a straight line by 0.002 or less, whichever are fewer.
+product is taken as the product of the means over pieces of time in which the image hardly moves, or ln w departs from
+a straight line by 0.002 or less: in each cell of time (`schedule.CELL_US`) those that are fewer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.backend import jit
-from hesim_render.flux import FluxSource, SampledFlux
+from hesim_render.flux import AuditableFlux, FluxSource, Sample, SampledFlux
 from hesim_render.scene import Scene
+from hesim_render.schedule import CELL_US, Block
 from hesim_render.specs.light import LightSpec
 from hesim_render.specs.waveform import WaveformSpec
 from hesim_render.waveform import Waveform
@@ -29,10 +31,12 @@ _WINDOW_STEPS = 8
 def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
     """The scene once for each different waveform, lit only by the lights that have it; first those without any.
 
-    Scenes without flicker are one part, themselves.
+    Scenes without flicker are one part, themselves. A level of a Mitsuba scene is of all its light: it has to be a
+    factor already (`in_absolute_light`).
     """
     own = scene.spec.mitsuba
     if own is not None:
+        assert not own.has_level
         return _mitsuba_parts(scene)
     lights = scene.spec.lights
     flickering = [_flicker(light.waveform) for light in lights]
@@ -85,20 +89,21 @@ def _mitsuba_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
     return parts
 
 
-def flickering(scene: Scene, make: Callable[[Scene], FluxSource], window_us: float = 1.0) -> FluxSource:
+def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_us: float = 1.0) -> FluxSource:
     """The source of a scene's flux, whatever its lights do.
 
     Parameters
     ----------
     scene : with or without waveforms.
-    make : builds the source of one part of it (``lambda part: RenderedFlux(part, sensor)``), called once where
-        no light flickers.
+    make : builds the source of one part of it, called once where no light flickers; the second argument is the
+        highest power of the part's light over its mean.
     window_us : in which event pixels integrate; a jump of the light is followed through it.
     """
     parts = light_parts(scene)
     if len(parts) == 1 and parts[0][0] is None:
-        return make(parts[0][1])
-    waveforms, sources = [waveform for waveform, _ in parts], [make(part) for _, part in parts]
+        return make(parts[0][1], 1.0)
+    waveforms = [waveform for waveform, _ in parts]
+    sources = [make(part, 1.0 if waveform is None else waveform.highest) for waveform, part in parts]
     if sources[0].is_static or all(isinstance(source, SampledFlux) for source in sources):
         return SampledFlickerFlux(waveforms, sources, window_us)
     return FlickerFlux(waveforms, sources, window_us)
@@ -167,18 +172,25 @@ class FlickerFlux:
         if self._still is not None:
             return _weighted(self._still.halves(pixels), self._weights(begin, end))
         low, high = float(begin.min()), float(end.max())
-        splits = self._splits_us(low, high)
-        if splits.size == 0:
+        cuts = self._cuts_us(low, high)
+        if cuts.size == 0:
             return self._piece(pixels, begin, end, self._weights(begin, end))
-        return self._pieces(pixels, begin, end, np.concatenate([[low], splits, [high]]))
+        return self._pieces(pixels, begin, end, np.concatenate([[low], cuts, [high]]))
 
-    def _splits_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Where to cut an interval so that in each piece image or light hardly change, the fewer of the two."""
+    def _cuts_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside an interval between which image or light hardly change: in every cell the fewer."""
         light = self._follow_us(begin_us, end_us)
         if light.size == 0:
             return light
-        motion = self.sources[0].sample_times_us(begin_us, end_us)
-        return motion if motion.size < light.size else light
+        cuts = [np.empty(0)]
+        for number in range(int(begin_us // CELL_US), -(-int(np.ceil(end_us)) // CELL_US)):
+            low, high = number * CELL_US, (number + 1) * CELL_US
+            # of whole cells, whatever part of them is asked for
+            bright = self._follow_us(low, high)
+            motion = self.sources[0].sample_times_us(low, high) if bright.size else bright
+            cuts += [min(bright, motion, key=len), np.array([high], np.float64)]
+        every = np.unique(np.concatenate(cuts))
+        return every[(every > begin_us) & (every < end_us)]
 
     def _piece(
         self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, weights: list[NDArray[np.float64]]
@@ -221,38 +233,109 @@ class FlickerFlux:
 class SampledFlickerFlux(FlickerFlux):
     """The same where the sources take many windows at once, or nothing moves; implements `SampledFlux`."""
 
-    def flux_of_windows(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
-    ) -> Iterator[tuple[Any, Any]]:
-        """See `SampledFlux.flux_of_windows`."""
+    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
+        """See `SampledFlux.instants_us`."""
+        inner = np.rint(self.sample_times_us(begin_us - 1, end_us + 1)).astype(np.int64)
+        cells = np.arange(begin_us // CELL_US, end_us // CELL_US + 1, dtype=np.int64) * CELL_US
+        every = np.unique(np.concatenate([np.rint([begin_us, end_us]).astype(np.int64), inner, cells]))
+        return every[(every >= begin_us) & (every <= end_us)]
+
+    def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
+        """See `SampledFlux.flux_of_blocks`.
+
+        Windows in which light and image both change are cut into pieces, which are windows of their own.
+        """
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
-        begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
-        if begin.size == 0:
-            return
         if self._still is not None:
             halves = self._still.halves(pixels)
-            for weights in np.stack(self._weights(begin, end), axis=1):
-                yield _weighted(halves, list(weights))
+            for block in blocks:
+                begin, end = block.begin_us[block.wanted], block.end_us[block.wanted]
+                for weights in np.stack(self._weights(begin, end), axis=1):
+                    yield Sample(*_weighted(halves, list(weights)), np.zeros(pixels.size, np.float32))
             return
-        # windows in which light and image both change are cut; their pieces are windows of their own
-        low, high = float(begin.min()), float(end.max())
-        light, motion = self._follow_us(low, high), self.sources[0].sample_times_us(low, high)
-        cut = [min(_between(light, b, e), _between(motion, b, e), key=len) for b, e in zip(begin, end, strict=True)]
-        first = np.concatenate([[b, *inner] for b, inner in zip(begin, cut, strict=True)])
-        last = np.concatenate([[*inner, e] for e, inner in zip(end, cut, strict=True)])
-        count = np.array([inner.size + 1 for inner in cut])
-        length = np.repeat(end - begin, count)
-        share = np.divide(last - first, length, out=np.ones_like(length), where=length > 0)
-        weights = np.stack(self._weights(first, last), axis=1) * share[:, None]
+        mine, *others = itertools.tee(map(self._cut, blocks), 1 + len(self.sources))
         streams = []
-        for source in self.sources:
+        for source, cut in zip(self.sources, others, strict=True):
             assert isinstance(source, SampledFlux)
-            streams.append(source.flux_of_windows(pixels, first, last))
-        pieces = zip(weights, *streams, strict=True)
-        for number in count:
-            taken = [next(pieces) for _ in range(number)]
-            halves = [half for _, *parts in taken for half in parts]
-            yield _weighted(halves, [weight for own, *_ in taken for weight in own])
+            streams.append(source.flux_of_blocks(pixels, (pieces for pieces, _ in cut)))
+        samples = zip(*streams, strict=True)
+        for pieces, counts in mine:
+            begin, end = pieces.begin_us[pieces.wanted], pieces.end_us[pieces.wanted]
+            weights = np.stack(self._weights(begin, end), axis=1)
+            for first, count in zip(np.cumsum(counts) - counts, counts, strict=True):
+                length = end[first + count - 1] - begin[first]
+                share = (end - begin)[first : first + count] / length if length > 0 else np.ones(1)
+                yield self._sum([next(samples) for _ in range(count)], weights[first : first + count] * share[:, None])
+
+    def _cut(self, block: Block) -> tuple[Block, NDArray[np.int64]]:
+        """Pieces of a block's windows; and how many each wanted one has.
+
+        Of the first window, which belongs to the block before, there is the last piece: where that one ends.
+        """
+        begin, end, wanted, counts = [], [], [], []
+        for number, (low, high, asked) in enumerate(zip(block.begin_us, block.end_us, block.wanted, strict=True)):
+            bounds = np.concatenate([[low], self._cuts_us(low, high), [high]])
+            if number == 0 and not asked:
+                bounds = bounds[-2:]
+            begin.append(bounds[:-1])
+            end.append(bounds[1:])
+            wanted.append(np.full(bounds.size - 1, asked))
+            if asked:
+                counts.append(bounds.size - 1)
+        return Block(*map(np.concatenate, (begin, end, wanted))), np.array(counts, np.int64)
+
+    def _sum(self, samples: Sequence[tuple[Sample, ...]], weights: NDArray[np.float64]) -> Sample:
+        """Of all sources, [source] each, in the pieces of a window; `weights` [piece, source]."""
+        every = [sample for piece in samples for sample in piece]
+        half_a, half_b = _weighted([(one.half_a, one.half_b) for one in every], list(weights.ravel()))
+        # the halves of all pieces have the same random numbers: their errors add up; those of two sources do not
+        of_sources = np.zeros((len(self.sources), len(every[0].error) if every[0].error is not None else 0), np.float32)
+        for number, total in enumerate(of_sources):
+            for piece, weight in zip(samples, weights[:, number], strict=True):
+                error = piece[number].error
+                if error is not None:
+                    total += np.float32(weight) * error
+        return Sample(half_a, half_b, np.sqrt(np.sum(of_sources**2, axis=0)))
+
+    # ---- for the audit, where the sources have what it takes ---------------------------------------
+
+    @property
+    def _auditable(self) -> list[AuditableFlux]:
+        return [source for source in self.sources if isinstance(source, AuditableFlux)]
+
+    @property
+    def rays_traced(self) -> int:
+        """Of all sources."""
+        return sum(source.rays_traced for source in self._auditable)
+
+    def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
+        """None: light changes everywhere."""
+        return np.zeros(pixel.size, np.bool_)
+
+    def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
+        """See `ChangeDrivenFlux.noise_unit`."""
+        return self._auditable[0].noise_unit(pixel, flux, events)
+
+    def reference_flux(
+        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], quality: float
+    ) -> NDArray[np.float64]:
+        """See `ChangeDrivenFlux.reference_flux`."""
+        if self._still is not None:
+            asked, place = np.unique(pixel, return_inverse=True)
+            zero = np.zeros(asked.size)
+            parts = [source.reference_flux(asked, zero, zero + 1.0, quality)[place] for source in self._auditable]
+            return np.sum([w * part for w, part in zip(self._weights(begin_us, end_us), parts, strict=True)], axis=0)
+        spans, number = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
+        bounds = [np.concatenate([[low], self._cuts_us(low, high), [high]]) for low, high in spans.T]
+        counts = np.array([each.size - 1 for each in bounds])[number.ravel()]
+        pair = np.repeat(np.arange(pixel.size), counts)
+        low, high = (np.concatenate([bounds[k][part] for k in number.ravel()]) for part in (slice(-1), slice(1, None)))
+        length = (end_us - begin_us)[pair]
+        share = np.divide(high - low, length, out=np.ones_like(length), where=length > 0)
+        total = np.zeros(pixel.size)
+        for source, weight in zip(self._auditable, self._weights(low, high), strict=True):
+            np.add.at(total, pair, share * weight * source.reference_flux(pixel[pair], low, high, quality))
+        return total
 
 
 class _StillFlux:
@@ -294,11 +377,6 @@ class _StillFlux:
         for kept in self._kept:
             room = [types.Float(np.zeros(missing, np.float32)) for _ in range(2)]
             kept[:] = [dr.concat([*old]) for old in zip(kept, room, strict=True)] if kept else room
-
-
-def _between(times_us: NDArray[np.float64], begin_us: float, end_us: float) -> NDArray[np.float64]:
-    first, last = np.searchsorted(times_us, begin_us, side="right"), np.searchsorted(times_us, end_us, side="left")
-    return times_us[first : max(first, last)]
 
 
 def _weighted(halves: Sequence[tuple[Any, Any]], weights: Sequence[ArrayLike]) -> tuple[Any, Any]:

@@ -69,6 +69,7 @@ def build(
             "f_number": sensor.lens.f_number,
             "focal_length_mm": sensor.lens.focal_length_mm,
             "magnification": sensor.lens.magnification,
+            "axis_mm": list(sensor.lens.axis_mm),
         },
         "sensor": {"name": spec.name, "file": sensor.file, "sha256": content_hash(spec), "spec": _dump(spec)},
         "scene": None

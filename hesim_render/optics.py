@@ -23,11 +23,14 @@ class Lens:
     f_number : N.
     focal_length_mm : f.
     magnification : m (|m| counts); image distance is f (1 + |m|).
+    axis_mm : where the optical axis meets the chip, from the full sensor's centre: to the right and downwards in the
+        image (the principal point).
     """
 
     f_number: float
     focal_length_mm: float
     magnification: float
+    axis_mm: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(
@@ -61,7 +64,7 @@ class Lens:
 
 
 def pixel_centres_mm(layout: Layout) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Position of pixel centres on the chip from the optical axis (the full sensor's centre).
+    """Position of pixel centres on the chip from the full sensor's centre.
 
     Returns
     -------
@@ -76,13 +79,25 @@ def pixel_centres_mm(layout: Layout) -> tuple[NDArray[np.floating], NDArray[np.f
 
 def relative_illumination(layout: Layout, lens: Lens) -> NDArray[np.float32]:
     """V(x) at every pixel centre, [row, col]: cos⁴ of the chief ray's angle, a table, or 1."""
-    kind = layout.spec.lens.relative_illumination
-    x, y = pixel_centres_mm(layout)
-    squared = x[None, :] ** 2 + y[:, None] ** 2
+    row, col = np.ogrid[layout.row0 : layout.row0 + layout.rows, layout.col0 : layout.col0 + layout.cols]
+    return relative_illumination_at(layout.spec, lens, row, col)
+
+
+def relative_illumination_at(
+    spec: SensorSpec, lens: Lens, row: NDArray[np.integer], col: NDArray[np.integer]
+) -> NDArray[np.float32]:
+    """V(x) at the centres of pixels of the full sensor, in the shape of `row` and `col` together."""
+    geometry, kind = spec.geometry, spec.lens.relative_illumination
+    pitch_mm = geometry.pitch_um * 1e-3
+    x, y = (
+        (place + 0.5 - count / 2) * pitch_mm - axis
+        for place, count, axis in zip((col, row), (geometry.cols, geometry.rows), lens.axis_mm, strict=True)
+    )
+    squared = x**2 + y**2
     if isinstance(kind, IlluminationTable):
         return np.interp(np.sqrt(squared), kind.image_height_mm, kind.relative).astype(np.float32)
     if kind == "none":
-        return np.ones(layout.shape, dtype=np.float32)
+        return np.ones(squared.shape, dtype=np.float32)
     return ((1 + squared / lens.image_distance_mm**2) ** -2).astype(np.float32)
 
 

@@ -32,6 +32,11 @@ class Stream(IntEnum):
     THRESHOLD_ON = 20
     THRESHOLD_OFF = 21
     RENDER_PILOT = 22
+    RENDER_ZOOM = 40
+    AUDIT = 41
+    AUDIT_PILOT = 42
+    LIGHT_LEVEL = 43
+    LIGHT_LEVEL_PILOT = 44
 
 
 def stream_key(seed: int, stream: Stream) -> int:

@@ -42,6 +42,10 @@ class Scene:
         motion: Sequence[TrackSpec | Mapping[str, Any]] = (),
         max_depth: int | None = None,
         radiance_scale: float = 1.0,
+        illuminance_lux: float | None = None,
+        irradiance_w_m2: float | None = None,
+        plane_point_m: Sequence[float] | None = None,
+        plane_normal: Sequence[float] | None = None,
         waveforms: Mapping[str, Any] | None = None,
         name: str = "mitsuba",
     ) -> Scene:
@@ -56,14 +60,23 @@ class Scene:
         motion : tracks (keys of `TrackSpec`) of shapes, by their id, and of ``camera``.
         max_depth : path length; default the scene's own path tracer with its depth, else 8.
         radiance_scale : multiplies all radiance, which is taken as W m⁻² sr⁻¹ nm⁻¹.
+        illuminance_lux, irradiance_w_m2 : in its place: the level that all light of the scene together makes, lx or
+            W m⁻² (360 to 830 nm), on the plane through `plane_point_m` [3] with the normal `plane_normal` [3].
         waveforms : flicker of emitters (keys of a scene file's ``waveform``), by the id of their shape or their own.
 
         Raises
         ------
         SpecError
-            If the camera or the motion is not valid, or the file is missing.
+            If the camera, the motion or the level is not valid, or the file is missing.
         """
-        source: dict[str, Any] = {"radiance_scale": radiance_scale, "waveforms": dict(waveforms or {})}
+        source: dict[str, Any] = {
+            "radiance_scale": radiance_scale,
+            "illuminance_lux": illuminance_lux,
+            "irradiance_w_m2": irradiance_w_m2,
+            "plane_point_m": plane_point_m,
+            "plane_normal": plane_normal,
+            "waveforms": dict(waveforms or {}),
+        }
         if isinstance(scene, Mapping):
             source["inline"] = dict(scene)
         else:

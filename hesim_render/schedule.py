@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +58,65 @@ def exposures(spec: ApsSpec, rows: int, duration_us: int) -> list[Exposure]:
         if exposure.end_us > duration_us:
             return found
         found.append(exposure)
+
+
+#: Intervals between windows in a block: what is filled in lies between two windows of one.
+BLOCK_INTERVALS = 16
+#: Sample times of sensors without a tick of their own are found cell by cell of this length, µs; cells begin at its
+#: multiples, which are sample times themselves.
+CELL_US = 1000
+
+
+@dataclass(frozen=True)
+class Block:
+    """Successive windows in which event pixels are sampled.
+
+    Blocks are cut at times of their own, whatever is asked for: so what a run gives at a time does not depend on when
+    it begins or ends. The last window of a block is the first of the next.
+
+    Parameters
+    ----------
+    begin_us, end_us : [w], in order of time.
+    wanted : [w], windows that the run asks for; the others are needed to fill in between.
+    """
+
+    begin_us: NDArray[np.float64]
+    end_us: NDArray[np.float64]
+    wanted: NDArray[np.bool_]
+
+
+def tick_blocks(spec: EvsSpec, begin_us: float, end_us: float) -> Iterator[Block]:
+    """Windows of the fixed comparisons after one time and up to another: window k ends at k·tick_us."""
+    assert spec.tick_us is not None
+    first, last = int(begin_us // spec.tick_us) + 1, int(end_us // spec.tick_us)
+    for number in range((first - 1) // BLOCK_INTERVALS, -(-last // BLOCK_INTERVALS)):
+        ticks = np.arange(BLOCK_INTERVALS * number, BLOCK_INTERVALS * (number + 1) + 1)
+        wanted = (ticks >= first) & (ticks <= last)
+        wanted[0] = False  # it is the last one of the block before
+        ends = ticks.astype(np.float64) * spec.tick_us
+        yield Block(ends - spec.window_us, ends, wanted)
+
+
+def instant_blocks(
+    instants_us: Callable[[float, float], NDArray[np.int64]], window_us: int, begin_us: float, end_us: float
+) -> Iterator[Block]:
+    """Windows that end at the instants of a source, after one time and up to another.
+
+    Of every `BLOCK_INTERVALS` cells, the instants are cut into blocks of as many intervals.
+
+    Parameters
+    ----------
+    instants_us : see `SampledFlux.instants_us`.
+    """
+    length = BLOCK_INTERVALS * CELL_US
+    for number in range(int(begin_us // length), -(-int(np.ceil(end_us)) // length)):
+        instants = instants_us(number * length, (number + 1) * length)
+        for first in range(0, instants.size - 1, BLOCK_INTERVALS):
+            ends = instants[first : first + BLOCK_INTERVALS + 1].astype(np.float64)
+            wanted = (ends > begin_us) & (ends <= end_us)
+            wanted[0] = False
+            if wanted.any():
+                yield Block(ends - window_us, ends, wanted)
 
 
 def ticks_us(spec: EvsSpec, duration_us: int) -> NDArray[np.int64]:

@@ -13,10 +13,13 @@ from hesim_render.capture import Capture, Progress, noise_models
 from hesim_render.errors import RangeError
 from hesim_render.flicker import flickering
 from hesim_render.recording import Recording, RecordingWriter
-from hesim_render.renderer.coherent import QUALITY, CoherentFlux
-from hesim_render.renderer.estimate import Estimate, estimate
+from hesim_render.renderer.audit import STRETCHES, Audit
+from hesim_render.renderer.change_driven import QUALITY, ChangeDrivenFlux
 from hesim_render.renderer.flux import RenderedFlux
+from hesim_render.renderer.forecast import Estimate, forecast
+from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.moving import NeedsExactMode
+from hesim_render.renderer.notes import NotedFlux
 from hesim_render.scene import Scene
 from hesim_render.sensor import Sensor
 from hesim_render.units import US_PER_S
@@ -87,22 +90,27 @@ def simulate(
     if quality is not None and (exact or samples is not None):
         raise RangeError("quality", quality, "no exact mode and no samples beside it: they are another way")
     aps, evs = noise_models(sensor, clean, without)
-    flux, settings = _source(scene, sensor, seed, quality, samples, exact, progress)
+    seen, level = in_absolute_light(scene)
+    flux, settings = _source(seen, sensor, seed, quality, samples, exact, progress)
+    if level is not None:
+        settings["light_level"] = level.as_dict()
     settings |= {"clean": clean, "without": list(without), "backend": backend.select().describe()}
-    capture = Capture(flux, flux.sensor, aps, evs, duration_us, seed)
-    rendering = _coherent_parts(flux)
+    rendering = _change_driven_parts(flux)
+    wanted = rendering[0].quality if rendering else None
+    plain = Capture(flux, flux.sensor, aps, evs, duration_us, seed)
     if rendering:
-        parts = [estimate(part, *capture.event_windows, *capture.frame_exposures) for part in rendering]
-        expected = Estimate(*(sum(getattr(p, name) for p in parts) for name in ("seconds", "peak_bytes", "rays")))
+        expected = forecast(rendering, plain.event_pixels, plain.event_blocks, *plain.frame_exposures)
         if on_estimate is not None:
             on_estimate(expected)
         if max_minutes is not None and expected.seconds > 60 * max_minutes:
             raise RangeError(
-                "quality", rendering[0].quality,
+                "quality", wanted,
                 f"a larger one: this run takes {expected}, more than {max_minutes:g} min (--yes, max_minutes=None)",
             )  # fmt: skip
         if flux.is_static:
             rendering[0].progress = _share_progress(expected.rays, progress)
+    noted = _noted(flux, plain, seed) if rendering else None
+    capture = plain if noted is None else Capture(noted, flux.sensor, aps, evs, duration_us, seed)
     with RecordingWriter(
         out,
         flux.sensor,
@@ -113,8 +121,15 @@ def simulate(
         overwrite=overwrite,
     ) as writer:
         capture.record(writer, progress)
-        if rendering:
-            writer.add_settings({"render": _report(rendering)})
+        render: dict[str, Any] = {
+            "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
+        }
+        if noted is not None:
+            render |= _work_done(rendering)
+            noise = flux.sensor.evs if flux.sensor.spec.evs is not None else None
+            audit = Audit(noted, flux, rendering[0].quality, noise, capture.event_pixels, seed)
+            render["audit"] = audit.run()
+        writer.add_settings({"render": render})
         return writer.finish()
 
 
@@ -132,9 +147,12 @@ def _source(
     window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
     if not exact and samples is None:
         wanted = QUALITY if quality is None else quality
+
+        def make(part: Scene, most_power: float) -> ChangeDrivenFlux:
+            return ChangeDrivenFlux(part, sensor, wanted, seed=seed, most_power=most_power)
+
         try:
-            flux = flickering(scene, lambda part: CoherentFlux(part, sensor, wanted, seed=seed), window_us)
-            return flux, {"mode": "coherent", "quality": wanted}
+            return flickering(scene, make, window_us), {"mode": "change-driven", "quality": wanted}
         except NeedsExactMode as error:
             if quality is not None:
                 raise
@@ -142,20 +160,30 @@ def _source(
     default = MOVING_SAMPLES if scene.spec.motion else STATIC_SAMPLES
     rays = default if samples is None else samples
     told = _ray_progress(scene, sensor, rays, progress)
-    flux = flickering(scene, lambda part: RenderedFlux(part, sensor, samples=rays, seed=seed, progress=told), window_us)
+    flux = flickering(
+        scene, lambda part, _: RenderedFlux(part, sensor, samples=rays, seed=seed, progress=told), window_us
+    )
     return flux, settings | {"mode": "exact", "samples": rays}
 
 
-def _coherent_parts(flux: Any) -> list[CoherentFlux]:
+def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
     """The change-driven renderers of a source: one for each waveform of its lights; none in the exact mode."""
-    return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, CoherentFlux)]
+    return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
 
 
-def _report(parts: list[CoherentFlux]) -> dict[str, Any]:
-    """What was reached; where lights flicker apart, of the part that is worst."""
-    reports = [part.report() for part in parts]
-    worst = max(reports, key=lambda report: report["audit"]["exceeding_fraction_at_most"])
-    return worst if len(reports) == 1 else {**worst, "rays": sum(r["rays"] for r in reports), "renders": len(reports)}
+def _noted(flux: Any, capture: Capture, seed: int) -> NotedFlux:
+    """The source, with units of an audit noted on the way."""
+    spec = flux.sensor.spec.evs
+    stretch = STRETCHES[spec.reference] if spec is not None else (0, 1, 0)
+    windows = 0 if flux.is_static else sum(int(block.wanted.sum()) for block in capture.event_blocks())
+    frames = 1 if flux.is_static else max(1, len(capture.frame_exposures[1]))
+    return NotedFlux(flux, capture.event_pixels, windows, frames, *stretch, seed)
+
+
+def _work_done(parts: list[ChangeDrivenFlux]) -> dict[str, Any]:
+    """Rays and pairs of all parts, plain values."""
+    total = {name: sum(getattr(part.counts, name) for part in parts) for name in vars(parts[0].counts)}
+    return {"quality": parts[0].quality, "renders": len(parts), **total}
 
 
 def _share_progress(total: float, progress: Progress | None) -> Callable[[int], None] | None:

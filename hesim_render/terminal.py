@@ -98,19 +98,52 @@ def _reached(render: dict[str, Any] | None) -> list[str]:
     """What a render of a wanted quality has come to."""
     if render is None:
         return []
-    audit = render["audit"]
-    lines = [f"  render: error {render['error_rms_noise']:.2f} of the sensor's noise (asked for {render['quality']:g})"]
-    if render["pairs_over_quality"]:
-        share = render["pairs_over_quality"] / max(1, render["pairs_rendered"])
-        lines[0] += f"; {100 * share:.2g} % of the pixels need more rays than the most allowed"
-    if audit["filled_in"]:
-        bound = audit["exceeding_fraction_at_most"]
-        verdict = "" if bound <= audit["wanted_at_most"] else ": more than it should; ask for a smaller --quality"
-        lines.append(
-            f"  audit: of {audit['filled_in']} values not rendered at most {100 * bound:.2g} % are off by more than "
-            f"{audit['tolerance_noise']:g} of the noise (99 % confidence){verdict}"
+    wanted = f", asked for {render['quality']:g}" if "quality" in render else ""
+    lines = []
+    for name, error in render["error_noise"].items():
+        if error is not None:
+            lines.append(
+                f"  render, {name}: stated error {_short(error['rms'])} of the sensor's noise (rms{wanted}); "
+                f"95 % of values below {_short(error['p95'])}, 99 % below {_short(error['p99'])}"
+            )
+    audit = render.get("audit", {})
+    for name in ("events", "frames"):
+        part = audit.get(name)
+        if part is None:
+            continue
+        line = (
+            f"  audit, {name}: {_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of "
+            f"the noise, with 99 % confidence at most {_percent(part['off_at_most'])}"
         )
-    return lines
+        if part.get("true_events"):
+            line += (
+                f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
+                f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"
+            )
+        lines.append(line)
+    return lines + _verdict(audit)
+
+
+def _verdict(audit: dict[str, Any]) -> list[str]:
+    """The line that says so if a run is not what it should be, or not shown to be."""
+    if not is_short_of_wish(audit):
+        if audit.get("verdict") == "not shown":
+            return ["  audit: too little was looked at again to confirm this run's quality; nothing speaks against it"]
+        return []
+    return [f"  NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]
+
+
+def is_short_of_wish(audit: dict[str, Any] | None) -> bool:
+    """Whether an audit has found that a run is not what was asked for."""
+    return audit is not None and audit.get("verdict") == "not met"
+
+
+def _short(value: float) -> str:
+    return f"{value:.2g}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
 
 
 class Interrupts:

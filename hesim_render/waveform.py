@@ -31,6 +31,11 @@ class Waveform(Protocol):
         """True where it is 1 at all times."""
         ...
 
+    @property
+    def highest(self) -> float:
+        """Highest value, 1 or more."""
+        ...
+
     def mean(self, begin_us: ArrayLike, end_us: ArrayLike) -> NDArray[np.float64]:
         """Mean over each interval in closed form, arrays of any shapes that fit; the value where begin is end."""
         ...
@@ -79,6 +84,10 @@ class Mains:
     def is_constant(self) -> bool:
         return self.depth == 0
 
+    @property
+    def highest(self) -> float:
+        return 1 + self.depth
+
     def mean(self, begin_us: ArrayLike, end_us: ArrayLike) -> NDArray[np.float64]:
         """See `Waveform.mean`."""
         begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
@@ -120,6 +129,10 @@ class Pwm:
     @property
     def is_constant(self) -> bool:
         return self.duty == 1
+
+    @property
+    def highest(self) -> float:
+        return 1 / self.duty
 
     def _on(self, cycles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Time switched on since the start of a period, in periods."""
@@ -179,6 +192,10 @@ class Table:
     @property
     def is_constant(self) -> bool:
         return bool(np.ptp(self._power) == 0)
+
+    @property
+    def highest(self) -> float:
+        return float(self._power.max())
 
     def _integral(self, local_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """∫ w from the first sample on, µs; `local_us` counts from there and may lie outside the table."""

@@ -7,7 +7,8 @@ import numpy as np
 from scipy import constants
 
 import hesim_render as hr
-from hesim_render.renderer.flux import RenderedFlux
+from hesim_render.renderer.flux import RenderedFlux, used_responses
+from hesim_render.renderer.pairs import PairTracer, Windows
 from hesim_render.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 
@@ -61,3 +62,16 @@ def mitsuba_scene(shapes, motion=(), depth=3):
         motion=list(motion),
         max_depth=depth,
     )
+
+
+def pair_tracer(scene, sensor, seed=3):
+    """What the default mode traces with."""
+    return PairTracer(scene, sensor, seed, used_responses(sensor))
+
+
+def traced(tracer, rays, begin_us=0.0, end_us=1000.0, lit=False):
+    """Every pixel of the region in one window, a `PairFlux`."""
+    pixel = tracer.sensor.layout.full_index.ravel()
+    window = Windows(np.array([begin_us]), np.array([end_us]))
+    count = pixel.size
+    return tracer.trace(pixel, np.zeros(count, np.int64), window, np.full(count, rays), np.full(count, lit))

@@ -9,11 +9,12 @@ from hesim_render.backend import jit
 from hesim_render.capture import Capture, noise_models
 from hesim_render.errors import SpecError
 from hesim_render.flicker import FlickerFlux, SampledFlickerFlux, flickering, light_parts
-from hesim_render.flux import SampledFlux
+from hesim_render.flux import Sample, SampledFlux
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.flux import RenderedFlux
 from hesim_render.renderer.specfilm import reference_flux
 from hesim_render.scene import Scene
+from hesim_render.schedule import Block
 from hesim_render.waveform import Mains, Pwm
 
 CARD = {"type": "flat", "width_m": 0.4, "height_m": 0.3, "reflectance": {"flat": 0.5}}
@@ -50,9 +51,14 @@ class Formula:
 class Windows(Formula):
     """The same, asked for many windows at once."""
 
-    def flux_of_windows(self, pixel, begin_us, end_us):
-        for begin, end in zip(begin_us, end_us, strict=True):
-            yield self.mean_flux(pixel, begin, end)
+    def instants_us(self, begin_us, end_us):
+        first, last = np.ceil(np.array([begin_us, end_us]) / self.pace_us).astype(np.int64)
+        return (np.arange(first, last) * self.pace_us).astype(np.int64)
+
+    def flux_of_blocks(self, pixel, blocks):
+        for block in blocks:
+            for k in np.flatnonzero(block.wanted):
+                yield Sample(*self.mean_flux(pixel, block.begin_us[k], block.end_us[k]), None)
 
 
 def run(flux, sensor, duration_us):
@@ -73,7 +79,7 @@ def test_rows_of_a_rolling_shutter_equal_the_closed_form():
     begin = np.arange(64)[:, None] * 37.5
     for waveform in (MAINS, PWM):
         scene = card({**light, "waveform": waveform})
-        flux = flickering(scene, lambda part: RenderedFlux(part, sensor, 4, 3))
+        flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 4, 3))
         assert not flux.is_static
         frames, _ = run(flux, sensor, 100_000)
         assert len(frames) == len(steady) == 3
@@ -110,7 +116,7 @@ def test_each_light_is_rendered_once_while_nothing_moves():
         {"type": "point", "position_m": [0, 1, 1], "illuminance_lux": 50, "waveform": {**MAINS, "depth": 0}},
     ]
 
-    def make(part):
+    def make(part, most_power):
         rays.append(0)
         number = len(rays) - 1
 
@@ -127,7 +133,7 @@ def test_each_light_is_rendered_once_while_nothing_moves():
 def test_a_scene_without_flicker_is_its_own_source():
     scene = card({"type": "uniform", "illuminance_lux": 1}, {"type": "uniform", "illuminance_lux": 2})
     made = []
-    assert flickering(scene, lambda part: made.append(part) or "the source") == "the source"
+    assert flickering(scene, lambda part, _: made.append(part) or "the source") == "the source"
     assert made == [scene]
     flat = card({"type": "uniform", "illuminance_lux": 1, "waveform": {"type": "pwm", "frequency_hz": 100, "duty": 1}})
     assert [waveform for waveform, _ in light_parts(flat)] == [None]
@@ -158,7 +164,7 @@ def image(source, shape, begin_us, end_us):
 def test_lights_add_up():
     sensor = mono(24, 18)
     scene = card(*LIGHTS)
-    flux = flickering(scene, lambda part: RenderedFlux(part, sensor, 256, 3))
+    flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 256, 3))
     assert len(flux.sources) == 3
     parts = [np.mean(image(source, (18, 24), 0, 1), axis=0) for source in flux.sources]
     seen = np.mean(image(flux, (18, 24), 2000, 5300), axis=0)
@@ -180,7 +186,7 @@ def test_lights_add_up():
 def test_one_instant_agrees_with_the_second_estimator():
     sensor, t_us = mono(12, 8), 1100.0
     scene = card(*LIGHTS)
-    flux = flickering(scene, lambda part: RenderedFlux(part, sensor, 512, 3))
+    flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 512, 3))
     a, b = image(flux, (8, 12), t_us, t_us)
     reference = reference_flux(scene, sensor, 256, t_us, repeats=8, seed=9)
     other, error = reference.mosaic()
@@ -215,7 +221,7 @@ def test_emitters_of_a_mitsuba_scene_flicker_by_name(tmp_path):
     box["lamp"] = {**lamp, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [4, 4, 4]}}}
     sensor = mono(24, 24)
     scene = Scene.from_mitsuba(box, waveforms={"lamp": PWM}, max_depth=3)
-    flux = flickering(scene, lambda part: RenderedFlux(part, sensor, 64, 3))
+    flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 64, 3))
     dark = np.mean(image(flux, (24, 24), 1000, 2000), axis=0)  # on from 0 to 0.75 ms of 2.5 ms
     lit = np.mean(image(flux, (24, 24), 0, 500), axis=0)
     box["lamp"] = lamp
@@ -231,14 +237,14 @@ def test_emitters_of_a_mitsuba_scene_flicker_by_name(tmp_path):
     (tmp_path / "s.xml").write_text(xml)
     camera = {"origin_m": (0, 0, 4)}
     scene = Scene.from_mitsuba(tmp_path / "s.xml", waveforms={"bulb": PWM}, camera=camera)
-    flux = flickering(scene, lambda part: RenderedFlux(part, sensor, 64, 3))
+    flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 64, 3))
     on, off = (np.mean(image(flux, (24, 24), *span), axis=0)[12, 12] for span in ((0, 1), (1000, 1001)))
     # sky: L = ρ L_sky; bulb at 2 m: ρ I/(π d²); with d65 of equal power, the bulb 1/duty bright
     np.testing.assert_allclose(on / off, 1 + 3 / (4 * np.pi) / 0.3, rtol=0.02)
     with pytest.raises(SpecError, match=r"no emitter 'lamp' in the Mitsuba scene; there are 'bulb'"):
         flickering(
             Scene.from_mitsuba(tmp_path / "s.xml", waveforms={"lamp": PWM}, camera=camera),
-            lambda part: RenderedFlux(part, sensor, 2),
+            lambda part, _: RenderedFlux(part, sensor, 2),
         )
 
 
@@ -353,15 +359,19 @@ def test_windows_are_what_the_mean_over_each_would_be():
     begin = np.arange(12) * 1500.0
     end = begin + 1500.0
     pixels = np.arange(3, dtype=np.uint32)
-    seen = [np.array(a)[1] / 1.01 for a, _ in flux.flux_of_windows(pixels, begin, end)]
-    assert len(seen) == 12
-    for k in range(12):
+    blocks = [Block(begin[part], end[part], np.arange(6) > 0) for part in (slice(0, 6), slice(5, 11))]
+    blocks[0].wanted[0] = True
+    seen = [np.array(sample.half_a)[1] / 1.01 for sample in flux.flux_of_blocks(pixels, blocks)]
+    assert len(seen) == 11
+    for k in range(11):
         steady = 3e4 * (1 + 100 * (begin[k] + 750) * 1e-6)
         expected = product_mean(1e5, 100.0, begin[k] * 1e-6, end[k] * 1e-6) + steady
         np.testing.assert_allclose(seen[k], expected, rtol=2e-4)
     still = flickering_formula([Mains(50, 0.4, 70)], [Windows(1e5)])
-    for k, (a, _) in enumerate(still.flux_of_windows(pixels, begin, end)):
-        np.testing.assert_allclose(np.array(a) / 1.01, product_mean(1e5, 0, begin[k] * 1e-6, end[k] * 1e-6), rtol=1e-5)
+    for k, sample in enumerate(still.flux_of_blocks(pixels, blocks)):
+        np.testing.assert_allclose(
+            np.array(sample.half_a) / 1.01, product_mean(1e5, 0, begin[k] * 1e-6, end[k] * 1e-6), rtol=1e-5
+        )
     assert [len(asked) for asked in still.sources[0].asked] == [3]
 
 
@@ -380,7 +390,7 @@ def test_edges_of_the_motion_are_passed_on_and_times_are_those_of_both():
     )
     sensor = mono(32, 24)
     plain = RenderedFlux(light_parts(scene)[0][1], sensor, 2)
-    flux = flickering(scene, lambda part: RenderedFlux(part, sensor, 2))
+    flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 2))
     assert not isinstance(flux, SampledFlux)
     np.testing.assert_array_equal(flux.slice_edges_us(0, 5000), plain.slice_edges_us(0, 5000))
     times = flux.sample_times_us(0, 5000)

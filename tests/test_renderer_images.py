@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from rendering import flux_image, mitsuba_scene, mono
+from rendering import flux_image, mitsuba_scene, mono, pair_tracer
+from rendering import traced as traced_pairs
 
 from hesim_render.renderer import paths
 from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.flux import used_responses
 from hesim_render.renderer.images import Cones, LampImages
-from hesim_render.renderer.timed import TimedTracer
 
 COLS, ROWS = 32, 24
 GREY = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
@@ -45,11 +44,7 @@ def room(bsdf=GREY, depth=3, **shapes):
 
 def traced(scene, rays, seed=3):
     """Both halves of the flux of every pixel, [2, n]."""
-    sensor = mono(COLS, ROWS)
-    tracer = TimedTracer(scene, sensor, seed, used_responses(sensor))
-    pixel = np.arange(COLS * ROWS, dtype=np.uint32)
-    times = np.zeros(pixel.size), np.full(pixel.size, 1000.0)
-    result = tracer.trace(pixel, *times, np.full(pixel.size, rays))
+    result = traced_pairs(pair_tracer(scene, mono(COLS, ROWS), seed), rays)
     return np.stack([result.half_a, result.half_b]).astype(np.float64)
 
 

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from rendering import mitsuba_scene, mono
+from rendering import mitsuba_scene, mono, pair_tracer, traced
 
 from hesim_render.renderer import moving, parts
 from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.flux import used_responses
 from hesim_render.renderer.parts import Part
-from hesim_render.renderer.timed import TimedTracer
 
 COUNT = 100_000
 
@@ -85,8 +83,7 @@ def test_hits_and_surfaces_are_those_of_mitsuba(name):
     assert part._scene is None
     theirs = scene.ray_intersect(ray)
     hit, face = part.nearest(ray, False, everywhere)
-    ours = hit.compute_surface_interaction(ray, mi.RayFlags.All, face == 0)
-    part.describe(ours, ray, hit, face)
+    ours = part.surface(hit, face, ray, mi.RayFlags.All, everywhere)
 
     met, wanted = np.array(hit.is_valid()), np.array(theirs.is_valid())
     assert 0.05 < wanted.mean() < 0.9
@@ -172,8 +169,7 @@ def test_a_ray_leaves_the_face_it_starts_from():
         normal /= np.linalg.norm(normal)
         ray = mi.Ray3f(mi.Point3f((middle + size * normal[:, None]).astype(np.float32)), mi.Vector3f(-normal))
         hit, face = part.nearest(ray, False, mi.Bool(True))
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(False))
-        part.describe(si, ray, hit, face)
+        si = part.surface(hit, face, ray, mi.RayFlags.All, mi.Bool(True))
         assert np.array(face).min() == 1
         turned = rng.normal(size=(3, COUNT))
         turned /= np.linalg.norm(turned, axis=0)
@@ -229,8 +225,8 @@ def test_an_even_sky_is_left_to_the_surfaces_own_directions():
     pixel = np.arange(32 * 24, dtype=np.uint32)
 
     def weights_and_flux(shapes):
-        tracer = TimedTracer(mitsuba_scene(shapes, depth=3), sensor, 3, used_responses(sensor))
-        result = tracer.trace(pixel, np.zeros(pixel.size), np.ones(pixel.size), np.full(pixel.size, 256))
+        tracer = pair_tracer(mitsuba_scene(shapes, depth=3), sensor)
+        result = traced(tracer, 256, 0.0, 1.0)
         weights = {light.class_name(): light.sampling_weight() for light in tracer.parts.static.emitters()}
         return weights, np.stack([result.half_a, result.half_b]).astype(np.float64)
 

@@ -115,4 +115,6 @@ def _illumination(recording: Recording) -> NDArray[np.float32]:
     spec = SensorSpec.model_validate(recording.manifest["sensor"]["spec"])
     roi, used = recording.manifest["roi"], recording.manifest["lens"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
-    return relative_illumination(layout, Lens(used["f_number"], used["focal_length_mm"], used["magnification"]))
+    axis_x, axis_y = used.get("axis_mm", (0.0, 0.0))  # recordings of before it was told have theirs in the middle
+    lens = Lens(used["f_number"], used["focal_length_mm"], used["magnification"], (axis_x, axis_y))
+    return relative_illumination(layout, lens)

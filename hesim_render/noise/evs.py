@@ -243,12 +243,15 @@ class EvsNoise:
 
     def _log_level(self, electrons: Any, k: _Coefficients, xp: ModuleType) -> tuple[Any, Any]:
         x = k.slope * electrons + k.base
+        return xp.log(x), self._variance(electrons, k, xp) / (x * x)
+
+    def _variance(self, electrons: Any, k: _Coefficients, xp: ModuleType) -> Any:
+        """s²."""
         root = electrons if self.spec.shot_law == "linear" else xp.sqrt(electrons)
         # with full anticorrelation s² is a square that can be 0: rounding must not take it below
-        variance = xp.maximum((k.light * root + k.cross) * root + k.dark, 0.0)
-        return xp.log(x), variance / (x * x)
+        return xp.maximum((k.light * root + k.cross) * root + k.dark, 0.0)
 
-    def noise_equivalent_e(self, electrons: NDArray, event_pixel: NDArray[np.integer]) -> NDArray[np.float64]:
+    def noise_equivalent_e(self, electrons: NDArray, position: NDArray[np.integer]) -> NDArray:
         """The change of a window's electrons that equals one standard deviation of ln x, or θ/20 if that is more.
 
         What a deviation of the clean signal is measured against. The floor keeps a sensor (nearly) without
@@ -256,19 +259,31 @@ class EvsNoise:
 
         Parameters
         ----------
-        electrons : [n], noise-free electrons of the window.
-        event_pixel : [n], places on the event grid, row-major.
+        electrons : [..., n], noise-free electrons of the window; float32 is kept.
+        position : [n], event positions, counted in reading order of the tile.
 
         Returns
         -------
-        [n], electrons.
+        [..., n], electrons: the larger of s and θ/20·x, over the slope dx/dN.
+        """
+        kind = np.result_type(electrons, np.float32)
+        k = _Coefficients(**{name: values.astype(kind)[position] for name, values in vars(self._table).items()})
+        theta = min(self.spec.contrast_threshold_on, self.spec.contrast_threshold_off)
+        counted = np.maximum(electrons, kind.type(0))
+        floor = kind.type(LEAST_NOISE_THETA * theta) * (k.slope * counted + k.base)
+        return np.maximum(np.sqrt(self._variance(counted, k, np)), floor) / k.slope
+
+    def log_signal(self, electrons_per_s: NDArray[np.float64], event_pixel: NDArray[np.integer]) -> NDArray[np.float64]:
+        """ln x, noise-free, of a flux.
+
+        Parameters
+        ----------
+        electrons_per_s : [..., n], e⁻/s.
+        event_pixel : [n], places on the event grid, row-major.
         """
         where = self.layout.evs_position.ravel()[event_pixel]
         k = _Coefficients(**{name: values[where] for name, values in vars(self._table).items()})
-        x = k.slope * electrons + k.base
-        _, variance = self._log_level(np.maximum(electrons, 0.0), k, np)
-        theta = min(self.spec.contrast_threshold_on, self.spec.contrast_threshold_off)
-        return np.maximum(np.sqrt(variance), LEAST_NOISE_THETA * theta) * x / k.slope
+        return self._log_level(np.maximum(electrons_per_s, 0.0) * (self.spec.window_us * S_PER_US), k, np)[0]
 
     def _position_number(self, position: int | tuple[int, int] | None) -> int:
         known = self.layout.spec.positions("evs")

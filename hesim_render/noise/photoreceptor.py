@@ -44,6 +44,8 @@ class Photoreceptor:
     noise : with `photoreceptor` given.
     """
 
+    STATE = ("_t_us", "_node", "_input", "_state", "_rate", "_node_rate")
+
     def __init__(self, noise: EvsNoise) -> None:
         spec = noise.photoreceptor
         assert spec is not None

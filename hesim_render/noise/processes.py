@@ -36,6 +36,8 @@ class BandNoise:
     for it.
     """
 
+    STATE = ("_node", "_value", "_state")
+
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         cutoff_hz = noise.spec.photoreceptor_cutoff_hz
         assert cutoff_hz is not None
@@ -96,6 +98,8 @@ class BandNoise:
 
 class LeakProcess:
     """Leak events: each pixel waits exponentially distributed times."""
+
+    STATE = ("_due_us", "_count")
 
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         self._key = noise.device_key

@@ -39,6 +39,8 @@ class EventReadout:
     dropped : events lost so far.
     """
 
+    STATE = ("_waiting", "_clock", "dropped")
+
     def __init__(self, rate_hz: float, capacity: int, rows: int) -> None:
         self._rate_hz, self._capacity, self._rows = float(rate_hz), int(capacity), rows
         self._waiting = 0

@@ -28,6 +28,8 @@ class Refractory:
     pixels : how many there are.
     """
 
+    STATE = ("_ready_us",)
+
     def __init__(self, period_us: float, pixels: int) -> None:
         import drjit as dr
 

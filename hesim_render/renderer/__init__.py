@@ -6,6 +6,7 @@ Nothing outside this package imports mitsuba.
 from hesim_render.renderer.camera import View, place_camera
 from hesim_render.renderer.cube import read_spectral_exr, render_cube, write_spectral_exr
 from hesim_render.renderer.flux import RenderedFlux
+from hesim_render.renderer.reference import reference_windows
 from hesim_render.renderer.specfilm import reference_flux
 from hesim_render.renderer.trajectory import Trajectory
 
@@ -16,6 +17,7 @@ __all__ = [
     "place_camera",
     "read_spectral_exr",
     "reference_flux",
+    "reference_windows",
     "render_cube",
     "write_spectral_exr",
 ]

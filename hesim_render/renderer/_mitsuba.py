@@ -19,6 +19,7 @@ from hesim_render import backend
 from hesim_render.errors import SpecError
 from hesim_render.spectra import Spectrum
 
+_LEAST_THREADS = 2
 #: Largest departure of a wavelength from an even grid, relative, that counts as rounding.
 _EVEN = 1e-9
 
@@ -37,7 +38,19 @@ def mitsuba() -> Any:
     if mi.variant() != wanted:
         mi.set_variant(wanted)
     mi.set_log_level(mi.LogLevel.Error)
+    _have_threads()
     return mi
+
+
+def _have_threads() -> None:
+    """Let there be two threads at least: on a machine of one core Mitsuba would wait for ever.
+
+    It reads and writes EXR files in tasks of its pool, one of which waits for others.
+    """
+    import drjit as dr
+
+    if dr.thread_count() < _LEAST_THREADS:
+        dr.set_thread_count(_LEAST_THREADS)
 
 
 @contextmanager
@@ -78,25 +91,13 @@ def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[N
         raise SpecError(f"Mitsuba cannot read this scene: {' '.join(lines)[:400]}", file=file, key=key) from None
 
 
-def load_scene(
-    mi: Any, source: Path | dict[str, Any], shines: Callable[[str], bool] | None = None, names: Sequence[str] = ()
-) -> Any:
-    """A scene from an XML file or a dictionary, nothing merged; where asked to, with some of its emitters left out.
+def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], None]) -> Any:
+    """A scene from an XML file or a dictionary, nothing merged.
 
     Parameters
     ----------
-    shines : whether the emitter of a name is wanted. Its name is the id of its shape, or its own.
-    names : that must be emitters of the scene.
-
-    Raises
-    ------
-    SpecError
-        If a name is not one of an emitter.
+    review : called with the `ParserState` of what was read, before anything is made of it; it may change that.
     """
-    if shines is None:
-        if isinstance(source, Path):
-            return mi.load_file(str(source), optimize=False)
-        return mi.load_dict(source, optimize=False)
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -110,14 +111,25 @@ def load_scene(
             parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
         )
         parser.transform_all(config, state)
-        _switch_off(state, shines, names)
+        review(state)
         return parser.instantiate(config, state)
     finally:
         mi.set_file_resolver(resolver)
 
 
-def _switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:
-    """Take the unwanted emitters out of a parsed scene; a shape that loses its own stays."""
+def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:
+    """Take the unwanted emitters out of a parsed scene; a shape that loses its own stays.
+
+    Parameters
+    ----------
+    shines : whether the emitter of a name is wanted. Its name is the id of its shape, or its own.
+    names : that must be emitters of the scene.
+
+    Raises
+    ------
+    SpecError
+        If a name is not one of an emitter.
+    """
     import mitsuba as mi
 
     nodes, known = state.nodes, set()
@@ -194,7 +206,7 @@ def transform(mi: Any, matrix: NDArray[np.float64] | Sequence[Sequence[float]]) 
 class Movable:
     """One shape of a loaded scene whose pose can be set: initial geometry, moved by a rigid pose."""
 
-    def __init__(self, parameters: Any, prefix: str) -> None:
+    def __init__(self, parameters: Any, prefix: str, shape: Any) -> None:
         self._parameters = parameters
         self.prefix = prefix
         self._to_world: NDArray[np.float64] | None = None
@@ -208,8 +220,12 @@ class Movable:
         else:
             matrix = np.array(parameters[f"{prefix}.to_world"].matrix, dtype=np.float64)
             self._to_world = matrix.reshape(matrix.shape[0], matrix.shape[1], -1)[:, :, 0]
-            unit = box_corners(-np.ones(3), np.ones(3))  # Mitsuba's analytic shapes fit into [-1, 1]³
-            self.corners = unit @ self._to_world[:3, :3].T + self._to_world[:3, 3]
+            if shape.class_name() == "Instance":
+                box = shape.bbox()
+                self.corners = box_corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())
+            else:
+                unit = box_corners(-np.ones(3), np.ones(3))  # Mitsuba's analytic shapes fit into [-1, 1]³
+                self.corners = unit @ self._to_world[:3, :3].T + self._to_world[:3, 3]
 
     def set_pose(self, pose: NDArray[np.float64]) -> None:
         """Put the shape at `pose` (4×4 rigid) times its initial placement; takes effect at ``parameters.update()``."""

@@ -16,21 +16,20 @@ from hesim_render.renderer._mitsuba import (
     Movable,
     as_spec_error,
     box_corners,
-    load_scene,
     make_mesh,
     spectrum_dict,
     transform,
 )
+from hesim_render.renderer.mitsuba_camera import MitsubaCamera
+from hesim_render.renderer.mitsuba_scene import load_mitsuba, path_tracer
+from hesim_render.renderer.paint import Paint
 from hesim_render.renderer.targets import build_target
 from hesim_render.renderer.trajectory import Trajectory, rotation_about
-from hesim_render.specs.scene import MitsubaSpec, ObjectSpec, SceneSpec
+from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.spectra import Spectrum, require_coverage
 
-#: Path length for a Mitsuba scene without a path tracer of its own.
-_DEFAULT_MITSUBA_DEPTH = 8
-#: Segments from which on Russian roulette ends some paths. Mitsuba's default is 5; but a vector of lanes takes as long
-#: as its longest path, so that roulette saves little, and what it adds to the noise is a lot.
-_ROULETTE_DEPTH = 16
+#: Shapes that have no inside: they are seen from both sides.
+_OPEN_SHAPES = ("rectangle", "mesh")
 
 
 @dataclass
@@ -46,6 +45,10 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : of the groups that really move.
     is_dark : True where nothing emits.
+    paints : of all shapes but lamps, where all are matt and the light is direct; else None.
+    exact_because : why the scene needs the exact mode; None where it does not.
+    camera : the Mitsuba scene's own, where it is used.
+    integrator_plugin : what a Mitsuba scene's integrator was made of; None where it was made before.
     """
 
     mi: Any
@@ -55,6 +58,10 @@ class BuiltScene:
     groups: dict[str, list[Movable]]
     trajectories: dict[str, Trajectory]
     is_dark: bool
+    paints: list[Paint] | None
+    exact_because: str | None = None
+    camera: MitsubaCamera | None = None
+    integrator_plugin: dict[str, Any] | None = None
 
     def pose(self, t_us: float) -> None:
         """Put every moving object at its pose of `t_us`."""
@@ -81,10 +88,9 @@ class BuiltScene:
             return np.zeros((8, 3))
         return box_corners(np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel())
 
-    def mitsuba_sensor(self) -> Mapping[str, Any] | None:
-        """Parameters of the scene's own first sensor, if it has one."""
-        sensors = self.scene.sensors()
-        return self.mi.traverse(sensors[0]) if sensors else None
+    def mitsuba_sensor(self) -> MitsubaCamera | None:
+        """The camera of the scene's own first sensor, if it has one and the scene file has none."""
+        return self.camera
 
 
 def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = None) -> BuiltScene:
@@ -98,29 +104,39 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
     Raises
     ------
     SpecError
-        If Mitsuba refuses the scene, a spectrum does not cover a response, or a track moves nothing.
+        If Mitsuba refuses the scene, a plugin of it is not rendered, a spectrum does not cover a response, or a track
+        moves nothing.
     """
     if responses:
         check_coverage(spec, responses)
+    because, camera, plugin = None, None, None
     if spec.mitsuba is not None:
-        scene = _load_mitsuba(mi, spec, spec.mitsuba)
-        integrator = _integrator(mi, scene, spec.max_depth)
+        loaded = load_mitsuba(mi, spec, spec.mitsuba)
+        scene, integrator, because, camera = loaded.scene, loaded.integrator, loaded.exact_because, loaded.camera
+        plugin = loaded.integrator_plugin
         groups: dict[str, list[str]] = {}
+        paints = None
     else:
-        content, groups = _describe(mi, spec)
+        content, groups, paints = _describe(mi, spec)
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
-        integrator = _path_tracer(mi, spec.max_depth or 2)
+        integrator = path_tracer(mi, spec.max_depth or 2)
     parameters = mi.traverse(scene)
     trajectories = {track.object: Trajectory(track) for track in spec.motion if track.object != "camera"}
     movable: dict[str, list[Movable]] = {}
+    shapes = {shape.id(): shape for shape in scene.shapes()}
     for name in trajectories:
         prefixes = groups.get(name, [name])
         for prefix in prefixes:
-            if f"{prefix}.vertex_positions" not in parameters and f"{prefix}.to_world" not in parameters:
-                known = ", ".join(sorted(shape.id() for shape in scene.shapes()))
+            if prefix not in shapes:
+                known = ", ".join(sorted(shapes))
                 raise SpecError(f"motion: no shape {name!r} in the Mitsuba scene; there are {known}", file=spec.file)
-        movable[name] = [Movable(parameters, prefix) for prefix in prefixes]
+            if f"{prefix}.vertex_positions" not in parameters and f"{prefix}.to_world" not in parameters:
+                kind = shapes[prefix].class_name()
+                raise SpecError(
+                    f"motion: shape {name!r} is a {kind}, which cannot move; use a mesh (PLY, OBJ)", file=spec.file
+                )
+        movable[name] = [Movable(parameters, prefix, shapes[prefix]) for prefix in prefixes]
     return BuiltScene(
         mi=mi,
         scene=scene,
@@ -129,13 +145,18 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
         groups=movable,
         trajectories={name: trajectory for name, trajectory in trajectories.items() if trajectory.moves},
         is_dark=len(scene.emitters()) == 0,
+        paints=paints if (spec.max_depth or 2) == 2 else None,
+        exact_because=because,
+        camera=camera,
+        integrator_plugin=plugin,
     )
 
 
-def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]]]:
-    """Mitsuba's dictionary of a scene file, and which shape ids belong to each movable name."""
+def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
+    """Mitsuba's dictionary of a scene file, which shape ids belong to each movable name, and the shapes' paint."""
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
+    paints: list[Paint] = []
     if spec.target is not None:
         groups["target"] = []
         for number, piece in enumerate(build_target(spec.target)):
@@ -143,15 +164,24 @@ def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[
             bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
             content[name] = make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf)
             groups["target"].append(name)
+            paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
         content[name] = _object(mi, item, name, spec.folder)
         groups[item.name] = [name]
+        paints.append(_paint(item, name))
     try:
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
-    return content, groups
+    return content, groups, paints
+
+
+def _paint(item: ObjectSpec, name: str) -> Paint:
+    """What `_object` paints an object with."""
+    colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
+    u, v = item.pattern_count
+    return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
 
 
 def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
@@ -168,9 +198,8 @@ def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
             "color1": spectrum_dict(item.pattern.load()),
             "to_uv": transform(mi, scale),
         }
-    # seen from both sides where a shape has no inside
     bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
-    if item.shape in ("rectangle", "mesh"):
+    if item.shape in _OPEN_SHAPES:
         bsdf = {"type": "twosided", "material": bsdf}
     if item.shape == "sphere":
         to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))
@@ -220,70 +249,6 @@ def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
             vertices.append(face)
             uv.append(flat_uv)
     return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv)
-
-
-def _load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> Any:
-    """A scene of Mitsuba's own, with the emitters that are wanted."""
-    if source.file is not None:
-        path = spec.folder / source.file
-        if not path.is_file():
-            raise SpecError(f"no such Mitsuba scene file: {path}", file=spec.file, key="mitsuba.file")
-        content: Path | dict[str, Any] = path
-        where: tuple[Path | None, str | None] = (path, None)
-    else:
-        own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {})
-        content, where = {"type": "scene", **own}, (spec.file, "mitsuba.inline")
-    with as_spec_error(*where):
-        scene = load_scene(mi, content)
-    if not isinstance(scene, mi.Scene):
-        raise SpecError("the Mitsuba file describes no scene", file=source.file or spec.file, key="mitsuba")
-    meant_dark = bool(spec.lights)  # of type 'none', or the scene file would have been refused
-    if meant_dark and scene.emitters():
-        raise SpecError("type 'none' is darkness, but the Mitsuba scene has emitters", file=spec.file, key="light")
-    if not meant_dark and not scene.emitters():
-        raise SpecError(
-            "the Mitsuba scene has no emitter, so there is nothing to see; if it is meant to be dark, write "
-            "'light: {type: none}' beside it",
-            file=spec.file,
-            key="mitsuba",
-        )
-    if source.lit is not None or source.unlit or source.waveforms:
-        names = [*(source.lit or ()), *source.unlit, *source.waveforms]
-        try:
-            with as_spec_error(*where):
-                scene = load_scene(mi, content, source.may_shine, names)
-        except SpecError as error:
-            if error.file is not None:
-                raise
-            raise SpecError(str(error), file=spec.file, key="mitsuba") from None
-    return scene
-
-
-def _integrator(mi: Any, scene: Any, depth: int | None) -> Any:
-    """The scene's own path tracer where it has one and no depth is asked for, else one of that depth."""
-    own = scene.integrator()
-    if depth is None and isinstance(own, mi.MonteCarloIntegrator):
-        return own
-    return _path_tracer(mi, depth or _DEFAULT_MITSUBA_DEPTH)
-
-
-def _path_tracer(mi: Any, depth: int) -> Any:
-    return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": _ROULETTE_DEPTH})
-
-
-def _plugin_dict(mi: Any, node: Mapping[str, Any]) -> dict[str, Any]:
-    """A dictionary as YAML writes it: 4×4 lists become transforms, lists of numbers in spectra become text."""
-    content: dict[str, Any] = {}
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            content[key] = _plugin_dict(mi, value)
-        elif isinstance(value, list) and np.shape(value) == (4, 4):
-            content[key] = transform(mi, value)
-        elif isinstance(value, list) and key in ("wavelengths", "values"):
-            content[key] = ",".join(f"{float(v):.9g}" for v in value)
-        else:
-            content[key] = value
-    return content
 
 
 def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:

@@ -75,21 +75,25 @@ class LampImages:
     def __len__(self) -> int:
         return len(self._images)
 
-    def seen_from(self, si: Any, active: Any) -> Cones:
-        """Cones of directions from a surface point to the images that can light it."""
+    def seen_from(self, point: Any, upwards: Any, active: Any) -> Cones:
+        """Cones of directions from surface points to the images that can light them.
+
+        Parameters
+        ----------
+        point, upwards : Point3f, and unit Vector3f to the side that is seen; world space.
+        """
         import drjit as dr
 
         mi = self._mi
         cones = []
-        upwards = dr.mulsign(mi.Vector3f(si.sh_frame.n), mi.Frame3f.cos_theta(si.wi))
         for centre, square, normal, offset in self._images:
-            to = centre - si.p
+            to = centre - point
             far = dr.squared_norm(to)
             axis = to * dr.rsqrt(far)
             square_sine = dr.minimum(square / far, 1.0)
             width = square_sine / (1 + dr.sqrt(1 - square_sine))
             there = active & (far > 1.02 * square) & (width > _NARROWEST)
-            there &= (dr.dot(mi.Vector3f(si.p), normal) > offset) & (dr.dot(upwards, axis) > 0)
+            there &= (dr.dot(mi.Vector3f(point), normal) > offset) & (dr.dot(upwards, axis) > 0)
             chance = dr.select(there, mi.Float(_SHARE / len(self._images)), 0.0)
             cones.append((axis, width, chance))
         return Cones(mi, cones)

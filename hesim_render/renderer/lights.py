@@ -88,7 +88,7 @@ def emitters(mi: Any, given: Sequence[LightSpec]) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     skies: list[Spectrum] = []
     for number, light in enumerate(given):
-        name = "light" if len(given) == 1 else f"light_{number}"
+        name = name_of(given, number)
         level = irradiance(light)
         if light.type == "area":
             entries[name] = _area(mi, light, level, key_of(given, number))
@@ -109,36 +109,60 @@ def emitters(mi: Any, given: Sequence[LightSpec]) -> dict[str, Any]:
     return entries
 
 
+def name_of(given: Sequence[LightSpec], number: int) -> str:
+    """Name of a light's entry in the Mitsuba scene."""
+    return "light" if len(given) == 1 else f"light_{number}"
+
+
 def key_of(given: Sequence[LightSpec], number: int) -> str:
     """Where a light stands in the scene file."""
     return "light" if len(given) == 1 else f"light.{number}"
 
 
-def _beam(light: LightSpec, level: Spectrum, key: str) -> dict[str, Any]:
-    """A directional or a point light."""
+def geometry_on_plane(light: LightSpec, key: str) -> float:
+    """What a light of unit strength gives its plane at its point, unshadowed: irradiance is strength times this.
+
+    ``area``: radiance, ∫ cos θ dω in sr. ``point``: intensity, cos θ/d² in sr/m². ``directional``: irradiance across
+    the beam, cos θ.
+
+    Raises
+    ------
+    SpecError
+        If the light cannot reach its plane from the front.
+    """
     plane, normal = _plane(light, key)
     if light.type == "directional":
-        travel = _unit(np.array(light.direction, dtype=np.float64), light, f"{key}.direction")
-        across = level.scaled(1 / _facing(float(-travel @ normal), key))
-        return {"type": "directional", "direction": travel.tolist(), "irradiance": spectrum_dict(across)}
-    away = np.array(light.position_m, dtype=np.float64) - plane
-    cosine = _facing(float(_unit(away, light, f"{key}.position_m") @ normal), key)
-    intensity = spectrum_dict(level.scaled(float(away @ away) / cosine))
-    return {"type": "point", "position": list(light.position_m or ()), "intensity": intensity}
+        return _facing(float(-beam_direction(light, key) @ normal), key)
+    if light.type == "point":
+        away = np.array(light.position_m, dtype=np.float64) - plane
+        return _facing(float(_unit(away, light, f"{key}.position_m") @ normal), key) / float(away @ away)
+    frame = area_light_frame(light)
+    corners = frame[:3, 3] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ frame[:3, :2].T
+    return _facing(form_factor_integral(corners, plane, normal), key)
+
+
+def beam_direction(light: LightSpec, key: str = "light") -> NDArray[np.float64]:
+    """Unit vector [3] in which a directional light travels."""
+    return _unit(np.array(light.direction, dtype=np.float64), light, f"{key}.direction")
+
+
+def _beam(light: LightSpec, level: Spectrum, key: str) -> dict[str, Any]:
+    """A directional or a point light."""
+    strength = spectrum_dict(level.scaled(1 / geometry_on_plane(light, key)))
+    if light.type == "directional":
+        return {"type": "directional", "direction": beam_direction(light, key).tolist(), "irradiance": strength}
+    return {"type": "point", "position": list(light.position_m or ()), "intensity": strength}
 
 
 def _area(mi: Any, light: LightSpec, level: Spectrum | None, key: str) -> dict[str, Any]:
-    plane, normal = _plane(light, key)
-    frame = area_light_frame(light)
+    frame, geometry = area_light_frame(light), geometry_on_plane(light, key)
     rectangle: dict[str, Any] = {
         "type": "rectangle",
         "to_world": transform(mi, frame),
         "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
     }
     if level is not None:
-        corners = frame[:3, 3] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ frame[:3, :2].T
-        radiance = level.scaled(1 / _facing(form_factor_integral(corners, plane, normal), key))
-        rectangle["emitter"] = {"type": "area", "radiance": spectrum_dict(radiance)}
+        rectangle["emitter"] = {"type": "area", "radiance": spectrum_dict(level.scaled(1 / geometry))}
     return rectangle
 
 

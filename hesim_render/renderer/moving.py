@@ -1,14 +1,16 @@
 """A scene in which every ray has a time of its own: what moves rests in a scene of its own, and rays go to it.
 
-Mitsuba has no animated transforms, and setting a pose costs a rebuild. Here a ray is turned into each
-moving object's own frame at the ray's own time, met with the object at rest, and the nearest hit of all
-frames is turned back. Any number of instants is then one kernel, motion within an exposure is exact, and
-nothing is rebuilt or recompiled.
+Mitsuba has no animated transforms, and setting a pose costs a rebuild. Here a ray is turned into each moving object's
+own frame at the ray's own time, met with the object at rest, and the nearest hit of all frames counts. Any number of
+instants is then one kernel, motion within an exposure is exact, and nothing is rebuilt or recompiled.
+
+Objects are asked only about rays that meet the box which holds them all the while (`Moment.boxes`): poses are not even
+computed for the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
+from hesim_render.renderer.boxes import Moment, inverse_of, meets_box
 from hesim_render.renderer.builder import BuiltScene
+from hesim_render.renderer.fleet import Fleet
 from hesim_render.renderer.parts import Part
-from hesim_render.renderer.trajectory import DevicePose, Trajectory
+from hesim_render.renderer.tracks import DevicePose, Tracks
+from hesim_render.renderer.trajectory import Trajectory
+
+#: Objects in closed form that are tried one by one; more are tried in a loop, whose kernel serves any number.
+_FEW = 3
 
 
 class NeedsExactMode(SpecError):
@@ -42,14 +50,43 @@ class Group:
     trajectory: Trajectory
     corners: NDArray[np.float64]
 
-    def swept_box(self, begin_us: float, end_us: float, steps: int = 16) -> NDArray[np.float64]:
-        """Axis-parallel box around every place the group takes within an interval, [2, 3], m."""
-        times = np.linspace(begin_us, end_us, steps + 1)
-        poses = self.trajectory.matrix(times)
-        points = self.corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-        # between two steps a corner leaves their chord by less than the chord's own length
-        margin = np.linalg.norm(np.diff(points, axis=0), axis=-1).max(initial=0.0) / 2 + 1e-6
-        return np.stack([points.min(axis=(0, 1)) - margin, points.max(axis=(0, 1)) + margin])
+
+class Surface:
+    """Where rays have met a scene.
+
+    A moving object is met, and its surface evaluated, where it rests: textures and attributes of meshes are looked up
+    by the place on the mesh as it was loaded. What leaves the surface is turned to where the object is.
+
+    Parameters
+    ----------
+    rest : `SurfaceInteraction3f` in the frame in which the met shapes rest.
+    pose : of those shapes, per lane; None where nothing moves.
+    met : Dr.Jit Bool, whether the ray came through the box of a moving object.
+    """
+
+    def __init__(self, mi: Any, rest: Any, pose: DevicePose | None, met: Any) -> None:
+        self.rest, self._pose, self.met = rest, pose, met
+        point, normal = rest.p, rest.n
+        if pose is not None:
+            point, normal = mi.Point3f(pose.to_world(point)), mi.Normal3f(pose.turn_to_world(normal))
+        #: The same point as `Interaction3f` in world space.
+        self.world = mi.Interaction3f(rest.t, rest.time, rest.wavelengths, point, normal)
+
+    @property
+    def shading_normal(self) -> Any:
+        """In world space."""
+        n = self.rest.sh_frame.n
+        return n if self._pose is None else self._pose.turn_to_world(n)
+
+    def to_local(self, direction: Any) -> Any:
+        """From world space into the shading frame."""
+        turned = direction if self._pose is None else self._pose.turn_to_rest(direction)
+        return self.rest.to_local(turned)
+
+    def to_world(self, direction: Any) -> Any:
+        """From the shading frame into world space."""
+        turned = self.rest.to_world(direction)
+        return turned if self._pose is None else type(turned)(self._pose.turn_to_world(turned))
 
 
 class MovingScene:
@@ -62,11 +99,14 @@ class MovingScene:
     Raises
     ------
     NeedsExactMode
-        If a moving shape emits light, the scene's integrator is not Mitsuba's path tracer, or it hides lights.
+        If a moving shape emits light, a plugin of the scene asks for that mode, the scene's integrator is not Mitsuba's
+        path tracer, or it hides lights.
     """
 
     def __init__(self, built: BuiltScene) -> None:
         mi = built.mi
+        if built.exact_because is not None:
+            raise NeedsExactMode(built.exact_because)
         if not path_traced(built):
             name = built.integrator.class_name()
             raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
@@ -81,6 +121,8 @@ class MovingScene:
         built.rest()
         parts: dict[str, dict[str, Any]] = {name: {} for name in built.trajectories}
         resting: dict[str, Any] = {}
+        #: All shapes by the ids that they were loaded with; Mitsuba gives them others in the scenes made here.
+        self.shapes = {shape.id(): shape for shape in built.scene.shapes()}
         for number, shape in enumerate(built.scene.shapes()):
             group = moving.get(shape.id())
             if group is None:
@@ -110,67 +152,126 @@ class MovingScene:
             )
             for name, shapes in parts.items()
         ]
+        self._sort_groups()
 
-    def intersect(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> Any:
-        """The nearest surface of all parts, `SurfaceInteraction3f` in world space.
+    def _sort_groups(self) -> None:
+        """Which groups are tried one by one, and which in a loop."""
+        simple = [number for number, group in enumerate(self.groups) if group.part.form is not None]
+        together = simple if len(simple) > _FEW else []
+        self._single = [number for number in range(len(self.groups)) if number not in together]
+        self._fleet = None
+        if self.groups:
+            self._tracks = Tracks([group.trajectory for group in self.groups])
+        if together:
+            forms = [form for k in together if (form := self.groups[k].part.form) is not None]
+            self._fleet = Fleet(self.mi, forms, together, self._tracks)
+
+    def intersect(self, ray: Any, moment: Moment, coherent: Any, active: Any, flags: Any = None) -> Surface:
+        """The nearest surface of all parts.
 
         Parameters
         ----------
         ray : Ray3f in world space.
-        poses : of each group, per lane.
+        moment : when.
         coherent : whether neighbouring lanes' rays are alike.
+        flags : `RayFlags` of what to know of the surface; default all.
         """
         import drjit as dr
 
         mi = self.mi
-        nearest, face, chosen, ray_there = self._nearest(ray, poses, coherent, active)
-        si = nearest.compute_surface_interaction(ray_there, mi.RayFlags.All, active & (face == 0))
-        for number, part in enumerate([self._resting, *(group.part for group in self.groups)]):
-            if part.face_count:
-                part.describe(si, ray_there, nearest, dr.select(chosen == number, face, 0))
-        if not poses:
-            return si
-        pose = _pose_of(chosen, poses)
-        si.p, si.n = mi.Point3f(pose.to_world(si.p)), mi.Normal3f(pose.turn_to_world(si.n))
-        for part, names in ((si.sh_frame, ("s", "t", "n")), (si, ("dp_du", "dp_dv"))):
-            for name in names:
-                own = getattr(part, name)
-                setattr(part, name, type(own)(pose.turn_to_world(own)))
-        return si
+        flags = mi.RayFlags.All if flags is None else flags
+        hit, face = self._resting.nearest(ray, coherent, active)
+        rest = self._resting.surface(hit, face, ray, flags, active)
+        if not self.groups:
+            return Surface(mi, rest, None, mi.Bool(False))
+        pose = DevicePose.none(mi.Vector3f)
 
-    def distance(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
-        """To the nearest surface of all parts, m; infinite where there is none."""
-        return self._nearest(ray, poses, False, active)[0].t
+        def take(closer: Any, found: Any, own: DevicePose, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            rest, *columns, shift = state
+            columns = [dr.select(closer, a, b) for a, b in zip(own.columns, columns, strict=True)]
+            return dr.select(closer, found, rest), *columns, dr.select(closer, own.shift, shift)
 
-    def place_before(self, ray: Any, now: Sequence[DevicePose], then: Sequence[DevicePose]) -> tuple[Any, Any, Any]:
-        """Where the point that a ray meets at one time was at another, in world space; whether it meets any; whose."""
-        nearest, _, whose, ray_there = self._nearest(ray, now, True, self.mi.Bool(True))
-        point = ray_there(nearest.t)
-        return _pose_of(whose, then).to_world(point) if then else point, nearest.is_valid(), whose
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            local.maxt = dr.minimum(local.maxt, state[0].t)
+            hit, face = group.part.nearest(local, coherent, near)
+            closer = near & hit.is_valid()
+            return take(closer, group.part.surface(hit, face, local, flags, closer), own, state)
 
-    def occluded(self, ray: Any, poses: Sequence[DevicePose], active: Any) -> Any:
-        """Whether anything lies on a ray before its `maxt`."""
-        blocked = self._resting.blocks(ray, active)
-        for group, pose in zip(self.groups, poses, strict=True):
-            blocked |= group.part.blocks(_at_rest(ray, pose), active & ~blocked)
-        return blocked
+        resting = rest.t
+        state: tuple[Any, ...] = rest, *pose.columns, pose.shift
+        state, met = self._visit_groups(ray, moment, active, resting, state, visit)
+        if self._fleet is not None:
+            fleet = self._fleet
+            hit, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
+            met |= near
 
-    def _nearest(self, ray: Any, poses: Sequence[DevicePose], coherent: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """Preliminary intersection, face of its part, number of that (0 rests), and the ray in its frame."""
+            def describe(*state: Any) -> tuple[Any, ...]:
+                own = fleet.pose(number, moment)
+                found = hit.compute_surface_interaction(_at_rest(ray, own), flags, hit.is_valid())
+                return take(hit.is_valid(), found, own, state)
+
+            state = dr.if_stmt(state, hit.is_valid(), describe, lambda *state: state, label="moving surface")
+        rest, *columns, shift = state
+        return Surface(mi, rest, DevicePose(tuple(columns), shift), met)
+
+    def distance(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+        """To the nearest surface of all parts, m, infinite where there is none; and whether it met a group's box."""
         import drjit as dr
 
-        mi = self.mi
-        nearest, face = self._resting.nearest(ray, coherent, active)
-        chosen, ray_there = mi.UInt32(0), ray
-        for number, (group, pose) in enumerate(zip(self.groups, poses, strict=True), start=1):
-            local = _at_rest(ray, pose)
-            local.maxt = dr.select(nearest.t < ray.maxt, nearest.t, ray.maxt)
-            hit, place = group.part.nearest(local, coherent, active)
-            closer = hit.is_valid()
-            nearest, face = dr.select(closer, hit, nearest), dr.select(closer, place, face)
-            chosen = dr.select(closer, mi.UInt32(number), chosen)
-            ray_there = dr.select(closer, local, ray_there)
-        return nearest, face, chosen, ray_there
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            local.maxt = dr.minimum(local.maxt, state[0])
+            hit, _ = group.part.nearest(local, False, near)
+            return (dr.select(near & hit.is_valid(), hit.t, state[0]),)
+
+        resting = self._resting.nearest(ray, False, active)[0].t
+        (nearest,), met = self._visit_groups(ray, moment, active, resting, (resting,), visit)
+        if self._fleet is not None:
+            hit, _, near = self._fleet.nearest(ray, moment, dr.minimum(ray.maxt, nearest), active)
+            nearest, met = dr.select(hit.is_valid(), hit.t, nearest), met | near
+        return nearest, met
+
+    def resting_distance(self, ray: Any) -> Any:
+        """To the nearest surface of what rests, m; infinite where there is none."""
+        return self._resting.nearest(ray, True, self.mi.Bool(True))[0].t
+
+    def occluded(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+        """Whether anything lies on a ray before its `maxt`; and whether it met a group's box."""
+
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return (state[0] | group.part.blocks(local, near & ~state[0]),)
+
+        blocked = self._resting.blocks(ray, active)
+        # what rests blocks the ray whatever moves
+        free = active & ~blocked
+        (blocked,), met = self._visit_groups(ray, moment, free, ray.maxt, (blocked,), visit)
+        if self._fleet is not None:
+            others, near = self._fleet.blocks(ray, moment, free)
+            blocked, met = blocked | others, met | near
+        return blocked, met
+
+    def _visit_groups(
+        self, ray: Any, moment: Moment, active: Any, length: Any, state: tuple[Any, ...], visit: Callable[..., Any]
+    ) -> tuple[tuple[Any, ...], Any]:
+        """Let each group of those tried one by one, whose box the first `length` metres of a ray meet, change a state.
+
+        Returns
+        -------
+        state, met : the latter Dr.Jit Bool, whether any box was met.
+        """
+        import drjit as dr
+
+        met = self.mi.Bool(False)
+        inverse = inverse_of(ray.d)
+        for number in self._single:
+            near = active & meets_box(ray, inverse, length, moment.box(number))
+            met |= near
+
+            def turn_to(*state: Any, number: int = number, near: Any = near) -> Any:
+                pose = self._tracks.pose(number, moment.local_us(number))
+                return visit(self.groups[number], pose, _at_rest(ray, pose), near, state)
+
+            state = dr.if_stmt(state, near, turn_to, lambda *state: state, label="moving group")
+        return state, met
 
 
 def _at_rest(ray: Any, pose: DevicePose) -> Any:
@@ -178,14 +279,6 @@ def _at_rest(ray: Any, pose: DevicePose) -> Any:
     local = type(ray)(ray)
     local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
     return local
-
-
-def _pose_of(chosen: Any, poses: Sequence[DevicePose]) -> DevicePose:
-    """The pose of the group of each lane's number, from 1; 0 rests."""
-    pose = DevicePose.none(type(poses[0].shift))
-    for number, other in enumerate(poses, start=1):
-        pose = other.where(chosen == number, pose)
-    return pose
 
 
 def spare_even_skies(mi: Any, emitters: Sequence[Any]) -> None:
@@ -199,38 +292,6 @@ def spare_even_skies(mi: Any, emitters: Sequence[Any]) -> None:
             parameters = mi.traverse(emitter)
             parameters["sampling_weight"] = 0.0
             parameters.update()
-
-
-def device_box(mi: Any, corners: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Corners [2, 3] of an axis-parallel box for `meets_box`, somewhat widened: rounding must not take a rim."""
-    import drjit as dr
-
-    margin = 1e-4 * float(np.linalg.norm(corners[1] - corners[0]))
-    box = mi.Vector3f(corners[0] - margin), mi.Vector3f(corners[1] + margin)
-    dr.make_opaque(*box)
-    return box
-
-
-def inverse_of(direction: Any) -> Any:
-    """1 / d of each coordinate for `meets_box`; finite, for 0 · ∞ is nowhere."""
-    import drjit as dr
-
-    return dr.rcp(dr.select(abs(direction) < 1e-30, 1e-30, direction))
-
-
-def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
-    """Whether the first `length` metres of a ray meet a box; `inverse` is `inverse_of` its direction."""
-    import drjit as dr
-
-    one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
-    # not dr.minimum and dr.maximum: what those do about NaN takes most of the time
-    ordered = one < other
-    near, far = dr.select(ordered, one, other), dr.select(ordered, other, one)
-    enter, leave = near.x, far.x
-    for axis in ("y", "z"):
-        first, last = getattr(near, axis), getattr(far, axis)
-        enter, leave = dr.select(first > enter, first, enter), dr.select(last < leave, last, leave)
-    return (enter <= leave) & (leave >= 0) & (enter <= length)
 
 
 def path_traced(built: BuiltScene) -> bool:

@@ -32,12 +32,14 @@ class Face:
     Parameters
     ----------
     triangle : number of the first; it is the half with u + v <= 1.
+    order : which corners of both triangles lie at (0, 0), (1, 0), (0, 1), and at (1, 1), (1, 0), (0, 1).
     to_uvh : [3, 4], metres to u and v, 0 to 1 on the face, and to the height over it in metres.
     surface : what Mitsuba says of both triangles, [2, ...] each: `n` and `shading`, normals; `s`, the first axis of the
         shading frame; `dp_du`, `dp_dv`; and `uv` [2, 3, 2], texture coordinates at (0, 0) and their change along u, v.
     """
 
     triangle: int
+    order: tuple[tuple[int, int, int], tuple[int, int, int]]
     to_uvh: NDArray[np.float64]
     surface: dict[str, NDArray[np.float64]]
 
@@ -68,7 +70,7 @@ def faces_of(mi: Any, shape: Any) -> list[Face]:
             [other[at_u] + other[at_v] - other[opposite], other[opposite] - other[at_v], other[opposite] - other[at_u]],
         ]
         surface = {name: values[:, 0] for name, values in told.items()}
-        found.append(Face(2 * number, to_uvh, {**surface, "uv": np.array(uv)}))
+        found.append(Face(2 * number, order, to_uvh, {**surface, "uv": np.array(uv)}))
     return found
 
 
@@ -109,6 +111,36 @@ def _at_corners(mi: Any, shape: Any) -> dict[str, NDArray[np.float64]]:
     return {name: np.array(value, np.float64).T.reshape(count // 2, 2, 3, -1) for name, value in told.items()}
 
 
+@dataclass(frozen=True)
+class Ball:
+    """Middle, m, and the square of its radius, m²."""
+
+    middle: NDArray[np.float64]
+    square: float
+
+
+@dataclass(frozen=True)
+class SimpleForm:
+    """Faces and balls, each with its shape of Mitsuba."""
+
+    faces: list[tuple[Face, Any]]
+    balls: list[tuple[Ball, Any]]
+
+    @classmethod
+    def of(cls, mi: Any, scene: Any) -> SimpleForm | None:
+        """That of all shapes of a scene, if they are nothing else and not too many."""
+        form = cls([], [])
+        for shape in scene.shapes():
+            if shape.class_name() == "Sphere":
+                form.balls.append((_ball_around(shape.bbox(), 3**-0.5), shape))
+                continue
+            faces = faces_of(mi, shape)
+            if not faces:
+                return None
+            form.faces.extend((face, shape) for face in faces)
+        return form if len(form.faces) + len(form.balls) <= _MOST else None
+
+
 class Part:
     """Some shapes in the frame in which they rest.
 
@@ -131,24 +163,22 @@ class Part:
         self._surfaces: list[dict[str, list[Any]]] = []
         #: What Mitsuba searches, and the ball around it.
         self._scene = self._around = None
-        shapes = scene.shapes()
-        faces = [faces_of(mi, shape) for shape in shapes]
-        is_ball = [shape.class_name() == "Sphere" for shape in shapes]
-        simple = all(ball or found for ball, found in zip(is_ball, faces, strict=True))
-        if simple and sum(is_ball) + sum(map(len, faces)) <= _MOST:
-            for shape, found in zip(shapes, faces, strict=True):
-                for face in found:
-                    rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in face.to_uvh]
-                    self._faces.append((rows, face.triangle, mi.ShapePtr(shape)))
-                    self._surfaces.append({name: _on_device(mi, value) for name, value in face.surface.items()})
-                if not found:
-                    self._balls.append((*_ball_around(mi, shape.bbox(), 3**-0.5), mi.ShapePtr(shape)))
+        #: The shapes, if they are met in closed form.
+        self.form = SimpleForm.of(mi, scene)
+        if self.form is not None:
+            for face, shape in self.form.faces:
+                rows = [(mi.Vector3f(row[:3]), mi.Float(float(row[3]))) for row in face.to_uvh]
+                self._faces.append((rows, face.triangle, mi.ShapePtr(shape)))
+                self._surfaces.append({name: _on_device(mi, value) for name, value in face.surface.items()})
+            for ball, shape in self.form.balls:
+                self._balls.append((mi.Point3f(ball.middle), mi.Float(ball.square), mi.ShapePtr(shape)))
         else:
             self._scene = scene
             # somewhat widened: rounding must not take a rim
-            self._around = _ball_around(mi, scene.bbox(), 1.0001) if apart else None
-        held = [ball[:2] for ball in self._balls], [face[0] for face in self._faces], self._surfaces, self._around
-        dr.make_opaque(held)
+            ball = _ball_around(scene.bbox(), 1.0001)
+            self._around = (mi.Point3f(ball.middle), mi.Float(ball.square)) if apart else None
+        # shapes as well: their numbers within the kernel would make it another one for every scene
+        dr.make_opaque(self._balls, [(rows, shape) for rows, _, shape in self._faces], self._surfaces, self._around)
 
     @property
     def face_count(self) -> int:
@@ -183,10 +213,10 @@ class Part:
             return dr.select(closer, t, end)
 
         for middle, square, shape in self._balls:
-            t = _to_ball(ray, middle, square)
+            t = to_ball(ray, middle, square)
             end = take(active & (t >= 0) & (t < end), t, shape)
         for number, (rows, _, shape) in enumerate(self._faces, start=1):
-            t, place, inside = _to_face(ray, rows)
+            t, place, inside = to_face(ray, rows)
             closer = active & inside & (t >= 0) & (t < end)
             end, face = take(closer, t, shape), dr.select(closer, number, face)
             found.prim_uv = dr.select(closer, place, found.prim_uv)
@@ -198,21 +228,29 @@ class Part:
             return self._scene.ray_test(ray, active & self._near(ray))
         blocked = self._mi.Bool(False)
         for middle, square, _ in self._balls:
-            t = _to_ball(ray, middle, square)
+            t = to_ball(ray, middle, square)
             blocked |= (t >= 0) & (t < ray.maxt)
         for rows, _, _ in self._faces:
-            t, _, inside = _to_face(ray, rows)
+            t, _, inside = to_face(ray, rows)
             blocked |= inside & (t >= 0) & (t < ray.maxt)
         return blocked & active
 
-    def describe(self, si: Any, ray: Any, hit: Any, face: Any) -> None:
-        """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one.
+    def surface(self, hit: Any, face: Any, ray: Any, flags: Any, active: Any) -> Any:
+        """What a ray has met, `SurfaceInteraction3f` in the part's own frame; its t is infinite where that is nothing.
 
         Parameters
         ----------
-        si : of everything else; it is changed.
-        ray, hit, face : given to and returned by `nearest`.
+        hit, face : given by `nearest` for `ray`.
+        flags : `RayFlags` of what to know of it. Of faces all is known.
+        active : lanes in which anything is wanted.
         """
+        si = hit.compute_surface_interaction(ray, flags, active & (face == 0))
+        if self._faces:
+            self._describe_faces(si, ray, hit, face)
+        return si
+
+    def _describe_faces(self, si: Any, ray: Any, hit: Any, face: Any) -> None:
+        """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one."""
         import drjit as dr
 
         u, v = hit.prim_uv
@@ -251,13 +289,13 @@ def _on_device(mi: Any, values: NDArray[np.float64]) -> list[Any]:
     return [tuple(mi.Point2f(row) for row in value) for value in kept]
 
 
-def _ball_around(mi: Any, box: Any, factor: float) -> tuple[Any, Any]:
-    """Middle of a box, and the square of `factor` times half its diagonal."""
+def _ball_around(box: Any, factor: float) -> Ball:
+    """About the middle of a box, its radius `factor` times half the diagonal."""
     low, high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
-    return mi.Point3f((low + high) / 2), mi.Float(float((factor * np.linalg.norm(high - low) / 2) ** 2))
+    return Ball((low + high) / 2, float((factor * np.linalg.norm(high - low) / 2) ** 2))
 
 
-def _to_ball(ray: Any, middle: Any, square: Any) -> Any:
+def to_ball(ray: Any, middle: Any, square: Any) -> Any:
     """Distance along a ray to a ball; negative or not a number where it lies behind or is missed."""
     import drjit as dr
 
@@ -271,10 +309,14 @@ def _to_ball(ray: Any, middle: Any, square: Any) -> Any:
     return dr.select(first >= 0, first, second)
 
 
-def _to_face(ray: Any, rows: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
+def to_face(ray: Any, rows: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
     """Distance along a ray to a face's plane, the place there, and whether it lies on the face.
 
     Where the ray runs along the plane they are not numbers, and it does not.
+
+    Parameters
+    ----------
+    rows : of the map to u, v and height: three of a vector and a number.
     """
     import drjit as dr
     import mitsuba as mi

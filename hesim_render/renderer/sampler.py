@@ -113,6 +113,14 @@ def sampler_class(variant: str) -> Any:
             super().__init__(props if props is not None else mi.Properties())
             self._tables = [mi.UInt32(third_coordinates(first, _TABLE_BITS)) for first in (0, _TABLE_BITS)]
             dr.make_opaque(*self._tables)
+            self.rest()
+
+        def rest(self) -> None:
+            """Let go of a wavefront: what is left of one changes the next one's kernel, which then compiles anew."""
+            self.keys: Any = ()
+            self.sample, self.dimension = mi.UInt32(), mi.UInt32()
+            self._mask: Any = 0
+            self._bits = 0
 
         def setup(self, key: Any, pixel: Any, half: Any, sample: Any, samples_per_half: Any, most: int = 0) -> None:
             """Start one wavefront.

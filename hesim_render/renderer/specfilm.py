@@ -15,6 +15,7 @@ from hesim_render.renderer._mitsuba import spectrum_dict, transform, using_varia
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import MITSUBA_AXES, View, place_camera
 from hesim_render.renderer.flux import used_responses
+from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.scene import Scene
 from hesim_render.sensor import Sensor
@@ -50,15 +51,15 @@ def perspective_dict(mi: Any, view: View, camera_to_world: NDArray[np.float64], 
     """Mitsuba's perspective sensor over exactly the read-out region."""
     left, right, top, bottom = view.region_mm
     width, height = right - left, bottom - top
-    image_mm = view.sensor.lens.image_distance_mm
+    image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
     return {
         "type": "perspective",
         "fov": degrees(2 * atan(width / 2 / image_mm)),
         "fov_axis": "x",
         # Mitsuba counts the offset of the film's centre from the axis, in units of its size
-        "principal_point_offset_x": (left + right) / 2 / width,
-        "principal_point_offset_y": (top + bottom) / 2 / height,
-        "near_clip": 1e-4,
+        "principal_point_offset_x": ((left + right) / 2 - axis_x) / width,
+        "principal_point_offset_y": ((top + bottom) / 2 - axis_y) / height,
+        "near_clip": max(1e-4, view.near_m),
         "far_clip": 1e5,
         "to_world": transform(mi, camera_to_world @ MITSUBA_AXES),
         "sampler": {"type": "independent"},
@@ -109,6 +110,7 @@ def reference_flux(
         raise RangeError("repeats", repeats, "2 or more")
     if sensor.spec.lens.psf_fwhm_um > 0:
         raise SpecError("the reference estimator renders no lens PSF; set it to 0", key="lens.psf_fwhm_um")
+    scene, _ = in_absolute_light(scene)
     parts = [(1.0 if w is None else float(w.mean(t_us, t_us)), part) for w, part in light_parts(scene)]
     view: View | None = None
     renders = np.zeros(1)

@@ -13,7 +13,9 @@ from hesim_render.errors import RangeError
 from hesim_render.renderer._mitsuba import mitsuba
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import RayFactory, place_camera
+from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.sampler import sampler_class
+from hesim_render.renderer.tables import spread_out
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.rng import Stream, stream_key
 from hesim_render.scene import Scene
@@ -27,17 +29,6 @@ BLOCK_RAYS = 1 << 20
 Wavelengths = Callable[[Any, Any], list[Any]]
 #: (mosaic index, radiance at those four) → the quantities to average.
 Values = Callable[[Any, Any], list[Any]]
-
-
-def spread_out(kind: Any, table: NDArray, lane: Any) -> Any:
-    """Entries of a table on the host, by lane.
-
-    One kernel serves all lengths and places in memory: a table of one entry would be a constant in it, and one that
-    is read in order may be aligned or not. Both compile anew.
-    """
-    import drjit as dr
-
-    return dr.gather(kind, kind(np.append(table, table[-1:])), lane)
 
 
 class Tracer:
@@ -76,6 +67,7 @@ class Tracer:
 
         mi, types = mitsuba(), jit()
         self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
+        scene, _ = in_absolute_light(scene)
         self.built = build(mi, scene.spec, responses)
         self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
         self.sensor = self.view.sensor
@@ -85,18 +77,12 @@ class Tracer:
         self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
         self._rays = RayFactory(self.view)
         self._sampler = sampler_class(mi.variant())()
-        layout = self.sensor.layout
-        self._cols = dr.opaque(types.UInt32, layout.cols)
-        self._first_index = dr.opaque(types.UInt32, int(layout.full_index[0, 0]))
-        self._full_cols = dr.opaque(types.UInt32, layout.spec.geometry.cols)
+        self._full_cols = dr.opaque(types.UInt32, self.sensor.spec.geometry.cols)
 
-    def _row_and_col(self, pixel: Any) -> tuple[Any, Any]:
-        row = pixel // self._cols
-        return row, pixel - row * self._cols
-
-    def _index(self, row: Any, col: Any) -> Any:
-        """Number of a pixel on the full sensor, whatever the region: what its random numbers follow."""
-        return self._first_index + row * self._full_cols + col
+    def _row_and_col(self, index: Any) -> tuple[Any, Any]:
+        """Of a pixel's number on the full sensor; that is what its random numbers follow, too."""
+        row = index // self._full_cols
+        return row, index - row * self._full_cols
 
     def _report(self, rays: int) -> None:
         self.rays_done += rays
@@ -139,6 +125,7 @@ class PixelTracer(Tracer):
             raise RangeError("samples", samples, f"at most {block_rays} rays per pixel")
         super().__init__(scene, sensor, responses, progress, block_rays)
         self.samples = samples
+        self._full_index = self.sensor.layout.full_index.ravel()
         self._posed_us: float | None = None
         self._key = dr.opaque(jit().UInt64, stream_key(seed, Stream.RENDER))
 
@@ -214,18 +201,21 @@ class PixelTracer(Tracer):
         place = ray - lane * self.samples
         half = dr.select(place >= per_half, types.UInt32(1), types.UInt32(0))
         pixel = spread_out(types.UInt32, pixels, lane)
+        index = spread_out(types.UInt32, self._full_index[pixels], lane)
         spread = None if times is None else [spread_out(types.Float, table, lane) for table in times]
-        quantities = self._rays_of(pixel, half, place - half * per_half, spread, wavelengths, values)
+        quantities = self._rays_of(pixel, index, half, place - half * per_half, spread, wavelengths, values)
         sums = [dr.block_sum(quantity, per_half) * (1 / per_half) for quantity in quantities]
         dr.eval(*sums)
-        index = dr.arange(types.UInt32, count) * 2
-        halves = [(dr.gather(types.Float, s, index), dr.gather(types.Float, s, index + 1)) for s in sums]
+        self._sampler.rest()
+        first = dr.arange(types.UInt32, count) * 2
+        halves = [(dr.gather(types.Float, s, first), dr.gather(types.Float, s, first + 1)) for s in sums]
         dr.eval(halves)
         return halves
 
     def _rays_of(
         self,
         pixel: Any,
+        index: Any,
         half: Any,
         sample: Any,
         spread: list[Any] | None,
@@ -234,11 +224,12 @@ class PixelTracer(Tracer):
     ) -> list[Any]:
         """The wanted quantities of one ray per lane."""
         mi, types = self.built.mi, jit()
-        row, col = self._row_and_col(pixel)
+        row, col = self._row_and_col(index)
         sampler = self._sampler
-        sampler.setup(self._key, self._index(row, col), half, sample, self.samples // 2)
-        (aperture, moment), choice = sampler.next_3d(), sampler.next_1d()
+        sampler.setup(self._key, index, half, sample, self.samples // 2)
+        aperture, moment = sampler.next_3d()
         blur = sampler.next_2d() if self._rays.has_psf else None
+        choice = sampler.next_1d()
         origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
         if spread is not None:
             assert self.camera is not None

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hesim_render.backend import jit
+from hesim_render.renderer.tables import table
 from hesim_render.spectra import Spectrum
 
 #: Parts of a response's integral for which the first cell is tabled: few of them hold more than the end of one cell.
@@ -38,8 +39,8 @@ class WavelengthSampler:
         room = max(response.wavelength_nm.size for response in responses.values()) + 1
         cells, shares, starts, totals = [], [], [], []
         for response in responses.values():
-            grid, table = response.wavelength_nm, response.values
-            area = np.concatenate([[0.0], np.cumsum((table[1:] + table[:-1]) / 2 * np.diff(grid))])
+            grid, values = response.wavelength_nm, response.values
+            area = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(grid))])
             share, more = (area / area[-1]).astype(np.float32), room - grid.size
             place = np.arange(_BINS + 1, dtype=np.float32) / _BINS
             start = np.clip(np.searchsorted(share, place, side="right") - 1, 0, grid.size - 2)
@@ -47,14 +48,14 @@ class WavelengthSampler:
             over = np.where(start[1:] > start[:-1], share[start[:-1] + 1], np.float32(2)).view(np.uint32)
             first = start[:-1] | np.where(start[1:] > start[:-1] + 1, _SEVERAL, 0)
             starts.append(np.append(np.stack([first, over], axis=1), [[start[-1], 0]], axis=0))
-            ends = np.stack([x for values in (share, table, grid, 0 * grid) for x in (values[:-1], values[1:])], axis=1)
+            ends = np.stack([x for each in (share, values, grid, 0 * grid) for x in (each[:-1], each[1:])], axis=1)
             cells.append(np.pad(ends, ((0, more), (0, 0)), mode="edge"))
             shares.append(np.pad(share[:-1], (0, more), constant_values=2.0))  # never reached
             totals.append(area[-1])
         self._room = room - 1
         self._cells, self._shares, self._totals = (
-            types.Float(table.astype(np.float32).ravel())
-            for table in (np.concatenate(cells), np.concatenate(shares), np.array(totals))
+            table(types.Float, values.astype(np.float32))
+            for values in (np.concatenate(cells), np.concatenate(shares), np.array(totals))
         )
         self._starts = types.UInt32(np.concatenate(starts).astype(np.uint32).ravel())
         dr.make_opaque(self._cells, self._shares, self._totals, self._starts)

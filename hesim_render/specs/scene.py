@@ -169,14 +169,21 @@ class MitsubaSpec(Strict):
     """A scene of Mitsuba's own: exactly one of an XML file, a built-in, or an inline dictionary.
 
     In an inline dictionary a 4×4 list of rows stands for a transform. Radiance is taken as
-    W m⁻² sr⁻¹ nm⁻¹ times `radiance_scale`. The first sensor is the camera unless the scene file
-    has a `camera` section. Emitters are named by the id of their shape, or by their own.
+    W m⁻² sr⁻¹ nm⁻¹ times `radiance_scale`; or it is scaled so that the plane through `plane_point_m`
+    with normal `plane_normal` gets `illuminance_lux` or `irradiance_w_m2`, from all light of the scene
+    together, what surfaces throw back included, at t = 0, flickering lights at their time means. The
+    first sensor is the camera unless the scene file has a `camera` section. Emitters are named by the
+    id of their shape, or by their own.
     """
 
     file: str | None = None
     builtin: Literal["cornell_box"] | None = None
     inline: Mapping[str, Any] | None = None
     radiance_scale: PositiveFloat = 1.0
+    illuminance_lux: PositiveFloat | None = None
+    irradiance_w_m2: PositiveFloat | None = Field(None, description="integrated over 360 to 830 nm")
+    plane_point_m: Vector | None = Field(None, description="where the level holds")
+    plane_normal: Direction | None = Field(None, description="of the plane there, to the side that is lit")
     waveforms: dict[str, WaveformSpec] = Field({}, description="flicker of emitters; their radiance is the time mean")
     lit: tuple[str, ...] | None = Field(None, description="these emitters alone give light; default all")
     unlit: tuple[str, ...] = Field((), description="these emitters give none")
@@ -187,7 +194,22 @@ class MitsubaSpec(Strict):
             raise ValueError("give exactly one of file, builtin and inline")
         if self.lit is not None and self.unlit:
             raise ValueError("give lit or unlit, not both")
+        if self.illuminance_lux is not None and self.irradiance_w_m2 is not None:
+            raise ValueError("give illuminance_lux or irradiance_w_m2, not both")
+        if self.has_level and self.radiance_scale != 1:
+            raise ValueError("radiance_scale: a level in lux or W m^-2 takes its place; give one of them")
+        for key in ("plane_point_m", "plane_normal"):
+            if (getattr(self, key) is not None) != self.has_level:
+                needs = (
+                    "is required beside a level" if self.has_level else "goes with illuminance_lux or irradiance_w_m2"
+                )
+                raise ValueError(f"{key} {needs}")
         return self
+
+    @property
+    def has_level(self) -> bool:
+        """Whether its light is given by a level on a plane."""
+        return self.illuminance_lux is not None or self.irradiance_w_m2 is not None
 
     def may_shine(self, emitter: str) -> bool:
         """Whether an emitter of this name is left on."""

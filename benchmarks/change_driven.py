@@ -1,20 +1,24 @@
-"""Seconds per simulated second of a moving scene, three ways at the same error, against the share that changes.
+"""Seconds per simulated second of a moving scene, three ways, and what the default mode is worth against a reference.
 
-    python benchmarks/coherent.py [--scenes star,sweep,glass] [--activities 3,10,25,100] [--quality Q]
-    python benchmarks/coherent.py --area
+    python benchmarks/change_driven.py [--scenes star,sweep,glass] [--activities 3,10,25,100] [--quality Q]
+                                       [--ticks 32] [--pixels 200] [--size 346x260] [--no-timing]
+    python benchmarks/change_driven.py --area
 
-(a) `mi.render` with `specfilm`, once per tick; (b) the exact mode; (c) the coherent mode. 346×260 pixels, 800 Hz. In
-all three Russian roulette is played from the sixteenth segment on. (c) alone sends paths to images of lamps in mirrors,
-and does not sample an even sky beside a lamp.
+(a) `mi.render` with `specfilm`, once per tick; (b) the exact mode; (c) the default mode, change-driven. 346×260 pixels,
+800 Hz.
 
-(c) runs over two chunks of ticks, the second of which is timed; at quality 0.5, but glass at 2, for its caustics ask
-for 1700 rays a pixel at 1. Its error is the rms over pixels, in units of each one's own event noise (3 % of the
-signal), against a reference of 8192 rays a pixel, on one pixel in eight, in two ticks that are filled in for the most
-part. (a) and (b) then get as many samples as bring their noise to that error, and one tick of each is timed at that
-number. Their noise is measured from two independent pictures, so the floor that their error has besides (nothing
-moves within a picture of (a), nor do objects within a slice of (b)) is not held against them; the error that they
-reach is printed beside. Activity is the share of pixels whose flux changes by more than 1 % from one tick to the
-next, at 256 rays with the same random numbers.
+(c) is judged in random pixels, each in a tick of its own, drawn from all ticks, the first ones too: half of the pairs
+evenly, half of those pixels that change. The truth is `WindowReference`: Mitsuba's cameras and films, averaged over
+instants; its error is asked to be a fifth of the wish, and printed. Errors are in units of each pixel's own event
+noise: rms, median, 95 % and 99 % quantiles of the true ones beside those that the run states for the same pairs. Events
+are those of some changing pixels in all ticks. A missed event is one of the reference that exceeds its threshold by
+more than three stated standard errors and that no event of the run in the tick before, that tick or the tick after is
+like.
+
+(a) and (b) get as many samples as bring their noise to the true rms of (c) over all pixels, and one tick of each is
+timed at that number. Nothing moves within a picture of (a), nor do objects within a slice of (b), which is not held
+against them. Activity is the share of pixels whose flux changes by more than 1 % from one tick to the next, at 256 rays
+with the same random numbers.
 
 With `--area`: what (c) takes for eight chequered tiles that turn, and for the same eight of which four rest.
 """
@@ -31,15 +35,16 @@ import hesim_render as hr
 from hesim_render.renderer._mitsuba import mitsuba, spectrum_dict
 from hesim_render.renderer.builder import build
 from hesim_render.renderer.camera import place_camera
-from hesim_render.renderer.coherent import CoherentFlux
+from hesim_render.renderer.change_driven import ChangeDrivenFlux
+from hesim_render.renderer.compare import compare_ticks
 from hesim_render.renderer.flux import RenderedFlux, used_responses
+from hesim_render.renderer.reference import WindowReference
 from hesim_render.renderer.specfilm import camera_at, perspective_dict
-from hesim_render.renderer.timed import TimedTracer
 from hesim_render.scene import Scene
+from hesim_render.schedule import tick_blocks
 from hesim_render.specs.scene import SceneSpec
 
 TICK_US, WINDOW_US = 1250.0, 1000.0
-CHUNK = 32
 SENSOR = {
     "geometry.rows": 260,
     "geometry.cols": 346,
@@ -224,37 +229,93 @@ def window(tick: int) -> tuple[float, float]:
     return end - WINDOW_US, end
 
 
-class Reference:
-    """Converged flux of some pixels in some ticks, and the error of anything else against it."""
+def event_noise(sensor: hr.Sensor, flux: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """One standard deviation of the noise of event pixels, e⁻/s."""
+    seconds = WINDOW_US * 1e-6
+    position = np.zeros(np.shape(pixel), np.int64)
+    return sensor.evs.noise_equivalent_e(flux * seconds, position) / seconds
 
-    def __init__(self, scene: Scene, sensor: hr.Sensor, ticks: list[int]) -> None:
-        pixels = sensor.rows * sensor.cols
-        self.pixel = np.sort(np.random.default_rng(0).choice(pixels, pixels // 8, replace=False)).astype(np.uint32)
-        self.flux: dict[int, np.ndarray] = {}
-        self._noise = sensor.evs
-        self.variance = 0.0
-        for tick in ticks:
-            begin, end = (np.full(self.pixel.size, t) for t in window(tick))
-            runs = []
-            for seed in (1001, 1002):
-                tracer = TimedTracer(scene, sensor, seed, used_responses(sensor))
-                result = tracer.trace(self.pixel, begin, end, np.full(self.pixel.size, 4096))
-                runs.append(0.5 * (result.half_a.astype(np.float64) + result.half_b))
-            self.flux[tick] = 0.5 * (runs[0] + runs[1])
-            self.variance += np.mean((0.5 * (runs[0] - runs[1]) / self._scale(tick)) ** 2) / len(ticks)
 
-    def _scale(self, tick: int) -> np.ndarray:
-        electrons = self.flux[tick] * WINDOW_US * 1e-6
-        return self._noise.noise_equivalent_e(electrons, self.pixel) / (WINDOW_US * 1e-6)
+class Run:
+    """(c): all event pixels in all ticks; how long it took without the first block, in which kernels are compiled."""
 
-    def square_noise(self, one: np.ndarray, other: np.ndarray, tick: int) -> float:
-        """Mean variance of pictures of which these are two, in the same units."""
-        return float(np.mean(((one - other)[self.pixel] / self._scale(tick)) ** 2)) / 2
+    def __init__(self, scene: Scene, sensor: hr.Sensor, quality: float, ticks: int) -> None:
+        self.source = ChangeDrivenFlux(scene, sensor, quality, seed=5)
+        spec = self.source.sensor.spec.evs
+        blocks = list(tick_blocks(spec, 0.0, ticks * TICK_US))
+        self.windows = np.concatenate([np.stack([b.begin_us[b.wanted], b.end_us[b.wanted]], 1) for b in blocks])
+        first = int(blocks[0].wanted.sum())
+        flux, error, start = [], [], 0.0
+        for number, sample in enumerate(self.source.flux_of_blocks(sensor.layout.evs_pixel.ravel(), blocks)):
+            flux.append(0.5 * (np.array(sample.half_a, np.float64) + np.array(sample.half_b)))
+            error.append(np.array(sample.error, np.float64))
+            if number == first - 1:
+                start = time.perf_counter()
+        self.flux, self.error = np.array(flux), np.array(error)
+        later = len(flux) - first
+        self.seconds_per_tick = (time.perf_counter() - start) / later if later else float("nan")
+        counts = self.source.counts
+        self.rendered = counts.pairs / max(1, counts.values)
 
-    def square_error(self, flux: np.ndarray, tick: int) -> float:
-        """Mean squared error of a whole picture in units of the event noise, the reference's own taken off."""
-        off = (flux[self.pixel] - self.flux[tick]) / self._scale(tick)
-        return max(float(np.mean(off**2)) - self.variance, 1e-12)
+
+def quantiles(values: np.ndarray) -> str:
+    size = np.abs(values)
+    parts = np.quantile(size, [0.5, 0.95, 0.99])
+    return f"rms {np.sqrt(np.mean(size**2)):.3f} median {parts[0]:.3f} p95 {parts[1]:.3f} p99 {parts[2]:.3f}"
+
+
+def judge(run: Run, scene: Scene, sensor: hr.Sensor, quality: float, pixels: int) -> float:
+    """Print true and stated errors of random pairs, and events missed and too many; the true rms."""
+    rng = np.random.default_rng(3)
+    reference, every = WindowReference(scene, sensor), sensor.layout.evs_pixel.ravel()
+    unit = event_noise(reference.sensor, run.flux, every)
+    busy = np.flatnonzero(np.ptp(run.flux, axis=0) > quality * unit.mean(axis=0))
+    place = rng.integers(0, every.size, pixels)
+    if busy.size:
+        place[pixels // 2 :] = rng.choice(busy, pixels - pixels // 2)
+    tick = rng.integers(0, len(run.windows), pixels)
+    deviation, stated, own = np.zeros(pixels), run.error[tick, place] / unit[tick, place], np.zeros(pixels)
+    for number in np.unique(tick):
+        these = np.flatnonzero(tick == number)
+        wanted = 0.2 * quality * unit[number, place[these]]
+        found = reference.flux(run.windows[number], every[place[these]], wanted, seed=1)
+        deviation[these] = (run.flux[number, place[these]] - found.flux[0]) / unit[number, place[these]]
+        own[these] = found.stderr[0] / unit[number, place[these]]
+    evenly, changing = slice(0, pixels // 2), slice(pixels // 2, None)
+    print(f"   true error, all pixels:      {quantiles(deviation[evenly])}")
+    print(f"   stated,     all pixels:      {quantiles(stated[evenly])}")
+    print(f"   true error, changing pixels: {quantiles(deviation[changing])}")
+    print(f"   stated,     changing pixels: {quantiles(stated[changing])}")
+    off = np.mean(np.abs(deviation) > 3 * quality)
+    print(f"   of the reference: {quantiles(own)}; off by more than {3 * quality:g}: {100 * off:.2f} %", flush=True)
+    print_events(run, reference, rng.choice(busy, min(busy.size, max(4, pixels // 20)), replace=False), unit, quality)
+    return float(np.sqrt(np.mean(deviation[evenly] ** 2)))
+
+
+def print_events(run: Run, reference: WindowReference, place: np.ndarray, unit: np.ndarray, quality: float) -> None:
+    """Events of some pixels in all ticks, noise-free."""
+    if place.size == 0:
+        print("   nothing changes: no events")
+        return
+    noise, layout = reference.sensor.evs, reference.sensor.layout
+    found = reference.flux(run.windows, layout.evs_pixel.ravel()[place], 0.2 * quality * unit[:, place], seed=2)
+    own, error = run.flux[:, place], run.error[:, place]
+    level, truth, above = (noise.log_signal(f, place) for f in (own, found.flux, own + error))
+    maps = noise.threshold_on_map, noise.threshold_off_map
+    thresholds = tuple(np.broadcast_to(m, layout.evs_shape).ravel()[place].astype(np.float64) for m in maps)
+    counted = compare_ticks(level, truth, above - level, thresholds, np.ones(len(own), np.bool_))
+    true, total = counted.true.sum(), counted.found.sum()
+    print(
+        f"   events of {place.size} pixels: {true:.0f} true, {total:.0f} found, {counted.missed.sum():.0f} missed, "
+        f"{counted.extra.sum():.0f} extra, {counted.flips.sum():.0f} within three stated errors of a threshold",
+        flush=True,
+    )
+
+
+def square_noise(one: np.ndarray, other: np.ndarray, sensor: hr.Sensor) -> float:
+    """Mean variance of pictures of which these are two, over the square of the noise."""
+    unit = event_noise(sensor, 0.5 * (one + other), np.arange(one.size))
+    return float(np.mean(((one - other) / unit) ** 2)) / 2
 
 
 def exact_tick(scene: Scene, sensor: hr.Sensor, samples: int, tick: int) -> tuple[np.ndarray, float]:
@@ -319,31 +380,17 @@ def specfilm_tick(scene: Scene, sensor: hr.Sensor, spp: int, tick: int, seed: in
 
 def activity(scene: Scene, sensor: hr.Sensor, ticks: list[int]) -> float:
     """Share of pixels that change by more than 1 % per tick."""
-    tracer = TimedTracer(scene, sensor, 5, used_responses(sensor))
-    pixels = np.arange(sensor.rows * sensor.cols, dtype=np.uint32)[::4]
+    source = RenderedFlux(scene, sensor, samples=256, seed=5)
+    pixels = np.arange(sensor.rows * sensor.cols, dtype=np.uint32)[::8]
     shares = []
     for tick in ticks:
         flux = []
         for number in (tick, tick + 1):
-            begin, end = (np.full(pixels.size, t) for t in window(number))
-            result = tracer.trace(pixels, begin, end, np.full(pixels.size, 256))
-            flux.append(result.half_a.astype(np.float64) + result.half_b)
+            middle = sum(window(number)) / 2
+            halves = source.mean_flux(pixels, middle, middle)
+            flux.append(sum(np.array(half, np.float64) for half in halves))
         shares.append(np.mean(np.abs(flux[1] - flux[0]) > 0.01 * np.maximum(flux[0], 1e-9)))
     return float(np.mean(shares))
-
-
-def coherent(scene: Scene, sensor: hr.Sensor, quality: float, ticks: list[int]) -> tuple[dict, float, CoherentFlux]:
-    """(c): pictures of some ticks, and seconds per tick of the second chunk."""
-    source = CoherentFlux(scene, sensor, quality, seed=5)
-    pixels = sensor.layout.evs_pixel.ravel()
-    begin, end = np.array([window(tick) for tick in range(2 * CHUNK + 1)]).T
-    kept, start = {}, 0.0
-    for number, (half_a, half_b) in enumerate(source.flux_of_windows(pixels, begin, end)):
-        if number == CHUNK:
-            start = time.perf_counter()
-        if number in ticks:
-            kept[number] = 0.5 * (np.array(half_a, dtype=np.float64) + np.array(half_b))
-    return kept, (time.perf_counter() - start) / CHUNK, source
 
 
 def needed(first: int, square_noise: float, target: float, power: float) -> int:
@@ -351,51 +398,53 @@ def needed(first: int, square_noise: float, target: float, power: float) -> int:
     return max(2, 2 * round(first * (square_noise / target) ** (1 / power) / 2))
 
 
-def compare(name: str, wanted: int, quality: float) -> None:
+def compare(name: str, wanted: int, quality: float, options: argparse.Namespace) -> None:
     scene = SCENES[name](SPEEDS[name][wanted])
-    sensor = place_camera(scene.spec, hr.load_sensor("reference-mono", SENSOR), None).sensor
-    ticks = [CHUNK + 11, CHUNK + 24]
-    share = activity(scene, sensor, ticks)
-    reference = Reference(scene, sensor, ticks)
-    pictures, seconds_c, source = coherent(scene, sensor, quality, ticks)
-    target = float(np.mean([reference.square_error(pictures[tick], tick) for tick in ticks]))
-    tick = ticks[0]
+    cols, rows = options.size
+    given = hr.load_sensor("reference-mono", {**SENSOR, "geometry.cols": cols, "geometry.rows": rows})
+    sensor = place_camera(scene.spec, given, None).sensor
+    share = activity(scene, sensor, [11, options.ticks - 2])
+    print(f"{name}, {100 * share:.1f} % of the pixels change from tick to tick, quality {quality:g}", flush=True)
+    run = Run(scene, sensor, quality, options.ticks)
+    target = judge(run, scene, sensor, quality, options.pixels)
+    per_second, peak_gb = 1e6 / TICK_US, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    print(f"   (c) {run.seconds_per_tick * per_second:.0f} s/s, {100 * run.rendered:.1f} % of the pairs rendered, "
+          f"{run.source.rays_traced / 1e6:.1f} M rays, peak {peak_gb:.2f} GB", flush=True)  # fmt: skip
+    if options.no_timing:
+        return
+    tick = options.ticks // 2
     halves, _ = exact_tick(scene, sensor, 16, tick)
     # stratified: squared noise was seen to fall by n^-1.2 or faster
-    spp_b = needed(16, reference.square_noise(*halves, tick) / 2, target, 1.2)
-    halves, seconds_b = exact_tick(scene, sensor, spp_b, tick)
-    error_b = reference.square_error(halves.mean(axis=0), tick) ** 0.5
+    spp_b = needed(16, square_noise(*halves, sensor) / 2, target**2, 1.2)
+    _, seconds_b = exact_tick(scene, sensor, spp_b, tick)
     images = [specfilm_tick(scene, sensor, 64, tick, seed)[0] for seed in (0, 10_000)]
-    spp_a = needed(64, reference.square_noise(*images, tick), target, 1.0)
-    image, seconds_a = specfilm_tick(scene, sensor, spp_a, tick)
-    error_a = reference.square_error(image, tick) ** 0.5
-    per_second = 1e6 / TICK_US
-    rendered = 1 - source.audit.skipped / (sensor.rows * sensor.cols * 2 * CHUNK)
-    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    spp_a = needed(64, square_noise(*images, sensor), target**2, 1.0)
+    _, seconds_a = specfilm_tick(scene, sensor, spp_a, tick)
     print(
-        f"{name:6s} {100 * share:5.1f} %  error {target**0.5:.3f} | "
-        f"(a) {seconds_a * per_second:8.0f} s/s {spp_a:5d} spp {error_a:.3f} | "
-        f"(b) {seconds_b * per_second:7.0f} s/s {spp_b:4d} spp {error_b:.3f} | "
-        f"(c) {seconds_c * per_second:6.0f} s/s | a/c {seconds_a / seconds_c:6.1f}  b/c {seconds_b / seconds_c:5.1f} | "
-        f"rendered {100 * rendered:.1f} % audit <= {100 * source.audit.bound:.2f} % | peak {peak_gb:.2f} GB",
+        f"   at the same rms: (a) {seconds_a * per_second:.0f} s/s with {spp_a} spp, "
+        f"(b) {seconds_b * per_second:.0f} s/s with {spp_b} spp; "
+        f"a/c {seconds_a / run.seconds_per_tick:.1f}  b/c {seconds_b / run.seconds_per_tick:.1f}",
         flush=True,
     )
 
 
-def compare_area(quality: float) -> None:
+def compare_area(quality: float, options: argparse.Namespace) -> None:
     """Seconds of (c) for all tiles moving and for half of them."""
     seconds = []
     for moving in (8, 4):
         scene = tiles(moving)
         sensor = place_camera(scene.spec, hr.load_sensor("reference-mono", SENSOR), None).sensor
-        share = activity(scene, sensor, [CHUNK + 11, CHUNK + 24])
-        _, per_tick, source = coherent(scene, sensor, quality, [])
-        seconds.append(per_tick * 1e6 / TICK_US)
-        rendered = 1 - source.audit.skipped / (sensor.rows * sensor.cols * 2 * CHUNK)
+        run = Run(scene, sensor, quality, options.ticks)
+        seconds.append(run.seconds_per_tick * 1e6 / TICK_US)
         print(
-            f"{moving} tiles turn: {100 * share:.1f} % change, {seconds[-1]:.0f} s/s, rendered {100 * rendered:.1f} %"
+            f"{moving} tiles turn: {seconds[-1]:.0f} s/s, {100 * run.rendered:.1f} % of the pairs rendered", flush=True
         )
     print(f"half the area takes 1/{seconds[0] / seconds[1]:.2f} of the time")
+
+
+def _size(text: str) -> tuple[int, int]:
+    cols, rows = text.split("x")
+    return int(cols), int(rows)
 
 
 def main() -> None:
@@ -403,14 +452,20 @@ def main() -> None:
     parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--activities", default="3,10,25,100")
     parser.add_argument("--quality", type=float, help="instead of each scene's own")
+    parser.add_argument(
+        "--ticks", type=int, default=32, help="of a run; two blocks of 16 or more for a time without compiling"
+    )
+    parser.add_argument("--pixels", type=int, default=200, help="pairs that are judged")
+    parser.add_argument("--size", type=_size, default=(346, 260), help="of the sensor")
+    parser.add_argument("--no-timing", action="store_true", help="leave (a) and (b) out")
     parser.add_argument("--area", action="store_true")
     options = parser.parse_args()
     if options.area:
-        compare_area(options.quality or QUALITY["star"])
+        compare_area(options.quality or QUALITY["star"], options)
         return
     for name in options.scenes.split(","):
         for wanted in options.activities.split(","):
-            compare(name, int(wanted), options.quality or QUALITY[name])
+            compare(name, int(wanted), options.quality or QUALITY[name], options)
 
 
 if __name__ == "__main__":

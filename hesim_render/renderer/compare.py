@@ -1,0 +1,127 @@
+"""Noise-free events of one run against those of another: which are missed, which are too many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Standard errors by which a signal must exceed the threshold for its event to count as missed or too many.
+SURE = 3.0
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Events of each unit within its core, [unit].
+
+    Parameters
+    ----------
+    true, found : events of the reference and of the run.
+    missed : true ones that no found one is like, though the reference exceeds the threshold by more than `SURE`
+        standard errors.
+    extra : found ones that no true one is like, though the run exceeds the threshold by that much.
+    flips : all others that have no like.
+    """
+
+    true: NDArray[np.float64]
+    found: NDArray[np.float64]
+    missed: NDArray[np.float64]
+    extra: NDArray[np.float64]
+    flips: NDArray[np.float64]
+
+
+def compare_ticks(
+    run: NDArray[np.float64],
+    reference: NDArray[np.float64],
+    error: NDArray[np.float64],
+    thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
+    core: NDArray[np.bool_],
+) -> Counted:
+    """Of a sensor that compares successive samples.
+
+    Two events are alike if their polarity agrees and their ticks differ by at most one.
+
+    Parameters
+    ----------
+    run, reference : ln x, [window, unit].
+    error : standard error of `run`, [window, unit].
+    thresholds : θ₊ and θ₋ of each unit's pixel, [unit].
+    core : [window], in which events are counted.
+    """
+    true, found, missed, extra, flips = counts = [np.zeros(run.shape[1]) for _ in range(5)]
+    change, wanted = np.diff(run, axis=0), np.diff(reference, axis=0)
+    spread = np.hypot(error[1:], error[:-1])
+    counted = core[1:, None]
+    for sign, theta in ((1.0, thresholds[0]), (-1.0, thresholds[1])):
+        own, other = sign * change - theta, sign * wanted - theta
+        is_found, is_true = own > 0, other > 0
+        lost, added = is_true & ~_near(is_found), is_found & ~_near(is_true)
+        sure_lost, sure_added = lost & (other > SURE * spread), added & (own > SURE * spread)
+        for total, which in (
+            (true, is_true),
+            (found, is_found),
+            (missed, sure_lost),
+            (extra, sure_added),
+            (flips, (lost | added) & ~sure_lost & ~sure_added),
+        ):
+            total += np.sum(which & counted, axis=0)
+    return Counted(*counts)
+
+
+def _near(which: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Windows next to or among those marked, [window, unit]."""
+    found = which.copy()
+    found[1:] |= which[:-1]
+    found[:-1] |= which[1:]
+    return found
+
+
+def compare_crossings(
+    run: NDArray[np.float64],
+    reference: NDArray[np.float64],
+    error: NDArray[np.float64],
+    thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
+    core: NDArray[np.bool_],
+    most: int,
+) -> Counted:
+    """Of an asynchronous sensor: both signals start from the reference, whose every event sets the level of both.
+
+    An event of one signal has its like if the other one crosses the same level within a step of the source.
+
+    Parameters
+    ----------
+    most : events that are counted of a unit at most.
+    """
+    count = run.shape[1]
+    true, found, missed, extra, flips = (np.zeros(count) for _ in range(5))
+    level = reference[0].copy()
+    theta_on, theta_off = thresholds
+    last = run.shape[0] - 1
+    for k in range(1, last + 1):
+        around = slice(k - 1, min(k + 1, last) + 1)
+        spread = error[around].max(axis=0)
+        for sign, theta in ((1.0, theta_on), (-1.0, theta_off)):
+            ahead, own = sign * reference, sign * run
+            goal = sign * level + theta
+            # the run's own crossing of what the reference does not reach near by
+            over = (own[k] > goal) & (own[k - 1] <= goal) & (ahead[around].max(axis=0) < goal)
+            sure = over & (own[around].max(axis=0) > goal + SURE * spread)
+            if core[k]:
+                extra += sure
+                flips += over & ~sure
+                found += over
+            for _ in range(most):
+                crosses = ahead[k] > goal
+                if not crosses.any():
+                    break
+                like = own[around].max(axis=0) > goal
+                sure = crosses & ~like & (ahead[around].max(axis=0) > goal + SURE * spread)
+                if core[k]:
+                    true += crosses
+                    found += crosses & like
+                    missed += sure
+                    flips += crosses & ~like & ~sure
+                level = np.where(crosses, level + sign * theta, level)
+                goal = sign * level + theta
+    return Counted(*(np.minimum(total, most) for total in (true, found, missed, extra, flips)))

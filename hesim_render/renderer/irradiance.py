@@ -1,0 +1,95 @@
+"""Irradiance by a Lambertian rectangle in closed form, on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+#: Area over squared distance below which a rectangle counts as a point at its middle: the sum over edges loses its
+#: digits in float32 there, and the middle is right to about this part.
+_SMALL_SR = 1e-4
+
+
+class RectangleLight:
+    """A rectangle that shines from its front, of radiance 1.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    frame : [4, 4]; columns are half the width, half the height, the unit normal and the middle, metres.
+    """
+
+    def __init__(self, mi: Any, frame: Any) -> None:
+        import drjit as dr
+
+        self._mi = mi
+        vectors = [mi.Vector3f(frame[:3, k]) for k in range(4)]
+        corners = [frame[:3, 3] + a * frame[:3, 0] + b * frame[:3, 1] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        self._half_width, self._half_height, self._normal, middle = vectors
+        self._middle = mi.Point3f(middle)
+        self._corners = [mi.Point3f(corner) for corner in corners]
+        area = 4 * float((frame[:3, 0] ** 2).sum() ** 0.5 * (frame[:3, 1] ** 2).sum() ** 0.5)
+        self._area_m2 = mi.Float(area)
+        dr.make_opaque(self._half_width, self._half_height, self._normal, self._middle, self._corners, self._area_m2)
+
+    def irradiance(self, point: Any, normal: Any) -> Any:
+        """∫ cos θ dω over the rectangle, what lies below the horizon cut off; sr.
+
+        Lambert's formula, ½ |Σ γ_i (Γ_i · n)| with γ_i the angle that edge i subtends and Γ_i the unit normal of the
+        plane through the point and that edge (Lambert 1760; Baum, Rushmeier and Winget 1989 have it for polygons).
+        Clipping a convex polygon at a plane leaves its edges shortened, and one more along the horizon.
+
+        Parameters
+        ----------
+        point : Point3f per lane.
+        normal : unit Vector3f per lane.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        rays = [corner - point for corner in self._corners]
+        heights = [dr.dot(ray, normal) for ray in rays]
+        total = mi.Float(0.0)
+        leaving, entering = dr.zeros(mi.Vector3f), dr.zeros(mi.Vector3f)
+        crosses = mi.Bool(False)
+        for k in range(4):
+            a, b, height_a, height_b = rays[k], rays[(k + 1) % 4], heights[k], heights[(k + 1) % 4]
+            above_a, above_b = height_a >= 0, height_b >= 0
+            on_horizon = dr.fma(b - a, height_a / (height_a - height_b), a)
+            first, second = dr.select(above_a, a, on_horizon), dr.select(above_b, b, on_horizon)
+            total += dr.select(above_a | above_b, _edge(first, second, normal), 0.0)
+            leaving = dr.select(above_a & ~above_b, on_horizon, leaving)
+            entering = dr.select(~above_a & above_b, on_horizon, entering)
+            crosses |= above_a != above_b
+        total += dr.select(crosses, _edge(leaving, entering, normal), 0.0)
+        to = self._middle - point
+        square = dr.squared_norm(to)
+        before = -dr.dot(to, self._normal)
+        as_point = self._area_m2 * before * dr.dot(to, normal) / (square * square)
+        exact = dr.select(self._area_m2 < _SMALL_SR * square, dr.maximum(as_point, 0.0), 0.5 * abs(total))
+        return dr.select(before > 0, exact, 0.0)
+
+    def sample(self, point: Any, normal: Any, place: Any) -> tuple[Any, Any]:
+        """A point drawn evenly on the rectangle, and its share of the irradiance: the mean of that is `irradiance`.
+
+        Parameters
+        ----------
+        point, normal : see `irradiance`.
+        place : Point2f in [0, 1)².
+        """
+        import drjit as dr
+
+        drawn = dr.fma(self._half_width, 2 * place.x - 1, dr.fma(self._half_height, 2 * place.y - 1, self._middle))
+        to = drawn - point
+        square = dr.squared_norm(to)
+        cosines = dr.maximum(dr.dot(to, normal), 0.0) * dr.maximum(-dr.dot(to, self._normal), 0.0)
+        return drawn, dr.select(square > 0, self._area_m2 * cosines / (square * square), 0.0)
+
+
+def _edge(first: Any, second: Any, normal: Any) -> Any:
+    """γ (Γ · n) of one edge."""
+    import drjit as dr
+
+    across = dr.cross(first, second)
+    length = dr.norm(across)
+    angle = dr.atan2(length, dr.dot(first, second))
+    return dr.select(length > 0, angle * dr.dot(across, normal) / length, 0.0)

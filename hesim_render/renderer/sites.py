@@ -1,0 +1,104 @@
+"""Pixels that are looked at: those of a list, and those next to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: How far from a listed pixel its neighbours reach, pixels.
+REACH = 3
+
+
+@dataclass(frozen=True)
+class Sites:
+    """Listed pixels and their neighbours on the mosaic of the full sensor, whatever region is read out.
+
+    What is told of a pixel's neighbourhood is thus the same for a crop as for the full sensor, to the bit: sums have
+    their terms in the same order.
+
+    Parameters
+    ----------
+    index : [m], numbers on the full sensor, increasing.
+    listed : [n], places in `index` of the listed pixels, in the order of the list.
+    shape : rows and columns of the rectangle around all sites, and `cell` [m] their places in it; None where the
+        listed pixels have no neighbours.
+    """
+
+    index: NDArray[np.uint32]
+    listed: NDArray[np.int64]
+    shape: tuple[int, int] | None = None
+    cell: NDArray[np.int64] | None = None
+    _count: list[NDArray[np.float32]] = field(default_factory=list)
+
+    @classmethod
+    def alone(cls, pixel: NDArray[np.uint32]) -> Sites:
+        """Pixels without neighbours."""
+        index, listed = np.unique(pixel, return_inverse=True)
+        return cls(index, listed.astype(np.int64))
+
+    @classmethod
+    def around(cls, pixel: NDArray[np.uint32], rows: int, cols: int) -> Sites:
+        """Pixels with their neighbours, up to `REACH` away, on a full sensor of so many rows and columns."""
+        row, col = np.divmod(pixel.astype(np.int64), cols)
+        top, bottom = max(0, int(row.min()) - REACH), min(rows, int(row.max()) + REACH + 1)
+        left, right = max(0, int(col.min()) - REACH), min(cols, int(col.max()) + REACH + 1)
+        shape = bottom - top, right - left
+        wanted = np.zeros((shape[0] + 2 * REACH, shape[1] + 2 * REACH), np.bool_)
+        inner = wanted[REACH:-REACH, REACH:-REACH]
+        inner[row - top, col - left] = True
+        near = np.zeros(shape, np.bool_)
+        for down in range(2 * REACH + 1):
+            for right_ in range(2 * REACH + 1):
+                near |= wanted[down : down + shape[0], right_ : right_ + shape[1]]
+        cell = np.flatnonzero(near)
+        place = np.cumsum(near.ravel()) - 1
+        site_row, site_col = np.divmod(cell, shape[1])
+        index = ((site_row + top) * cols + site_col + left).astype(np.uint32)
+        return cls(index, place[(row - top) * shape[1] + col - left], shape, cell)
+
+    @property
+    def size(self) -> int:
+        return self.index.size
+
+    def mean(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean over the sites among each listed pixel's 3×3, of values [m]; [n]."""
+        if self.shape is None:
+            return values[self.listed]
+        if not self._count:
+            self._count.append(self._sum(np.ones(self.size, np.float32)))
+        return self._sum(values) / self._count[0]
+
+    def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        image = self._image(values, 1, 0.0)
+        across = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
+        return self._at_listed(across[:-2] + across[1:-1] + across[2:])
+
+    def most(self, values: NDArray, radius: int) -> NDArray:
+        """Largest value within `radius` pixels of each listed one, diagonally too, of values [m]; [n]."""
+        if self.shape is None:
+            return values[self.listed]
+        lowest = False if values.dtype == np.bool_ else -np.inf
+        image = self._image(values, radius, lowest)
+        cols, rows = image.shape[1] - 2 * radius, image.shape[0] - 2 * radius
+        across = image[:, :cols]
+        for shift in range(1, 2 * radius + 1):
+            across = np.maximum(across, image[:, shift : shift + cols])
+        found = across[:rows]
+        for shift in range(1, 2 * radius + 1):
+            found = np.maximum(found, across[shift : shift + rows])
+        return self._at_listed(found)
+
+    def _image(self, values: NDArray, margin: int, empty: float | bool) -> NDArray:
+        assert self.shape is not None
+        rows, cols = self.shape
+        image = np.full((rows + 2 * margin, cols + 2 * margin), empty, values.dtype)
+        inner = np.full(rows * cols, empty, values.dtype)
+        inner[self.cell] = values
+        image[margin : margin + rows, margin : margin + cols] = inner.reshape(rows, cols)
+        return image
+
+    def _at_listed(self, image: NDArray) -> NDArray:
+        assert self.cell is not None
+        return image.ravel()[self.cell[self.listed]]

@@ -1,0 +1,93 @@
+"""Boxes, outlines and speeds of moving objects hold at every instant, keyframes or not."""
+
+import numpy as np
+import pytest
+
+from hesim_render.renderer.bounds import fastest_m_per_s, places, stays_in
+from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.specs.scene import TrackSpec
+
+CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (0.2, 0.4) for z in (-0.3, 0.0)])
+
+
+def track(*keyframes, **options):
+    return Trajectory(TrackSpec.model_validate({"object": "x", "keyframes": list(keyframes), **options}))
+
+
+def random_track(rng):
+    """Shifts, turns about changing axes, jumps of a microsecond, held and repeated."""
+    times = np.cumsum(rng.choice([1, 200, 700, 3000], rng.integers(2, 7)))
+    one_axis = rng.random() < 0.5
+    axis = rng.normal(size=3).tolist()
+    keys = [
+        {
+            "t_us": int(t),
+            "translation_m": rng.normal(size=3).tolist(),
+            "rotation_axis": axis if one_axis else rng.normal(size=3).tolist(),
+            "rotation_deg": float(rng.uniform(-1000, 1000) if one_axis else rng.uniform(-170, 170)),
+        }
+        for t in times
+    ]
+    repeat = bool(rng.random() < 0.5)
+    if repeat:
+        keys.append({**keys[0], "t_us": int(times[-1]) + 500})
+    return track(*keys, pivot_m=rng.normal(size=3).tolist(), repeat=repeat)
+
+
+def seen(trajectory, begin, end):
+    """Corners at instants crowded about the ends and everywhere else, [k, 8, 3]."""
+    knots = trajectory.knots_us.astype(float)
+    period = knots[-1] - knots[0]
+    turns = np.arange(np.floor(begin / period) - 1, np.ceil(end / period) + 1) if trajectory.repeat else [0.0]
+    at_knots = (knots[None] + np.array(turns)[:, None] * period).ravel()
+    times = np.concatenate([np.linspace(begin, end, 1500), at_knots, at_knots + 0.5, at_knots - 0.5])
+    poses = trajectory.matrix(times[(times >= begin) & (times <= end)])
+    return CORNERS @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_an_object_never_leaves_its_box(seed):
+    rng = np.random.default_rng(seed)
+    trajectory = random_track(rng)
+    spans = []
+    for length in (1.0, 300.0, 2500.0, 20_000.0):
+        begin = float(rng.uniform(0, 8000))
+        spans.append((begin, begin + length))
+    for (begin, end), (low, high) in zip(spans, stays_in(CORNERS, trajectory, spans), strict=True):
+        points = seen(trajectory, begin, end)
+        assert np.all(points >= low - 1e-9) and np.all(points <= high + 1e-9)
+        # and the box is not much larger than what it holds, where the object turns little
+        size = np.ptp(points.reshape(-1, 3), axis=0)
+        assert np.all(high - low < 1.6 * size + 0.05)
+
+
+def test_what_comes_for_a_moment_is_in_the_box():
+    there = track({"t_us": 0}, {"t_us": 3010}, {"t_us": 3011, "translation_m": [0, 5, 0]},
+                  {"t_us": 3710, "translation_m": [0, 5, 0]}, {"t_us": 3711})  # fmt: skip
+    (low, high), (_, before) = stays_in(CORNERS, there, [(2000.0, 4000.0), (2000.0, 3010.0)])
+    assert high[1] == pytest.approx(5.4) and low[1] == pytest.approx(0.2)
+    assert before[1] == pytest.approx(0.4)
+
+
+def test_straight_lines_between_places_are_within_their_margin():
+    turning = track({"t_us": 0}, {"t_us": 10_000, "rotation_axis": [0, 0, 1], "rotation_deg": 900})
+    ((points, margin),) = places(CORNERS, turning, 1000.0, 3000.0)
+    share = np.linspace(0, 1, 40)[:, None, None, None]
+    lines = points[:-1] + share * np.diff(points, axis=0)
+    poses = turning.matrix(np.linspace(1000.0, 3000.0, 400))
+    true = CORNERS @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    for corner in range(8):
+        every = lines[:, :, corner].reshape(-1, 3)
+        far = np.linalg.norm(true[:, None, corner] - every, axis=2).min(axis=1)
+        assert far.max() < margin + 2e-3
+
+
+def test_no_point_is_faster_than_the_fastest():
+    for seed in range(20):
+        trajectory = random_track(np.random.default_rng(100 + seed))
+        begin, end = 500.0, 4500.0
+        times = np.linspace(begin, end, 8001)
+        poses = trajectory.matrix(times)
+        points = CORNERS @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        speed = np.linalg.norm(np.diff(points, axis=0), axis=2).max() / 0.5e-6
+        assert speed <= fastest_m_per_s(CORNERS, trajectory, begin, end) * (1 + 1e-6)

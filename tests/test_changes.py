@@ -1,0 +1,101 @@
+"""What a block is rendered of, and what is filled in; numbers of rays."""
+
+import numpy as np
+import pytest
+
+from hesim_render.renderer.changes import changes, fill_in, longer
+from hesim_render.renderer.options import TUNING, Gain
+from hesim_render.renderer.pilot import Closer, Pilot, allocate
+from hesim_render.renderer.sites import REACH, Sites
+
+
+def marks(flux, least=1.0):
+    flux = np.array(flux, np.float32)[:, None]
+    return changes(flux, np.full(flux.shape, least, np.float32))[:, 0].astype(int).tolist()
+
+
+def test_windows_are_marked_where_the_flux_leaves_the_last_mark():
+    assert marks([0, 0, 0, 0]) == [0, 0, 0, 0]
+    # slowly: where it has gone by the bound, and the step itself was small
+    assert marks([0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4]) == [0, 0, 0, 1, 0, 0, 1]
+    # at once: both windows
+    assert marks([0, 0, 5, 5, 5]) == [0, 1, 1, 0, 0]
+    # for one window only
+    assert marks([0, 0, 5, 0, 0]) == [0, 1, 1, 1, 0]
+
+
+def test_longer_marks_reach_no_further():
+    marked = np.zeros((7, 1), np.bool_)
+    marked[3] = True
+    assert longer(marked, 1)[:, 0].astype(int).tolist() == [0, 0, 1, 1, 1, 0, 0]
+
+
+def test_what_is_not_known_lies_on_straight_lines_in_time():
+    centre = np.array([0.0, 10, 30, 60, 100])
+    known = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [1, 1]], np.bool_)
+    values = np.where(known, np.array([[0, 5.0], [9, 7], [9, 9], [6, 9], [7, 25]]), 99).astype(np.float32)
+    fill_in(values, known, centre)
+    np.testing.assert_allclose(values[:, 0], [0, 1, 3, 6, 7], rtol=1e-6)
+    np.testing.assert_allclose(values[:, 1], [5, 7, 7 + 18 * 20 / 90, 7 + 18 * 50 / 90, 25], rtol=1e-6)
+
+
+def test_neighbours_of_a_crop_are_those_of_the_full_sensor():
+    rng, rows, cols = np.random.default_rng(1), 40, 50
+    image = rng.random(rows * cols).astype(np.float32)
+    every = Sites.around(np.arange(rows * cols, dtype=np.uint32), rows, cols)
+    row, col = np.meshgrid(np.arange(12, 20), np.arange(15, 30), indexing="ij")
+    listed = (row * cols + col).ravel().astype(np.uint32)
+    some = Sites.around(rng.permutation(listed), rows, cols)
+    order = some.index[some.listed]
+    np.testing.assert_array_equal(np.sort(order), np.sort(listed))
+    np.testing.assert_array_equal(some.mean(image[some.index]), every.mean(image)[order])
+    for radius in range(1, REACH + 1):
+        np.testing.assert_array_equal(some.most(image[some.index], radius), every.most(image, radius)[order])
+    plane = image.reshape(rows, cols)
+    where = (order == 13 * cols + 20).argmax()
+    assert some.most(image[some.index], 2)[where] == plane[11:16, 18:23].max()
+    assert some.mean(image[some.index])[where] == pytest.approx(plane[12:15, 19:22].mean(), rel=1e-6)
+
+
+def pilot_of(flux, scatter, unshadowed=None, closer=()):
+    tables = [np.array(values, np.float32)[None] for values in (flux, scatter)]
+    open_ = tables[0] if unshadowed is None else np.array(unshadowed, np.float32)[None]
+    return Pilot(tables[0], tables[0], tables[1], tables[1], open_, list(closer))
+
+
+def rays_of(pilot, quality=0.5, unit=0.03):
+    count = pilot.lit.shape[1]
+    sites = Sites.around(np.arange(count, dtype=np.uint32), 1, count)
+    units = unit * np.ones(pilot.lit.shape, np.float32)
+    return allocate(pilot, 0, sites, units, quality, Gain(*TUNING.matt_gain), TUNING, False)
+
+
+def test_rays_follow_scatter_quality_and_what_is_near_by():
+    calm = np.ones(9)
+    rays, lit, error = rays_of(pilot_of(calm, np.zeros(9)))
+    # one ray may bring one wanted error at most: 1 / (0.5 · 0.03) = 67
+    assert rays.tolist() == [64] * 9 and lit.all() and np.all(error == 0)
+    scatter = np.zeros(9)
+    scatter[4] = 1.5
+    rays, _, error = rays_of(pilot_of(calm, scatter))
+    assert rays[4] > rays[3] > rays[1] and rays[4] >= 128
+    # half of the mean over neighbours counts, so that the wish is met with something to spare for rounding
+    assert error[4] < 1.3 * 0.5 * 0.03
+    finer, _, _ = rays_of(pilot_of(calm, scatter), quality=0.1)
+    assert finer[4] > 4 * rays[4]
+    bright = np.ones(9)
+    bright[6] = 30.0
+    rays, _, _ = rays_of(pilot_of(bright, np.zeros(9)))
+    assert rays[4] > 128 and rays[2] == 64  # two pixels off the edge of something bright; four off
+    seen_closer = Closer(np.array([4]), np.array([2.0], np.float32), np.array([2.0], np.float32))
+    rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), closer=[seen_closer]))
+    assert rays[4] > 256 and rays[2] == 64
+
+
+def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():
+    flux = np.ones((1, 1), np.float32)
+    half = Pilot(flux, flux, 0.1 * flux, 0.2 * flux, flux)
+    assert rays_of(half)[1].all()
+    assert not rays_of(Pilot(flux, flux, 0.2 * flux, 0.1 * flux, flux))[1].any()
+    # what is hidden for the most part is the sum of what is seen, not the whole less what is hidden
+    assert not rays_of(Pilot(flux, flux, 0.1 * flux, 0.2 * flux, 3 * flux))[1].any()

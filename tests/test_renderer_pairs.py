@@ -1,0 +1,180 @@
+"""Pairs of a pixel and a window: the same paths as Mitsuba's, whatever else is asked for at the same time."""
+
+import gc
+
+import numpy as np
+import pytest
+import rendering
+from rendering import mono, pair_tracer, traced
+
+import hesim_render as hr
+from hesim_render.renderer import moving
+from hesim_render.renderer._mitsuba import mitsuba
+from hesim_render.renderer.flux import RenderedFlux
+from hesim_render.renderer.pairs import Windows
+from hesim_render.renderer.parts import meets_ball
+from hesim_render.renderer.sampler import sampler_class
+
+DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
+LAMP = {
+    "type": "rectangle",
+    "to_world": [[0.15, 0, 0, 0.8], [0, 0, -0.15, 1.6], [0, 0.15, 0, 1.2], [0, 0, 0, 1]],
+    "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 0.2}},
+}
+SKY = {"type": "constant", "radiance": {"type": "uniform", "value": 0.003}}
+
+
+def sphere(position, radius, reflectance):
+    columns = [[radius, 0, 0, position[0]], [0, radius, 0, position[1]], [0, 0, radius, position[2]], [0, 0, 0, 1]]
+    bsdf = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
+    return {"type": "sphere", "to_world": columns, "bsdf": bsdf}
+
+
+def plane(bsdf, z=0.0, half=1.0):
+    placing = [[half, 0, 0, 0], [0, half, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]]
+    return {"type": "rectangle", "to_world": placing, "bsdf": bsdf}
+
+
+@pytest.fixture
+def draws_of_mitsuba(monkeypatch):
+    """Random numbers in the order in which Mitsuba's path tracer takes them, and skies sampled as it does."""
+
+    def next_vertex(self):
+        light, lobe, place = self.next_2d(), self.next_1d(), self.next_2d()
+        return place, lobe, light, self.next_1d()
+
+    monkeypatch.setattr(sampler_class(mitsuba().variant()), "next_vertex", next_vertex)
+    monkeypatch.setattr(moving, "spare_even_skies", lambda mi, emitters: None)
+
+
+def test_balls_rule_out_no_ray_that_meets_what_is_in_them():
+    """Against the roots of the quadratic in double precision; with ends before, inside and beyond the ball."""
+    mi, rng, count = mitsuba(), np.random.default_rng(1), 100_000
+    middle, radius = np.array([0.3, -0.2, 1.1]), 0.25
+    origin = middle + rng.normal(size=(count, 3)) * rng.choice([0.1, 0.5], (count, 1))
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    length = rng.exponential(0.5, count)
+    to = origin - middle
+    along, rest = np.sum(to * direction, axis=1), np.sum(to**2, axis=1) - radius**2
+    root = np.sqrt(np.maximum(along**2 - rest, 0))
+    meets = (along**2 > rest) & (-along - root < length) & (-along + root > 0)
+    ray = mi.Ray3f(mi.Point3f(*origin.T), mi.Vector3f(*direction.T))
+    ball = mi.Point3f(middle), mi.Float((1.0001 * radius) ** 2)
+    found = np.array(meets_ball(ray, mi.Float(length), ball))
+    assert 0.1 < meets.mean() < 0.6
+    assert not np.any(meets & ~found)
+    assert np.mean(found & ~meets) < 0.05  # rays that end within a radius before it
+
+
+def lamps(count):
+    """Small tilted lamps in a row above the wall."""
+    turn = [[-0.05, 0, 0], [0, 0.04, -0.03], [0, -0.03, -0.04]]
+    return {
+        f"lamp{k}": {
+            "type": "rectangle",
+            "to_world": [[*turn[0], 0.25 * (k - count / 2)], [*turn[1], 0.2], [*turn[2], 0.9], [0, 0, 0, 1]],
+            "bsdf": DIFFUSE,
+            "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 0.2}},
+        }
+        for k in range(count)
+    }
+
+
+@pytest.mark.parametrize(("depth", "roulette"), [(2, 16), (4, 16), (12, 16), (12, 3)])
+@pytest.mark.parametrize("light", [{"sky": SKY}, {"lamp": LAMP, "sky": SKY}, lamps(3), lamps(12)])
+def test_paths_are_those_of_mitsuba(light, depth, roulette, draws_of_mitsuba):
+    """However long they are, and whatever their last segment may run into: the same rays to the same value.
+
+    With the roulette of a scene's own path tracer too.
+    """
+    glossy = {"type": "roughconductor", "material": "none", "alpha": 0.2}
+    shapes = {"ball": sphere((0, 0, 0.3), 0.2, 0.9), "wall": plane(DIFFUSE), "mirror": plane(glossy, z=0.1, half=0.3)}
+    own = {"integrator": {"type": "path", "max_depth": depth, "rr_depth": roulette}}
+    scene = rendering.mitsuba_scene({**own, **shapes, **light}, [], None)
+    sensor = mono(32, 24)
+    exact = RenderedFlux(scene, sensor, samples=16, seed=3)
+    wanted = np.array(exact.mean_flux(np.arange(32 * 24, dtype=np.uint32), 0, 0)[0])
+    got = traced(pair_tracer(scene, sensor), 16, 0.0, 0.0).half_a
+    assert wanted.max() > 0
+    # a ray that grazes an edge may fall to the other side by rounding
+    assert np.isclose(got, wanted, rtol=1e-4).mean() > 0.995
+    assert np.sum(got) == pytest.approx(np.sum(wanted), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
+def test_matt_surfaces_have_the_flux_of_the_exact_mode(name):
+    """Both estimates against Mitsuba's own paths, in a window so short that nothing moves.
+
+    Sums over 8×6 pixels, differences over their standard errors from both halves: beyond 5 in one of 10^5 runs; the
+    light itself is in closed form here, so that edges are all that has noise.
+    """
+    scene, sensor = hr.load_scene(name), mono()
+    exact = RenderedFlux(scene, sensor, samples=512, seed=3, max_motion_px=0.002)
+    pixels = np.arange(64 * 48, dtype=np.uint32)
+
+    def groups(half_a, half_b):
+        a, b = (np.array(half, np.float64).reshape(8, 6, 8, 8).mean(axis=(1, 3)) for half in (half_a, half_b))
+        return (a + b) / 2, (a - b) / 2
+
+    tracer = pair_tracer(scene, sensor)
+    for t_us in (1000.0, 777_000.0):
+        wanted, their_error = groups(*exact.mean_flux(pixels, t_us, t_us))
+        for lit in (True, False):
+            told = traced(tracer, 512, t_us, t_us, lit)
+            found, error = groups(told.half_a, told.half_b)
+            spread = np.sqrt(np.mean(error**2) + np.mean(their_error**2))
+            assert spread < 0.01 * wanted.mean()
+            assert abs(np.mean(found - wanted)) < 5 * spread / found.size**0.5
+            assert np.abs(found - wanted).max() < 12 * spread  # groups at edges have more noise than others
+
+
+def test_a_pair_does_not_depend_on_its_company():
+    tracer, rng = pair_tracer(hr.load_scene("camera-sweep"), mono()), np.random.default_rng(0)
+    pixel = tracer.sensor.layout.full_index.ravel()[rng.permutation(64 * 48)]
+    begin = rng.uniform(0, 5e5, pixel.size)
+    samples, lit = 2 ** rng.integers(3, 8, pixel.size), rng.random(pixel.size) < 0.5
+    number = np.arange(pixel.size)
+    together = tracer.trace(pixel, number, Windows(begin, begin + 1000), samples, lit)
+    some = rng.choice(pixel.size, 40, replace=False)
+    alone = tracer.trace(pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), samples[some], lit[some])
+    for field in ("half_a", "half_b", "met"):
+        np.testing.assert_array_equal(getattr(together, field)[some], getattr(alone, field))
+    pilot = tracer.pilot(pixel, number, Windows(begin, begin + 1000), 16, 1.25)
+    alone = tracer.pilot(pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), 16, 1.25)
+    for field in ("lit", "hidden", "unshadowed", "lit_scatter", "hidden_scatter"):
+        np.testing.assert_array_equal(getattr(pilot, field)[some], getattr(alone, field))
+
+
+@pytest.mark.parametrize("depth", [2, 4])
+def test_one_kernel_serves_lists_of_any_length_and_alignment(depth):
+    """From two pairs on."""
+    import drjit as dr
+
+    scene = hr.load_scene("rotating-star", {"max_depth": depth})
+    tracer = pair_tracer(scene, mono(), 1)
+    every = tracer.sensor.layout.full_index.ravel()
+
+    def run(count, first, windows):
+        pixel = every[first : first + count]
+        begin = 1250.0 * np.arange(windows)
+        number = np.arange(count) % windows
+        span = Windows(begin, begin + 1000.0)
+        tracer.trace(pixel, number, span, np.full(count, 8), np.full(count, True))
+        tracer.pilot(pixel, number, span, 16, 1.25)
+
+    def kernels(*lists):
+        dr.kernel_history_clear()
+        for count, first, windows in lists:
+            run(count, first, windows)
+        return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+    gc.collect()  # kernels list the surfaces of all scenes that are still about, those of other tests too
+    run(2000, 0, 3)  # what is made once for a scene
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    try:
+        known = kernels((128, 0, 2))
+        assert len(known) >= 3
+        assert kernels((2, 0, 1), (3, 1, 2), (77, 3, 16), (1000, 4, 100), (2500, 5, 1)) <= known
+    finally:
+        dr.set_flag(dr.JitFlag.KernelHistory, False)
