@@ -68,14 +68,14 @@ class Cells:
             [np.arange(n) * min(most / n, 1.0) for n in np.unique(self.polarity, return_counts=True)[1]]
         )
         _, group = np.unique(np.stack([self.polarity[order], np.floor(rank)]), axis=1, return_inverse=True)
-        total = np.bincount(group, pixels)
+        total = np.bincount(group, pixels).astype(np.float64)
 
         def mean(values: NDArray) -> NDArray[np.float64]:
             return np.bincount(group, values[order] * pixels) / np.maximum(total, 1e-30)
 
         relative = mean(self.relative)
         spread = np.sqrt(np.maximum(mean(self.spread**2 + self.relative**2) - relative**2, 0.0))
-        events = np.bincount(group, self.events[order])
+        events = np.bincount(group, self.events[order]).astype(np.float64)
         return Cells(mean(self.signal_dn), mean(self.polarity), relative, spread, total, events, self.trials)
 
     def with_spread(self, factor: float) -> Cells:
@@ -183,7 +183,8 @@ def pool_events(
             spreads.append(left.astype(np.float32))
             index.append(cell + number)
             number += pixels.size
-    cells = Cells(*(np.concatenate(column) for column in columns), trials=static.trials)
+    signals, signs, centres, withins, numbers, events = (np.concatenate(column) for column in columns)
+    cells = Cells(signals, signs, centres, withins, numbers, events, static.trials)
     return PixelCounts(
         signal, np.broadcast_to(static.position, good.shape)[take], weights, np.stack(counts), np.array(polarities),
         np.array(is_dark), np.stack(relatives), np.stack(spreads), np.stack(index), cells,

@@ -84,7 +84,7 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
             raise SpecError(f"{name} holds {counts.dtype.name}; save whole numbers of events", file=file)
         if counts.min() < 0 or counts.max() > trials:
             raise SpecError(f"{name} holds counts outside 0 to n_trials = {trials}", file=file)
-    maps = {name: data[name].astype(np.int64) for name in names}
+    maps: dict[str, NDArray[np.int64]] = {name: data[name].astype(np.int64) for name in names}
     for first, second in (("n_on", "n_off"), ("dark_n_on", "dark_n_off")):
         if first in maps and (maps[first] + maps[second]).max() > trials:
             raise SpecError(f"{first} and {second} hold more events together than n_trials = {trials}", file=file)

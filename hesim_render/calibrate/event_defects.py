@@ -11,7 +11,14 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import binom, poisson
 
 from hesim_render.calibrate.event_counts import StaticCapture
-from hesim_render.calibrate.event_medians import LEAST_EVENTS, by_group, density, like_brightness, middle_and_spread, spread_of_thresholds
+from hesim_render.calibrate.event_medians import (
+    LEAST_EVENTS,
+    by_group,
+    density,
+    like_brightness,
+    middle_and_spread,
+    spread_of_thresholds,
+)
 from hesim_render.calibrate.steps import Steps
 from hesim_render.calibrate.thresholds import Thresholds, totals_of
 

@@ -187,32 +187,21 @@ def _evaluate(
 
 
 def pixel_scores(
-    pixels: PixelCounts, eta: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None,
-    extra: NDArray | None = None,
+    pixels: PixelCounts, eta: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
-    """Covariance of the score, from how each pixel's own score scatters, and the information; of one fit `eta` [6].
+    """Covariance [6, 6] of the score of one fit `eta` [6], from how the pixels' own scatter, and the information.
 
     All counts of a pixel, ON and OFF, lit and dark, are taken together, whatever makes them scatter or vary alike:
     its thresholds, noise correlated from tick to tick, changes in time.
-
-    Parameters
-    ----------
-    extra : [cell, k], further derivatives of ln P, of parameters that the fit does not have.
-
-    Returns
-    -------
-    Covariance and information [6 + k, 6 + k], and the score's sum [6 + k].
     """
     cells = pixels.cells
     log_p, slope = log_probability(eta, cells, theta_v, law)
     slope = slope * np.asarray(free, bool)
-    if extra is not None:
-        slope = np.concatenate([slope, extra], axis=1)
     p = np.exp(log_p)
     influence = (slope / np.maximum(1 - p, 1e-12)[:, None]) if variance is None else slope * (
         cells.total * p / variance
     )[:, None]  # fmt: skip
-    meat = np.zeros((slope.shape[1],) * 2)
+    meat = np.zeros((6, 6))
     for begin in range(0, pixels.signal_dn.size, _CHUNK):
         part = np.s_[begin : begin + _CHUNK]
         score = sum(
@@ -220,9 +209,7 @@ def pixel_scores(
             for k, cell in zip(pixels.counts, pixels.cell, strict=True)
         )
         meat += score.T @ (score if pixels.weight is None else score * pixels.weight[part, None] ** 2)
-    information = (slope * (cells.total * p)[:, None]).T @ influence
-    total = (cells.events - cells.total * p) @ influence
-    return meat, information, total
+    return meat, (slope * (cells.total * p)[:, None]).T @ influence
 
 
 def sandwich(
@@ -230,6 +217,6 @@ def sandwich(
 ) -> NDArray[np.float64]:
     """Covariance [6, 6] of one fit, from how the pixels' scores scatter; 0 for what is not free."""
     mask = np.asarray(free, bool)
-    meat, information, _ = pixel_scores(pixels, eta, theta_v, law, free, variance)
+    meat, information = pixel_scores(pixels, eta, theta_v, law, free, variance)
     bread = np.linalg.pinv(information, hermitian=True) * mask[:, None] * mask
     return bread @ meat @ bread

@@ -154,7 +154,7 @@ def maps(result: EvsCalibration) -> dict[str, NDArray]:
 def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, NDArray]:
     fit, good = result.together, ~result.bad
     step = max(1, -(-max(static.n_on.shape) // _FIGURE_PX))
-    figures = {
+    figures: dict[str, NDArray] = {
         "figure_probability": ((static.n_on + static.n_off)[::step, ::step] / (2 * static.trials)).astype(np.float32)
     }
     figures["figure_rates"] = _rates(result.plain.cells)

@@ -44,7 +44,7 @@ class Steps:
 
 
 def pixel_groups(shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """A group of `GROUPS` for every pixel [row, col], at random but always the same: neighbours are in different ones."""
+    """One of `GROUPS` for every pixel [row, col], drawn at random but always the same: neighbours are apart."""
     return np.random.default_rng(20).integers(0, GROUPS, shape)
 
 
@@ -75,7 +75,7 @@ def read_steps(captures: CaptureSet, good: NDArray[np.bool_]) -> Steps:
         for counts in step_maps(captures, name, contrast.size, good.shape, trials):
             rows.append(np.bincount(group[good], counts[good], GROUPS))
             total += counts
-        sums[name], totals[name] = np.array(rows), total
+        sums[name], totals[name] = np.array(rows, dtype=np.float64), total
     return Steps(
         contrast=contrast,
         signal_dn=float(np.median(signal)),
