@@ -154,6 +154,29 @@ def test_mismatch_from_the_static_counts_alone(tmp_path):
     assert np.abs((value - [29.0, 6240.0, 0.03, 0.0]) / error).max() < 4.5
 
 
+@pytest.mark.parametrize("mismatch", [0.15, 0.25])
+def test_large_mismatch_is_recovered_from_steps_and_from_the_static_counts_alone(tmp_path, mismatch):
+    """A z beyond 4 has a chance of 6e-5. No good one of 16,384 pixels is called bad, at a chance of 1e-7 each, but for
+    those whose threshold came out at 0 or below (4 of its spreads at 25 %), which have an event at every tick."""
+    both = capture_sets.generated(7, size=128, frames=8, mismatch=mismatch)
+    capture_sets.write_events(tmp_path / "set", size=128, trials=20000, mismatch=mismatch)
+    injected = np.load(both / "truth_maps.npz")["evs_bad"]
+    injected |= 1 + mismatch * np.random.default_rng(8).standard_normal(injected.shape) < 0.05
+    for folder, source, bad in ((both, "steps", injected), (tmp_path / "set", "static counts", 0 * injected)):
+        calibrate_evs(folder, tmp_path / f"{source}.yaml")
+        section = read_calibration(tmp_path / f"{source}.yaml")["evs"]
+        found = section["threshold_mismatch"]
+        assert found["from"] == source
+        assert abs(found["value"] - mismatch) < 4 * found["standard_error"]
+        assert found["standard_error"] < 0.03 * mismatch
+        called = read_maps(tmp_path / f"{source}.yaml", "evs")["bad_pixels"]
+        assert not np.any(called > bad)
+        assert np.sum(called) >= 0.9 * np.sum(bad)
+        assert section["goodness"]["p_value"] > 1e-4
+        assert all(section["dispersion"][name]["value"] is None or section["dispersion"][name]["value"] >= 0
+                   for name in ("temporal", "temporal_difference"))  # fmt: skip
+
+
 def test_closed_form_of_the_mean_over_thresholds():
     u, m = np.linspace(0.5, 4, 8), 0.15
     z = np.linspace(-9, 9, 20001)
