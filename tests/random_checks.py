@@ -82,6 +82,26 @@ def check(random: RandomScene, windows: int, pixels: int, duration_us: int = DUR
     return Checked(*map(np.concatenate, (deviation, stated, own)))
 
 
+def check_exposure(random: RandomScene, pixels: int, begin_us: float = 1000.0, end_us: float = 3000.0) -> Checked:
+    """Pixels drawn at random, in one exposure. Stated is half the difference of both halves: right in mean square."""
+    rng = np.random.default_rng([76, random.seed])
+    window_us = random.sensor.spec.evs.window_us
+
+    def make(part, most_power):
+        return ChangeDrivenFlux(part, random.sensor, QUALITY, seed=random.seed, most_power=most_power)
+
+    source = flickering(random.scene, make, window_us)
+    every = np.arange(random.sensor.rows * random.sensor.cols, dtype=np.uint32)
+    half_a, half_b = (np.array(half, np.float64) for half in source.mean_flux(every, begin_us, end_us))
+    chosen = rng.choice(every.size, pixels, replace=False)
+    flux, half = 0.5 * (half_a + half_b)[chosen], 0.5 * (half_a - half_b)[chosen]
+    reference = WindowReference(random.scene, random.sensor)
+    index = reference.sensor.layout.full_index.ravel()[chosen]
+    unit = np.maximum(Noise(reference.sensor).of("any", index)(flux.astype(np.float32)).astype(np.float64), 1e-9)
+    found = reference.flux([[begin_us, end_us]], chosen, 0.2 * QUALITY * unit, seed=random.seed)
+    return Checked((flux - found.flux[0]) / unit, np.abs(half) / unit, found.stderr[0] / unit)
+
+
 @dataclass(frozen=True)
 class EventErrors:
     """Events of some pixels over a whole run, noise-free: of the default mode and of the reference.

@@ -1,6 +1,7 @@
 """What is small, thin, fast, or there for a moment only: found in the default mode, and its audit right about it.
 
-No constant of the renderer was chosen on these scenes. The truth is every pair of a pixel and a tick, traced with many
+What one ray may weigh and the margin of exposures were chosen when some of these scenes had shown the need, no other
+constant was. The truth is every pair of a pixel and a tick, traced with many
 rays of other random numbers; the tracer itself is judged in `test_renderer_pairs` and `test_renderer_reference`.
 """
 

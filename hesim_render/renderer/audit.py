@@ -36,7 +36,7 @@ _STILL_PART = 0.25
 #: as much moves meanwhile and rays gain less than is expected of them.
 _REFERENCE = {"eventful": 0.5, "calm": 0.5, "frames": 0.2}
 #: Units that are looked at before it is asked whether they are enough: at first, and later on.
-_LEAST_BATCH, _MOST_BATCH = 1024, 16384
+_LEAST_BATCH, _MOST_BATCH = 256, 16384
 #: Rays of an audit at most: a part of the run's own, or so many if that is more.
 _PART, _RAYS = 0.25, 30_000_000
 
