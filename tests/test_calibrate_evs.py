@@ -10,9 +10,9 @@ from scipy.stats import chi2, poisson
 
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.captures import read_captures
+from hesim_render.calibrate.event_cells import PixelThresholds, pool_events
 from hesim_render.calibrate.event_counts import read_static
 from hesim_render.calibrate.event_model import mean_probability, probability_variance
-from hesim_render.calibrate.event_pool import pool_events
 
 
 def curve(a, b, c, d, theta_v, light, mismatch=0.0, law="linear"):
@@ -152,6 +152,29 @@ def test_mismatch_from_the_static_counts_alone(tmp_path):
     assert section["theta"]["value"] is None and "evs_steps" in section["theta"]["reason"]
     value, error = fitted(section)
     assert np.abs((value - [29.0, 6240.0, 0.03, 0.0]) / error).max() < 4.5
+
+
+@pytest.mark.parametrize("mismatch", [0.15, 0.25])
+def test_large_mismatch_is_recovered_from_steps_and_from_the_static_counts_alone(tmp_path, mismatch):
+    """A z beyond 4 has a chance of 6e-5. No good one of 16,384 pixels is called bad, at a chance of 1e-7 each, but for
+    those whose threshold came out at 0 or below (4 of its spreads at 25 %), which have an event at every tick."""
+    both = capture_sets.generated(7, size=128, frames=8, mismatch=mismatch)
+    capture_sets.write_events(tmp_path / "set", size=128, trials=20000, mismatch=mismatch)
+    injected = np.load(both / "truth_maps.npz")["evs_bad"]
+    injected |= 1 + mismatch * np.random.default_rng(8).standard_normal(injected.shape) < 0.05
+    for folder, source, bad in ((both, "steps", injected), (tmp_path / "set", "static counts", 0 * injected)):
+        calibrate_evs(folder, tmp_path / f"{source}.yaml")
+        section = read_calibration(tmp_path / f"{source}.yaml")["evs"]
+        found = section["threshold_mismatch"]
+        assert found["from"] == source
+        assert abs(found["value"] - mismatch) < 4 * found["standard_error"]
+        assert found["standard_error"] < 0.03 * mismatch
+        called = read_maps(tmp_path / f"{source}.yaml", "evs")["bad_pixels"]
+        assert not np.any(called > bad)
+        assert np.sum(called) >= 0.9 * np.sum(bad)
+        assert section["goodness"]["p_value"] > 1e-4
+        assert all(section["dispersion"][name]["value"] is None or section["dispersion"][name]["value"] >= 0
+                   for name in ("temporal", "temporal_difference"))  # fmt: skip
 
 
 def test_closed_form_of_the_mean_over_thresholds():
@@ -375,13 +398,16 @@ def test_mean_brightness_of_a_bin_stands_for_its_pixels(tmp_path):
     counts = np.full(light.shape, 1)
     np.savez(tmp_path / "set" / "evs_static.npz", signal_dn=light, n_on=counts, n_off=counts, n_trials=20000)
     static = read_static(read_captures(tmp_path / "set"))
-    pooled = pool_events(replace(static, n_on=1e6 * exact), np.ones(light.shape, bool)).together()
-    used = pooled.pixels[0] > 0
-    mean = pooled.counts.on[0, used] / pooled.pixels[0, used] / 1e6
-    np.testing.assert_allclose(curve(**known, light=pooled.counts.signal_dn[0, used]), mean, rtol=3e-3)
-    spread = np.sqrt(np.maximum(pooled.scatter()[0, used, 0, 0], 0)) / 1e6
-    # a bin of 3.9 % in brightness has a standard deviation of 1.1 %; d ln P/d ln I is 5.5 at most
-    assert np.max(spread / mean) < 0.065
+    good = np.ones(light.shape, bool)
+    pixels = pool_events(replace(static, n_on=1e6 * exact), good, PixelThresholds.unknown(light.shape, 0.0))
+    lit_on = np.unique(pixels.cell[0])
+    cells, number = pixels.cells, pixels.cells.pixels[lit_on]
+    mean = cells.events[lit_on] / number / 1e6
+    np.testing.assert_allclose(curve(**known, light=cells.signal_dn[lit_on]), mean, rtol=1e-3)
+    square = np.bincount(pixels.cell[0], exact.ravel() ** 2)[lit_on] / number
+    spread = np.sqrt(np.maximum(square - mean**2, 0))
+    # a bin of 2 % in brightness has a standard deviation of 0.6 %; d ln P/d ln I is 5.5 at most
+    assert np.max(spread / mean) < 0.033
 
 
 @pytest.mark.slow

@@ -100,6 +100,30 @@ def test_notes_cannot_break_the_page(tmp_path):
     assert "<script>" not in (tmp_path / "r.html").read_text()
 
 
+def test_cells_without_an_event_are_arrows_and_no_cell_is_missing(tmp_path, monkeypatch):
+    """Few trials of a bright scene: most cells of it count nothing, and 0 is on no logarithmic axis."""
+    drawn = {"points": [], "arrows_down": []}
+    for name in drawn:
+        monkeypatch.setattr(
+            f"hesim_render.calibrate.report.Plot.{name}",
+            lambda self, x, y, *rest, name=name, **more: drawn[name].append((self, x, y)) or self,
+        )
+    capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=120.0, c=0.001)
+    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "r.html")
+    maps = read_maps(tmp_path / "c.yaml", "evs")
+    signal, on, off, trials = maps["figure_rates"].T
+    first = drawn["points"][0][0]  # the plot of rates against brightness: ON, then OFF
+    points, arrows = ([(x, y) for plot, x, y in drawn[name] if plot is first] for name in drawn)
+    for events, (x, y), (at, limit) in zip((on, off), points, arrows, strict=True):
+        none = events == 0
+        assert none.any() and not none.all()
+        np.testing.assert_array_equal(x, signal[~none])
+        np.testing.assert_allclose(y, events[~none] / trials[~none])
+        np.testing.assert_array_equal(at, signal[none])
+        # 95 %: (1 - P)^n = 0.05
+        np.testing.assert_allclose((1 - limit) ** trials[none], 0.05, rtol=0.02)
+
+
 def test_what_cannot_be_written_or_read(both, tmp_path):
     folder, _ = both
     if os.geteuid() != 0:

@@ -5,6 +5,7 @@ Frames are decompressed one at a time, so a capture set larger than memory can b
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -20,7 +21,9 @@ from hesim_render.errors import SpecError
 from hesim_render.specs.files import Strict, load_yaml, validate
 from hesim_render.specs.sensor import SensorSpec, read_sensor
 
-_BROKEN = (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error)
+_BROKEN = (OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+#: Largest array that is read whole: a map of float64 over a sensor of 256 Mpx.
+_MOST_BYTES = 1 << 31
 
 
 class SignalReference(Strict):
@@ -95,14 +98,7 @@ class CaptureSet:
         SpecError
             If the file or one of the `required` arrays is missing, or cannot be read.
         """
-        file = self._file(name)
-        try:
-            with np.load(file, allow_pickle=False) as data:
-                found = {key: data[key] for key in data.files}
-        except _BROKEN as error:
-            raise _unreadable(file, error) from None
-        _require(file, required, list(found))
-        return found
+        return small_arrays(self._file(name), required)
 
     def has(self, name: str) -> bool:
         return (self.folder / f"{name}.npz").is_file()
@@ -175,7 +171,7 @@ class FrameStack:
 
     def _header(self, stream: IO[bytes]) -> tuple[tuple[int, int, int, int], np.dtype]:
         shape, dtype = _read_header(stream, self.file)
-        if dtype.kind == "O":
+        if dtype.hasobject:
             raise SpecError(
                 "frames is an array of objects, as NumPy makes of frames of different sizes; all frames must be "
                 "[exposure, frame, row, col] of one size",
@@ -227,13 +223,73 @@ class FrameStack:
             yield frame
 
 
+def small_arrays(file: Path, required: tuple[str, ...], skip: tuple[str, ...] = ()) -> dict[str, NDArray]:
+    """Arrays of an ``.npz`` file but those to `skip`, which are only looked for.
+
+    Raises
+    ------
+    SpecError
+        If the file or a `required` array is missing, cannot be read, or would take more memory than a map can.
+    """
+    found: dict[str, NDArray] = {}
+    try:
+        with zipfile.ZipFile(file) as archive:
+            names = [Path(name).stem for name in archive.namelist()]
+            _require(file, required, names)
+            for member in names:
+                if member in skip:
+                    continue
+                with archive.open(f"{member}.npy") as stream:
+                    found[member] = _read_values(stream, member, file)
+    except SpecError:
+        raise
+    except _BROKEN as error:
+        raise _unreadable(file, error) from None
+    return found
+
+
+def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least: float = 0.0) -> float:
+    """The one number that an array holds.
+
+    Raises
+    ------
+    SpecError
+        If it holds text, several values, or a number that is not finite or too small.
+    """
+    kind = "whole number" if whole else "number"
+    wrong = SpecError(f"{name} must be one {kind} of {least:g} or more", file=file)
+    if value.size != 1 or value.dtype.kind not in "uif":
+        raise wrong
+    found = float(value.item())
+    if not np.isfinite(found) or found < least or (whole and found != int(found)):
+        raise wrong
+    return found
+
+
+def _check_size(shape: tuple[int, ...], dtype: np.dtype, name: str, file: Path) -> None:
+    if dtype.hasobject:
+        raise SpecError(f"{name} is an array of objects; save numbers", file=file)
+    size = math.prod(int(n) for n in shape) * dtype.itemsize
+    if size > _MOST_BYTES:
+        raise SpecError(f"{name} would take {size / 1e9:.3g} GB, more than a map of any sensor", file=file)
+
+
+def _read_values(stream: IO[bytes], name: str, file: Path) -> NDArray:
+    shape, fortran_order, dtype = _npy_header(stream)
+    _check_size(shape, dtype, name, file)
+    buffer = bytearray(math.prod(shape) * dtype.itemsize)
+    _fill(stream, memoryview(buffer))
+    values = np.frombuffer(buffer, dtype=dtype)
+    return values.reshape(shape[::-1]).T if fortran_order else values.reshape(shape)
+
+
 def count_maps(captures: CaptureSet, name: str, member: str) -> Iterator[NDArray]:
     """Maps [row, col] of a member [k, row, col], one at a time."""
     file = captures.folder / f"{name}.npz"
     try:
         with zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
             shape, _ = _read_header(stream, file)
-    except (KeyError, *_BROKEN) as error:
+    except _BROKEN as error:
         raise _unreadable(file, error) from None
     if len(shape) != 3:
         raise SpecError(f"{member} has shape {shape}; expected [contrast, row, col]", file=file)
@@ -245,7 +301,8 @@ def _stream(file: Path, member: str, count: int, shape: tuple[int, ...]) -> Iter
     try:
         with zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
             _, dtype = _read_header(stream, file)
-            buffer = bytearray(int(np.prod(shape)) * dtype.itemsize)
+            _check_size(shape, dtype, member, file)
+            buffer = bytearray(math.prod(shape) * dtype.itemsize)
             for _ in range(count):
                 _fill(stream, memoryview(buffer))
                 yield np.frombuffer(buffer, dtype=dtype).reshape(shape)
@@ -266,12 +323,16 @@ def _fill(stream: IO[bytes], view: memoryview, piece: int = 1 << 18) -> None:
 
 
 def _read_header(stream: IO[bytes], file: Path) -> tuple[tuple[int, ...], np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran_order, dtype = read(stream)
+    shape, fortran_order, dtype = _npy_header(stream)
     if fortran_order and len(shape) > 1:
         raise SpecError("arrays must be in C order (use numpy.ascontiguousarray before saving)", file=file)
     return shape, dtype
+
+
+def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    return read(stream)
 
 
 def _require(file: Path, required: tuple[str, ...], found: list[str]) -> None:

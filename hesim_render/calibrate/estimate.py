@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,3 +27,30 @@ def estimated(value: float, standard_error: float, unit: str = "") -> dict[str, 
 def not_identifiable(reason: str) -> dict[str, Any]:
     """A parameter the data do not tell."""
     return {"value": None, "reason": reason}
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A relative standard deviation over pixels, such as the mismatch of thresholds.
+
+    Attributes
+    ----------
+    value : 0 where it is not significant. error : standard error, NaN where it is not.
+    limit : upper limit of 95 % where it is not.
+    """
+
+    value: float
+    error: float
+    limit: float
+
+    @property
+    def relative_error(self) -> float:
+        """Of the value; 0 where that is 0."""
+        return self.error / self.value if self.value > 0 else 0.0
+
+    def described(self) -> dict[str, Any]:
+        """As `estimated`, or 0 with its limit."""
+        if self.value > 0:
+            return estimated(self.value, self.error, "relative std")
+        note = "the pixels scatter no more than counting makes them"
+        return {"value": 0.0, "upper_limit": self.limit, "note": note}

@@ -1,4 +1,4 @@
-"""Event counts of a static scene: bad pixels, pooling by brightness, over-dispersion."""
+"""``evs_static.npz``: event counts of a static scene, read and checked."""
 
 from __future__ import annotations
 
@@ -7,15 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
-from scipy.stats import binom
 
-from hesim_render.calibrate.captures import CaptureSet
+from hesim_render.calibrate.captures import CaptureSet, number
 from hesim_render.calibrate.result import read_calibration, read_maps
 from hesim_render.errors import SpecError
 from hesim_render.units import S_PER_US
-
-_CHANCE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -74,9 +70,9 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
         )
     data = captures.arrays("evs_static", ("n_on", "n_off", "n_trials"))
     signal = np.asarray(data["signal_dn"]) if "signal_dn" in data else _composite_signal(captures, calibration, file)
-    if signal.ndim != 2 or signal.dtype.kind not in "uif":
+    if signal.ndim != 2 or signal.dtype.kind not in "uif" or signal.size == 0:
         raise SpecError(f"signal_dn has shape {signal.shape}; expected numbers [row, col]", file=file)
-    trials = _trials(data["n_trials"], file)
+    trials = int(number(data["n_trials"], "n_trials", file, whole=True, least=1))
     names = [name for name in ("n_on", "n_off", "dark_n_on", "dark_n_off") if name in data]
     if len(names) == 3:
         raise SpecError("dark_n_on and dark_n_off are given together or not at all", file=file)
@@ -88,7 +84,10 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
             raise SpecError(f"{name} holds {counts.dtype.name}; save whole numbers of events", file=file)
         if counts.min() < 0 or counts.max() > trials:
             raise SpecError(f"{name} holds counts outside 0 to n_trials = {trials}", file=file)
-    maps = {name: data[name].astype(np.int64) for name in names}
+    maps: dict[str, NDArray[np.int64]] = {name: data[name].astype(np.int64) for name in names}
+    for first, second in (("n_on", "n_off"), ("dark_n_on", "dark_n_off")):
+        if first in maps and (maps[first] + maps[second]).max() > trials:
+            raise SpecError(f"{first} and {second} hold more events together than n_trials = {trials}", file=file)
     total = sum(int(counts.sum()) for counts in maps.values())
     if total == 0:
         raise SpecError("holds no event at all; capture more trials, or lower the threshold", file=file)
@@ -150,12 +149,6 @@ def _composite_signal(captures: CaptureSet, calibration: str | Path | None, file
     return np.maximum(rate.astype(np.float64), 0.0) * reference.t_ref_us * S_PER_US
 
 
-def _trials(value: NDArray, file: object) -> int:
-    if value.size != 1 or value.dtype.kind not in "uif" or value.item() < 1 or value.item() != int(value.item()):
-        raise SpecError("n_trials must be one whole number above 0", file=str(file))
-    return int(value.item())
-
-
 def event_tile(captures: CaptureSet, shape: tuple[int, ...]) -> tuple[int, int]:
     """Event pixels of a tile: as the sensor or capture.yaml says, else from the sizes of the two grids.
 
@@ -181,65 +174,3 @@ def event_tile(captures: CaptureSet, shape: tuple[int, ...]) -> tuple[int, int]:
             file=captures.folder,
         )
     return tile
-
-
-def bad_event_pixels(static: StaticCapture) -> NDArray[np.bool_]:
-    """Pixels [row, col] whose counts no threshold within the spread of the others could give.
-
-    Pixels are compared with the mean of those of like brightness; the spread of thresholds is taken from
-    the middle of their distribution, so that the bad ones do not widen it. A pixel is bad where a
-    threshold 5 spreads (6 % at least) away would give its count with a chance below 1e-7.
-    """
-    bad = ~np.isfinite(static.signal_dn)
-    for signal, *both in static.sessions:
-        filled = np.where(bad, 0.0, signal)
-        edges = np.unique(np.quantile(filled.ravel()[:: _stride(filled)], np.linspace(0, 1, 25)))
-        group = np.searchsorted(edges[1:-1], filled, side="right")
-        for counts in both:
-            bad |= _outliers(counts, group, bad, static.trials)
-    return bad
-
-
-def _outliers(counts: NDArray, group: NDArray, bad: NDArray, trials: int) -> NDArray[np.bool_]:
-    outlying = bad.copy()
-    size = int(group.max()) + 1
-    for _ in range(6):
-        number = np.bincount(group[~outlying], minlength=size)
-        total = np.bincount(group[~outlying], weights=counts[~outlying], minlength=size)
-        rate = (total + 0.5) / (np.maximum(number, 1) * trials + 1)
-        u = np.maximum(-ndtri(np.minimum(rate, 0.5)), 0.05)
-        reach = max(0.06, 5 * _robust_spread(counts, group, outlying, trials, rate, u))
-        high, low = ndtr(-u * max(1 - reach, 0.0)), ndtr(-u * (1 + reach))
-        found = bad.copy()
-        # Only counts far off need the exact tail.
-        margin = 4.0
-        n, h, w = counts, (trials * high)[group], (trials * low)[group]
-        over, under = n > h + margin * np.sqrt(h), n < w - margin * np.sqrt(w)
-        found[over] |= binom.sf(n[over] - 1, trials, high[group[over]]) < _CHANCE
-        found[under] |= binom.cdf(n[under], trials, low[group[under]]) < _CHANCE
-        if np.array_equal(found, outlying):
-            break
-        outlying = found
-    return outlying
-
-
-def _stride(array: NDArray) -> int:
-    """Step through an array that leaves some 100,000 values: medians need no more. Odd, to visit all positions."""
-    return 2 * (array.size // 200_000) + 1
-
-
-def _robust_spread(counts: NDArray, group: NDArray, outlying: NDArray, trials: int, rate: NDArray, u: NDArray) -> float:
-    """Relative spread of thresholds beyond counting noise, from medians; groups of few events are left out."""
-    step = _stride(counts)
-    counts, group, outlying = counts.ravel()[::step], group.ravel()[::step], outlying.ravel()[::step]
-    spreads = []
-    for g in np.flatnonzero(trials * rate > 5):
-        values = counts[(group == g) & ~outlying]
-        if values.size < 50:
-            continue
-        threshold = -ndtri((values + 0.5) / (trials + 1))
-        middle = np.median(threshold)
-        robust = 1.4826 * np.median(np.abs(threshold - middle))
-        slope = np.exp(-0.5 * u[g] ** 2) / np.sqrt(2 * np.pi)
-        spreads.append((robust**2 - rate[g] / trials / slope**2) / u[g] ** 2)
-    return float(np.sqrt(max(np.median(spreads), 0.0))) if spreads else 0.0

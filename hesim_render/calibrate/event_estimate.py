@@ -8,22 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 
-from hesim_render.calibrate.event_dispersion import Dispersion
-from hesim_render.calibrate.event_fit import Scatter, maximise, quasi_sandwich, sandwich, search, start_values
+from hesim_render.calibrate.event_cells import Cells, PixelCounts
+from hesim_render.calibrate.event_fit import maximise, sandwich, search, start_values
+from hesim_render.calibrate.event_goodness import Goodness, goodness
 from hesim_render.calibrate.event_model import (
-    EventCounts,
     Law,
     log_likelihood,
-    log_probabilities,
+    log_probability,
     natural,
-    probabilities,
     probability_variance,
     threshold_over_noise,
 )
-from hesim_render.calibrate.event_pool import PooledEvents
 
 #: Least eigenvalue of a scaled information matrix that tells all its parameters apart.
 _SINGULAR = 1e-9
+#: Times that the scatter and the fit follow from each other.
+_REWEIGHTED = 4
+#: Cells of a polarity in which counts of widely spread thresholds are compared with a law.
+_NORMAL = 24
 #: χ²/dof above which standard errors are widened by its root.
 POOR_FIT = 2.0
 #: χ²/dof above which the model does not describe the counts at all.
@@ -43,22 +45,24 @@ class EventFit:
     Attributes
     ----------
     parameters : [6] as `event_model.PARAMETERS`. free : [6], which were fitted.
-    values : [6], A, B, C, D, ρ, λ. covariance : [6, 6] of them. fisher_covariance : as if counts were binomial.
+    whole : [6], the parameters of the fit of A to D, before any was given up.
+    values : [6], A, B, C, D, ρ, λ. covariance : [6, 6] of them, from how the pixels' scores scatter.
+    design_effect : variance of A … D, on the average, over that of counts that scatter as the model says.
     reasons : why A, B, C or D is not identifiable, by name.
-    log_likelihood : trinomial, without the constant.
-    pearson_chi2, dof : of the bins.
+    log_likelihood : without constants.
+    goodness : χ² of the counts by brightness.
     """
 
     law: Law
     parameters: NDArray[np.float64]
+    whole: NDArray[np.float64]
     free: tuple[bool, ...]
     values: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    fisher_covariance: NDArray[np.float64]
+    design_effect: float
     reasons: dict[str, str]
     log_likelihood: float
-    pearson_chi2: float
-    dof: int
+    goodness: Goodness
 
     def identified(self, name: str) -> bool:
         """Whether the data tell A, B, C or D."""
@@ -66,146 +70,138 @@ class EventFit:
 
 
 def fit_events(
-    pooled: PooledEvents,
+    pixels: PixelCounts,
     theta_v: float,
     law: Law,
-    mismatch: float,
-    spread: Dispersion | None,
-    start: NDArray | None = None,
+    start: NDArray,
     asymmetry: tuple[bool, ...] | None = None,
 ) -> EventFit:
-    """Fit A, B, C, D (and ρ, λ where the counts call for them) to one set of bins [1, bin].
+    """Fit A, B, C, D (and ρ, λ where the counts call for them).
 
     Parameters that the data do not tell are dropped in the order D, C, A; the rest is fitted again.
-    ρ and λ are kept where a likelihood-ratio test rejects their absence at 1e-3.
+    ρ and λ are kept where a likelihood-ratio test rejects their absence at 1e-3. Where thresholds spread, the
+    counts are weighed with the scatter that follows (quasi-likelihood), else the likelihood is binomial.
 
     Parameters
     ----------
-    spread : measured over-dispersion; None takes the counts as binomial.
-    start, asymmetry : from a fit of more data: its parameters, and its choice of free parameters.
+    start : [6], as `event_model.PARAMETERS`.
+    asymmetry : from a fit of more data, its choice of free parameters.
     """
-    bins = pooled.position(0)
-    counts = EventCounts(*(v[0] for v in (bins.counts.signal_dn, bins.counts.trials, bins.counts.on, bins.counts.off)))
-    theta = theta_v * bins.relative[0]
-    begin = _best_start(counts, theta, theta_v, law, mismatch) if start is None else start.copy()
-    inverse = None
-    dispersed = spread is not None and (mismatch > 0 or spread.in_time != (1.0, 1.0))
+    cells = pixels.cells
+    begin = start.copy()
     reasons: dict[str, str] = {}
     free = [True] * 4 + ([False, False] if asymmetry is None else list(asymmetry[4:]))
+    whole: NDArray | None = None
     while True:
-        eta, fisher, _ = maximise(counts, begin[None], theta, law, mismatch, free)
+        eta, fisher, variance = _fit(cells, begin, theta_v, law, free)
+        whole = eta.copy() if whole is None else whole
         if asymmetry is None:
-            eta, fisher, free = _test_asymmetry(
-                counts,
-                eta,
-                fisher,
-                theta,
-                law,
-                mismatch,
-                free,
-                _dispersion_factor(bins, eta[0], theta, law, mismatch),
-            )
-        likelihood = _likelihood(counts, eta[0], theta, law, mismatch)
-        if dispersed and spread is not None:
-            for _ in range(2):
-                inverse = np.linalg.inv(_model_scatter(bins, eta[0], theta, law, mismatch, spread))[None]
-                eta, fisher, _ = maximise(counts, eta, theta, law, mismatch, free, inverse)
-        covariance, mixed = _covariance(fisher[0])
+            eta, fisher, free = _test_asymmetry(pixels, eta, fisher, theta_v, law, free, variance)
+        covariance, mixed = _covariance(fisher)
         # Where the data tell only a combination, none of its members is identified, though some stay in the fit.
         reasons |= {
             "ABCD"[k]: "the static capture tells only a combination of parameters; " + _CAPTURE[k] for k in mixed
         }
-        weak = _weakest(eta[0], covariance, free, counts)
+        weak = _weakest(eta, covariance, free, cells)
         if weak is None:
             break
         name, index, reason = weak
-        if index == 2 and free[0] and 0 in mixed and _better_without(0, 2, counts, eta, theta, law, mismatch, free):
+        if index == 2 and free[0] and 0 in mixed and _better_without(0, 2, cells, eta, theta_v, law, free):
             name, index, reason = "A", 0, reasons["A"]
         reasons.setdefault(name, reason)
         free[index] = False
-        begin = _without(eta[0], index)
+        begin = _without(eta, index)
         if index == 2 and free[3]:
             reasons["D"], free[3], begin[3] = "it has no effect without C", False, 0.0
     mask = np.array(free)
-    fisher_covariance = covariance * mask[:, None] * mask
-    used_covariance = fisher_covariance
-    if dispersed:
-        own, lit_dark = bins.scatter_about(
-            *(bins.trials * p for p in probabilities(eta, bins.counts.signal_dn, theta, law, mismatch))
-        )
-        pixels = bins.pixels[0][:, None, None]
-        scatter = Scatter(own[0] * pixels, lit_dark[0] * pixels, bins.dark_bin)
-        if inverse is None:
-            used_covariance = sandwich(eta[0], counts, theta, law, mismatch, free, scatter)
-        else:
-            used_covariance = (
-                quasi_sandwich(eta[0], counts, theta, law, mismatch, inverse[0], scatter, covariance)
-                * mask[:, None]
-                * mask
-            )
-    values, natural_covariance = natural(eta[0], used_covariance)
-    _, natural_fisher = natural(eta[0], fisher_covariance)
-    chi2 = _pearson(bins, eta[0], theta, law, mismatch, spread if dispersed else None)
-    dof = 2 * counts.signal_dn.size - int(mask.sum())
-    if chi2 > POOR_FIT * dof:
+    measured = sandwich(pixels, eta, theta_v, law, free, variance)
+    values, natural_covariance = natural(eta, measured)
+    used = np.flatnonzero(mask[:4])
+    effect = float(np.mean(np.diag(measured)[used] / np.maximum(np.diag(covariance)[used], 1e-300))) if used.size else 1
+    fit = goodness(pixels, eta, theta_v, law, int(mask.sum()))
+    if fit.per_dof > POOR_FIT:
         # The counts scatter about the model more than they should: no error may be smaller than that scatter.
-        natural_covariance = natural_covariance * (chi2 / dof)
+        natural_covariance = natural_covariance * fit.per_dof
+    likelihood = _log_likelihood(cells, eta, theta_v, law, variance)
     return EventFit(
-        law, eta[0], tuple(free), values, natural_covariance, natural_fisher, reasons, likelihood, chi2, dof
-    )
+        law, eta, whole, tuple(free), values, natural_covariance, max(effect, 1.0), reasons, likelihood, fit
+    )  # fmt: skip
 
 
-def _best_start(
-    counts: EventCounts, theta: float | NDArray, theta_v: float, law: Law, mismatch: float
-) -> NDArray[np.float64]:
-    """Where the likeliest of several searches for A, B, C and D ends: from one start alone it may be a side hill."""
-    tried, _, _ = search(counts, start_values(counts, theta_v, law), theta, law, mismatch, [True] * 4 + [False] * 2)
-    likelihood = [_likelihood(counts, eta, theta, law, mismatch) for eta in tried]
-    return tried[int(np.nanargmax(likelihood))]
+def _fit(
+    cells: Cells, begin: NDArray, theta_v: float, law: Law, free: list[bool]
+) -> tuple[NDArray, NDArray, NDArray | None]:
+    """Parameters [6], information [6, 6] and, where thresholds spread, the variance the cells were weighed with."""
+    eta, variance = begin[None], None
+    for _ in range(_REWEIGHTED if np.any(cells.spread > 0) else 1):
+        if np.any(cells.spread > 0):
+            variance = cell_variance(cells, eta[0], theta_v, law)
+        eta, fisher, _ = maximise(cells, eta, theta_v, law, free, variance)
+    return eta[0], fisher[0], variance
+
+
+def _log_likelihood(cells: Cells, eta: NDArray, theta_v: float, law: Law, variance: NDArray | None) -> float:
+    """Of the events: binomial, or where thresholds spread normal with the scatter that follows; without constants."""
+    if variance is not None and np.ptp(cells.relative) == 0:
+        cells = cells.coarser(_NORMAL)  # sums of many pixels, whose law is near a normal one
+    log_p, _ = log_probability(eta, cells, theta_v, law)
+    if variance is None:
+        return float(log_likelihood(cells, log_p))
+    own = cell_variance(cells, eta, theta_v, law)
+    return -0.5 * float(np.sum((cells.events - cells.total * np.exp(log_p)) ** 2 / own + np.log(own)))
+
+
+def best_start(typical: Cells, theta_v: float, law: Law) -> tuple[NDArray[np.float64], float, float]:
+    """Where the likeliest of several searches for A, B, C and D ends: from one start alone it may be a side hill.
+
+    Returns
+    -------
+    Parameters [6], ln L, and the scatter about them over that of counting.
+    """
+    tried, _, _ = search(typical, start_values(typical, theta_v, law), theta_v, law, [True] * 4 + [False] * 2)
+    log_p = log_probability(tried, typical, theta_v, law)[0]
+    likelihood = log_likelihood(typical, log_p)
+    best = int(np.nanargmax(likelihood))
+    expected = typical.total * np.exp(log_p[best])
+    scatter = float(np.mean((typical.events - expected) ** 2 / np.maximum(expected, 1e-9)))
+    return tried[best], float(likelihood[best]), max(scatter, 1.0)
 
 
 def _test_asymmetry(
-    counts: EventCounts,
-    eta: NDArray,
-    fisher: NDArray,
-    theta_v: float | NDArray,
-    law: Law,
-    mismatch: float,
-    free: list[bool],
-    factor: float,
-) -> tuple[NDArray, NDArray, list[bool]]:
-    """Add ρ, then λ, where the likelihood gains enough for the parameter added (1e-3, scaled by over-dispersion)."""
+    pixels: PixelCounts, eta: NDArray, fisher: NDArray, theta_v: float, law: Law, free: list[bool],
+    variance: NDArray | None,
+) -> tuple[NDArray, NDArray, list[bool]]:  # fmt: skip
+    """Add ρ, then λ, where the fit gains enough for the parameter added (1e-3, scaled by over-dispersion)."""
+    cells = pixels.cells
+    enough = float(chi2_law.isf(1e-3, 1))
 
-    enough = float(chi2_law.isf(1e-3, 1)) / 2 * factor
+    def misfit(parameters: NDArray) -> float:
+        log_p, _ = log_probability(parameters, cells, theta_v, law)
+        if variance is None:
+            return -2 * float(log_likelihood(cells, log_p))
+        return float(np.sum((cells.events - cells.total * np.exp(log_p)) ** 2 / variance))
+
     for index in (4, 5):
         if free[index]:
             continue
         wider = list(free)
         wider[index] = True
-        tried, information, _ = maximise(counts, eta, theta_v, law, mismatch, wider)
-        gain = _likelihood(counts, tried[0], theta_v, law, mismatch) - _likelihood(
-            counts, eta[0], theta_v, law, mismatch
-        )
-        if gain > enough:
-            eta, fisher, free = tried, information, wider
+        tried, information, _ = maximise(cells, eta[None], theta_v, law, wider, variance)
+        gain = misfit(eta) - misfit(tried[0])
+        if gain <= enough:
+            continue
+        measured = sandwich(pixels, tried[0], theta_v, law, wider, variance)[index, index]
+        dispersed = max(1.0, float(measured / np.maximum(_covariance(information[0])[0][index, index], 1e-300)))
+        if gain > enough * dispersed:
+            eta, fisher, free = tried[0], information[0], wider
     return eta, fisher, free
 
 
-def _dispersion_factor(bins: PooledEvents, eta: NDArray, theta_v: float | NDArray, law: Law, mismatch: float) -> float:
-    """Scatter of ON − OFF over the pixels beyond counting: what a test of their asymmetry must allow for."""
-    scatter = bins.scatter()[0]
-    on, off = probabilities(eta, bins.counts.signal_dn[0], theta_v, law, mismatch)
-    use = bins.pixels[0] > 1
-    measured = (scatter[:, 0, 0] + scatter[:, 1, 1] - 2 * scatter[:, 0, 1])[use]
-    expected = (bins.trials * (on + off))[use]
-    return max(1.0, float(np.sum(measured * bins.pixels[0][use]) / np.sum(expected * bins.pixels[0][use])))
-
-
-def _weakest(eta: NDArray, covariance: NDArray, free: list[bool], counts: EventCounts) -> tuple[str, int, str] | None:
+def _weakest(eta: NDArray, covariance: NDArray, free: list[bool], cells: Cells) -> tuple[str, int, str] | None:
     """The next parameter to give up, or None where all that are left are identified."""
     values, natural_covariance = natural(eta, covariance * np.outer(free, free))
     error = np.sqrt(np.maximum(np.diag(natural_covariance), 0))
-    narrow = np.ptp(counts.signal_dn) < 0.2 * counts.signal_dn.max()
+    narrow = np.ptp(cells.signal_dn) < 0.2 * cells.signal_dn.max()
     span = "the static capture holds too narrow a range of brightness" if narrow else "its error exceeds its value"
     if free[3] and abs(values[3]) > 0.99:
         return "D", 3, f"it ends at the edge of its range; {_CAPTURE[3]}"
@@ -226,26 +222,15 @@ def _without(eta: NDArray, index: int) -> NDArray[np.float64]:
 
 
 def _better_without(
-    one: int,
-    other: int,
-    counts: EventCounts,
-    eta: NDArray,
-    theta_v: float | NDArray,
-    law: Law,
-    mismatch: float,
-    free: list[bool],
+    one: int, other: int, cells: Cells, eta: NDArray, theta_v: float, law: Law, free: list[bool]
 ) -> bool:
     """Whether leaving out `one` parameter fits better than leaving out the `other`."""
     values = []
     for index in (one, other):
         kept = [ok and k != index for k, ok in enumerate(free)]
-        fitted, _, _ = maximise(counts, _without(eta[0], index)[None], theta_v, law, mismatch, kept)
-        values.append(_likelihood(counts, fitted[0], theta_v, law, mismatch))
+        fitted, _, variance = _fit(cells, _without(eta, index), theta_v, law, kept)
+        values.append(_log_likelihood(cells, fitted, theta_v, law, variance))
     return values[0] > values[1]
-
-
-def _likelihood(counts: EventCounts, eta: NDArray, theta_v: float | NDArray, law: Law, mismatch: float) -> float:
-    return float(log_likelihood(counts, *log_probabilities(eta, counts.signal_dn, theta_v, law, mismatch)[:2]))
 
 
 def _covariance(information: NDArray) -> tuple[NDArray[np.float64], list[int]]:
@@ -258,50 +243,27 @@ def _covariance(information: NDArray) -> tuple[NDArray[np.float64], list[int]]:
     return inverse / np.outer(scale, scale), mixed
 
 
-def _model_scatter(
-    bins: PooledEvents, eta: NDArray, theta_v: float | NDArray, law: Law, mismatch: float, spread: Dispersion | None
-) -> NDArray[np.float64]:
-    """Covariance [bin, 2, 2] of a bin's total counts: trinomial in time, thresholds over pixels."""
-    signal, n = bins.counts.signal_dn[0], bins.trials
-    # Never below a thousandth of an event in a bin: a trial fit may make P vanish, and the matrix must have an inverse.
-    least = 1e-3 / np.maximum(bins.counts.trials[0], 1)
-    on, off = (np.maximum(p, least) for p in probabilities(eta, signal, theta_v, law, mismatch))
-    total, difference = spread.in_time if spread is not None else (1.0, 1.0)
-    # the trinomial covariance, scaled in its sum and difference, so that it stays one however large P is
-    both, apart = total * (on + off) * (1 - on - off), difference * (on + off - (on - off) ** 2)
-    skew = np.sqrt(total * difference) * (on * (1 - on) - off * (1 - off))
-    one = np.empty((signal.size, 2, 2))
-    one[:, 0, 0], one[:, 1, 1] = (both + apart) / 4 + skew / 2, (both + apart) / 4 - skew / 2
-    one[:, 0, 1] = one[:, 1, 0] = (both - apart) / 4
-    one *= n
-    if spread is not None and mismatch > 0:
-        u, _ = threshold_over_noise(eta, signal, theta_v, law)
-        between = n * n * probability_variance(u, mismatch)
-        shared = spread.common**2 - spread.difference**2
-        total = spread.common**2 + spread.difference**2
-        one[:, 0, 0] += between
-        one[:, 1, 1] += between
-        one[:, 0, 1] += between * (shared / total if total > 0 else 1.0)
-        one[:, 1, 0] = one[:, 0, 1]
-    return one * bins.pixels[0][:, None, None]
+def cell_variance(cells: Cells, eta: NDArray, theta_v: float, law: Law) -> NDArray[np.float64]:
+    """Variance of each cell's events: binomial in time, thresholds over pixels. Above 0 whatever `eta` is."""
+    log_p, _ = log_probability(eta, cells, theta_v, law)
+    # never below a thousandth of an event in a cell: a trial fit may make P vanish
+    p = np.maximum(np.exp(log_p), 1e-3 / np.maximum(cells.total, 1))
+    u, _ = threshold_over_noise(eta, cells.signal_dn, theta_v, law)
+    u = u * (1 - cells.polarity * eta[4])
+    between = probability_variance(u, cells.spread, cells.relative)
+    return np.maximum(cells.pixels, 1e-30) * cells.trials * (p * (1 - p) + cells.trials * between)
 
 
-def _pearson(
-    bins: PooledEvents, eta: NDArray, theta_v: float | NDArray, law: Law, mismatch: float, spread: Dispersion | None
-) -> float:
-    on, off = probabilities(eta, bins.counts.signal_dn[0], theta_v, law, mismatch)
-    n = bins.counts.trials[0]
-    residual = np.stack([bins.counts.on[0] - n * on, bins.counts.off[0] - n * off], axis=-1)
-    scatter = _model_scatter(bins, eta, theta_v, law, mismatch, spread)
-    return float(np.einsum("bi,bij,bj->", residual, np.linalg.inv(scatter), residual))
+def with_mismatch_error(fit: EventFit, pixels: PixelCounts, theta_v: float, relative_error: float) -> EventFit:
+    """Add what the mismatch's own error does to A … D (its effect on them by a finite difference).
 
-
-def with_mismatch_error(
-    fit: EventFit, pooled: PooledEvents, theta_v: float, mismatch: float, error: float, spread: Dispersion
-) -> EventFit:
-    """Add what the mismatch's own error does to A … D (its effect on them by a finite difference)."""
-    if mismatch <= 0 or error <= 0:
+    Parameters
+    ----------
+    relative_error : of the spread of thresholds that the cells have.
+    """
+    if not relative_error > 0:
         return fit
-    moved = fit_events(pooled, theta_v, fit.law, mismatch + error, spread, fit.parameters, fit.free)
+    wider = replace(pixels, cells=pixels.cells.with_spread(1 + relative_error))
+    moved = fit_events(wider, theta_v, fit.law, fit.parameters, fit.free)
     change = np.where(fit.free, moved.values - fit.values, 0.0)
     return replace(fit, covariance=fit.covariance + np.outer(change, change))

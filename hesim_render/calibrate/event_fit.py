@@ -1,34 +1,39 @@
 """Maximum likelihood of the event model, many fits at once, and the covariance of what it gives.
 
-Fisher scoring with Levenberg–Marquardt damping; every array carries a leading axis of fits (starts,
-tile positions or bootstrap samples), so that 200 starts cost little more than one.
+Fisher scoring with Levenberg–Marquardt damping; parameters carry a leading axis of fits (starts), so that
+200 starts cost little more than one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
-from hesim_render.calibrate.event_model import EventCounts, Law, log_likelihood, log_probabilities
+from hesim_render.calibrate.event_cells import Cells, PixelCounts
+from hesim_render.calibrate.event_model import Law, log_likelihood, log_probability
 
 _ROUNDS = 300
+#: A search whose ln L rises by less in so many rounds has come to where it will.
+_PATIENCE, _PROGRESS = 25, 1e-4
 #: ln of the factors of C that a search tries first.
 _REACH_OF_C = np.linspace(-3.0, 3.0, 25)
 _LEAST = np.array([0.0, -30.0, 0.0, -np.inf, -0.95, 0.0])
 _LARGEST = np.array([np.inf, 60.0, np.inf, np.inf, 0.95, 0.5])
+#: Pixels whose scores are summed up at a time.
+_CHUNK = 1 << 16
 
 
-def start_values(counts: EventCounts, theta_v: float, law: Law) -> NDArray[np.float64]:
-    """Rough starts [start, 6] that agree with the dimmest and the brightest bins, for many strengths of C."""
-    order = np.argsort(counts.signal_dn)
-    few = max(1, len(order) // 10)
-    bright = max(float(counts.signal_dn[order[-few:]].mean()), 1e-6)
-    b = _threshold_over_noise(counts, order[:few]) * np.sqrt(2) / theta_v
+def start_values(cells: Cells, theta_v: float, law: Law) -> NDArray[np.float64]:
+    """Rough starts [start, 6] that agree with the dimmest and the brightest cells, for many strengths of C."""
+    order = np.argsort(cells.signal_dn)
+    few = max(2, len(order) // 10)
+    bright = max(float(cells.signal_dn[order[-few:]].mean()), 1e-6)
+    b = _threshold_over_noise(cells, order[:few]) * np.sqrt(2) / theta_v
     noise = np.array([0.1, 0.5, 2.0, 10.0, 50.0, 200.0, 1000.0])  # C y at the brightest
-    x = _threshold_over_noise(counts, order[-few:]) * np.sqrt(2 * (1 + noise**2)) / theta_v
+    x = _threshold_over_noise(cells, order[-few:]) * np.sqrt(2 * (1 + noise**2)) / theta_v
     starts = np.zeros((noise.size, 6))
     starts[:, 0] = np.maximum(x - b, 0.01 * b) / bright
     starts[:, 1] = np.log(b)
@@ -36,43 +41,37 @@ def start_values(counts: EventCounts, theta_v: float, law: Law) -> NDArray[np.fl
     return starts
 
 
-def _threshold_over_noise(counts: EventCounts, bins: NDArray[np.intp]) -> float:
-    """u of a few bins together, from their mean rate."""
-    from scipy.special import ndtri
-
-    rate = (counts.on[bins].sum() + counts.off[bins].sum() + 1) / (2 * counts.trials[bins].sum() + 2)
+def _threshold_over_noise(cells: Cells, some: NDArray[np.intp]) -> float:
+    """u of a few cells together, from their mean rate."""
+    rate = (cells.events[some].sum() + 1) / (cells.total[some].sum() + 2)
     return max(-float(ndtri(min(rate, 0.49))), 0.05)
 
 
 def search(
-    counts: EventCounts, start: NDArray, theta_v: float | NDArray, law: Law, mismatch: float, free: Sequence[bool]
+    cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """`maximise` from starts that may be far off.
 
-    Far off, P is 0 or ½ in most bins, and the likelihood sends A and C, of which only the ratio then counts, away
-    for good. So least squares of u, the Q⁻¹ of each bin's rate, comes first: it is linear in A and B, and C is the
+    Far off, P is 0 or ½ in most cells, and the likelihood sends A and C, of which only the ratio then counts, away
+    for good. So least squares of u, the Q⁻¹ of each cell's rate, comes first: it is linear in A and B, and C is the
     best of many about the start's; D stays.
     """
-    return maximise(counts, _approach(counts, start, theta_v, law, mismatch, free), theta_v, law, mismatch, free)
+    return maximise(cells, _approach(cells, start, theta_v, law, free), theta_v, law, free, variance)
 
 
-def _approach(
-    counts: EventCounts, start: NDArray, theta_v: float | NDArray, law: Law, mismatch: float, free: Sequence[bool]
-) -> NDArray[np.float64]:
+def _approach(cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequence[bool]) -> NDArray[np.float64]:
     """Least squares of u [fit, 6]; a start whose A, B or C is not free stays as it is."""
     if not all(free[:3]):
         return np.array(start)
-    from scipy.special import ndtri
-
-    p = np.minimum((counts.on + counts.off + 0.5) / (2 * counts.trials + 1), 0.49)
+    p = np.minimum((cells.events + 0.5) / (cells.total + 1), 0.49)
     v = -ndtri(p)
-    u = v / np.sqrt(np.maximum(1 - (mismatch * v) ** 2, 0.1))
-    weight = counts.trials * np.exp(-v * v) / p  # inverse variance of u, but for a factor
-    shot = counts.signal_dn if law == "linear" else np.sqrt(counts.signal_dn)
-    scale = np.exp(_REACH_OF_C)[:, None]  # [scale, 1], against [fit, scale, bin]
+    u = v / np.sqrt(np.maximum(cells.relative**2 - (cells.spread * v) ** 2, 0.1))
+    weight = cells.total * np.exp(-v * v) / p  # inverse variance of u, but for a factor
+    shot = cells.signal_dn if law == "linear" else np.sqrt(cells.signal_dn)
+    scale = np.exp(_REACH_OF_C)[:, None]  # [scale, 1], against [fit, scale, cell]
     w, e = start[:, 2, None, None] * scale**2, start[:, 3, None, None] * scale
     base = theta_v / np.sqrt(2 * np.maximum((1 + e * shot) ** 2 + w * shot**2, 1e-12))
-    slope = base * counts.signal_dn
+    slope = base * cells.signal_dn
     aa, ab, bb = (np.sum(weight * x * y, axis=-1) for x, y in ((slope, slope), (slope, base), (base, base)))
     ay, by = np.sum(weight * slope * u, axis=-1), np.sum(weight * base * u, axis=-1)
     a = np.maximum((ay * bb - by * ab) / np.maximum(aa * bb - ab * ab, 1e-300), 0.0)
@@ -86,22 +85,20 @@ def _approach(
 
 
 def maximise(
-    counts: EventCounts,
+    cells: Cells,
     start: NDArray,
-    theta_v: float | NDArray,
+    theta_v: float,
     law: Law,
-    mismatch: float,
     free: Sequence[bool],
-    inverse_covariance: NDArray | None = None,
+    variance: NDArray | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Fit the event model.
 
     Parameters
     ----------
-    theta_v : Θ, or Θ times the relative threshold of each bin's pixels [bin].
     start : [fit, 6] in the order of `event_model.PARAMETERS`; parameters that are not `free` stay there.
-    inverse_covariance : [fit, bin, 2, 2] of the counts (ON, OFF); the estimating equation then weighs with it
-        instead of the trinomial's own (quasi-likelihood of over-dispersed counts).
+    variance : [cell], of a cell's number of events; the estimating equation then weighs with it instead of the
+        binomial's own (quasi-likelihood of over-dispersed counts).
 
     Returns
     -------
@@ -110,20 +107,27 @@ def maximise(
     """
     eta = np.array(start, dtype=np.float64)
     mask = np.asarray(free, bool)
-    bright = max(float(counts.signal_dn.max()), 1e-9)
+    bright = max(float(cells.signal_dn.max()), 1e-9)
     reach = bright if law == "linear" else np.sqrt(bright)
     converged = np.zeros(len(eta), bool)
     active = np.arange(len(eta))
     damping = np.full(len(eta), 1e-3)
-    value, score, information = _evaluate(counts, eta, theta_v, law, mismatch, mask, inverse_covariance, True)
-    for _ in range(_ROUNDS):
+    value, score, information = _evaluate(cells, eta, theta_v, law, mask, variance, True)
+    before = value
+    for round_ in range(_ROUNDS):
+        if round_ % _PATIENCE == _PATIENCE - 1:
+            if np.all(value - before < _PROGRESS):
+                break  # far out in a valley without end, where only a combination of parameters is told
+            before = value
         now = eta[active]
         plain = _solve(now, score, information, 0.0)
         done = np.sum(plain * score, axis=1) < 1e-8
         if np.any(done):
             converged[active[done]] = True
             keep = ~done
-            active, damping, value, score, information = (v[keep] for v in (active, damping, value, score, information))
+            active, damping, value, before, score, information = (
+                v[keep] for v in (active, damping, value, before, score, information)
+            )
             if active.size == 0:
                 break
             now = eta[active]
@@ -134,15 +138,13 @@ def maximise(
         limit[:, 2], limit[:, 3] = 0.7 * strength**2, 0.7 * strength
         step /= np.maximum(1, np.max(np.abs(step) / limit, axis=1))[:, None]
         trial = np.where(mask, np.clip(now + step, _LEAST, _LARGEST), now)
-        new_value, new_score, new_information = _evaluate(
-            counts, trial, theta_v, law, mismatch, mask, inverse_covariance, True
-        )
+        new_value, new_score, new_information = _evaluate(cells, trial, theta_v, law, mask, variance, True)
         better = new_value >= value - 1e-12 * np.abs(value)
         eta[active[better]] = trial[better]
         value, score = np.where(better, new_value, value), np.where(better[:, None], new_score, score)
         information = np.where(better[:, None, None], new_information, information)
         damping = np.where(better, damping / 5, damping * 5).clip(1e-9, 1e9)
-    _, _, fisher = _evaluate(counts, eta, theta_v, law, mismatch, mask, inverse_covariance)
+    _, _, fisher = _evaluate(cells, eta, theta_v, law, mask, variance)
     return eta, fisher, converged
 
 
@@ -157,115 +159,64 @@ def _solve(eta: NDArray, score: NDArray, information: NDArray, damping: NDArray 
 
 
 def _evaluate(
-    counts: EventCounts,
+    cells: Cells,
     eta: NDArray,
-    theta_v: float | NDArray,
+    theta_v: float,
     law: Law,
-    mismatch: float,
     mask: NDArray[np.bool_],
-    inverse_covariance: NDArray | None,
+    variance: NDArray | None,
     searching: bool = False,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Objective [fit], its gradient [fit, 6] and the information [fit, 6, 6]."""
-    log_on, log_off, on_slope, off_slope = log_probabilities(eta, counts.signal_dn, theta_v, law, mismatch)
-    on, off = np.exp(log_on), np.exp(log_off)
-    on_slope, off_slope = on_slope * mask, off_slope * mask
-    n = counts.trials
-    if inverse_covariance is None:
-        value = log_likelihood(counts, log_on, log_off)
-        rest = n - counts.on - counts.off
-        none = np.maximum(1 - on - off, 1e-12)
-        both = on[..., None] * on_slope + off[..., None] * off_slope
-        score = np.matmul((counts.on - rest * on / none)[..., None, :], on_slope)[..., 0, :]
-        score += np.matmul((counts.off - rest * off / none)[..., None, :], off_slope)[..., 0, :]
-        on_weight, off_weight = n * on, n * off
+    log_p, slope = log_probability(eta, cells, theta_v, law)
+    p, slope, n = np.exp(log_p), slope * mask, cells.total
+    residual = cells.events - n * p
+    if variance is None:
+        value = log_likelihood(cells, log_p)
+        rest = np.maximum(1 - p, 1e-12)
+        influence, weight = residual / rest, n * p / rest
         if searching:
             # Far off, where P underflows, the expected information vanishes; the curvature of n ln Q does not.
-            on_weight = np.maximum(on_weight, counts.on / (1 - 2 * log_on))
-            off_weight = np.maximum(off_weight, counts.off / (1 - 2 * log_off))
-        fisher = sum(
-            np.matmul((s * w[..., None]).swapaxes(-1, -2), s)
-            for s, w in ((on_slope, on_weight), (off_slope, off_weight), (both, n / none))
-        )
+            weight = np.maximum(weight, cells.events / (1 - 2 * log_p))
     else:
-        residual = np.stack([counts.on - n * on, counts.off - n * off], axis=-1)
-        slope = _count_slopes(counts, on, off, on_slope, off_slope)
-        weighted = np.matmul(inverse_covariance, residual[..., None])[..., 0]
-        value = -0.5 * np.sum(residual * weighted, axis=(-1, -2))
-        flat = slope.reshape(*slope.shape[:-3], -1, 6)
-        turned = np.matmul(inverse_covariance, slope).reshape(flat.shape)
-        score = np.matmul(weighted.reshape(*flat.shape[:-2], 1, -1), flat)[..., 0, :]
-        fisher = np.matmul(flat.swapaxes(-1, -2), turned)
-    fisher = fisher + np.diag(1.0 * ~mask)
-    return value, score, fisher
+        value = -0.5 * np.sum(residual**2 / variance, axis=-1)
+        influence, weight = residual * n * p / variance, (n * p) ** 2 / variance
+    score = np.matmul(influence[..., None, :], slope)[..., 0, :]
+    information = np.matmul((slope * weight[..., None]).swapaxes(-1, -2), slope)
+    return value, score, information + np.diag(1.0 * ~mask)
 
 
-@dataclass(frozen=True)
-class Scatter:
-    """How the bins' total counts (ON, OFF) scatter, measured over their pixels.
+def pixel_scores(
+    pixels: PixelCounts, eta: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Covariance [6, 6] of the score of one fit `eta` [6], from how the pixels' own scatter, and the information.
 
-    Attributes
-    ----------
-    own : [bin, 2, 2], covariance of a bin's counts.
-    lit_dark : [bin, 2, 2], of a lit bin's counts with those of the same pixels in the dark, which are a part of
-        bin `dark_bin` [bin]: a pixel's threshold moves both. −1 where there is none.
+    All counts of a pixel, ON and OFF, lit and dark, are taken together, whatever makes them scatter or vary alike:
+    its thresholds, noise correlated from tick to tick, changes in time.
     """
-
-    own: NDArray[np.float64]
-    lit_dark: NDArray[np.float64]
-    dark_bin: NDArray[np.intp]
-
-    def of_sum(self, influence: NDArray) -> NDArray[np.float64]:
-        """Covariance [6, 6] of the sum over bins of counts times `influence` [bin, 2, 6]."""
-        own = np.einsum("bip,bij,bjq->pq", influence, self.own, influence, optimize=True)
-        lit = self.dark_bin >= 0
-        dark = influence[self.dark_bin[lit]]
-        both = np.einsum("bip,bij,bjq->pq", influence[lit], self.lit_dark[lit], dark, optimize=True)
-        return own + both + both.T
+    cells = pixels.cells
+    log_p, slope = log_probability(eta, cells, theta_v, law)
+    slope = slope * np.asarray(free, bool)
+    p = np.exp(log_p)
+    influence = (slope / np.maximum(1 - p, 1e-12)[:, None]) if variance is None else slope * (
+        cells.total * p / variance
+    )[:, None]  # fmt: skip
+    meat = np.zeros((6, 6))
+    for begin in range(0, pixels.signal_dn.size, _CHUNK):
+        part = np.s_[begin : begin + _CHUNK]
+        score = sum(
+            (k[part] - cells.trials * p[cell[part]])[:, None] * influence[cell[part]]
+            for k, cell in zip(pixels.counts, pixels.cell, strict=True)
+        )
+        meat += score.T @ (score if pixels.weight is None else score * pixels.weight[part, None] ** 2)
+    return meat, (slope * (cells.total * p)[:, None]).T @ influence
 
 
 def sandwich(
-    parameters: NDArray,
-    counts: EventCounts,
-    theta_v: float | NDArray,
-    law: Law,
-    mismatch: float,
-    free: Sequence[bool],
-    scatter: Scatter,
+    pixels: PixelCounts, eta: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None
 ) -> NDArray[np.float64]:
-    """Covariance [6, 6] of one maximum-likelihood fit where counts scatter as `scatter`, not as a trinomial."""
+    """Covariance [6, 6] of one fit, from how the pixels' scores scatter; 0 for what is not free."""
     mask = np.asarray(free, bool)
-    one = EventCounts(counts.signal_dn, counts.trials, counts.on, counts.off)
-    _, _, fisher = _evaluate(one, parameters[None], theta_v, law, mismatch, mask, None)
-    log_on, log_off, on_slope, off_slope = log_probabilities(parameters, counts.signal_dn, theta_v, law, mismatch)
-    on, off = np.exp(log_on), np.exp(log_off)
-    both = (on[:, None] * on_slope + off[:, None] * off_slope) / np.maximum(1 - on - off, 1e-12)[:, None]
-    influence = np.stack([on_slope + both, off_slope + both], axis=1)
-    meat = scatter.of_sum(influence) * mask[:, None] * mask
-    bread = np.linalg.inv(fisher[0])
+    meat, information = pixel_scores(pixels, eta, theta_v, law, free, variance)
+    bread = np.linalg.pinv(information, hermitian=True) * mask[:, None] * mask
     return bread @ meat @ bread
-
-
-def quasi_sandwich(
-    parameters: NDArray,
-    counts: EventCounts,
-    theta_v: float | NDArray,
-    law: Law,
-    mismatch: float,
-    inverse_covariance: NDArray,
-    scatter: Scatter,
-    bread: NDArray,
-) -> NDArray[np.float64]:
-    """The same for one quasi-likelihood fit with `inverse_covariance` [bin, 2, 2] and covariance `bread`."""
-    log_on, log_off, on_slope, off_slope = log_probabilities(parameters, counts.signal_dn, theta_v, law, mismatch)
-    slope = _count_slopes(counts, np.exp(log_on), np.exp(log_off), on_slope, off_slope)
-    influence = np.einsum("bij,bjp->bip", inverse_covariance, slope)
-    return bread @ scatter.of_sum(influence) @ bread
-
-
-def _count_slopes(
-    counts: EventCounts, on: NDArray, off: NDArray, on_slope: NDArray, off_slope: NDArray
-) -> NDArray[np.float64]:
-    """Derivatives [..., bin, 2, 6] of the expected counts (ON, OFF)."""
-    n = counts.trials
-    return np.stack([(n * on)[..., None] * on_slope, (n * off)[..., None] * off_slope], axis=-2)

@@ -1,21 +1,22 @@
 """Event probability against brightness, as the calibration fits it (Eqs. 9–12 of the paper, corrected).
 
     u(I) = Θ (A I + B) / √(2 g),   g = 1 + 2 D y + y²,   y = C I ("linear") or C √I ("sqrt" shot law)
-    P₊ = Q((1 − ρ) u / √(1 + m² u²)) + λ,     P₋ = Q((1 + ρ) u / √(1 + m² u²))
+    P₊ = Q((1 − ρ) r u / √(1 + m² u²)) + λ,     P₋ = Q((1 + ρ) r u / √(1 + m² u²))
 
-A = β0β1/β4, B = β0β2/β4, C = β3/β4, D = β5; u = θ/σ_n, ρ = (θ₋ − θ₊)/(θ₋ + θ₊), m the relative
-standard deviation of the thresholds over pixels, λ leak events per trial. The mean of Q(u (1 + m z)) over
-a normal z is exactly Q(u / √(1 + m² u²)).
+A = β0β1/β4, B = β0β2/β4, C = β3/β4, D = β5; u = θ/σ_n, ρ = (θ₋ − θ₊)/(θ₋ + θ₊), λ leak events per trial.
+r is what is known of a pixel's threshold, relative to the mean of all, and m the relative standard deviation of
+what is not known: the mean of Q(u (r + m z)) over a normal z is exactly Q(r u / √(1 + m² u²)).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
+
+from hesim_render.calibrate.event_cells import Cells
 
 Law = Literal["linear", "sqrt"]
 #: Order of the parameters of the fit, with C and D as w = C² (1 − D²) and e = C D: g = (1 + e y)² + w y² has neither
@@ -26,24 +27,7 @@ _LARGEST_U = 1e6
 _HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
 
 
-@dataclass(frozen=True)
-class EventCounts:
-    """Counts pooled by brightness; all arrays [..., bin].
-
-    Attributes
-    ----------
-    signal_dn : mean signal of a bin. trials : trials of all its pixels together. on, off : its events.
-    """
-
-    signal_dn: NDArray[np.float64]
-    trials: NDArray[np.float64]
-    on: NDArray[np.float64]
-    off: NDArray[np.float64]
-
-
-def threshold_over_noise(
-    parameters: NDArray, signal_dn: NDArray, theta_v: float | NDArray, law: Law
-) -> tuple[NDArray, NDArray]:
+def threshold_over_noise(parameters: NDArray, signal_dn: NDArray, theta_v: float, law: Law) -> tuple[NDArray, NDArray]:
     """u [..., bin] and ∂ ln u / ∂ (A, ln B, w, e) [..., bin, 4]; `parameters` [..., 6] as `PARAMETERS`."""
     a, b, w, e = (parameters[..., k, None] for k in range(4))
     b = np.exp(b)
@@ -80,56 +64,61 @@ def from_natural(values: NDArray) -> NDArray[np.float64]:
     return parameters
 
 
-def log_probabilities(
-    parameters: NDArray, signal_dn: NDArray, theta_v: float | NDArray, law: Law, mismatch: float
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """ln P₊, ln P₋ [..., bin] and their derivatives [..., bin, 6], finite however small P is."""
-    u, slopes = threshold_over_noise(parameters, signal_dn, theta_v, law)
+def log_probability(parameters: NDArray, cells: Cells, theta_v: float, law: Law) -> tuple[NDArray, NDArray]:
+    """ln P [..., cell] and its derivatives [..., cell, 6], finite however small P is."""
+    u, slopes = threshold_over_noise(parameters, cells.signal_dn, theta_v, law)
     rho, leak = parameters[..., 4, None], parameters[..., 5, None]
-    widened = np.sqrt(1 + (mismatch * u) ** 2)
-    results = []
-    for sign in (-1.0, 1.0):
-        v = (1 + sign * rho) * u / widened
-        logarithm = log_ndtr(-v)
-        hazard = np.exp(-0.5 * v * v - _HALF_LOG_2PI - logarithm)
-        jacobian = np.zeros((*v.shape, 6))
-        jacobian[..., :4] = (-hazard * v / widened**2)[..., None] * slopes
-        jacobian[..., 4] = -hazard * sign * u / widened
-        if sign < 0:
-            with np.errstate(divide="ignore"):
-                both = np.logaddexp(logarithm, np.log(leak))
-            jacobian *= np.exp(logarithm - both)[..., None]
-            jacobian[..., 5] = np.exp(-np.maximum(both, -300.0))
-            logarithm = both
-        results.append((logarithm, jacobian))
-    (on, on_slope), (off, off_slope) = results
-    return on, off, on_slope, off_slope
+    on = cells.polarity > 0
+    widened = np.sqrt(1 + (cells.spread * u) ** 2)
+    scale = cells.relative * u / widened
+    v = (1 - cells.polarity * rho) * scale
+    logarithm = log_ndtr(-v)
+    hazard = np.exp(-0.5 * v * v - _HALF_LOG_2PI - logarithm)
+    jacobian = np.zeros((*v.shape, 6))
+    jacobian[..., :4] = (-hazard * v / widened**2)[..., None] * slopes
+    jacobian[..., 4] = hazard * cells.polarity * scale
+    with np.errstate(divide="ignore"):
+        both = np.where(on, np.logaddexp(logarithm, np.log(leak)), logarithm)
+    jacobian *= np.exp(logarithm - both)[..., None]
+    jacobian[..., 5] = np.where(on, np.exp(-np.maximum(both, -300.0)), 0.0)
+    return both, jacobian
 
 
-def probabilities(
-    parameters: NDArray, signal_dn: NDArray, theta_v: float | NDArray, law: Law, mismatch: float
+def probability(parameters: NDArray, cells: Cells, theta_v: float, law: Law) -> NDArray:
+    """P [..., cell] of the cell's polarity."""
+    return np.exp(log_probability(parameters, cells, theta_v, law)[0])
+
+
+def both_probabilities(
+    parameters: NDArray, signal_dn: NDArray, theta_v: float, law: Law, mismatch: float
 ) -> tuple[NDArray, NDArray]:
-    """P₊, P₋ [..., bin]."""
-    on, off, _, _ = log_probabilities(parameters, signal_dn, theta_v, law, mismatch)
-    return np.exp(on), np.exp(off)
+    """P₊, P₋ [bin], means over the pixels' thresholds."""
+    one, none = np.ones(signal_dn.shape), np.zeros(signal_dn.shape)
+    results = []
+    for polarity in (1.0, -1.0):
+        line = Cells(signal_dn, polarity * one, one, mismatch * one, one, none, 1)
+        results.append(probability(parameters, line, theta_v, law))
+    return results[0], results[1]
 
 
-def mean_probability(u: NDArray, mismatch: float) -> NDArray:
+def mean_probability(u: NDArray, mismatch: NDArray | float) -> NDArray:
     """Mean of Q over the pixels' thresholds."""
     return ndtr(-u / np.sqrt(1 + (mismatch * u) ** 2))
 
 
-def probability_variance(u: NDArray, mismatch: float) -> NDArray:
-    """Variance over pixels of Q(u (1 + m z)), z standard normal (Gauss–Hermite, 40 points)."""
+def probability_variance(u: NDArray, mismatch: NDArray | float, relative: NDArray | float = 1.0) -> NDArray:
+    """Variance over pixels of Q(u (r + m z)), z standard normal (Gauss–Hermite, 40 points)."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(40)
     weights = weights / weights.sum()
-    p = ndtr(-u[..., None] * (1 + mismatch * nodes))
-    mean = p @ weights
-    return np.maximum((p * p) @ weights - mean * mean, 0.0)
+    mean, square = np.zeros(u.shape), np.zeros(u.shape)
+    for z, weight in zip(nodes, weights, strict=True):
+        p = ndtr(-u * (relative + mismatch * z))
+        mean += weight * p
+        square += weight * p * p
+    return np.maximum(square - mean * mean, 0.0)
 
 
-def log_likelihood(counts: EventCounts, log_on: NDArray, log_off: NDArray) -> NDArray:
-    """Trinomial log-likelihood (ON, OFF, none) without the constant, summed over bins [...]."""
-    none = np.maximum(1 - np.exp(log_on) - np.exp(log_off), _SMALLEST)
-    rest = counts.trials - counts.on - counts.off
-    return np.sum(counts.on * log_on + counts.off * log_off + rest * np.log(none), axis=-1)
+def log_likelihood(cells: Cells, log_p: NDArray) -> NDArray:
+    """Binomial log-likelihood of the events of each polarity without the constant, summed over cells [...]."""
+    rest = np.log(np.maximum(-np.expm1(np.minimum(log_p, -1e-12)), _SMALLEST))
+    return np.sum(cells.events * log_p + (cells.total - cells.events) * rest, axis=-1)

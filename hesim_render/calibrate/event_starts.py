@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibrate.event_cells import PixelCounts
 from hesim_render.calibrate.event_estimate import EventFit
 from hesim_render.calibrate.event_fit import search
-from hesim_render.calibrate.event_model import EventCounts, from_natural, natural
-from hesim_render.calibrate.event_pool import PooledEvents
+from hesim_render.calibrate.event_model import from_natural, natural
 
 _STARTS = 200
 
 
 def multi_start(
-    pooled: PooledEvents, fit: EventFit, theta_v: float, mismatch: float, seed: int, starts: int = _STARTS
+    pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, starts: int = _STARTS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Maximum likelihood from many starts: A, B, C spread by e² either way, D over (−0.9, 0.9).
 
@@ -22,8 +22,6 @@ def multi_start(
     -------
     (A, B, C, D) [start, 4] each start ended at, and their standard errors [4] from the Fisher information.
     """
-    bins = pooled.position(0).counts
-    counts = EventCounts(*(v[0] for v in (bins.signal_dn, bins.trials, bins.on, bins.off)))
     rng = np.random.default_rng(seed)
     begin = np.tile(fit.values, (starts, 1))
     free = np.array(fit.free)
@@ -32,7 +30,7 @@ def multi_start(
     if free[3]:
         begin[:, 3] = rng.uniform(-0.9, 0.9, starts)
     begin[:, 4:] = np.where(free[4:], 0.0, begin[:, 4:])
-    eta, fisher, _ = search(counts, from_natural(begin), theta_v, fit.law, mismatch, fit.free)
+    eta, fisher, _ = search(pixels.cells.coarser(), from_natural(begin), theta_v, fit.law, fit.free)
     values, covariance = natural(eta, np.linalg.pinv(fisher))
     errors = np.sqrt(np.maximum(np.einsum("fii->fi", covariance)[:, :4], 0))
     return values[:, :4], np.where(free[:4], np.median(errors, axis=0), np.nan)

@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from hesim_render.calibrate.captures import CaptureSet
 from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.event_analysis import DECISIVE, EvsCalibration
+from hesim_render.calibrate.event_cells import Cells, PixelThresholds, pool_events
+from hesim_render.calibrate.event_counts import StaticCapture
 from hesim_render.calibrate.event_estimate import EventFit
-from hesim_render.calibrate.event_model import probabilities
-from hesim_render.calibrate.evs import DECISIVE, EvsCalibration
+from hesim_render.calibrate.event_model import both_probabilities
+from hesim_render.calibrate.thresholds import curve
 
 _FIGURE_PX = 320
 _UNITS = {"A": "1/(V DN)", "B": "1/V", "C": "1/DN", "D": ""}
@@ -24,7 +26,8 @@ _MODEL = (
 
 def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | None) -> dict[str, Any]:
     """The section ``evs``; a parameter the data do not tell is null, with its reason."""
-    fit, other, spread, thresholds = result.together, result.other_law, result.spread, result.thresholds
+    fit, spread, thresholds = result.together, result.dispersion, result.thresholds
+    other = "sqrt" if fit.law == "linear" else "linear"
     tile = result.static.tile
     theta = not_identifiable(result.thresholds_reason)
     section: dict[str, Any] = {
@@ -34,8 +37,8 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
         "shot_law": fit.law,
         "shot_law_log_likelihood": {
             fit.law: fit.log_likelihood,
-            other.law: other.log_likelihood,
-            "decisive": bool(abs(fit.log_likelihood - other.log_likelihood) > DECISIVE and fit.identified("C")),
+            other: fit.log_likelihood - result.advantage,
+            "decisive": bool(abs(result.advantage) > DECISIVE and fit.identified("C")),
         },
         **_parameters(fit),
         "positions": [
@@ -51,9 +54,10 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
             "theta": estimated(thresholds.theta, thresholds.theta_error, "ln"),
             "theta_on": estimated(thresholds.theta_on, error[0], "ln"),
             "theta_off": estimated(thresholds.theta_off, error[1], "ln"),
-            "step_chi2_per_dof": thresholds.chi2_per_dof,
         }
-    section["threshold_mismatch"] = _mismatch(result)
+    section["threshold_mismatch"] = result.mismatch.described() | {
+        "from": "static counts" if thresholds is None else "steps"
+    }
     rho, leak = fit.values[4:]
     error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
     absent = "not significant (likelihood ratio at 1e-3): the model without it is kept"
@@ -61,15 +65,22 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     section["leak_per_trial"] = (
         estimated(leak, error[5], "ON events") if fit.free[5] else {"value": 0.0, "note": absent}
     )
+    hidden = "hidden behind the mismatch of thresholds, or too few events"
     section["dispersion"] = {
-        "temporal": estimated(spread.temporal, spread.temporal_error),
-        "temporal_difference": estimated(spread.temporal_difference, spread.temporal_difference_error),
-        "standard_errors": "binomial" if np.array_equal(fit.covariance, fit.fisher_covariance) else "sandwich",
+        name: estimated(value, error) if np.isfinite(value) else not_identifiable(hidden)
+        for name, value, error in (
+            ("temporal", spread.total, spread.total_error),
+            ("temporal_difference", spread.difference, spread.difference_error),
+        )
     }
+    section["dispersion"]["standard_errors"] = "sandwich"
+    section["dispersion"]["design_effect"] = fit.design_effect
     section["goodness"] = {
-        "chi2_per_dof": fit.pearson_chi2 / max(fit.dof, 1),
-        "dof": fit.dof,
-        "positions_chi2_per_dof": [one.pearson_chi2 / max(one.dof, 1) for one in result.fits],
+        "chi2_per_dof": fit.goodness.per_dof,
+        "dof": fit.goodness.dof,
+        "p_value": fit.goodness.p_value,
+        "positions_chi2_per_dof": [one.goodness.per_dof for one in result.fits],
+        "positions_p_value": [one.goodness.p_value for one in result.fits],
     }
     section["signal_range_dn"] = [float(np.nanmin(result.static.signal_dn)), float(np.nanmax(result.static.signal_dn))]
     section["trials"] = result.static.trials
@@ -94,20 +105,6 @@ def _parameters(fit: EventFit) -> dict[str, Any]:
         else not_identifiable(fit.reasons.get(name, "not told by the data"))
         for k, name in enumerate("ABCD")
     }
-
-
-def _mismatch(result: EvsCalibration) -> dict[str, Any]:
-    if result.mismatch > 0:
-        where = "steps" if result.thresholds is not None else "static counts"
-        return estimated(result.mismatch, _error_of_mismatch(result), "relative std") | {"from": where}
-    limit = float(np.sqrt(4) * _error_of_mismatch(result))
-    return {"value": 0.0, "upper_limit": limit, "note": "the pixels scatter no more than counting makes them"}
-
-
-def _error_of_mismatch(result: EvsCalibration) -> float:
-    if result.thresholds is not None or result.mismatch == 0:
-        return result.mismatch_error
-    return result.mismatch_error**2 / (2 * result.mismatch)
 
 
 def _gauge(result: EvsCalibration) -> dict[str, Any]:
@@ -143,54 +140,68 @@ def _gauge(result: EvsCalibration) -> dict[str, Any]:
 
 def maps(result: EvsCalibration) -> dict[str, NDArray]:
     """Map files of the section, and small arrays for the report (their names start with ``figure_``)."""
-    static, fit = result.static, result.together
-    arrays: dict[str, NDArray] = {"bad_pixels": result.bad}
+    defects, static = result.defects, result.static
+    arrays: dict[str, NDArray] = {
+        "bad_pixels": result.bad, "defect": defects.kind, "defect_on_per_trial": defects.on,
+        "defect_off_per_trial": defects.off,
+    }  # fmt: skip
     if result.thresholds is not None:
         arrays["threshold_on_relative"] = result.thresholds.pixel_on
         arrays["threshold_off_relative"] = result.thresholds.pixel_off
-    step = max(1, -(-max(static.signal_dn.shape) // _FIGURE_PX))
-    arrays["figure_probability"] = ((static.n_on + static.n_off) / (2 * static.trials))[::step, ::step].astype(
-        np.float32
-    )
-    together = result.pooled.together()
-    used = together.pixels[0] > 0
-    c = together.counts
-    signal, n = c.signal_dn[0][used], c.trials[0][used]
-    arrays["figure_rates"] = np.stack([signal, c.on[0][used] / n, c.off[0][used] / n, n], axis=1)
-    top = float(signal.max())
+    return arrays | _static_figures(result, static) | _step_figures(result)
+
+
+def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, NDArray]:
+    fit, good = result.together, ~result.bad
+    step = max(1, -(-max(static.n_on.shape) // _FIGURE_PX))
+    figures: dict[str, NDArray] = {
+        "figure_probability": ((static.n_on + static.n_off)[::step, ::step] / (2 * static.trials)).astype(np.float32)
+    }
+    figures["figure_rates"] = _rates(result.plain.cells)
+    top = float(figures["figure_rates"][:, 0].max())
     line = np.unique(np.concatenate([np.linspace(0, top, 150), np.geomspace(1e-4 * top, top, 150)]))
-    on, off = probabilities(fit.parameters, line, result.theta_v, fit.law, result.mismatch)
-    arrays["figure_rates_fit"] = np.stack([line, on, off], axis=1)
-    by_position = result.pooled.counts
-    arrays["figure_position_rates"] = np.stack(
+    on, off = both_probabilities(fit.parameters, line, result.theta_v, fit.law, result.mismatch.value)
+    figures["figure_rates_fit"] = np.stack([line, on, off], axis=1)
+    unknown = PixelThresholds.unknown(good.shape, result.mismatch.value)
+    figures["figure_position_rates"] = np.concatenate(
         [
-            by_position.signal_dn,
-            (by_position.on + by_position.off) / np.maximum(2 * by_position.trials, 1),
-            by_position.trials,
-        ],
-        axis=-1,
+            np.column_stack([np.full(len(rates), k), rates])
+            for k in range(len(result.fits))
+            for rates in [_rates(pool_events(static, good, unknown, k).cells)]
+        ]
     )
-    arrays["figure_position_fits"] = np.stack(
+    figures["figure_position_fits"] = np.stack(
         [
-            np.mean(probabilities(one.parameters, line, result.theta_v, one.law, result.mismatch), axis=0)
+            np.mean(both_probabilities(one.parameters, line, result.theta_v, one.law, result.mismatch.value), axis=0)
             for one in result.fits
         ]
     )
     for name, (_, on_map, off_map) in zip(("lit", "dark"), static.sessions, strict=False):
-        top = max(4.0, float(np.quantile(np.maximum(on_map, off_map)[~result.bad], 0.999)) * 1.15)
+        top = max(4.0, float(np.quantile(np.maximum(on_map, off_map)[good], 0.999)) * 1.15)
         edges = np.linspace(-0.5, top, min(64, int(top) + 1) + 1)
-        arrays[f"figure_on_off_{name}"] = np.histogram2d(
-            off_map[~result.bad], on_map[~result.bad], bins=(edges, edges)
-        )[0]
-        arrays[f"figure_on_off_{name}_top"] = np.array(top)
-    arrays["figure_starts"] = result.starts
-    arrays["figure_starts_error"] = result.starts_standard_error
-    if result.thresholds is not None and result.steps is not None:
-        t, total = result.thresholds, result.steps.pixels * result.steps.trials
-        arrays["figure_steps"] = np.stack([t.step, result.steps.on / total, result.steps.off / total], axis=1)
-        line = np.linspace(t.step.min(), t.step.max(), 200)
-        width = t.width * np.maximum(1 + t.slope * line / t.theta, 0.2)
-        arrays["figure_steps_fit"] = np.stack(
-            [line, ndtr(-(t.theta_on - line) / width), ndtr(-(t.theta_off + line) / width)], axis=1
-        )
-    return arrays
+        figures[f"figure_on_off_{name}"] = np.histogram2d(off_map[good], on_map[good], bins=(edges, edges))[0]
+        figures[f"figure_on_off_{name}_top"] = np.array(top)
+    figures["figure_starts"] = result.starts
+    figures["figure_starts_error"] = result.starts_standard_error
+    return figures
+
+
+def _rates(cells: Cells) -> NDArray[np.float64]:
+    """Signal, ON and OFF events, and trials of either, of each brightness: rows [cell, 4]."""
+    on, off = cells.polarity > 0, cells.polarity < 0
+    return np.stack([cells.signal_dn[on], cells.events[on], cells.events[off], cells.total[on]], axis=1)
+
+
+def _step_figures(result: EvsCalibration) -> dict[str, NDArray]:
+    thresholds, steps = result.thresholds, result.steps
+    if thresholds is None or steps is None:
+        return {}
+    events = [counts.sum(axis=1) for counts in (steps.on, steps.off)]
+    line = np.linspace(thresholds.step.min(), thresholds.step.max(), 200)
+    return {
+        "figure_steps": np.stack([thresholds.step, *events], axis=1),
+        "figure_steps_trials": np.array(steps.trials_of_all),
+        "figure_steps_fit": np.stack(
+            [line, curve(thresholds.values, 1.0, line), curve(thresholds.values, -1.0, line)], axis=1
+        ),
+    }

@@ -13,6 +13,8 @@ from hesim_render.calibrate.result import read_calibration, read_maps, write_tex
 from hesim_render.calibrate.svg import COLOURS, Plot, number, picture, table
 from hesim_render.calibrate.variance import polynomial
 
+#: Mean number of events of which a chance of 5 % is left that none is counted: −ln 0.05.
+_UPPER_OF_NONE = 3.0
 _STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;color:#1b1b1b;max-width:1320px;margin:2rem auto;padding:0 1rem}
 h1{font-size:1.6rem}h2{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px solid #ccc}
@@ -179,6 +181,7 @@ def _evs(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
             _rates(maps),
             _position_rates(maps),
         ),
+        "<p>Arrows: no event was counted; they start at the 95 % limit.</p>",
         _row(*(_on_off(name, maps) for name in ("lit", "dark"))),
         _row(_steps(maps), _starts(section, maps)),
         "<h2>Parameters (EVS)</h2>",
@@ -199,44 +202,46 @@ def _brightness_axis(signal: NDArray) -> tuple[str, tuple[float, float], bool]:
 
 
 def _rates(maps: dict[str, NDArray]) -> str:
-    signal, on, off, _ = maps["figure_rates"].T
+    signal, on, off, trials = maps["figure_rates"].T
     line, fit_on, fit_off = maps["figure_rates_fit"].T
-    both = np.concatenate([on, off])
-    low = min(v[v > 0].min(initial=1e-3) for v in (both, fit_on, fit_off))
+    lowest, highest = _probability_span(np.concatenate([on, off]), np.concatenate([trials, trials]))
     label, reach, log_x = _brightness_axis(signal)
-    plot = Plot(
-        "Event probability against brightness",
-        label,
-        "P per trial",
-        reach,
-        (0.8 * low, 1.2 * both.max()),
-        log_y=True,
-        log_x=log_x,
-    )
-    plot.points(signal, on, COLOURS[1], "ON").points(signal, off, COLOURS[0], "OFF")
+    range_ = 0.8 * min(lowest, fit_on.min(), fit_off.min()), 1.2 * highest
+    title = "Event probability against brightness"
+    plot = Plot(title, label, "P per trial", reach, range_, log_y=True, log_x=log_x)
+    _counted(plot, signal, on, trials, COLOURS[1], "ON")
+    _counted(plot, signal, off, trials, COLOURS[0], "OFF")
     return plot.line(line, fit_on, COLOURS[1]).line(line, fit_off, COLOURS[0], dashed=True).svg()
 
 
 def _position_rates(maps: dict[str, NDArray]) -> str:
-    rates, fits = maps["figure_position_rates"], maps["figure_position_fits"]
-    used = rates[..., 2] > 0
-    p = rates[..., 1]
-    positive = p[used & (p > 0)]
-    label, reach, log_x = _brightness_axis(rates[..., 0][used])
-    plot = Plot(
-        "By tile position",
-        label,
-        "P per trial",
-        reach,
-        (0.8 * min(positive.min(), fits.min()), 1.2 * positive.max()),
-        log_y=True,
-        log_x=log_x,
-    )
+    fits = maps["figure_position_fits"]
+    position, signal, on, off, trials = maps["figure_position_rates"].T
+    lowest, highest = _probability_span(on + off, 2 * trials)
+    label, reach, log_x = _brightness_axis(signal)
+    range_ = 0.8 * min(lowest, fits.min()), 1.2 * highest
+    plot = Plot("By tile position", label, "P per trial", reach, range_, log_y=True, log_x=log_x)
     line = maps["figure_rates_fit"][:, 0]
-    for k in range(len(rates)):
-        colour = COLOURS[k % len(COLOURS)]
-        plot.points(rates[k, used[k], 0][::3], p[k, used[k]][::3], colour, radius=1.2).line(line, fits[k], colour)
+    for k, fit in enumerate(fits):
+        colour, some = COLOURS[k % len(COLOURS)], np.flatnonzero(position == k)[::3]
+        _counted(plot, signal[some], (on + off)[some], 2 * trials[some], colour, radius=1.2)
+        plot.line(line, fit, colour)
     return plot.svg()
+
+
+def _counted(
+    plot: Plot, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", radius: float = 1.7
+) -> None:
+    """Rates as points; where nothing was counted, an arrow down from the 95 % limit, as 0 is on no logarithmic axis."""
+    some = events > 0
+    plot.points(x[some], events[some] / trials[some], colour, label, radius)
+    plot.arrows_down(x[~some], _UPPER_OF_NONE / trials[~some], colour)
+
+
+def _probability_span(events: NDArray, trials: NDArray) -> tuple[float, float]:
+    """Lowest and highest of what `_counted` draws."""
+    shown = np.where(events > 0, events, _UPPER_OF_NONE) / trials
+    return float(shown.min()), float(shown.max())
 
 
 def _on_off(name: str, maps: dict[str, NDArray]) -> str:
@@ -258,7 +263,8 @@ def _steps(maps: dict[str, NDArray]) -> str:
     step, on, off = maps["figure_steps"].T
     line, fit_on, fit_off = maps["figure_steps_fit"].T
     plot = Plot("S-curve", "S = ln x₁/x₀", "P per trial", _span(step), (0, 1))
-    plot.points(step, on, COLOURS[1], "ON", 2.5).points(step, off, COLOURS[0], "OFF", 2.5)
+    n = float(maps["figure_steps_trials"])
+    plot.points(step, on / n, COLOURS[1], "ON", 2.5).points(step, off / n, COLOURS[0], "OFF", 2.5)
     return plot.line(line, fit_on, COLOURS[1]).line(line, fit_off, COLOURS[0]).svg()
 
 
@@ -303,7 +309,12 @@ def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
         )
     )
     rows.append(
-        ("χ²/dof", f"{section['goodness']['chi2_per_dof']:.3f}", "", f"{section['goodness']['dof']} degrees of freedom")
+        (
+            "χ²/dof",
+            f"{section['goodness']['chi2_per_dof']:.3f}",
+            "",
+            f"{section['goodness']['dof']} degrees of freedom, p = {section['goodness']['p_value']:.2g}",
+        )
     )
     rows.append(("bad pixels", str(section["bad_pixels"]), "", ""))
     return rows

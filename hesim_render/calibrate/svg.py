@@ -90,6 +90,11 @@ class Plot:
         )
         return self._add(f'<path d="{dots}" fill="{colour}" fill-opacity="0.55"/>', colour, label)
 
+    def arrows_down(self, x: NDArray, y: NDArray, colour: str) -> Plot:
+        """From upper limits."""
+        path = "".join(f"M{a:.1f} {b:.1f}v7m-2 -3l2 3l2 -3" for a, b in self._inside(x, y))
+        return self._add(f'<path d="{path}" fill="none" stroke="{colour}" stroke-opacity="0.7"/>', colour, "")
+
     def line(self, x: NDArray, y: NDArray, colour: str, label: str = "", dashed: bool = False) -> Plot:
         ok = np.isfinite(x) & np.isfinite(self._up(y))
         path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(self._x(x[ok]), self._y(y[ok]), strict=True))
