@@ -112,8 +112,9 @@ def _reached(render: dict[str, Any] | None) -> list[str]:
         if part is None:
             continue
         line = (
-            f"  audit, {name}: {_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of "
-            f"the noise, with 99 % confidence at most {_percent(part['off_at_most'])}"
+            f"  audit, {name}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
+            f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of the noise, "
+            f"with 99 % confidence at most {_percent(part['off_at_most'])}"
         )
         if part.get("true_events"):
             line += (

@@ -169,7 +169,30 @@ def glint() -> Scene:
     return Scene(SceneSpec.model_validate(spec))
 
 
+def specks(count: int = 24, seed: int = 2) -> Scene:
+    """Bright balls of less than a pixel, each there for a tenth of a window, before a camera that pans."""
+    rng, objects, motion = np.random.default_rng(seed), [], []
+    for k in range(count):
+        x, y = rng.uniform([-0.25, -0.2], [0.25, 0.2])
+        objects.append(
+            {"name": f"speck{k}", "shape": "sphere", "size_m": [0.016] * 3, "position_m": [x, y + 5, 0.05],
+             "reflectance": 0.98}
+        )  # fmt: skip
+        begin = 1250 * (k % 16 + 1) + 250 + 125 * int(rng.integers(8)) + 3
+        away, there = [0, 0, 0], [0, -5, 0]
+        keys = ((0, away), (begin, away), (begin + 1, there), (begin + 115, there), (begin + 116, away))
+        motion.append(track(f"speck{k}", *keys))
+    wall = {**WALL, "name": "dark", "position_m": [0, 0, -0.29], "reflectance": 0.03}
+    pan = [
+        {"t_us": 0, "translation_m": [-0.04, 0, 0], "rotation_axis": [0, 1, 0], "rotation_deg": -1.5},
+        {"t_us": 25_000, "translation_m": [0.04, 0.02, 0], "rotation_axis": [0, 1, 0], "rotation_deg": 1.5},
+    ]
+    motion.append({"object": "camera", "pivot_m": [0, 0, 2], "keyframes": pan})
+    return scene([wall, *objects], motion)
+
+
 SCENES = {
+    "specks, camera pans": specks,
     "pop-in plates": pop_in,
     "thin rod": thin_rod,
     "80 flakes": lambda: flakes(80),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hesim_render.renderer.bounds import fastest_m_per_s, places, stays_in
+from hesim_render.renderer.bounds import fastest_m_per_s, places, places_seen, stays_in
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.specs.scene import TrackSpec
 
@@ -80,6 +80,43 @@ def test_straight_lines_between_places_are_within_their_margin():
         every = lines[:, :, corner].reshape(-1, 3)
         far = np.linalg.norm(true[:, None, corner] - every, axis=2).min(axis=1)
         assert far.max() < margin + 2e-3
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_nothing_leaves_its_outline_before_a_camera_that_moves(seed):
+    """In the camera's frame: dense instants, those about all keyframes too, against the hulls and their margins."""
+    rng = np.random.default_rng(200 + seed)
+    trajectory, camera = random_track(rng), random_track(rng)
+    begin = float(rng.uniform(0, 6000))
+    end = begin + float(rng.choice([3.0, 900.0, 5000.0]))
+    times = np.concatenate([np.linspace(begin, end, 1000), *(np.add.outer(t.ends_us(begin, end), [-0.01, 0, 0.01])
+                            .ravel() for t in (trajectory, camera))])  # fmt: skip
+    times = times[(times >= begin) & (times <= end)]
+    poses, views = trajectory.matrix(times), camera.matrix(times)
+    points = CORNERS @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    local = np.einsum("kji,knj->kni", views[:, :3, :3], points - views[:, None, :3, 3])
+    found = places_seen(CORNERS, trajectory, camera, begin, end)
+    for corner in range(8):
+        far = np.full(times.size, np.inf)
+        for there, margin in found:
+            a, b = there[:-1, corner], there[1:, corner]
+            way = b - a
+            share = np.einsum("kni,ni->kn", local[:, None, corner] - a, way) / np.maximum(np.sum(way**2, axis=1), 1e-30)
+            off = local[:, None, corner] - a - np.clip(share, 0, 1)[..., None] * way
+            far = np.minimum(far, np.linalg.norm(off, axis=2).min(axis=1) - margin)
+        assert far.max() < 1e-9
+    # and the margins are not what does it: of a tenth of the way at most
+    ways = max(float(np.ptp(there, axis=0).max()) for there, _ in found)
+    assert max(margin for _, margin in found) < 0.05 * ways + 0.02
+
+
+def test_a_keyframe_ends_a_stretch_of_time():
+    once = track({"t_us": 100}, {"t_us": 300}, {"t_us": 301, "translation_m": [1, 0, 0]})
+    assert once.ends_us(0, 1000).tolist() == [100, 300, 301]
+    assert once.ends_us(100, 301).tolist() == [300]
+    again = track({"t_us": 100}, {"t_us": 300, "translation_m": [1, 0, 0]}, {"t_us": 350}, repeat=True)
+    assert again.ends_us(0, 500).tolist() == [50, 100, 300, 350]
+    assert again.ends_us(400, 900).tolist() == [550, 600, 800, 850]
 
 
 def test_no_point_is_faster_than_the_fastest():

@@ -191,6 +191,31 @@ class Cropped:
         return self
 
 
+def test_a_run_that_is_not_what_was_asked_for_says_so_and_has_a_status_of_its_own(capsys, tmp_path, monkeypatch):
+    """With a tolerance that no run of this quality meets; then with the usual one."""
+    from hesim_render.renderer import audit
+
+    given = ("simulate", "rotating-star", "--sensor", "reference-mono", "--roi", "48x36", "--duration", 0.02)
+    for tolerance, wanted in ((0.1, 3), (audit.TOLERANCE, 0)):
+        monkeypatch.setattr(audit, "TOLERANCE", tolerance)
+        out = tmp_path / str(wanted)
+        status, text, err = call(capsys, *given, "--out", out)
+        told = json.loads((out / "recording.json").read_text())["settings"]["render"]
+        assert status == wanted and err == ""
+        assert (told["audit"]["verdict"] == "not met") == (status == 3)
+        short = [line for line in text.splitlines() if "NOT MET" in line]
+        assert len(short) == (status == 3)
+        for name in ("events", "frames"):
+            (line,) = (line for line in text.splitlines() if line.startswith(f"  render, {name}: stated error"))
+            assert f"{told['error_noise'][name]['rms']:.2g} of the sensor's noise (rms, asked for 0.5)" in line
+            (line,) = (line for line in text.splitlines() if line.startswith(f"  audit, {name}:"))
+            assert f"{100 * told['audit'][name]['off_at_most']:.2g} %" in line
+            assert f"rms {told['audit'][name]['deviation_noise']['rms']:.2g}" in line
+        if status == 3:
+            needed = told["audit"]["quality_needed"]
+            assert 0 < needed < 0.5 and f"--quality {needed:g} would do" in short[0]
+
+
 def test_view_writes_the_previews_anew(capsys, tmp_path):
     recordings.make("eiger", tmp_path / "r")
     (tmp_path / "r" / "preview.png").unlink()

@@ -23,7 +23,8 @@ class Tuning:
         changes and how many rays it gets. Half as many: edges are seen in steps of an eighth.
     frame_pilot_rays : of each frame pixel in each exposure.
     lone_pilot_rays : the same where they lie apart (event pixels of a hybrid tile), which have no neighbours to ask.
-    zoom_rays : of a pixel by which something comes that the pilot could miss, at most.
+    zoom_rays : of a pixel by which something comes that the pilot could miss, at most; a pair gets as many, if the
+        thing is small.
     zoom_room, gloss_room : all these rays in a window, over the pixels of the picture, for small things and for others.
     zoom_margin_px : around their outlines.
     small_px : least extent, up to which a thing is small.

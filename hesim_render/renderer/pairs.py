@@ -165,8 +165,9 @@ class PairTracer(Tracer):
         # the lit estimate of a pixel that is dark after all may fall below nothing; no flux does
         below = np.minimum(out.mean, 0)
         scale = self._scale(pixel)
-        out.half_a[:] = scale * (out.half_a - below)
-        out.half_b[:] = scale * (out.half_b - below)
+        half_a = out.half_a - below
+        out.half_b[:] = scale * np.maximum(out.half_b - below, -half_a)
+        out.half_a[:] = scale * half_a
         return out
 
     def pilot(

@@ -31,10 +31,12 @@ class Closer:
     Parameters
     ----------
     place : [k], places among the sites.
+    rays : [k], so many.
     lit_scatter, hidden_scatter : [k], e⁻/s.
     """
 
     place: NDArray[np.int64]
+    rays: NDArray[np.int64]
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
 
@@ -124,7 +126,7 @@ def _look_closer(
 ) -> list[Closer]:
     """What more rays say: of large things it takes the pilot's place, of small ones it is returned for each window."""
     looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
-    nothing = Closer(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+    nothing = Closer(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
     parts = [[nothing] for _ in closer]
     # large things first: a pixel may show something small as well
     for is_small, rays in sorted({(look.is_small, look.rays) for _, look in looks}):
@@ -138,7 +140,8 @@ def _look_closer(
             continue
         for number in np.unique(window):
             own = window == number
-            parts[number].append(Closer(place[own], told.lit_scatter[own], told.hidden_scatter[own]))
+            counts = np.full(np.count_nonzero(own), rays)
+            parts[number].append(Closer(place[own], counts, told.lit_scatter[own], told.hidden_scatter[own]))
     return [Closer(*map(np.concatenate, zip(*map(astuple, each), strict=True))) for each in parts]
 
 
@@ -198,6 +201,11 @@ def allocate(
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
+    if pilot.closer:
+        # what so many rays did not meet, one ray of a few could: it would weigh far too much
+        looked = np.zeros(sites.size, np.float32)
+        np.maximum.at(looked, pilot.closer[window].place, pilot.closer[window].rays.astype(np.float32))
+        wanted = np.maximum(wanted, looked[here])
     wanted = np.maximum(wanted, open_flux[here] / (np.float32(tuning.ray_weight * quality) * own))
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
     rays = np.left_shift(np.int16(1), bits)

@@ -134,6 +134,19 @@ class Trajectory:
         segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
         return self.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
 
+    def throughout(self, times_us: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
+        """Segment that holds a stretch of time without `ends_us` inside, and its poses at times of it, [k, 4, 4].
+
+        At the stretch's end the pose is that before a track that repeats jumps.
+        """
+        middle = 0.5 * (times_us[0] + times_us[-1])
+        knots, local = self.knots_us - self.knots_us[0], float(self.local_us(middle))
+        segment = int(np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2))
+        if not self.repeat:  # held before and after
+            local = middle - self.knots_us[0]
+        share = (local + times_us - middle - knots[segment]) / (knots[segment + 1] - knots[segment])
+        return segment, self.within(np.full(share.size, segment), np.clip(share, 0.0, 1.0))
+
     def within(self, segment: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pose in the segments between two keyframes at a share of each, 0 to 1 with both ends; [..., 4, 4]."""
         turn = _axis_angle(self.arc_axis[segment], share * self.arc_rad[segment])
@@ -170,6 +183,16 @@ class Trajectory:
                     length = knots[segment + 1] - knots[segment]
                     found.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
         return found
+
+    def ends_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside an interval at which a segment between two keyframes begins or ends, µs, in order."""
+        knots, first = self.knots_us, np.zeros(1)
+        if self.repeat:
+            first = np.arange(
+                np.floor((begin_us - knots[0]) / self.period_us), np.ceil((end_us - knots[0]) / self.period_us)
+            )
+        times = np.unique((knots + self.period_us * first[:, None]).ravel())
+        return times[(times > begin_us) & (times < end_us)]
 
     def pose_at(self, local_us: Any) -> DevicePose:
         """Pose of every lane at its own time.

@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from hesim_render.renderer.bounds import places
+from hesim_render.renderer.bounds import places, places_seen
 from hesim_render.renderer.camera import View
 from hesim_render.renderer.moving import Group
 from hesim_render.renderer.options import Tuning
 from hesim_render.renderer.trajectory import Trajectory
 from hesim_render.renderer.windows import Windows
 
-#: Instants of a window at which an object is looked for where the camera moves as well.
-_INSTANTS = 9
 #: Parts of a window to which its begin and its end are rounded away from its middle.
 _PARTS = 8
 
@@ -114,8 +112,13 @@ class Zoom:
     def _outline(self, group: Group, begin_us: float, end_us: float) -> tuple[float, Outline | None]:
         """Least extent of an object in the image at an instant, pixels, and what it sweeps; None outside."""
         points, extents, wider = [], [], 0.0
-        for corners, margin, pose in self._seen(group, begin_us, end_us):
-            seen, px_per_m = self._view.project_on_sensor(corners, pose)
+        if self._camera is None:
+            found = places(group.corners, group.trajectory, begin_us, end_us)
+        else:
+            found = places_seen(group.corners, group.trajectory, self._camera, begin_us, end_us)
+        for corners, margin in found:
+            rest = np.broadcast_to(self._view.camera_to_world, (len(corners), 4, 4))
+            seen, px_per_m = self._view.project_on_sensor(corners, rest)
             points.append(seen.reshape(-1, 2))
             extents.append(np.ptp(seen, axis=1).min())
             wider = max(wider, margin * float(px_per_m.max()))
@@ -129,19 +132,6 @@ class Zoom:
         except QhullError:  # points on a line, seen edge-on: the box around them will do
             sides = np.empty((0, 3))
         return float(min(extents)), Outline(low, high, sides)
-
-    def _seen(
-        self, group: Group, begin_us: float, end_us: float
-    ) -> list[tuple[NDArray[np.float64], float, NDArray[np.float64]]]:
-        """As `places`, and the camera's pose at each instant, [k, 4, 4]; some instants where the camera moves too."""
-        rest = self._view.camera_to_world
-        if self._camera is None:
-            found = places(group.corners, group.trajectory, begin_us, end_us)
-            return [(points, margin, np.broadcast_to(rest, (len(points), 4, 4))) for points, margin in found]
-        times = np.linspace(begin_us, end_us, _INSTANTS)
-        poses = group.trajectory.matrix(times)
-        points = group.corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-        return [(points, 0.0, self._camera.matrix(times) @ rest)]
 
     def sites(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, numbers: NDArray[np.int64]
