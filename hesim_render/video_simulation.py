@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from hesim_render import backend, spectra
-from hesim_render.capture import Capture, Progress, noise_models
+from hesim_render.capture import Capture, noise_models
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.mosaic import Mosaic, describe
+from hesim_render.progress import Progress, shown
 from hesim_render.recording import Recording, RecordingWriter
 from hesim_render.sensor import Sensor
 from hesim_render.units import S_PER_US, US_PER_S
@@ -32,7 +33,7 @@ def simulate_video(
     without: Sequence[str] = (),
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | Literal[False] | None = None,
     **options: Any,
 ) -> Recording:
     """RAW frames and events of a video, with the electrons behind them.
@@ -67,7 +68,8 @@ def simulate_video(
     aps, evs = noise_models(sensor, clean, without)
     flux = VideoFlux(source, sensor, VideoOptions.of(**options))
     try:
-        duration_us = _duration_us(duration_s, flux, str(source) if not isinstance(source, np.ndarray) else "array")
+        name = "array" if isinstance(source, np.ndarray) else str(source)
+        duration_us = _duration_us(duration_s, flux, name)
         settings = {
             "clean": clean,
             "without": list(without),
@@ -84,7 +86,8 @@ def simulate_video(
             overwrite=overwrite,
             mosaic=_mosaic(sensor, flux.options),
         ) as writer:
-            capture.record(writer, progress)
+            with shown(progress, f"{Path(name).name} → {sensor.name}") as told:
+                capture.record(writer, told)
             return writer.finish()
     finally:
         flux.close()

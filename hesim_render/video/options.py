@@ -7,8 +7,8 @@ from typing import Any, Literal
 from pydantic import Field, PositiveFloat, ValidationError, model_validator
 
 from hesim_render.camera import Camera
-from hesim_render.errors import SpecError
 from hesim_render.specs.files import Strict
+from hesim_render.specs.problems import spec_error
 from hesim_render.transfer import InputTransfer
 from hesim_render.video.colours import Primaries, Range, YuvMatrix
 from hesim_render.video.geometry import Fit
@@ -85,13 +85,8 @@ class VideoOptions(Strict):
         SpecError
             For an unknown name or a value out of range, with the name.
         """
+        wanted = {name: value for name, value in given.items() if value is not None}
         try:
-            return cls(**{name: value for name, value in given.items() if value is not None})
+            return cls(**wanted)
         except ValidationError as error:
-            problem = error.errors(include_url=False)[0]
-            key = ".".join(map(str, problem["loc"])) or None
-            message = problem["msg"].removeprefix("Value error, ")
-            raise SpecError(
-                f"{message} (it is {problem['input']!r})" if key and problem["type"] != "extra_forbidden" else message,
-                key=key,
-            ) from None
+            raise spec_error(error, cls, wanted) from None
