@@ -115,6 +115,26 @@ def test_a_run_goes_on_where_nobody_reads_what_it_says(tmp_path):
     assert (done.returncode, done.stderr) == (0, "") and (tmp_path / "o" / "recording.json").is_file()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["simulate", "dark", "--sensor", "reference-mono", "--roi", "8x8", "--out", "LONG"],
+        ["simulate", "LONG", "--sensor", "reference-mono", "--out", "o"],
+        ["simulate", "dark", "--sensor", "LONG", "--out", "o"],
+        ["video", "LONG", "--sensor", "reference-mono", "--out", "o"],
+        ["lab", "reference-mono", "--out", "LONG"],
+        ["demo", "--out", "LONG"],
+        ["view", "LONG"],
+        ["isp", "LONG"],
+        ["calibrate", "aps", "LONG", "--out", "c.yaml"],
+    ],
+)
+def test_a_name_of_256_characters_is_one_line(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fails(capsys, *["a" * 256 if argument == "LONG" else argument for argument in arguments])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_all_mistakes_of_a_file_are_a_line_each(capsys, tmp_path):
     changes = ["--set", "sensor.aps.reed_noise_e=1", "--set", "sensor.lens.f_number=-1"]
     status, out, err = call(

@@ -10,9 +10,10 @@ import typer
 
 from hesim_render.errors import RangeError
 from hesim_render.output import check_target
-from hesim_render.terminal import parse_roi
+from hesim_render.terminal import parse_roi, say
 
 if TYPE_CHECKING:
+    from hesim_render.progress import ProgressReport
     from hesim_render.sensor import Sensor
 
 
@@ -51,6 +52,9 @@ Without = Annotated[
         autocompletion=_noise_terms,
     ),
 ]
+#: Runs that take longer, by estimate, ask to be wanted.
+LONG_MINUTES = 30
+Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace what is there")]
 
 
@@ -75,3 +79,13 @@ def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:
 def cropped(sensor: Sensor, roi: str | None) -> Sensor:
     """The sensor with the region of ``--roi``."""
     return sensor if roi is None else sensor.crop(*parse_roi(roi))
+
+
+def told_beside(progress: ProgressReport) -> Callable[[object], None]:
+    """Prints what a run will take, while the progress gives way."""
+
+    def tell(expected: object) -> None:
+        with progress.paused():
+            say(f"estimate: {expected}")
+
+    return tell

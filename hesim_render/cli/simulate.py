@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hesim_render.cli.options import (
+    LONG_MINUTES,
     Clean,
     Overwrite,
     Region,
     SensorFile,
     Without,
+    Yes,
     check_duration,
     check_output,
     cropped,
     names_of,
+    told_beside,
 )
 from hesim_render.progress import progress_report
 from hesim_render.terminal import is_short_of_wish, say, split_overrides, summary
@@ -24,8 +27,6 @@ from hesim_render.terminal import is_short_of_wish, say, split_overrides, summar
 if TYPE_CHECKING:
     from hesim_render.recording import Recording
 
-#: Runs that take longer, by estimate, ask to be wanted.
-LONG_MINUTES = 30
 _NOT_MET = 3  # a recording is there, but worse than the quality that was asked for
 _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
 
@@ -47,7 +48,7 @@ def simulate(
     ] = None,
     exact: Annotated[bool, typer.Option("--exact", help="render every pixel of every slice, all alike")] = False,
     samples: Annotated[int | None, typer.Option(help="with --exact: rays per pixel and slice of time")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")] = False,
+    yes: Yes = False,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -107,11 +108,7 @@ def _simulate(
     loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
     loaded_scene = hr.load_scene(scene, scene_changes)
     with progress_report(f"{scene} → {sensor}") as progress:
-
-        def tell(expected: object) -> None:
-            with progress.paused():
-                say(f"estimate: {expected}")
-
         return hr.simulate(
-            loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress, on_estimate=tell, **options
-        )
+            loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
+            on_estimate=told_beside(progress), **options,
+        )  # fmt: skip

@@ -8,16 +8,19 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import (
+    LONG_MINUTES,
     Clean,
     Overwrite,
     Region,
     SensorFile,
     SensorKeys,
     Without,
+    Yes,
     check_duration,
     check_output,
     cropped,
     sensor_keys_only,
+    told_beside,
 )
 from hesim_render.progress import progress_report
 from hesim_render.terminal import say, split_overrides, summary
@@ -60,6 +63,7 @@ def video(
     lens_shading: Annotated[
         bool, typer.Option("--lens-shading", help="apply the sensor's relative illumination")
     ] = False,
+    yes: Yes = False,
     set_: SensorKeys = None,
     clean: Clean = False,
     without: Without = None,
@@ -78,6 +82,7 @@ def video(
     with progress_report(f"{Path(source).name} → {sensor}") as progress:
         recording = hr.simulate_video(
             source, loaded_sensor, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed,
+            max_minutes=None if yes else LONG_MINUTES, on_estimate=told_beside(progress),
             clean=clean, without=without or (), fps=fps, slow_motion=slow_motion, duty=duty,
             interpolation=interpolation, motion_factor=motion_factor, transfer=transfer, gamma=gamma,
             primaries=primaries, matrix=matrix, range=range_, bit_depth=bit_depth, mode=mode, others=others,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -89,13 +90,13 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
     """
     given = Path(name_or_path)
     if given.suffix in (".yaml", ".yml") or len(given.parts) > 1:
-        if given.is_file():
+        if os.path.isfile(given):
             return given
         raise SpecError("no such file", file=given)
     shipped = data_folder(kind) / f"{name_or_path}.yaml"
-    if shipped.is_file():
+    if os.path.isfile(shipped):  # False also where the name is too long
         return shipped
-    if given.is_file():
+    if os.path.isfile(given):
         return given
     names = list_names(kind)
     raise SpecError(
