@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from hesim_render.backend import jit
 from hesim_render.crosstalk import with_crosstalk
-from hesim_render.errors import RangeError
+from hesim_render.errors import RangeError, did_you_mean
 from hesim_render.evs import EvsStage
 from hesim_render.flux import FluxSource, SampledFlux
 from hesim_render.frame import Frame
 from hesim_render.noise.aps import APS_TERMS, ApsNoise
 from hesim_render.noise.evs import EVS_TERMS, EvsNoise
+from hesim_render.progress import Progress
 from hesim_render.render_error import ErrorMeter
 from hesim_render.schedule import CELL_US, Block, Exposure, exposures, instant_blocks, tick_blocks, ticks_us
 from hesim_render.sensor import Sensor
@@ -26,8 +27,8 @@ from hesim_render.units import S_PER_US
 if TYPE_CHECKING:
     from hesim_render.recording import RecordingWriter
 
-#: Called with (done, total, what): µs of simulated time, or rays while a static scene renders.
-Progress = Callable[[float, float, str], None]
+#: Names of all noise terms that can be switched off.
+NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))
 
 
 def noise_models(
@@ -38,17 +39,16 @@ def noise_models(
     Parameters
     ----------
     clean : all terms off.
-    without : names such as ``aps.read`` or ``evs.leak``; see `APS_TERMS` and `EVS_TERMS`.
+    without : names such as ``aps.read`` or ``evs.leak``; see `NOISE_TERMS`.
 
     Raises
     ------
     RangeError
         For a name that is not a term.
     """
-    known = [f"aps.{term}" for term in APS_TERMS] + [f"evs.{term}" for term in EVS_TERMS]
     for name in without:
-        if name not in known:
-            raise RangeError("noise term", name, f"one of {', '.join(known)}")
+        if name not in NOISE_TERMS:
+            raise RangeError("noise term", name, f"one of {', '.join(NOISE_TERMS)}{did_you_mean(name, NOISE_TERMS)}")
     aps = sensor.aps if sensor.spec.aps is not None else None
     evs = sensor.evs if sensor.spec.evs is not None else None
     if aps is not None:

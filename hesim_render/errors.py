@@ -6,7 +6,21 @@ anything else that escapes is a bug of ours and keeps its traceback.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+
+def closest(given: str, known: Iterable[str]) -> str | None:
+    """The known name that an unknown one resembles most, if one does."""
+    import difflib
+
+    return next(iter(difflib.get_close_matches(given, list(known), n=1)), None)
+
+
+def did_you_mean(given: str, known: Iterable[str]) -> str:
+    """What to add to a message about an unknown name."""
+    found = closest(given, known)
+    return f" (did you mean {found!r}?)" if found is not None else ""
 
 
 class HesimError(Exception):
@@ -22,7 +36,13 @@ class SpecError(HesimError, ValueError):
     file : the file it is in, if any.
     line : 1-based line in that file, if known.
     key : dotted key inside the file (``aps.read_noise_e``), if known.
+
+    Attributes
+    ----------
+    problems : all that is wrong, where there is more than one thing; `file`, `line` and `key` are the first one's.
     """
+
+    problems: tuple[SpecError, ...] = ()
 
     def __init__(
         self,
@@ -39,6 +59,16 @@ class SpecError(HesimError, ValueError):
         parts = [part for part in (where, key) if part]
         super().__init__(": ".join([*parts, message]))
 
+    @classmethod
+    def together(cls, problems: Sequence[SpecError]) -> SpecError:
+        """One error for all problems of a file, each on a line of its own; a single one as it is."""
+        if len(problems) == 1:
+            return problems[0]
+        joined = cls("\n".join(map(str, problems)))
+        first = problems[0]
+        joined.file, joined.line, joined.key, joined.problems = first.file, first.line, first.key, tuple(problems)
+        return joined
+
 
 class RangeError(HesimError, ValueError):
     """An argument lies outside the range in which the model holds."""
@@ -46,6 +76,14 @@ class RangeError(HesimError, ValueError):
     def __init__(self, name: str, value: object, expected: str) -> None:
         self.name, self.value, self.expected = name, value, expected
         super().__init__(f"{name} is {value!r}; expected {expected}")
+
+
+class ConflictError(HesimError, ValueError):
+    """Arguments that exclude each other were given together, or one without another that it needs."""
+
+
+class TooLongError(HesimError):
+    """A run would take longer than was allowed; the message says how long, and what takes less."""
 
 
 class BackendError(HesimError, RuntimeError):

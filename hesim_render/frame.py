@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Frame:
     """One RAW frame and its truth.
 
@@ -35,6 +35,10 @@ class Frame:
     exposure_us: int
     line_time_us: float
     index: int
+
+    def __repr__(self) -> str:
+        rows, cols = self.raw.shape
+        return f"<Frame {self.index}: {cols}x{rows} px, t_us={self.t_us}, exposure_us={self.exposure_us}>"
 
     @property
     def times(self) -> dict[str, Any]:

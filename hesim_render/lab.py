@@ -7,7 +7,7 @@ is that of `hesim_render.bench`.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from hesim_render.errors import RangeError
 from hesim_render.evs import EvsStage
 from hesim_render.npzfile import NpzWriter
 from hesim_render.output import OutputFolder, output_errors
+from hesim_render.progress import Progress
 from hesim_render.sensor import Sensor
 from hesim_render.specs.files import content_hash, list_names
 from hesim_render.specs.sensor import read_sensor
@@ -37,9 +38,6 @@ _CONTRASTS, _REACH = 21, 2.0
 _LEAST_TRIALS = 50
 _FEWEST_FRAMES = 8
 _FRAME_WORK = 8  # a frame takes about as long as so many ticks
-
-#: Called with (done, total, what).
-Progress = Callable[[float, float, str], None]
 
 
 def write_captures(

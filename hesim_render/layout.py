@@ -12,7 +12,7 @@ from hesim_render.errors import RangeError
 from hesim_render.specs.sensor import Role, SensorSpec
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Layout:
     """Read-out region of a sensor; all arrays are [row, col] with (0, 0) at the top left.
 
@@ -28,6 +28,9 @@ class Layout:
     col0: int
     rows: int
     cols: int
+
+    def __repr__(self) -> str:
+        return f"<Layout {self.spec.name!r}: {self.cols}x{self.rows}+{self.col0}+{self.row0} px>"
 
     @classmethod
     def full(cls, spec: SensorSpec) -> Layout:

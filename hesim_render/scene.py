@@ -10,10 +10,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from hesim_render.errors import SpecError
+from hesim_render.specs.problems import spec_error
 from hesim_render.specs.scene import CameraSpec, SceneSpec, TrackSpec, read_scene
 
+#: Most things a short description names.
+_MOST_PARTS = 6
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Scene:
     """What is seen, how it is lit, from where, and how it moves.
 
@@ -23,6 +27,21 @@ class Scene:
     """
 
     spec: SceneSpec
+
+    def __repr__(self) -> str:
+        spec = self.spec
+        if spec.mitsuba is not None:
+            parts = ["a scene of Mitsuba's"]
+        else:
+            parts = [] if spec.target is None else [f"target {spec.target.type}"]
+            parts += [f"object {item.name}" for item in spec.objects]
+            parts += [f"light {light.type}" for light in spec.lights]
+        moving = [track.object for track in spec.motion]
+        if moving:
+            parts.append(f"moving: {', '.join(moving)}")
+        if len(parts) > _MOST_PARTS:
+            parts = [*parts[: _MOST_PARTS - 1], f"{len(parts) - _MOST_PARTS + 1} more"]
+        return f"<Scene {self.name!r}: {'; '.join(parts)}>"
 
     @property
     def name(self) -> str:
@@ -95,9 +114,7 @@ class Scene:
         try:
             return cls(SceneSpec.model_validate(content))
         except ValidationError as error:
-            problem = error.errors(include_url=False)[0]
-            key = ".".join(str(part) for part in problem["loc"])
-            raise SpecError(problem["msg"].removeprefix("Value error, "), key=key or None) from None
+            raise spec_error(error, SceneSpec, content) from None
 
 
 def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:

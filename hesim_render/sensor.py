@@ -22,7 +22,7 @@ from hesim_render.specs.sensor import SensorSpec, read_sensor
 from hesim_render.spectra import Spectrum, constant, integrate_product
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sensor:
     """One sensor file over one read-out region.
 
@@ -39,6 +39,16 @@ class Sensor:
     @classmethod
     def from_spec(cls, spec: SensorSpec, file: str = "") -> Sensor:
         return cls(Layout.full(spec), Lens.of(spec), file)
+
+    def __repr__(self) -> str:
+        layout, geometry, lens = self.layout, self.spec.geometry, self.lens
+        parts = [f"{layout.cols}x{layout.rows}+{layout.col0}+{layout.row0} of {geometry.cols}x{geometry.rows} px"]
+        if self.spec.evs is not None:
+            parts.append(f"events on {layout.evs_shape[1]}x{layout.evs_shape[0]} px")
+        if self.spec.aps is None:
+            parts.append("no frames")
+        parts.append(f"f/{lens.f_number:g}, {lens.focal_length_mm:g} mm")
+        return f"<Sensor {self.name!r}: {'; '.join(parts)}>"
 
     @property
     def spec(self) -> SensorSpec:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from hesim_render import backend
-from hesim_render.capture import Capture, Progress, noise_models
-from hesim_render.errors import RangeError
+from hesim_render.capture import Capture, noise_models
+from hesim_render.errors import ConflictError, RangeError, TooLongError
 from hesim_render.flicker import flickering
+from hesim_render.progress import Progress, ProgressReport, shown
 from hesim_render.recording import Recording, RecordingWriter
 from hesim_render.renderer.audit import STRETCHES, Audit
 from hesim_render.renderer.change_driven import QUALITY, ChangeDrivenFlux
@@ -44,7 +45,7 @@ def simulate(
     max_minutes: float | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | Literal[False] | None = None,
     on_estimate: Callable[[Estimate], None] | None = None,
 ) -> Recording:
     """RAW frames and events of a scene, with the electrons behind them.
@@ -65,7 +66,7 @@ def simulate(
     max_minutes : refuse a run whose estimate is longer; None does not.
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
-    progress : called with (done, total, what).
+    progress : called with (done, total, what). None shows a bar in notebooks and nothing elsewhere; False nothing.
     on_estimate : called with what the run will take, before it begins; not in the exact mode.
 
     Returns
@@ -78,7 +79,11 @@ def simulate(
     Raises
     ------
     RangeError
-        For a duration, seed, quality, sample count or noise term out of range, or a run that would take too long.
+        For a duration, seed, quality, sample count or noise term out of range.
+    ConflictError
+        If `quality` comes with `exact` or `samples`.
+    TooLongError
+        If the run would take longer than `max_minutes`.
     SpecError
         If scene and sensor do not fit together (a spectrum that does not cover the response).
     OutputError
@@ -88,49 +93,71 @@ def simulate(
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
     if quality is not None and (exact or samples is not None):
-        raise RangeError("quality", quality, "no exact mode and no samples beside it: they are another way")
-    aps, evs = noise_models(sensor, clean, without)
-    seen, level = in_absolute_light(scene)
-    flux, settings = _source(seen, sensor, seed, quality, samples, exact, progress)
-    if level is not None:
-        settings["light_level"] = level.as_dict()
-    settings |= {"clean": clean, "without": list(without), "backend": backend.select().describe()}
-    rendering = _change_driven_parts(flux)
-    wanted = rendering[0].quality if rendering else None
-    plain = Capture(flux, flux.sensor, aps, evs, duration_us, seed)
-    if rendering:
-        expected = forecast(rendering, plain.event_pixels, plain.event_blocks, *plain.frame_exposures)
-        if on_estimate is not None:
-            on_estimate(expected)
-        if max_minutes is not None and expected.seconds > 60 * max_minutes:
-            raise RangeError(
-                "quality", wanted,
-                f"a larger one: this run takes {expected}, more than {max_minutes:g} min (--yes, max_minutes=None)",
-            )  # fmt: skip
-        if flux.is_static:
-            rendering[0].progress = _share_progress(expected.rays, progress)
-    noted = _noted(flux, plain, seed) if rendering else None
-    capture = plain if noted is None else Capture(noted, flux.sensor, aps, evs, duration_us, seed)
-    with RecordingWriter(
-        out,
-        flux.sensor,
-        scene=scene.spec,
-        seed=seed,
-        duration_us=duration_us,
-        settings=settings,
-        overwrite=overwrite,
-    ) as writer:
-        capture.record(writer, progress)
-        render: dict[str, Any] = {
-            "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
-        }
-        if noted is not None:
-            render |= _work_done(rendering)
-            noise = flux.sensor.evs if flux.sensor.spec.evs is not None else None
-            audit = Audit(noted, flux, rendering[0].quality, noise, capture.event_pixels, seed)
-            render["audit"] = audit.run()
-        writer.add_settings({"render": render})
-        return writer.finish()
+        other = "samples" if samples is not None else "exact"
+        raise ConflictError(
+            f"give --quality or --{other} (quality, {other}), not both: --quality asks for an error and gives each "
+            f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number"
+        )
+    noise = noise_models(sensor, clean, without)
+    settings: dict[str, Any] = {"clean": clean, "without": list(without)}
+    with shown(progress, f"{scene.name} → {sensor.name}") as told:
+        seen, level = in_absolute_light(scene)
+        flux, mode = _source(seen, sensor, seed, quality, samples, exact, told)
+        settings |= mode
+        if level is not None:
+            settings["light_level"] = level.as_dict()
+        settings |= {"backend": backend.select().describe(), "camera": _camera_used(flux)}
+        rendering = _change_driven_parts(flux)
+        wanted = rendering[0].quality if rendering else None
+        plain = Capture(flux, flux.sensor, *noise, duration_us, seed)
+        if rendering:
+            expected = forecast(rendering, plain.event_pixels, plain.event_blocks, *plain.frame_exposures)
+            if on_estimate is not None:
+                on_estimate(expected)
+            if max_minutes is not None and expected.seconds > 60 * max_minutes:
+                raise TooLongError(
+                    f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
+                    "(max_minutes=None), or ask for less: a shorter --duration, a smaller --roi, or a larger error, "
+                    f"such as --quality {2 * rendering[0].quality:g}"
+                )
+            if isinstance(told, ProgressReport):
+                told.expect(expected.seconds)
+            if flux.is_static:
+                rendering[0].progress = _share_progress(expected.rays, told)
+        noted = _noted(flux, plain, seed) if rendering else None
+        capture = plain if noted is None else Capture(noted, flux.sensor, *noise, duration_us, seed)
+        with RecordingWriter(
+            out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
+            overwrite=overwrite,
+        ) as writer:  # fmt: skip
+            capture.record(writer, told)
+            render: dict[str, Any] = {
+                "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
+            }
+            if noted is not None:
+                if told is not None:
+                    told(0, 1, "audit")
+                render |= _work_done(rendering)
+                model = flux.sensor.evs if flux.sensor.spec.evs is not None else None
+                render["audit"] = Audit(noted, flux, rendering[0].quality, model, capture.event_pixels, seed).run()
+            writer.add_settings({"render": render})
+            return writer.finish()
+
+
+def _camera_used(flux: Any) -> dict[str, Any]:
+    """Where the camera stands at rest and how wide it sees, whatever of it was said by whom; plain values."""
+    view = flux.view
+    left, right, _, _ = view.region_mm
+    axis, image_mm = view.sensor.lens.axis_mm[0], view.sensor.lens.image_distance_mm
+    across = np.arctan((right - axis) / image_mm) - np.arctan((left - axis) / image_mm)
+    pose = view.camera_to_world
+    return {
+        "origin_m": pose[:3, 3].tolist(),
+        "forward": (-pose[:3, 2]).tolist(),
+        "up": pose[:3, 1].tolist(),
+        "horizontal_fov_deg": float(np.degrees(across)),
+        "near_m": float(view.near_m),
+    }
 
 
 def _source(

@@ -12,11 +12,12 @@ import functools
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.errors import SpecError
+from hesim_render.errors import SpecError, did_you_mean
 from hesim_render.units import LUMINOUS_EFFICACY_LM_PER_W
 
 #: Largest step of the grid on which products are integrated, nm.
@@ -161,10 +162,13 @@ def require_coverage(spectrum: Spectrum, response: Spectrum, what: str, response
 
 
 @functools.cache
-def _colour():
+def colour_science() -> Any:
+    """The module ``colour``. It sets NumPy's print options for the whole program: they are put back."""
+    before = np.get_printoptions()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # it tells which optional packages are not installed
         import colour
+    np.set_printoptions(**before)
     return colour
 
 
@@ -177,18 +181,18 @@ def _lookup(table, name: str, what: str):  # noqa: ANN001
         return table[name]
     except KeyError:
         known = ", ".join(repr(key) for key in sorted(map(str, table)))
-        raise SpecError(f"unknown {what} {name!r}; known are {known}") from None
+        raise SpecError(f"unknown {what} {name!r}; known are {known}{did_you_mean(name, map(str, table))}") from None
 
 
 def illuminant_names() -> list[str]:
     """Names `illuminant` accepts: CIE illuminants and measured light sources of colour-science."""
-    colour = _colour()
+    colour = colour_science()
     return sorted({*colour.SDS_ILLUMINANTS, *colour.SDS_LIGHT_SOURCES})
 
 
 def illuminant(name: str) -> Spectrum:
     """Relative spectral power of a named illuminant (``D65``, ``A``, ``FL11``, ``LED-B3``, …)."""
-    colour = _colour()
+    colour = colour_science()
     if name in colour.SDS_LIGHT_SOURCES:
         return _from_colour(colour.SDS_LIGHT_SOURCES[name])
     return _from_colour(_lookup(colour.SDS_ILLUMINANTS, name, "illuminant"))
@@ -202,13 +206,13 @@ def colorchecker(dataset: str = "ISO 17321-1") -> dict[str, Spectrum]:
     dataset : ``ISO 17321-1`` and ``ColorChecker N Ohta`` reach from 380 to 780 nm;
         ``BabelColor Average`` (30 charts averaged) ends at 730 nm.
     """
-    charts = _colour().SDS_COLOURCHECKERS
+    charts = colour_science().SDS_COLOURCHECKERS
     return {name: _from_colour(sd) for name, sd in _lookup(charts, dataset, "ColorChecker data set").items()}
 
 
 def camera_sensitivity(camera: str, channel: str) -> Spectrum:
     """Peak-normalised camera sensitivity per unit *energy* of colour-science, per channel."""
-    curves = _lookup(_colour().MSDS_CAMERA_SENSITIVITIES, camera, "camera")
+    curves = _lookup(colour_science().MSDS_CAMERA_SENSITIVITIES, camera, "camera")
     labels = [str(label) for label in curves.labels]
     if channel not in labels:
         raise SpecError(f"camera {camera!r} has no channel {channel!r}; it has {', '.join(labels)}")
@@ -220,7 +224,7 @@ def srgb_reflectances() -> tuple[Spectrum, Spectrum, Spectrum]:
 
     Each lies between 0 and 1, they sum to 1, and under D65 a mixture has the tristimulus values of its colour.
     """
-    table = _colour().recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+    table = colour_science().recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
     red, green, blue = (Spectrum(np.asarray(table.wavelengths), column) for column in np.asarray(table.values).T)
     return red, green, blue
 
@@ -228,12 +232,12 @@ def srgb_reflectances() -> tuple[Spectrum, Spectrum, Spectrum]:
 @functools.cache
 def photopic() -> Spectrum:
     """V(λ), CIE 1924 photopic luminous efficiency, 360-830 nm at 1 nm."""
-    return _from_colour(_colour().SDS_LEFS["CIE 1924 Photopic Standard Observer"])
+    return _from_colour(colour_science().SDS_LEFS["CIE 1924 Photopic Standard Observer"])
 
 
 def colour_matching_functions() -> tuple[Spectrum, Spectrum, Spectrum]:
     """x̄, ȳ, z̄ of the CIE 1931 2° observer, 360-830 nm at 1 nm."""
-    table = _colour().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+    table = colour_science().MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     x, y, z = (Spectrum(np.asarray(table.wavelengths), column) for column in np.asarray(table.values).T)
     return x, y, z
 

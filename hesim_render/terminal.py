@@ -1,11 +1,12 @@
-"""What commands read from and write to a terminal: texts into values, a progress bar, a summary, interrupts."""
+"""What commands read from and write to a terminal: texts into values, lines, a summary."""
 
 from __future__ import annotations
 
 import contextlib
-import signal
+import os
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,12 +32,11 @@ def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any
 
 def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
     """Width, height and optional first column and row of ``512x384`` or ``512x384+100+200``."""
-    size, *offset = text.lower().split("+")
-    try:
-        width, height = (int(part) for part in size.split("x"))
-        x, y = (int(part) for part in offset) if offset else (None, None)
-    except ValueError:
-        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384") from None
+    match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})(?:\+([0-9]{1,9})\+([0-9]{1,9}))?", text)
+    if match is None:
+        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384")
+    width, height, x, y = (None if part is None else int(part) for part in match.groups())
+    assert width is not None and height is not None
     return width, height, x, y
 
 
@@ -48,23 +48,30 @@ def parse_exposures(text: str) -> list[int]:
         raise RangeError("exposures", text, "times in ms, such as 1,5,20") from None
 
 
-@contextlib.contextmanager
-def progress_bar(title: str) -> Iterator[Any]:
-    """A callback (done, total, what) that moves a bar on a terminal; silent elsewhere."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+def say(text: str) -> None:
+    """A line on stdout. Where nobody reads any more, the run goes on: its result is not the text."""
+    import typer
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None)
+    try:
+        typer.echo(text)
+    except BrokenPipeError:
+        silence_stdout()
 
-        def move(done: float, total: float, what: str) -> None:
-            bar.update(task, completed=done, total=total, description=f"{title}: {what}")
 
-        yield move
+def silence_stdout() -> None:
+    """From now on stdout goes nowhere, also what is still to be flushed when Python ends."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def complain(*lines: str) -> None:
+    """Lines on stderr, each with the program's name, if there is anyone to read them."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        for line in lines:
+            sys.stderr.write(f"hesim-render: {' '.join(line.split())}\n")
+        sys.stderr.flush()
 
 
 def summary(recording: Recording) -> str:
@@ -73,13 +80,13 @@ def summary(recording: Recording) -> str:
     counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
     video = manifest["settings"].get("video")
     scene = Path(video["source"]).name if video else (manifest.get("scene") or {}).get("name", "no scene file")
-    size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
     lines = [
-        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}",
-        f"  RAW frames: {counts['frames']} of {size}, {bits}",
+        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}"
     ]
-    if counts["frames"] == 0:
-        lines[1] += " (no frame's last row is fully exposed in this time)"
+    if any(any(row) for row in recording.mosaic.tile_aps):
+        size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
+        none = " (no frame's last row is fully exposed in this time)" if counts["frames"] == 0 else ""
+        lines.append(f"  RAW frames: {counts['frames']} of {size}, {bits}{none}")
     if grid["width"]:
         lines.append(
             f"  events: {counts['events']} ({counts['events_on']} ON, {counts['events_off']} OFF) "
@@ -145,25 +152,3 @@ def _short(value: float) -> str:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %"
-
-
-class Interrupts:
-    """SIGINT and SIGTERM end a run alike; and are remembered, for a library may turn the exception into its own."""
-
-    def __init__(self) -> None:
-        self.happened = False
-        self._before: dict[int, Any] = {}
-
-    def _note(self, *_: Any) -> None:
-        self.happened = True
-        raise KeyboardInterrupt
-
-    def __enter__(self) -> Interrupts:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from hesim_render import backend, spectra
-from hesim_render.capture import Capture, Progress, noise_models
-from hesim_render.errors import RangeError, SpecError
+from hesim_render.capture import Capture, noise_models
+from hesim_render.errors import RangeError, SpecError, TooLongError
 from hesim_render.mosaic import Mosaic, describe
+from hesim_render.progress import Progress, ProgressReport, in_words, shown
 from hesim_render.recording import Recording, RecordingWriter
 from hesim_render.sensor import Sensor
 from hesim_render.units import S_PER_US, US_PER_S
@@ -20,6 +23,48 @@ from hesim_render.video.flux import Source
 
 #: Slack of a duration given in decimals of the video's length, µs.
 _SLACK_US = 1.0
+#: Longest simulated time, s, as of `simulate`.
+_LONGEST_S = 1e6
+#: Processor seconds for a pixel of a picture, of an event sample and of a frame that is read out and stored; seconds
+#: for each of these besides its pixels, and in all. From `benchmarks/video.py`, for one core of an AVX-512 server.
+_PER_PIXEL_S, _PER_ITEM_S, _IN_ALL_S = np.array([8e-9, 17e-9, 60e-9]), np.array([1e-3, 1e-3, 2e-2]), 4.0
+
+
+@dataclass(frozen=True)
+class VideoEstimate:
+    """What a run will take, right to about a factor of two; decoding of hard codecs comes on top.
+
+    Parameters
+    ----------
+    seconds : in all.
+    pictures, event_samples, frames : how many of each.
+    """
+
+    seconds: float
+    pictures: int
+    event_samples: int
+    frames: int
+
+    def __str__(self) -> str:
+        return (
+            f"about {in_words(self.seconds)}, {self.pictures} pictures, {self.event_samples} event samples, "
+            f"{self.frames} frames"
+        )
+
+
+def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimate:
+    """From counts alone: nothing is read, and nothing is held in memory however long the run."""
+    aps, evs, shape = sensor.spec.aps, sensor.spec.evs, sensor.layout.shape
+    pictures = min(flux.clock.count, int(np.searchsorted(flux.clock.middle_us, duration_us)) + 1)
+    samples = 0
+    if evs is not None:
+        samples = pictures if evs.tick_us is None else duration_us // evs.tick_us
+    frames = 0 if aps is None else int(duration_us * S_PER_US * aps.frame_rate_hz)
+    count = np.array([pictures, samples, frames], dtype=np.float64)
+    rows, cols = sensor.layout.evs_shape
+    pixels = np.array([shape[0] * shape[1], rows * cols, shape[0] * shape[1]])
+    seconds = (count * pixels * _PER_PIXEL_S).sum() / (os.cpu_count() or 1) + (count * _PER_ITEM_S).sum() + _IN_ALL_S
+    return VideoEstimate(float(seconds), pictures, int(samples), frames)
 
 
 def simulate_video(
@@ -32,7 +77,9 @@ def simulate_video(
     without: Sequence[str] = (),
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | Literal[False] | None = None,
+    max_minutes: float | None = None,
+    on_estimate: Callable[[VideoEstimate], None] | None = None,
     **options: Any,
 ) -> Recording:
     """RAW frames and events of a video, with the electrons behind them.
@@ -43,7 +90,7 @@ def simulate_video(
         [time, row, col] or [time, row, col, channel].
     sensor : from `load_sensor` (crop it for a region of interest).
     duration_s : simulated time from the video's first picture, s; default all of it.
-    seed, clean, without, out, overwrite, progress : as in `simulate`.
+    seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as in `simulate`.
     options : of `hesim_render.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
         tags, ``mode``, ``white_lux`` or ``white_e_per_s`` with ``white_filter``, ``fit``, ``lens_shading``, …
 
@@ -59,6 +106,8 @@ def simulate_video(
         If the video cannot be read, is damaged or lacks colour tags or a clock.
     RangeError
         For a value out of range, or a duration longer than the video.
+    TooLongError
+        If the run would take longer than `max_minutes`.
     OutputError
         If `out` exists or cannot be written; nothing half-written is left.
     """
@@ -67,7 +116,16 @@ def simulate_video(
     aps, evs = noise_models(sensor, clean, without)
     flux = VideoFlux(source, sensor, VideoOptions.of(**options))
     try:
-        duration_us = _duration_us(duration_s, flux, str(source) if not isinstance(source, np.ndarray) else "array")
+        name = "array" if isinstance(source, np.ndarray) else str(source)
+        duration_us = _duration_us(duration_s, flux, name)
+        expected = _forecast(flux, sensor, duration_us)
+        if on_estimate is not None:
+            on_estimate(expected)
+        if max_minutes is not None and expected.seconds > 60 * max_minutes:
+            raise TooLongError(
+                f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
+                "(max_minutes=None), or ask for less: a shorter --duration or a smaller --roi"
+            )
         settings = {
             "clean": clean,
             "without": list(without),
@@ -84,7 +142,10 @@ def simulate_video(
             overwrite=overwrite,
             mosaic=_mosaic(sensor, flux.options),
         ) as writer:
-            capture.record(writer, progress)
+            with shown(progress, f"{Path(name).name} → {sensor.name}") as told:
+                if isinstance(told, ProgressReport):
+                    told.expect(expected.seconds)
+                capture.record(writer, told)
             return writer.finish()
     finally:
         flux.close()
@@ -100,12 +161,14 @@ def _duration_us(duration_s: float | None, flux: VideoFlux, name: str) -> int:
                 "give a duration that is there",
                 file=name,
             )
+        if length_us * S_PER_US > _LONGEST_S:
+            raise RangeError("fps", flux.options.fps, f"pictures of at most {_LONGEST_S:g} s in all, or a duration_s")
         duration_us = int(length_us + 1e-3)
         if duration_us < 1:
             raise SpecError(f"lasts {length_us:g} µs, less than one", file=name)
         return duration_us
-    if not duration_s > 0:
-        raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
+    if not 0 < duration_s <= _LONGEST_S:
+        raise RangeError("duration_s", duration_s, f"a time above 0, in seconds, and at most {_LONGEST_S:g}")
     duration_us = round(duration_s * US_PER_S)
     if duration_us < 1 or duration_us > length_us + _SLACK_US:
         raise RangeError("duration_s", duration_s, f"at most the video's {length_us * S_PER_US:.6g} s")

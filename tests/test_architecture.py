@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "hesim_render"
 
 # lowest first; a module may import its own layer and those below. Names are modules or packages.
 LAYERS = [
-    {"errors", "units", "rng", "backend", "spectra", "colorimetry", "events", "frame", "output"}
+    {"errors", "units", "rng", "backend", "progress", "spectra", "colorimetry", "events", "frame", "output"}
     | {"bands", "transfer", "waveform", "render_error"},
     {"specs"},
     {"optics", "layout", "noise"},

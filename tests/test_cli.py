@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,10 @@ import recordings
 import hesim_render as hr
 from hesim_render import backend, cli
 from hesim_render.backend import Candidate
+from hesim_render.capture import NOISE_TERMS
 from hesim_render.errors import RangeError
-from hesim_render.specs.files import list_names
+from hesim_render.specs.files import data_folder, list_names
+from hesim_render.terminal import parse_roi
 
 
 def call(capsys, *arguments):
@@ -69,6 +72,102 @@ def test_list_illuminants(capsys):
     assert {"D65", "A", "FL11", "LED-B3"} <= set(names)
 
 
+def test_list_noise_names_every_term_and_the_docs_do_too(capsys):
+    names = call(capsys, "list", "noise")[1].splitlines()
+    assert names == list(NOISE_TERMS) and "aps.read" in names and "evs.leak" in names
+    docs = (data_folder("sensors").parent / "docs" / "sensors.md").read_text()
+    table = docs[docs.index("## Switching noise off") : docs.index("## Changing one figure")]
+    assert {name for name in re.findall(r"`((?:aps|evs)\.\w+)`", table)} == set(names)
+
+
+def test_list_alone_lists_everything(capsys):
+    status, out, err = call(capsys, "list")
+    assert status == 0 and err == ""
+    for kind in ("scenes", "sensors", "illuminants", "noise"):
+        below = out[out.index(f"{kind}:\n") :].splitlines()[1:]
+        assert [line.strip() for line in below[:3]] == call(capsys, "list", kind)[1].splitlines()[:3]
+
+
+@pytest.mark.parametrize("command", ["--help", "--version", "list illuminants"])
+def test_output_that_nobody_reads_is_no_failure_and_a_full_disk_is_one_line(command):
+    run = [sys.executable, "-m", "hesim_render.cli", *command.split()]
+    reading, writing = os.pipe()
+    os.close(reading)
+    closed = subprocess.run(run, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (closed.returncode, closed.stderr) == (0, "")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(run, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "hesim-render: standard output: No space left on device\n")
+    with open("/dev/full", "w") as full:  # nor is there a traceback where nobody can be told
+        assert subprocess.run([*run, "--wrong"], stdout=full, stderr=full).returncode in (0, 2)
+
+
+def test_a_run_goes_on_where_nobody_reads_what_it_says(tmp_path):
+    run = [
+        sys.executable, "-m", "hesim_render.cli", "simulate", "dark", "--sensor", "reference-mono", "--roi", "8x8",
+        "--duration", "0.002", "--out", str(tmp_path / "o"),
+    ]  # fmt: skip
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(run, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "") and (tmp_path / "o" / "recording.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["simulate", "dark", "--sensor", "reference-mono", "--roi", "8x8", "--out", "LONG"],
+        ["simulate", "LONG", "--sensor", "reference-mono", "--out", "o"],
+        ["simulate", "dark", "--sensor", "LONG", "--out", "o"],
+        ["video", "LONG", "--sensor", "reference-mono", "--out", "o"],
+        ["lab", "reference-mono", "--out", "LONG"],
+        ["demo", "--out", "LONG"],
+        ["view", "LONG"],
+        ["isp", "LONG"],
+        ["calibrate", "aps", "LONG", "--out", "c.yaml"],
+    ],
+)
+def test_a_name_of_256_characters_is_one_line(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fails(capsys, *["a" * 256 if argument == "LONG" else argument for argument in arguments])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_mistakes_of_a_file_are_a_line_each(capsys, tmp_path):
+    changes = ["--set", "sensor.aps.reed_noise_e=1", "--set", "sensor.lens.f_number=-1"]
+    status, out, err = call(
+        capsys, "simulate", "dark", "--sensor", "eiger", "--roi", "16x16", "--out", tmp_path / "o", *changes
+    )
+    assert status == 2 and out == "" and not (tmp_path / "o").exists()
+    lines = err.splitlines()
+    assert len(lines) == 2 and all(line.startswith("hesim-render: ") for line in lines)
+    assert "aps.reed_noise_e: unknown key (did you mean 'read_noise_e'?)" in err and "lens.f_number" in err
+
+
+def test_the_summary_of_a_sensor_without_frames_speaks_of_events_alone(capsys, tmp_path):
+    events_only = ["--set", "sensor.pixels.M.roles=[evs]", "--set", "sensor.aps=null"]
+    events_only += ["--set", "sensor.sources={}", "--set", "sensor.assumptions={}"]
+    status, out, _ = call(
+        capsys, "simulate", "dark", "--sensor", "reference-mono", "--roi", "8x8", "--duration", "0.002", "--out",
+        tmp_path / "o", *events_only,
+    )  # fmt: skip
+    assert status == 0 and "events: " in out and "on 8x8 px" in out
+    assert "RAW" not in out and "bit" not in out
+
+
+def test_a_long_run_says_what_to_do_in_one_reading(capsys, tmp_path):
+    status, out, line = call(
+        capsys, "simulate", "rotating-star", "--sensor", "gen2", "--duration", "1000", "--out", tmp_path / "o",
+        "--quality", "0.4", "--roi", "64x64",
+    )  # fmt: skip
+    assert status == 2 and out.startswith("estimate: about ") and line.count("\n") == 1
+    assert "this run takes about " in line and "has to be wanted: add --yes (max_minutes=None), or ask for less" in line
+    assert "--duration, a smaller --roi, or a larger error, such as --quality 0.8" in line
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_doctor_says_what_runs(capsys):
     status, out, _ = call(capsys, "doctor")
     assert status == 0
@@ -111,6 +210,10 @@ def test_wrong_usage_is_one_line(arguments, text, capsys):
         (["--duration", "soon"], "--duration"),
         (["--roi", "512"], "--roi is '512'; expected WIDTHxHEIGHT"),
         (["--roi", "axb"], "expected WIDTHxHEIGHT"),
+        (["--roi", "٨x8"], "expected WIDTHxHEIGHT"),
+        (["--roi", "8x-8"], "expected WIDTHxHEIGHT"),
+        (["--roi", " 8x8"], "expected WIDTHxHEIGHT"),
+        (["--roi", "1_6x16"], "expected WIDTHxHEIGHT"),
         (["--roi", "512x384+1"], "expected WIDTHxHEIGHT"),
         (["--roi", "4000x384"], "roi width_px is 4000; expected 1 to 3264"),
         (["--roi", "510x384"], "a multiple of the tile's 4 pixels"),
@@ -124,6 +227,9 @@ def test_wrong_usage_is_one_line(arguments, text, capsys):
         (["--set", "light.illuminant={flat: 1, band_nm: [400, 600]}"], "of the response of"),
         (["--without", "aps.nothing"], "noise term is 'aps.nothing'; expected one of aps."),
         (["--sensor", "eigr"], "no sensor named 'eigr'; shipped are"),
+        (["--sensor", "eigr"], "(did you mean 'eiger'?)"),
+        (["--without", "aps.reed"], "(did you mean 'aps.read'?)"),
+        (["--quality", "0.3", "--samples", "8"], "give --quality or --samples (quality, samples), not both"),
         (["--sensor", "./my.yaml"], "my.yaml: no such file"),
     ],
 )
@@ -227,10 +333,10 @@ def test_view_writes_the_previews_anew(capsys, tmp_path):
 
 
 def test_parse_roi():
-    assert cli.parse_roi("512x384") == (512, 384, None, None)
-    assert cli.parse_roi("512X384+100+200") == (512, 384, 100, 200)
+    assert parse_roi("512x384") == (512, 384, None, None)
+    assert parse_roi("512X384+100+200") == (512, 384, 100, 200)
     with pytest.raises(RangeError):
-        cli.parse_roi("512x384x2")
+        parse_roi("512x384x2")
 
 
 def test_interrupt_exits_130_and_leaves_nothing(tmp_path):

@@ -10,7 +10,8 @@ from pydantic import BaseModel
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.layout import Layout
 from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene, read_sensor
-from hesim_render.specs.files import content_hash, data_folder, list_names, parse_override
+from hesim_render.specs.files import Strict, content_hash, data_folder, list_names, parse_override
+from hesim_render.specs.sensor import ApsSpec, EvsSpec
 
 SENSOR = (data_folder("sensors") / "eiger.yaml").read_text()
 SCENE = """schema_version: 1
@@ -76,7 +77,7 @@ MISTAKES = [
      "increase strictly"),
     ("quantum_efficiency: 0.7", "quantum_efficiency: {flat: 0.5, band_nm: [900, 1000]}", "filters.red",
      "do not overlap"),
-    ("f_number: 2.0", "f_number: 0", "lens.f_number", "greater than 0"),
+    ("f_number: 2.0", "f_number: 0", "lens.f_number", "greater than or equal to 0.1"),
     ("relative_illumination: cos4", "relative_illumination: {image_height_mm: [0, 1], relative: [1, 2]}",
      "lens.relative_illumination", "[0, 1]"),
     ("window_us: 1000", "window_us: 2000", "evs.window_us", "longer than tick_us"),
@@ -250,3 +251,127 @@ def test_the_documentation_names_every_key(model, document):
     text = (docs / document).read_text() + (docs / "sensors.md").read_text()
     untold = [key for key in keys_of(model) if not re.search(rf"(?<![\w]){key}(?![\w])", text)]
     assert untold == []
+
+
+def test_all_mistakes_of_a_file_are_told_at_once_in_order_of_lines(tmp_path):
+    text = (data_folder("sensors") / "eiger.yaml").read_text()
+    for old, new in (
+        ("read_noise_e:", "reed_noise_e:"),
+        ("f_number: 2.0", "f_number: 0"),
+        ("shutter: rolling", "shutter: roling"),
+    ):
+        assert text.count(old) >= 1
+        text = text.replace(old, new, 1)
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(SpecError) as caught:
+        read_sensor(tmp_path / "mine.yaml")
+    lines = str(caught.value).splitlines()
+    assert len(lines) == len(caught.value.problems) == 3
+    places = [int(line.split(":")[1]) for line in lines]
+    assert places == sorted(places) == [problem.line for problem in caught.value.problems]
+    assert [problem.key for problem in caught.value.problems] == ["lens.f_number", "aps.reed_noise_e", "aps.shutter"]
+    assert "unknown key (did you mean 'read_noise_e'?)" in lines[1]  # and not that read_noise_e is missing as well
+    assert "'rolling' or 'global'" in lines[2]
+    assert caught.value.line == places[0] and caught.value.key == "lens.f_number"
+
+
+def test_a_mistake_in_one_of_several_alternatives_is_told_once(tmp_path):
+    with pytest.raises(SpecError, match="image_height_mm must start") as caught:
+        read_sensor("eiger", {"lens.relative_illumination": {"image_height_mm": [2, 1], "relative": [1, 1]}})
+    assert caught.value.problems == ()
+    with pytest.raises(SpecError, match=r"image_height: unknown key \(did you mean 'image_height_mm'\?\)") as caught:
+        read_sensor("eiger", {"lens.relative_illumination": {"image_height": [0, 1], "relative": [1, 1]}})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("aps.read_noise_e", "5"),
+        ("aps.read_noise_e", True),
+        ("aps.bit_depth", "10"),
+        ("aps.bit_depth", True),
+        ("device_seed", False),
+        ("lens.magnification", "0.1"),
+        ("lens.magnification", True),
+        ("filters.red", {"wavelength_nm": [400, "700"], "value": [1, 1]}),
+        ("filters.red", {"flat": "0.5", "band_nm": [400, 700]}),
+    ],
+)
+def test_texts_and_booleans_are_no_numbers(key, value):
+    with pytest.raises(SpecError, match="expected a number, not"):
+        read_sensor("eiger", {key: value})
+
+
+def test_whole_floats_are_still_whole_numbers_and_texts_no_booleans():
+    assert read_sensor("eiger", {"aps.exposure_us": 2e3}).aps.exposure_us == 2000
+    with pytest.raises(SpecError, match=r"motion\.0\.repeat: .*boolean"):
+        read_scene("rotating-star", {"motion.0.repeat": "no"})
+
+
+def test_what_no_pixel_uses_is_refused():
+    with pytest.raises(SpecError, match=r"filters\.spare: no pixel has this filter"):
+        read_sensor("eiger", {"filters.spare": {"flat": 0.5, "band_nm": [400, 700]}})
+    # a comparison that defines a new white pixel, and leaves the tile as it was
+    with pytest.raises(SpecError, match=r"pixels\.W: no pixel of the tile has this letter"):
+        read_sensor("eiger", {"pixels.W": {"filter": "green", "roles": ["aps"]}})
+    # used only as the reference of the events' signal
+    spare = {"filters.spare": {"flat": 0.5, "band_nm": [400, 700]}, "evs.signal_reference.filter": "spare"}
+    assert "spare" in read_sensor("eiger", spare).filters
+
+
+@pytest.mark.parametrize(
+    ("band_nm", "cut"),
+    [
+        ((300, 700), "add an ultraviolet cut"),
+        ((400, 1000), "add an infrared cut"),
+        ((300, 1000), "add an ultraviolet and an infrared cut"),
+    ],
+)
+def test_the_cut_that_is_missing_is_named(band_nm, cut):
+    with pytest.raises(SpecError) as caught:
+        read_sensor("reference-mono", {"filters": {"clear": {"flat": 0.9, "band_nm": list(band_nm)}},
+                                       "pixels": {"M": {"filter": "clear", "roles": ["aps", "evs"]}}, "tile": "M",
+                                       "quantum_efficiency": 0.5})  # fmt: skip
+    assert str(caught.value).partition("rendered; ")[2].startswith(cut + ";")
+
+
+@pytest.mark.parametrize("key", ["geometry.pitch_um", "lens.f_number", "lens.focal_length_mm"])
+@pytest.mark.parametrize("value", [1e-300, 1e300])
+def test_absurd_sizes_are_refused(key, value):
+    with pytest.raises(SpecError, match=r"Input should be (greater|less) than"):
+        read_sensor("eiger", {key: value})
+
+
+def _required(model, prefix=""):
+    """Keys that a sensor file must have, those of optional sections where the section is there."""
+    for name, field in model.model_fields.items():
+        if field.is_required():
+            yield prefix + name
+        inner = [a for a in (field.annotation, *typing.get_args(field.annotation)) if isinstance(a, type)]
+        for each in inner:
+            if issubclass(each, Strict) and name in ("geometry", "lens", "aps", "evs", "signal_reference"):
+                yield from _required(each, f"{prefix}{name}.")
+
+
+def test_the_docs_mark_the_required_keys():
+    text = (data_folder("sensors").parent / "docs" / "sensors.md").read_text()
+    section, marked, named = "", set(), set()
+    for line in text[text.index("## Keys") :].splitlines():
+        if match := re.match(r"`(aps|evs)` describes", line):
+            section = f"{match[1]}."
+        if line.startswith("## ") and line != "## Keys":
+            break
+        if line.startswith("| `"):
+            first, last = line.split("|")[1], line.split("|")[3]
+            for key, star in re.findall(r"`([\w.]+)`(\\\*)?", first):
+                named.add(section + key)
+                if star:
+                    marked.add(section + key)
+            if "`signal_reference`" in first:
+                marked |= {f"evs.signal_reference.{key}" for key in re.findall(r"`(\w+)`\\\*", last)}
+    required = set(_required(SensorSpec)) - {"geometry", "lens"}
+    assert marked == required
+    for group, model in (("", SensorSpec), ("aps.", ApsSpec), ("evs.", EvsSpec)):
+        own = {group + name for name in model.model_fields}
+        assert own - named <= {"geometry", "lens", "aps", "evs", "noise", "sources", "assumptions"}

@@ -1,6 +1,8 @@
 """`hesim-render video` from a real file to a recording and pictures, and its mistakes."""
 
 import json
+import re
+import time
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ def test_a_video_file_becomes_a_recording_with_pictures(clip, tmp_path, capsys):
         "--white-lux", 800, "--set", "sensor.aps.exposure_us=4000", "--interpolation", "linear",
     )  # fmt: skip
     assert status == 0 and err == ""
-    assert text.startswith("bar.mp4 seen by eiger, 0.2 s") and "preview.png" in text
+    assert text.startswith("estimate: about ") and "\nbar.mp4 seen by eiger, 0.2 s" in text and "preview.png" in text
     assert "note: the pictures are enlarged 2 times" in text
     recording = hr.Recording.load(out)
     assert len(recording.frames) == 2 and recording.frames[0].exposure_us == 4000 and recording.events.size > 100
@@ -105,3 +107,33 @@ def test_a_camera_file_is_undone_and_travels_with_the_recording(clip, tmp_path, 
     mosaic = hr.Recording.load(out).mosaic
     np.testing.assert_allclose(mosaic.neutral, [1 / 2.643, 1, 1 / 1.764])
     np.testing.assert_allclose(mosaic.camera_to_srgb[0], [1.2, -0.15, -0.05])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--white-lux", "1e300"], ["--white-lux", "1e-300"], ["--white-lux", "inf"], ["--fps", "1e-300"],
+        ["--fps", "1e-9"], ["--fps", "1e300"], ["--slow-motion", "1e-300"], ["--slow-motion", "1e300"],
+        ["--gamma", "1e300", "--transfer", "gamma"], ["--gamma", "1e-300", "--transfer", "gamma"], ["--duty", "1e-300"],
+        ["--white-e-per-s", "1e300", "--white-filter", "green"],
+        ["--interpolation", "motion", "--motion-factor", "9999"],
+        ["--duration", "1e300"], ["--duration", "1e-300"],
+    ],
+)  # fmt: skip
+def test_absurd_values_are_refused_before_any_work(options, tmp_path, capsys, clip):
+    begin = time.monotonic()
+    fails(capsys, "video", clip, "--sensor", "davis346", "--roi", "32x32", "--out", tmp_path / "o", *options)
+    assert time.monotonic() - begin < 20 and list(tmp_path.iterdir()) == []
+
+
+def test_a_video_that_takes_days_has_to_be_wanted(tmp_path, capsys):
+    """Three pictures, an hour each: 8.6 million comparisons of every pixel, and 216,000 frames."""
+    np.save(tmp_path / "slow.npy", moving_bar(3))
+    status, out, err = call(
+        capsys, "video", tmp_path / "slow.npy", "--sensor", "gen2", "--fps", 1 / 3600, "--transfer", "srgb", "--out",
+        tmp_path / "o",
+    )  # fmt: skip
+    assert status == 2 and err.startswith("hesim-render: this run takes about ") and err.count("\n") == 1
+    counts = re.search(r"(\d+) pictures, (\d+) event samples, (\d+) frames", out)
+    assert [int(n) for n in counts.groups()] == [3, 8_640_000, 10_800 * 20]
+    assert "add --yes (max_minutes=None)" in err and not (tmp_path / "o").exists()

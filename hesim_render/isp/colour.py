@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError
+from hesim_render.spectra import colour_science
 
 
 @dataclass(frozen=True)
@@ -107,20 +108,11 @@ def _with_unit_rows(free: NDArray) -> NDArray[np.float64]:
 
 def delta_e_2000(linear_a: ArrayLike, linear_b: ArrayLike) -> NDArray[np.float64]:
     """ΔE2000 (CIE 142-2001) between linear sRGB values [..., 3], under sRGB's own white."""
-    return _colour().delta_E(_lab(linear_a), _lab(linear_b), method="CIE 2000")
+    return colour_science().delta_E(_lab(linear_a), _lab(linear_b), method="CIE 2000")
 
 
 def _lab(linear: ArrayLike) -> NDArray[np.float64]:
-    colour = _colour()
+    colour = colour_science()
     space = colour.RGB_COLOURSPACES["sRGB"]
     xyz = np.asarray(linear, dtype=np.float64) @ space.matrix_RGB_to_XYZ.T
     return colour.XYZ_to_Lab(xyz, space.whitepoint)
-
-
-def _colour():
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it tells which optional packages are not installed
-        import colour
-    return colour

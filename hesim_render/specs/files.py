@@ -5,25 +5,64 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import re
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-from hesim_render.errors import SpecError
+from hesim_render.errors import SpecError, did_you_mean
+from hesim_render.specs.problems import spec_error
+
+
+def _with_true_numbers(schema: Any) -> Any:
+    """A schema of pydantic's with what `_a_number` refuses refused wherever a number is expected."""
+    if isinstance(schema, list | tuple):
+        return type(schema)(_with_true_numbers(item) for item in schema)
+    if not isinstance(schema, dict) or _is_checked(schema):
+        return schema
+    inner = {key: _with_true_numbers(value) for key, value in schema.items() if key != "metadata"}
+    inner |= {key: value for key, value in schema.items() if key == "metadata"}
+    if inner.get("type") in ("float", "int"):
+        return core_schema.no_info_before_validator_function(_a_number, inner)
+    if inner.get("type") == "bool":
+        inner["strict"] = True
+    return inner
+
+
+def _is_checked(schema: dict[str, Any]) -> bool:
+    function = schema.get("function")
+    return isinstance(function, dict) and function.get("function") is _a_number
+
+
+def _a_number(value: Any) -> Any:
+    """Refuses what pydantic would make a number of; other texts it refuses itself."""
+    if isinstance(value, bool):
+        raise ValueError("expected a number, not true or false")
+    if isinstance(value, str):
+        try:
+            float(value)
+        except ValueError:
+            return value
+        raise ValueError("expected a number, not a text; leave the quotes away")
+    return value
 
 
 class Strict(BaseModel):
-    """Base of all file models: unknown keys are errors, values are never coerced from strings."""
+    """Base of all file models: unknown keys are errors, and neither a text nor yes or no passes as a number."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=False, allow_inf_nan=False, arbitrary_types_allowed=True
     )
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return _with_true_numbers(handler(source))
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -51,15 +90,19 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
     """
     given = Path(name_or_path)
     if given.suffix in (".yaml", ".yml") or len(given.parts) > 1:
-        if given.is_file():
+        if os.path.isfile(given):
             return given
         raise SpecError("no such file", file=given)
     shipped = data_folder(kind) / f"{name_or_path}.yaml"
-    if shipped.is_file():
+    if os.path.isfile(shipped):  # False also where the name is too long
         return shipped
-    if given.is_file():
+    if os.path.isfile(given):
         return given
-    raise SpecError(f"no {kind[:-1]} named {str(name_or_path)!r}; shipped are {', '.join(list_names(kind))}")
+    names = list_names(kind)
+    raise SpecError(
+        f"no {kind[:-1]} named {str(name_or_path)!r}; shipped are {', '.join(names)}"
+        f"{did_you_mean(str(name_or_path), names)}"
+    )
 
 
 def load_yaml(file: Path) -> CommentedMap:
@@ -123,112 +166,13 @@ def parse_override(text: str) -> tuple[str, Any]:
         raise SpecError(f"--set {text!r}: the value is not valid YAML") from None
 
 
-def line_of(data: Any, location: Iterable[Any]) -> int:
-    """1-based line of the deepest part of `location` that exists in `data`; 1 where none does."""
-    line = 1
-    node = data
-    for key in location:
-        try:
-            if isinstance(node, CommentedMap) and key in node:
-                line = node.lc.key(key)[0] + 1
-                node = node[key]
-            elif isinstance(node, CommentedSeq) and isinstance(key, int) and key < len(node):
-                line = node.lc.item(key)[0] + 1
-                node = node[key]
-        except (AttributeError, KeyError, TypeError):
-            break  # set by an override: it has no line
-    return line
-
-
 def validate(model: type[Model], data: CommentedMap, file: Path | None, overrides: Mapping[str, Any]) -> Model:
-    """Apply overrides and build the model; the first error becomes one `SpecError`."""
+    """Apply overrides and build the model; what is wrong becomes one `SpecError`."""
     apply_overrides(data, overrides)
     try:
         return model.model_validate(_plain(data), context={"folder": file.parent if file else Path()})
     except ValidationError as error:
-        raise _first_error(error, data, file, overrides) from None
-
-
-def _first_error(
-    error: ValidationError, data: CommentedMap, file: Path | None, overrides: Mapping[str, Any]
-) -> SpecError:
-    problems = error.errors(include_url=False)
-    # A wrong value where there are several alternatives is reported once per alternative: an unknown key
-    # says most, then what is wrong inside the alternative that was written, the deeper the better.
-    problem = max(
-        problems,
-        key=lambda p: (
-            p["type"] == "extra_forbidden",
-            not (p["type"] == "literal_error" and isinstance(p.get("input"), dict | list)),
-            len(p["loc"]),
-        ),
-    )
-    location = _keys_of(problem, data)
-    if problem["type"] == "extra_forbidden":
-        message = "unknown key"
-    elif problem["type"] == "missing":
-        message = "required key is missing"
-    else:
-        message = problem["msg"].removeprefix("Value error, ")
-        inside, message = _key_in(message, _node_at(data, location))
-        location += inside
-        given = problem.get("input")
-        if not isinstance(given, dict | list) and "," not in str(given):
-            message += f" (got {given!r})"
-    dotted = ".".join(str(key) for key in location)
-    if any(dotted == key or dotted.startswith(f"{key}.") or key.startswith(f"{dotted}.") for key in overrides):
-        return SpecError(f"{message}; set by an override", file=file, key=dotted)
-    return SpecError(message, file=file, line=line_of(data, location), key=dotted or None)
-
-
-def _node_at(data: Any, location: Iterable[Any]) -> Any:
-    """The part of `data` at `location`, None where there is none."""
-    for key in location:
-        try:
-            data = data[key]
-        except (KeyError, IndexError, TypeError):
-            return None
-    return data
-
-
-def _key_in(message: str, node: Any) -> tuple[list[Any], str]:
-    """Which key below `node` a message of a model's own check is about, and the message without it.
-
-    A check of a whole section (``tile: the letter 'X' is not defined``) is reported by pydantic for the
-    section; its text begins with the dotted key, says ``key is required``, or names keys on its way.
-    """
-    if not isinstance(node, Mapping):
-        return [], message
-    leading = re.match(r"([A-Za-z_]\w*(?:\.\w+)*)(: | is required)?", message)
-    if leading and (leading[1].split(".")[0] in node or leading[2] == " is required"):
-        path = _path_in(node, leading[1].split("."))
-        return path, message[leading.end() :] if leading[2] == ": " else message
-    named = [word for word in re.findall(r"[A-Za-z_]\w*", message) if word in node]
-    # a word with an underscore is surely meant as a key; a plain one may be just a word
-    return sorted(named, key=lambda word: "_" not in word)[:1], message
-
-
-def _path_in(node: Any, parts: list[str]) -> list[Any]:
-    """Parts of a dotted key as keys of `node`; a key of the file may itself hold dots (under sources)."""
-    joined = ".".join(parts)
-    if len(parts) <= 1 or (isinstance(node, Mapping) and joined in node):
-        return [int(joined) if isinstance(node, list) and joined.isdigit() else joined]
-    first: Any = int(parts[0]) if isinstance(node, list) and parts[0].isdigit() else parts[0]
-    return [first, *_path_in(_node_at(node, [first]), parts[1:])]
-
-
-def _keys_of(problem: Any, data: Any) -> list[Any]:
-    """The parts of a pydantic location that are keys of the file, not names of alternatives."""
-    keys: list[Any] = []
-    node = data
-    for key in problem["loc"]:
-        below = _node_at(node, [key])
-        if isinstance(node, Mapping | list) and (below is not None or (isinstance(node, Mapping) and key in node)):
-            keys.append(key)
-            node = below
-    if problem["type"] == "missing":
-        keys.append(problem["loc"][-1])
-    return keys
+        raise spec_error(error, model, data, file, overrides) from None
 
 
 def _plain(node: Any) -> Any:

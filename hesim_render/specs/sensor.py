@@ -15,6 +15,7 @@ from pydantic import Field, PositiveFloat, PositiveInt, field_validator, model_v
 from hesim_render.errors import SpecError
 from hesim_render.specs.calibration import NoiseFile, apply_calibration
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.sensor_checks import sensor_problems
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectra import Spectrum
 
@@ -25,7 +26,7 @@ NonNegative = Field(ge=0)
 class GeometrySpec(Strict):
     rows: PositiveInt
     cols: PositiveInt
-    pitch_um: PositiveFloat
+    pitch_um: float = Field(ge=0.1, le=1000)
     fill_factor: float = Field(1.0, gt=0, le=1)
     crosstalk: float = Field(0.0, ge=0, le=0.5, description="part of a pixel's electrons its 4 neighbours collect")
 
@@ -69,8 +70,8 @@ class IlluminationTable(Strict):
 class LensSpec(Strict):
     """Solid angle of the cone at the sensor: G = π / (1 + 4 N² (1 + |m|)²) sr."""
 
-    f_number: float = Field(gt=0)
-    focal_length_mm: PositiveFloat
+    f_number: float = Field(ge=0.1, le=1000)
+    focal_length_mm: float = Field(ge=0.01, le=1e5)
     transmittance: SpectrumSpec = SpectrumSpec(flat=1.0)
     magnification: float | Literal["focus"] = Field(
         "focus", description="m; 'focus' derives it from focal length and the scene's focus distance"
@@ -289,84 +290,10 @@ class SensorSpec(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> SensorSpec:
-        rows = self.tile_rows
-        for letter in dict.fromkeys("".join(rows)):
-            if letter not in self.pixels:
-                raise ValueError(f"tile: the letter {letter!r} is not defined under 'pixels'")
-        for letter, pixel in self.pixels.items():
-            if len(letter) != 1:
-                raise ValueError(f"pixels: {letter!r} must be a single letter")
-            if pixel.filter not in self.filters:
-                known = ", ".join(self.filters)
-                raise ValueError(f"pixels.{letter}.filter: no filter {pixel.filter!r}; defined are {known}")
-        if self.geometry.rows % len(rows) or self.geometry.cols % len(rows[0]):
-            raise ValueError(
-                f"geometry: {self.geometry.rows}×{self.geometry.cols} pixels are not a whole number of "
-                f"{len(rows)}×{len(rows[0])} tiles"
-            )
-        self._check_roles()
-        self._check_spectra()
-        for group in ("sources", "assumptions"):
-            for key in getattr(self, group):
-                self._require_key(group, key)
+        problems = list(sensor_problems(self))
+        if problems:
+            raise ValueError("\n".join(problems))
         return self
-
-    def _check_roles(self) -> None:
-        aps, evs = self.positions("aps"), self.positions("evs")
-        for role, positions, section in (("aps", aps, self.aps), ("evs", evs, self.evs)):
-            if bool(positions) != (section is not None):
-                raise ValueError(f"the tile has {len(positions)} {role} positions, so '{role}' must "
-                                 f"{'be given' if positions else 'be absent'}")  # fmt: skip
-        if self.aps is not None and self.aps.beta is not None:
-            shape = [[len(cell) for cell in row] for row in self.aps.beta]
-            if shape != [[6] * len(self.tile_rows[0])] * len(self.tile_rows):
-                raise ValueError("aps.beta: expected 6 coefficients for every position of the tile")
-        if self.evs is None:
-            return
-        if self.evs_grid is None:
-            raise ValueError("evs_grid is required where the tile has event pixels")
-        if self.evs_grid.rows_per_tile * self.evs_grid.cols_per_tile != len(evs):
-            raise ValueError(f"evs_grid: {self.evs_grid.rows_per_tile}×{self.evs_grid.cols_per_tile} does not hold "
-                             f"the tile's {len(evs)} event pixels")  # fmt: skip
-        if len(self.evs.coefficients) not in (1, len(evs)):
-            raise ValueError(f"evs.coefficients: expected 1 entry or {len(evs)}, one per event position")
-        reference = self.evs.signal_reference.filter
-        if reference != "own" and reference not in self.filters:
-            raise ValueError(f"evs.signal_reference.filter: no filter {reference!r}")
-
-    def _check_spectra(self) -> None:
-        from hesim_render.spectra import RENDERABLE_NM, constant, coverage
-
-        quantum_efficiency = self.quantum_efficiency.load()
-        if quantum_efficiency.values.min() < 0 or quantum_efficiency.values.max() > 1:
-            raise ValueError("quantum_efficiency must lie in [0, 1] electrons per photon")
-        for name, spec in self.filters.items():
-            values = spec.load().values
-            if values.min() < 0 or values.max() > 1.0 + 1e-9:
-                raise ValueError(f"filters.{name}: transmittance must lie in [0, 1]")
-            try:
-                response = self.filter_response(name)
-            except SpecError as error:
-                raise ValueError(f"filters.{name}: with quantum efficiency and lens, {error}") from None
-            if response.values.max() <= 0:
-                raise ValueError(f"filters.{name}: filter, quantum efficiency and lens share no wavelength")
-            if coverage(constant(1.0, *RENDERABLE_NM), response) < 0.999:
-                raise ValueError(
-                    f"filters.{name}: more than 0.1 % of the response lies outside "
-                    f"{RENDERABLE_NM[0]:g}-{RENDERABLE_NM[1]:g} nm, which cannot be rendered; add an infrared cut"
-                )
-
-    def _require_key(self, group: str, dotted: str) -> None:
-        node: Any = self
-        for key in dotted.split("."):
-            if isinstance(node, Strict):
-                node = getattr(node, key) if key in type(node).model_fields else None
-            elif isinstance(node, dict):
-                node = node.get(key)
-            else:
-                node = None
-            if node is None:
-                raise ValueError(f"{group}.{dotted}: there is no such key in this file")
 
 
 def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SensorSpec:

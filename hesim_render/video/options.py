@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, PositiveFloat, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from hesim_render.camera import Camera
-from hesim_render.errors import SpecError
 from hesim_render.specs.files import Strict
+from hesim_render.specs.problems import spec_error
 from hesim_render.transfer import InputTransfer
 from hesim_render.video.colours import Primaries, Range, YuvMatrix
 from hesim_render.video.geometry import Fit
@@ -42,13 +42,13 @@ class VideoOptions(Strict):
     lens_shading : whether the sensor's relative illumination applies; the video then is the scene, not the image.
     """
 
-    fps: PositiveFloat | None = None
-    slow_motion: PositiveFloat = 1.0
-    duty: float = Field(1.0, gt=0, le=1)
+    fps: float | None = Field(None, ge=1e-4, le=1e9)
+    slow_motion: float = Field(1.0, ge=1e-6, le=1e9)
+    duty: float = Field(1.0, ge=1e-6, le=1)
     interpolation: Literal["none", "linear", "motion"] = "none"
     motion_factor: int = Field(4, ge=2, le=64)
     transfer: InputTransfer | None = None
-    gamma: PositiveFloat | None = None
+    gamma: float | None = Field(None, ge=0.1, le=10)
     primaries: Primaries | None = None
     matrix: YuvMatrix | None = None
     range: Range | None = None
@@ -58,8 +58,8 @@ class VideoOptions(Strict):
     luma: tuple[float, float, float] = LUMA
     camera: Camera | None = None
     illuminant: str = "D65"
-    white_lux: PositiveFloat | None = None
-    white_e_per_s: PositiveFloat | None = None
+    white_lux: float | None = Field(None, ge=1e-6, le=1e9)
+    white_e_per_s: float | None = Field(None, ge=1e-6, le=1e15)
     white_filter: str | None = None
     fit: Fit = "cover"
     lens_shading: bool = False
@@ -85,13 +85,8 @@ class VideoOptions(Strict):
         SpecError
             For an unknown name or a value out of range, with the name.
         """
+        wanted = {name: value for name, value in given.items() if value is not None}
         try:
-            return cls(**{name: value for name, value in given.items() if value is not None})
+            return cls(**wanted)
         except ValidationError as error:
-            problem = error.errors(include_url=False)[0]
-            key = ".".join(map(str, problem["loc"])) or None
-            message = problem["msg"].removeprefix("Value error, ")
-            raise SpecError(
-                f"{message} (it is {problem['input']!r})" if key and problem["type"] != "extra_forbidden" else message,
-                key=key,
-            ) from None
+            raise spec_error(error, cls, wanted) from None

@@ -1,0 +1,64 @@
+"""The command line. Heavy modules are imported inside the commands, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
+from hesim_render.errors import HesimError
+from hesim_render.output import discard_unfinished
+from hesim_render.terminal import complain, silence_stdout
+
+#: Exit status where the user can help it.
+_REFUSED = 2
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point. Exit status 0; 2 with a line on stderr for each mistake of the user; 130 when interrupted.
+
+    3 where a recording is complete, but worse than the quality that was asked for. Where nobody reads the output any
+    more (``| head``) a run goes on to its end, and has the status it has.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    with Interrupts() as interrupts:
+        status = _run(given, interrupts)
+        if status == INTERRUPTED:  # newer typer turns the exception into this status itself
+            discard_unfinished()
+            complain("interrupted")
+    sys.exit(status)
+
+
+def _run(given: list[str], interrupts: Interrupts) -> int:
+    """The exit status of one command."""
+    usage_error: Any = ()
+    try:
+        import typer
+
+        from hesim_render.cli.commands import app
+
+        # typer carries its own copy of click in newer versions; this is the base of its usage errors in all
+        usage_error = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
+        status = app(args=given or ["--help"], standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except SystemExit as stop:
+        if stop.code == 1:  # so typer ends where its own output, such as the help, meets a closed pipe
+            silence_stdout()
+            return 0
+        raise
+    except Exception as error:
+        if interrupts.happened or type(error).__name__ == "Abort":
+            return INTERRUPTED
+        if isinstance(error, HesimError):
+            complain(*str(error).splitlines())
+        elif isinstance(error, usage_error):
+            complain(error.format_message().replace("Value error, ", ""))
+        elif isinstance(error, OSError):
+            silence_stdout()
+            complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+        else:
+            raise
+        return _REFUSED

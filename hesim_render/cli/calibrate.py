@@ -1,0 +1,78 @@
+"""Captures and what follows from them: ``lab`` and ``calibrate``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, Without, cropped, names_of, sensor_keys_only
+from hesim_render.output import check_target
+from hesim_render.progress import progress_report
+from hesim_render.terminal import parse_exposures, say, split_overrides
+
+
+class Part(StrEnum):
+    """What of a sensor is calibrated."""
+
+    aps = "aps"
+    evs = "evs"
+
+
+def lab(
+    sensor: Annotated[str, typer.Argument(help=SENSOR_HELP, autocompletion=names_of("sensors"))],
+    out: Annotated[Path, typer.Option(help="folder to write the capture set to")],
+    roi: Annotated[
+        str, typer.Option(help="WIDTHxHEIGHT or ...+X+Y, px, or 'full' (gigabytes of frames for a large sensor)")
+    ] = "256x256",
+    frames: Annotated[int, typer.Option(help="frames per exposure, dark and lit")] = 64,
+    ticks: Annotated[int, typer.Option(help="event comparisons on the static target, and in the dark")] = 20000,
+    dark_ms: Annotated[str, typer.Option(help="dark exposures, ms")] = "1,5,20,50,80",
+    lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
+    illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
+    seed: Annotated[int, typer.Option(help="of all temporal noise")] = 7,
+    set_: SensorKeys = None,
+    without: Without = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """A virtual calibration session: dark and lit captures to calibrate from."""
+    scene_changes, changes = split_overrides(set_ or [])
+    sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
+    exposures = {"dark_exposures_us": parse_exposures(dark_ms), "lit_exposures_us": parse_exposures(lit_ms)}
+    check_target(out, "capture.yaml", overwrite)
+    from hesim_render.lab import write_captures
+    from hesim_render.sensor import load_sensor
+
+    loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
+    if loaded.spec.evs is not None and loaded.spec.evs.reference == "last_event":
+        say(
+            "frames only: events of reference 'last_event' have no fixed comparisons to count, and their "
+            "calibration is not covered"
+        )
+    with progress_report(f"lab {sensor}") as progress:
+        folder = write_captures(
+            loaded, out, frames=frames, ticks=ticks, seed=seed, without=without or (), illuminant=illuminant,
+            overwrite=overwrite, progress=progress, **exposures,
+        )  # fmt: skip
+    for file in sorted(folder.iterdir()):
+        say(f"{file.stat().st_size / 1e6:10.1f} MB  {out / file.name}")
+
+
+def calibrate(
+    part: Annotated[Part, typer.Argument(help="aps (frames) or evs (events)")],
+    captures: Annotated[Path, typer.Argument(help="folder of a capture set")],
+    out: Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")],
+    report: Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")] = None,
+) -> None:
+    """Noise parameters from captures, into a file that a sensor file can point at."""
+    from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
+    from hesim_render.calibrate.summary import summary_lines
+
+    run = calibrate_aps if part is Part.aps else calibrate_evs
+    with progress_report(f"calibrate {part.value}") as move:
+        run(captures, out, report, lambda what, fraction: move(fraction, 1.0, what))
+    lines = summary_lines(read_calibration(out), part.value)
+    where = [f"in {out}"] if report is None else [f"in {out}", f"report: {report}"]
+    say("\n".join([*lines, *where]))

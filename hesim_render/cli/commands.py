@@ -1,0 +1,38 @@
+"""All commands together, in the order of the help."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from hesim_render import __version__
+from hesim_render.cli import calibrate, doctor, look, simulate, video
+from hesim_render.terminal import say
+
+app = typer.Typer(
+    name="hesim-render",
+    help="Render a scene, or turn a video, into RAW frames and events of a hybrid event-frame sensor.",
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        say(f"hesim-render {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _app(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say which.")] = False,
+) -> None:
+    pass
+
+
+for _command in (
+    doctor.doctor, doctor.list_, simulate.simulate, video.video, simulate.demo, calibrate.lab, calibrate.calibrate,
+    look.isp, look.view,
+):  # fmt: skip
+    app.command(_command.__name__.rstrip("_"))(_command)

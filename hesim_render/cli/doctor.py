@@ -1,0 +1,69 @@
+"""What runs here, and what there is to run: ``doctor`` and ``list``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from hesim_render.terminal import complain, say
+
+
+class Kind(StrEnum):
+    """What can be listed."""
+
+    scenes = "scenes"
+    sensors = "sensors"
+    illuminants = "illuminants"
+    noise = "noise"
+
+
+def doctor() -> None:
+    """Say what this machine can run, and what to install where it can run nothing."""
+    from hesim_render import backend
+    from hesim_render.manifest import software_versions
+
+    for name, version in software_versions().items():
+        say(f"{name:<14}{version}")
+    found = [backend.probe(candidate) for candidate in backend.candidates()]
+    for candidate in found:
+        verdict = "works" if candidate.works else f"does not work: {candidate.reason}"
+        say(f"{'candidate':<14}{candidate.describe()} - {verdict}")
+    chosen = next((candidate for candidate in found if candidate.works), None)
+    if chosen is None:
+        say(f"{'backend':<14}none")
+        complain(f"no Dr.Jit backend works on this machine: {backend.INSTALL_HINT}")
+        raise typer.Exit(2)
+    say(f"{'backend':<14}{chosen.describe()}, Mitsuba variant {chosen.backend}_ad_spectral")
+
+
+def list_(
+    kind: Annotated[Kind | None, typer.Argument(help="scenes, sensors, illuminants or noise; default all")] = None,
+) -> None:
+    """List the names that can be used."""
+    if kind is not None:
+        say("\n".join(_lines_of(kind)))
+        return
+    for each in Kind:
+        say("\n".join([f"{each.value}:", *(f"  {line}" for line in _lines_of(each))]))
+
+
+def _lines_of(kind: Kind) -> list[str]:
+    """One line for each name of a kind, with what it is where a file says so."""
+    if kind is Kind.illuminants:
+        from hesim_render.spectra import illuminant_names
+
+        return illuminant_names()
+    if kind is Kind.noise:
+        from hesim_render.capture import NOISE_TERMS
+
+        return list(NOISE_TERMS)
+    from hesim_render.specs.files import data_folder, list_names, load_yaml
+
+    names = list_names(kind.value)
+    width = max((len(name) for name in names), default=0)
+    files = (data_folder(kind.value) / f"{name}.yaml" for name in names)
+    return [
+        f"{name:<{width}}  {load_yaml(file).get('description', '')}" for name, file in zip(names, files, strict=True)
+    ]

@@ -1,0 +1,67 @@
+"""Ctrl-C: a run ends on it within two seconds, also in native code that does not return to Python."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from typing import Any
+
+from hesim_render.output import discard_unfinished
+
+#: Exit status of what was interrupted: 128 + SIGINT, as shells have it.
+INTERRUPTED = 130
+#: So long Python has to end the run itself, s.
+GRACE_S = 1.5
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupts:
+    """SIGINT and SIGTERM end a run alike; and are remembered, for a library may turn the exception into its own.
+
+    Python runs its signal handlers between two of its own instructions, so that a long call of native code would hold
+    an interrupt up. The C part of Python's handler writes the signal's number into a pipe at once, though: a thread
+    reads it there, gives the main thread `GRACE_S`, then removes what is unfinished and ends the process.
+    """
+
+    def __init__(self) -> None:
+        self.happened = False
+        self._before: dict[int, Any] = {}
+        self._ended = threading.Event()
+
+    def _note(self, *_: Any) -> None:
+        self.happened = True
+        raise KeyboardInterrupt
+
+    def __enter__(self) -> Interrupts:
+        self._reading, self._writing = os.pipe()
+        os.set_blocking(self._writing, False)
+        self._wakeup_before = signal.set_wakeup_fd(self._writing, warn_on_full_buffer=False)
+        threading.Thread(target=self._watch, name="interrupts", daemon=True).start()
+        for number in _SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def _watch(self) -> None:
+        while received := os.read(self._reading, 64):
+            if any(number in received for number in self._before):
+                break
+        else:
+            os.close(self._reading)
+            return
+        if self._ended.wait(GRACE_S):
+            os.close(self._reading)
+            return
+        discard_unfinished()
+        show_cursor = "\x1b[?25h\r\x1b[2K" if sys.stderr.isatty() else ""
+        os.write(2, f"{show_cursor}hesim-render: interrupted\n".encode())
+        os._exit(INTERRUPTED)
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._wakeup_before)
+        os.close(self._writing)

@@ -1,0 +1,51 @@
+"""Looking at recordings: ``isp`` and ``view``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hesim_render.cli.options import Overwrite
+from hesim_render.output import output_errors
+from hesim_render.progress import progress_report
+from hesim_render.terminal import say, summary
+
+
+def isp(
+    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
+    out: Annotated[Path | None, typer.Option(help="folder of the pictures; default NAME-pictures beside it")] = None,
+    pipeline: Annotated[Path | None, typer.Option(help="YAML file that changes the steps (docs/isp.md)")] = None,
+    no_denoise: Annotated[bool, typer.Option("--no-denoise", help="leave noise and row offsets as they are")] = False,
+    calibration: Annotated[
+        Path | None, typer.Option(help="calibration.yaml of a calibrated sensor, for its maps")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Develop the RAW frames of a recording into pictures."""
+    from hesim_render.isp import DENOISED_PICTURE, develop_recording, load_pipeline
+    from hesim_render.isp.develop import MARKER
+
+    steps = DENOISED_PICTURE if pipeline is None else load_pipeline(pipeline)
+    if no_denoise:
+        steps = steps.without("denoise")
+    with progress_report(f"developing {recording}") as progress:
+        folder = develop_recording(recording, out, steps, progress, overwrite, calibration)
+    say(f"pictures in {folder}")
+    noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
+    if noise is not None and noise["maps"] == "unknown":
+        say("the maps of the sensor's calibration are not in a recording: --calibration FILE takes them out")
+
+
+def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:
+    """Summarise a recording and write its previews anew."""
+    from hesim_render.recording import Recording
+    from hesim_render.showcase import write_previews
+
+    loaded = Recording.load(recording)
+    assert loaded.path is not None
+    with output_errors(loaded.path):
+        write_previews(loaded, loaded.path)
+    say(summary(loaded))

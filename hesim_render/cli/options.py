@@ -1,0 +1,91 @@
+"""What commands share: options, names to complete, and checks before any work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hesim_render.errors import RangeError
+from hesim_render.output import check_target
+from hesim_render.terminal import parse_roi, say
+
+if TYPE_CHECKING:
+    from hesim_render.progress import ProgressReport
+    from hesim_render.sensor import Sensor
+
+
+def names_of(kind: str) -> Callable[[str], list[str]]:
+    """Completes the names of shipped files of a kind, ``scenes`` or ``sensors``."""
+
+    def complete(incomplete: str) -> list[str]:
+        from hesim_render.specs.files import list_names
+
+        return [name for name in list_names(kind) if name.startswith(incomplete)]
+
+    return complete
+
+
+def _noise_terms(incomplete: str) -> list[str]:
+    from hesim_render.capture import NOISE_TERMS
+
+    return [name for name in NOISE_TERMS if name.startswith(incomplete)]
+
+
+SENSOR_HELP = "a name (see 'list sensors') or the path of a sensor file"
+
+#: Options that several commands share.
+SensorFile = Annotated[str, typer.Option(help=SENSOR_HELP, autocompletion=names_of("sensors"))]
+Region = Annotated[str | None, typer.Option(help="part of the sensor read out: WIDTHxHEIGHT or ...+X+Y, px")]
+SensorKeys = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="sensor.KEY=VALUE", help="change a key of the sensor file; repeatable"),
+]
+Clean = Annotated[bool, typer.Option("--clean", help="no noise at all")]
+Without = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TERM",
+        help="switch one noise term off, as aps.read (see 'list noise'); repeatable",
+        autocompletion=_noise_terms,
+    ),
+]
+#: Runs that take longer, by estimate, ask to be wanted.
+LONG_MINUTES = 30
+Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace what is there")]
+
+
+def check_duration(duration_s: float) -> None:
+    if not 0 < duration_s < float("inf"):
+        raise RangeError("--duration", duration_s, "a time above 0, in seconds")
+
+
+def check_output(out: Path, overwrite: bool) -> None:
+    """Refuse a bad output folder before anything is rendered."""
+    from hesim_render.manifest import MANIFEST_NAME
+
+    check_target(out, MANIFEST_NAME, overwrite)
+
+
+def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:
+    """Refuse ``--set`` of anything but a sensor file where there is no scene file."""
+    for key in scene_changes:
+        raise RangeError("--set", key, f"a key of the sensor file, as {example}")
+
+
+def cropped(sensor: Sensor, roi: str | None) -> Sensor:
+    """The sensor with the region of ``--roi``."""
+    return sensor if roi is None else sensor.crop(*parse_roi(roi))
+
+
+def told_beside(progress: ProgressReport) -> Callable[[object], None]:
+    """Prints what a run will take, while the progress gives way."""
+
+    def tell(expected: object) -> None:
+        with progress.paused():
+            say(f"estimate: {expected}")
+
+    return tell

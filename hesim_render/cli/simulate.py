@@ -1,0 +1,114 @@
+"""Scenes into recordings: ``simulate`` and ``demo``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from hesim_render.cli.options import (
+    LONG_MINUTES,
+    Clean,
+    Overwrite,
+    Region,
+    SensorFile,
+    Without,
+    Yes,
+    check_duration,
+    check_output,
+    cropped,
+    names_of,
+    told_beside,
+)
+from hesim_render.progress import progress_report
+from hesim_render.terminal import is_short_of_wish, say, split_overrides, summary
+
+if TYPE_CHECKING:
+    from hesim_render.recording import Recording
+
+_NOT_MET = 3  # a recording is there, but worse than the quality that was asked for
+_DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
+
+
+def simulate(
+    scene: Annotated[
+        str,
+        typer.Argument(
+            help="a name (see 'list scenes') or the path of a scene file", autocompletion=names_of("scenes")
+        ),
+    ],
+    sensor: SensorFile,
+    out: Annotated[Path, typer.Option(help="folder to write the recording to")],
+    duration: Annotated[float, typer.Option(help="simulated time, s")] = 0.1,
+    roi: Region = None,
+    seed: Annotated[int, typer.Option(help="of all noise and of the render")] = 7,
+    quality: Annotated[
+        float | None, typer.Option(help="error of the render as a part of the sensor's noise (default 0.5)")
+    ] = None,
+    exact: Annotated[bool, typer.Option("--exact", help="render every pixel of every slice, all alike")] = False,
+    samples: Annotated[int | None, typer.Option(help="with --exact: rays per pixel and slice of time")] = None,
+    yes: Yes = False,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="change a key of the scene file, or with sensor. of the sensor file"
+        ),
+    ] = None,
+    clean: Clean = False,
+    without: Without = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Render a scene and record it: RAW frames, events and their ground truth.
+
+    Ends with status 3 where the audit finds that the recording is worse than --quality asks for.
+    """
+    check_duration(duration)
+    scene_changes, sensor_changes = split_overrides(set_ or [])
+    recording = _simulate(
+        scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
+        overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
+        max_minutes=None if yes else LONG_MINUTES,
+        clean=clean, without=without or (),
+    )  # fmt: skip
+    say(summary(recording))
+    if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
+        raise typer.Exit(_NOT_MET)
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
+) -> None:
+    """Two small recordings with pictures: a ColorChecker, and a moving scene."""
+    runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
+    for target in runs:
+        check_output(target, overwrite=True)
+    for target, (scene, sensor) in runs.items():
+        recording = _simulate(scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        say(summary(recording) + "\n")
+    still, moving = runs
+    say(f"Look at {still / 'preview.png'} (24 measured patches)")
+    say(f"    and {moving / 'preview.gif'} (events of a moving scene).")
+
+
+def _simulate(
+    scene: str,
+    sensor: str,
+    out: Path,
+    *,
+    scene_changes: dict[str, Any] | None = None,
+    sensor_changes: dict[str, Any] | None = None,
+    roi: str | None = None,
+    overwrite: bool = False,
+    **options: Any,
+) -> Recording:
+    check_output(out, overwrite)
+    import hesim_render as hr
+
+    loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
+    loaded_scene = hr.load_scene(scene, scene_changes)
+    with progress_report(f"{scene} → {sensor}") as progress:
+        return hr.simulate(
+            loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
+            on_estimate=told_beside(progress), **options,
+        )  # fmt: skip

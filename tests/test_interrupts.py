@@ -1,0 +1,113 @@
+"""Ctrl-C: two seconds at most from anywhere in the command line, a KeyboardInterrupt in Python; nothing is left."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
+
+#: A lock that is taken twice: native code that never comes back, and that no signal wakes.
+_NEVER = """
+import ctypes, sys
+from hesim_render import manifest
+from hesim_render.cli import main
+from hesim_render.output import OutputFolder
+def never():
+    folder = OutputFolder(sys.argv[1], "marker")
+    (folder.path / "half").write_text("x")
+    print("there", flush=True)
+    lock, libc = ctypes.create_string_buffer(256), ctypes.CDLL(None)
+    libc.pthread_mutex_lock(lock), libc.pthread_mutex_lock(lock)
+manifest.software_versions = never
+main(["doctor"])
+"""
+#: The run takes the interrupt at its next step, within Python or where native code comes back.
+_IN_PYTHON = """
+import hesim_render as hr
+import sys, time
+sensor, scene = hr.load_sensor("gen2").crop(256, 256), hr.load_scene("rotating-star")
+try:
+    print("there", flush=True)
+    hr.simulate(scene, sensor, duration_s=20, quality=2)
+except BaseException as error:
+    print(type(error).__name__, flush=True)
+"""
+
+
+def _start(*command):
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # a test run in the background of a shell ignores SIGINT, and its children would too
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+def _interrupt(child, number=signal.SIGINT):
+    """Exit status, what it said, and how long it took from the signal."""
+    begin = time.monotonic()
+    os.kill(child.pid, number)
+    out, err = child.communicate(timeout=60)
+    return child.returncode, out, err, time.monotonic() - begin
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_native_code_that_never_returns_is_ended_and_cleaned_up_after(number, tmp_path):
+    child = _start(sys.executable, "-c", _NEVER, str(tmp_path / "o"))
+    assert child.stdout.readline() == "there\n" and len(list(tmp_path.iterdir())) == 1
+    status, _, err, seconds = _interrupt(child, number)
+    assert (status, err) == (INTERRUPTED, "hesim-render: interrupted\n")
+    assert seconds < 2.0 and list(tmp_path.iterdir()) == []
+
+
+def test_python_gets_a_keyboard_interrupt_at_the_next_step():
+    child = _start(sys.executable, "-c", _IN_PYTHON)
+    assert child.stdout.readline() == "there\n"
+    time.sleep(2.0)
+    status, out, err, _ = _interrupt(child)
+    assert (status, out, err) == (0, "KeyboardInterrupt\n", "")
+
+
+def test_handlers_are_put_back():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    wakeup = signal.set_wakeup_fd(-1)
+    signal.set_wakeup_fd(wakeup)
+    with Interrupts() as interrupts, pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5)
+    assert interrupts.happened
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert signal.set_wakeup_fd(wakeup) == wakeup
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12))
+def test_a_command_ends_within_two_seconds_whenever_it_is_interrupted(seed, tmp_path):
+    """While Python starts, Mitsuba loads, kernels compile or rays are traced: instants by a seeded generator."""
+    run = random.Random(seed)
+    scene = run.choice(["rotating-star", "camera-sweep", "cornell-box"])
+    child = _start(
+        sys.executable, "-m", "hesim_render.cli", "simulate", scene, "--sensor", "gen2", "--roi", "512x384",
+        "--duration", "5", "--yes", "--out", str(tmp_path / "o"),
+    )  # fmt: skip
+    time.sleep(run.uniform(0.4, 12.0))
+    status, _, err, seconds = _interrupt(child)
+    assert status == INTERRUPTED and err.endswith("hesim-render: interrupted\n") and "Traceback" not in err
+    assert seconds < 2.0 and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_python_gets_a_keyboard_interrupt_whenever_it_is_interrupted(seed):
+    child = _start(sys.executable, "-c", _IN_PYTHON)
+    assert child.stdout.readline() == "there\n"
+    time.sleep(random.Random(seed).uniform(0.1, 10.0))
+    status, out, err, _ = _interrupt(child)
+    assert (status, out, err) == (0, "KeyboardInterrupt\n", "")
