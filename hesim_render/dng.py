@@ -8,7 +8,10 @@ makes its pixels. Tags follow DNG 1.4 and TIFF/EP (ISO 12234-2).
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.errors import SpecError
+from hesim_render.guard import reading
 from hesim_render.mosaic import Mosaic
 
 PHOTOMETRIC_CFA = 32803
@@ -73,6 +78,40 @@ def write_dng(
         with tifffile.TiffFile(path, mode="r+") as written:
             page = written.pages[0].aspage()
             page.tags[_PHOTOMETRIC_TAG].overwrite(PHOTOMETRIC_LINEAR_RAW)
+
+
+def read_dng(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """The DN of a frame that `write_dng` wrote, [row, col].
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, or is not uncompressed uint16 of that `shape`.
+    """
+    import tifffile
+
+    with reading(path, "as a DNG file"), _quiet("tifffile"), tifffile.TiffFile(path) as file:
+        page = file.pages[0].aspage()
+        if page.shape != shape or page.dtype != np.uint16 or page.compression != 1:
+            raise SpecError(
+                f"holds {page.dtype} of {page.shape}; expected uncompressed uint16 of {shape}, as the manifest says",
+                file=path,
+            )
+        if sum(page.databytecounts) != 2 * shape[0] * shape[1]:
+            raise SpecError("holds fewer or more pixels than it says", file=path)
+        return page.asarray()
+
+
+@contextlib.contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """A library's log, off: what it would say of a damaged file is in our one error."""
+    log = logging.getLogger(name)
+    before = log.disabled
+    log.disabled = True
+    try:
+        yield
+    finally:
+        log.disabled = before
 
 
 def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.layout import Layout
+from hesim_render.manifest import sensor_spec
 from hesim_render.noise.aps import ADC_VARIANCE_DN2, APS_TERMS, ApsNoise
 from hesim_render.specs.calibration import NoiseFile, read_calibration, read_maps
 from hesim_render.specs.sensor import SensorSpec
@@ -93,7 +94,9 @@ class FrameNoise:
         )
 
     @classmethod
-    def of_recording(cls, manifest: Mapping[str, Any], calibration: str | Path | None = None) -> FrameNoise:
+    def of_recording(
+        cls, manifest: Mapping[str, Any], calibration: str | Path | None = None, folder: Path | None = None
+    ) -> FrameNoise:
         """Of the sensor that made a recording, less the terms that were switched off.
 
         Parameters
@@ -101,13 +104,14 @@ class FrameNoise:
         manifest : of the recording.
         calibration : the ``calibration.yaml`` of a calibrated sensor, whose maps a recording does not hold; without
             it the maps are taken as unknown.
+        folder : of the recording, for errors.
 
         Raises
         ------
         SpecError
-            If the calibration is not the one that the sensor had.
+            If the manifest holds no sensor that this version knows, or the calibration is not the one it had.
         """
-        spec = SensorSpec.model_validate(manifest["sensor"]["spec"])
+        spec = sensor_spec(manifest, folder)
         settings, roi = manifest.get("settings", {}), manifest["roi"]
         without = (name.removeprefix("aps.") for name in settings.get("without", ()) if name.startswith("aps."))
         off = frozenset(APS_TERMS) if settings.get("clean") else frozenset(without)

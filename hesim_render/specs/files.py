@@ -86,7 +86,7 @@ def load_yaml(file: Path) -> CommentedMap:
     return data
 
 
-def apply_overrides(data: CommentedMap, overrides: Mapping[str, Any]) -> None:
+def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> None:
     """Set dotted keys (``aps.read_noise_e``; list items by number) in place, before validation."""
     for dotted, value in overrides.items():
         node: Any = data
@@ -123,8 +123,10 @@ def parse_override(text: str) -> tuple[str, Any]:
         raise SpecError(f"--set {text!r}: the value is not valid YAML") from None
 
 
-def line_of(data: Any, location: Iterable[Any]) -> int:
-    """1-based line of the deepest part of `location` that exists in `data`; 1 where none does."""
+def line_of(data: Any, location: Iterable[Any]) -> int | None:
+    """1-based line of the deepest part of `location` that exists in `data`; 1 where none does, None for JSON."""
+    if not isinstance(data, CommentedMap):
+        return None
     line = 1
     node = data
     for key in location:
@@ -140,7 +142,7 @@ def line_of(data: Any, location: Iterable[Any]) -> int:
     return line
 
 
-def validate(model: type[Model], data: CommentedMap, file: Path | None, overrides: Mapping[str, Any]) -> Model:
+def validate(model: type[Model], data: dict[str, Any], file: Path | None, overrides: Mapping[str, Any]) -> Model:
     """Apply overrides and build the model; the first error becomes one `SpecError`."""
     apply_overrides(data, overrides)
     try:
@@ -150,7 +152,7 @@ def validate(model: type[Model], data: CommentedMap, file: Path | None, override
 
 
 def _first_error(
-    error: ValidationError, data: CommentedMap, file: Path | None, overrides: Mapping[str, Any]
+    error: ValidationError, data: dict[str, Any], file: Path | None, overrides: Mapping[str, Any]
 ) -> SpecError:
     problems = error.errors(include_url=False)
     # A wrong value where there are several alternatives is reported once per alternative: an unknown key
