@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import YAMLError
 
 from hesim_render.errors import SpecError
+from hesim_render.specs.yamlfile import read_yaml
 
 
 class Strict(BaseModel):
@@ -64,26 +65,7 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
 
 def load_yaml(file: Path) -> CommentedMap:
     """The mapping in a YAML file, with line numbers kept."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise SpecError(f"cannot be read ({error.strerror})", file=file) from None
-    except UnicodeDecodeError:
-        raise SpecError("is not a UTF-8 text file", file=file) from None
-    try:
-        data = YAML(typ="rt").load(text)
-    except MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        raise SpecError(
-            f"not valid YAML: {error.problem or error.context}",
-            file=file,
-            line=mark.line + 1 if mark else None,
-        ) from None
-    except YAMLError as error:
-        raise SpecError(f"not valid YAML: {str(error).splitlines()[0]}", file=file) from None
-    if not isinstance(data, CommentedMap):
-        raise SpecError("expected a mapping of keys to values at the top level", file=file, line=1)
-    return data
+    return read_yaml(file)
 
 
 def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> None:
