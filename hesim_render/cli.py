@@ -13,6 +13,7 @@ import typer
 
 from hesim_render import __version__
 from hesim_render.errors import HesimError, RangeError
+from hesim_render.guard import printable
 from hesim_render.output import check_target, discard_unfinished, output_errors
 from hesim_render.terminal import (
     Interrupts,
@@ -148,6 +149,9 @@ def simulate(
     ] = None,
     clean: Clean = False,
     without: Without = None,
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a scene and record it: RAW frames, events and their ground truth.
@@ -160,7 +164,7 @@ def simulate(
         scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
         overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
         max_minutes=None if yes else LONG_MINUTES, on_estimate=lambda expected: typer.echo(f"estimate: {expected}"),
-        clean=clean, without=without or (),
+        clean=clean, without=without or (), allow_outside=allow_outside,
     )  # fmt: skip
     typer.echo(summary(recording))
     if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
@@ -378,6 +382,7 @@ def _simulate(
     sensor_changes: dict[str, Any] | None = None,
     roi: str | None = None,
     overwrite: bool = False,
+    allow_outside: bool = False,
     **options: Any,
 ) -> Recording:
     _check_output(out, overwrite)
@@ -386,7 +391,7 @@ def _simulate(
     loaded_sensor = hr.load_sensor(sensor, sensor_changes)
     if roi is not None:
         loaded_sensor = loaded_sensor.crop(*parse_roi(roi))
-    loaded_scene = hr.load_scene(scene, scene_changes)
+    loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
     with progress_bar(f"{scene} → {sensor}") as progress:
         return hr.simulate(loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress, **options)
 
@@ -421,7 +426,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _fail(message: str) -> None:
-    sys.stderr.write(f"hesim-render: {' '.join(message.split())}\n")
+    sys.stderr.write(f"hesim-render: {printable(' '.join(message.split()))}\n")
     sys.exit(2)
 
 

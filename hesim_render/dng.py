@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
-from hesim_render.guard import reading
+from hesim_render.guard import printable, reading
 from hesim_render.mosaic import Mosaic
 
 PHOTOMETRIC_CFA = 32803
@@ -119,14 +119,14 @@ def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:
     exposure = Fraction(exposure_us, 1_000_000).limit_denominator(1_000_000)
     tags = [
         (271, _ASCII, 0, "hesim_render", True),
-        (272, _ASCII, 0, mosaic.sensor, True),
+        (272, _ASCII, 0, _ascii(mosaic.sensor), True),
         (274, _SHORT, 1, 1, True),  # Orientation: row 0 at the top
         (33434, _RATIONAL, 1, (exposure.numerator, exposure.denominator), True),
         (33437, _RATIONAL, 1, _rational(mosaic.f_number), True),
         (37386, _RATIONAL, 1, _rational(mosaic.focal_length_mm), True),
         (50706, _BYTE, 4, bytes((1, 4, 0, 0)), True),  # DNGVersion
         (50707, _BYTE, 4, bytes((1, 1, 0, 0)), True),  # DNGBackwardVersion
-        (50708, _ASCII, 0, f"hesim_render {mosaic.sensor}", True),  # UniqueCameraModel
+        (50708, _ASCII, 0, f"hesim_render {_ascii(mosaic.sensor)}", True),  # UniqueCameraModel
         (50714, _RATIONAL, 1, _rational(mosaic.black_level_dn), True),
         (50717, _SHORT, 1, mosaic.white_level_dn, True),
     ]
@@ -146,6 +146,11 @@ def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:
         (50728, _RATIONAL, neutral.size, _rationals(neutral), True),  # AsShotNeutral
         (50778, _SHORT, 1, _D65, True),  # CalibrationIlluminant1
     ]
+
+
+def _ascii(text: str) -> str:
+    """What an ASCII tag can hold of a name."""
+    return printable(text).encode("ascii", "backslashreplace").decode("ascii")
 
 
 def _by_plane(mosaic: Mosaic, planes: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

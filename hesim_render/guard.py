@@ -56,6 +56,16 @@ def reason(error: BaseException) -> str:
     return lines[0][:200] if lines and lines[0].strip() else type(error).__name__
 
 
+def leads_out(folder: Path, name: str | Path) -> bool:
+    """Whether a name, relative to a folder, stands for something that is not in it; links are followed."""
+    return not (folder / name).resolve().is_relative_to(folder.resolve())
+
+
+def printable(text: str) -> str:
+    """A text on one line without what moves the cursor, changes colours or turns the direction of writing."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 def inside(folder: Path, name: str, *, file: str | Path | None = None, key: str | None = None) -> Path:
     """The file `name` in `folder`, which must be there and not elsewhere.
 
@@ -70,9 +80,9 @@ def inside(folder: Path, name: str, *, file: str | Path | None = None, key: str 
     """
     told = folder / name if file is None else file
     with reading(told):
-        path, root = (folder / name).resolve(), folder.resolve()
-        if not path.is_relative_to(root):
-            raise SpecError(f"{name!r} leads out of its folder {root}", file=told, key=key)
+        if leads_out(folder, name):
+            raise SpecError(f"{name!r} leads out of its folder {folder.resolve()}", file=told, key=key)
+        path = (folder / name).resolve()
         if not path.is_file():
             raise SpecError(f"no such file: {folder / name}" if key else "no such file", file=told, key=key)
     return path

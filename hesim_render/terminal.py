@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hesim_render.errors import RangeError
+from hesim_render.guard import printable
 
 if TYPE_CHECKING:
     from hesim_render.recording import Recording
@@ -57,8 +58,9 @@ def progress_bar(title: str) -> Iterator[Any]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        title = printable(title)
         task = bar.add_task(title, total=None)
 
         def move(done: float, total: float, what: str) -> None:
@@ -91,7 +93,7 @@ def summary(recording: Recording) -> str:
     if recording.path is not None:
         pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
         lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def _reached(render: dict[str, Any] | None) -> list[str]:

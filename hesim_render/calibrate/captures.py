@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from hesim_render.errors import SpecError
+from hesim_render.guard import inside
 from hesim_render.npzfile import member_header, read_arrays, stream_member
 from hesim_render.specs.files import Strict, load_yaml, validate
 from hesim_render.specs.geometry import Region
@@ -118,8 +119,8 @@ def read_captures(folder: str | Path) -> CaptureSet:
     spec = validate(CaptureSpec, load_yaml(file), file, {})
     sensor = None
     if spec.sensor is not None:
-        beside = path / spec.sensor
-        sensor = read_sensor(beside if beside.is_file() else spec.sensor)
+        is_name = Path(spec.sensor).name == spec.sensor.removesuffix(".yaml") and not (path / spec.sensor).exists()
+        sensor = read_sensor(spec.sensor if is_name else inside(path, spec.sensor, file=file, key="sensor"))
         tile = len(sensor.tile_rows), len(sensor.tile_rows[0])
         if tile != (spec.tile_rows, spec.tile_cols):
             raise SpecError(

@@ -65,12 +65,18 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
             raise SpecError(f"no such Mitsuba scene file: {path}", file=spec.file, key="mitsuba.file")
         where = (path, None)
 
+    root: Path | None = None  # a dictionary that a program gave is its own
+    if not spec.allow_outside and spec.file is not None:
+        root = spec.folder
+    elif not spec.allow_outside and source.file is not None:
+        root = path.parent
+
     def load(review: Callable[[Any], None]) -> Any:
         with as_spec_error(*where):
             if source.file is not None:
-                return load_scene(mi, path, review)
+                return load_scene(mi, path, review, root)
             own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {}, spec.file)
-            return load_scene(mi, {"type": "scene", **own}, review)
+            return load_scene(mi, {"type": "scene", **own}, review, root)
 
     moving = [track.object for track in spec.motion]
     reason: str | None = None
