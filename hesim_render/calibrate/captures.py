@@ -183,6 +183,12 @@ class FrameStack:
                 f"frames of {rows}×{cols} pixels are not whole tiles of {spec.tile_rows}×{spec.tile_cols}",
                 file=self.file,
             )
+        if spec.roi is not None and (rows, cols) != (spec.roi.height_px, spec.roi.width_px):
+            raise SpecError(
+                f"frames of {rows}×{cols} pixels are not the roi of capture.yaml, "
+                f"{spec.roi.height_px}×{spec.roi.width_px}",
+                file=self.file,
+            )
         return exposures.astype(np.int64)
 
     def __iter__(self) -> Iterator[NDArray]:

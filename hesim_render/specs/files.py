@@ -7,10 +7,13 @@ import io
 import json
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+import numpy as np
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
+from pydantic_core import PydanticCustomError, core_schema
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
@@ -19,12 +22,36 @@ from hesim_render.errors import SpecError
 from hesim_render.specs.yamlfile import read_yaml
 
 
+def _number(value: Any, wanted: str) -> Any:
+    """Neither text nor true and false are numbers, though pydantic would make some of them."""
+    if isinstance(value, str | bytes | bool | np.bool_):
+        raise PydanticCustomError("number", "expected {wanted}", {"wanted": wanted})
+    return value
+
+
+def _numbers_only(schema: Any) -> Any:
+    """A pydantic schema in which every int and float takes numbers alone, whatever stands around it."""
+    if isinstance(schema, list | tuple):
+        return type(schema)(map(_numbers_only, schema))
+    if not isinstance(schema, dict):
+        return schema
+    inner = {key: _numbers_only(part) for key, part in schema.items()}
+    if schema.get("type") not in ("int", "float"):
+        return inner
+    wanted = "a number" if schema["type"] == "float" else "an integer"
+    return core_schema.no_info_before_validator_function(partial(_number, wanted=wanted), inner)
+
+
 class Strict(BaseModel):
     """Base of all file models: unknown keys are errors, values are never coerced from strings."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=False, allow_inf_nan=False, arbitrary_types_allowed=True
     )
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return _numbers_only(handler(source))
 
 
 Model = TypeVar("Model", bound=BaseModel)
