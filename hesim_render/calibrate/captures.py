@@ -21,6 +21,9 @@ from hesim_render.specs.files import Strict, load_yaml, validate
 from hesim_render.specs.geometry import Region
 from hesim_render.specs.sensor import SensorSpec, read_sensor
 
+#: Largest number that a capture may state, and in which doubles are still whole.
+_MOST = 2.0**53
+
 
 class SignalReference(Strict):
     """Unit of the EVS signal: I = k · Φ · t_ref, in DN of this exposure seen through `filter`."""
@@ -208,14 +211,14 @@ def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least:
     Raises
     ------
     SpecError
-        If it holds text, several values, or a number that is not finite or too small.
+        If it holds text, several values, or a number that is not finite, too small or too large.
     """
     kind = "whole number" if whole else "number"
-    wrong = SpecError(f"{name} must be one {kind} of {least:g} or more", file=file)
+    wrong = SpecError(f"{name} must be one {kind} of {least:g} or more, up to {_MOST:g}", file=file)
     if value.size != 1 or value.dtype.kind not in "uif":
         raise wrong
     found = float(value.item())
-    if not np.isfinite(found) or found < least or (whole and found != int(found)):
+    if not least <= found <= _MOST or (whole and found != int(found)):
         raise wrong
     return found
 
