@@ -1,10 +1,11 @@
-"""Damage files and read them, many times over: ``python fuzz.py SUBJECT FIRST LAST`` prints one JSON line a try.
+"""Damage files and read them, many times over: ``fuzz.py SUBJECT:FIRST:LAST …`` prints one JSON line a try.
 
 A try ends well (``fine``) or in one clear error (``refused``); ``broke`` is another exception. Whoever runs this takes
 a try that is not reported in time for a hang, and one that ends the process for a crash.
 """
 
 import json
+import resource
 import shutil
 import sys
 import tempfile
@@ -12,7 +13,7 @@ import traceback
 import warnings
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mutations import mutate
 from subjects import SUBJECTS, files_of, quiet
@@ -48,13 +49,16 @@ def main(name, first, last):
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
     try:
         SUBJECTS[name][0](folder)
-        SUBJECTS[name][1](folder)  # what is not damaged is read
-        print(json.dumps({"seed": None}), flush=True)
+        with quiet():
+            SUBJECTS[name][1](folder)  # what is not damaged is read
         for seed in range(first, last):
-            print(json.dumps(attempt(name, folder, seed)), flush=True)
+            print(json.dumps({"subject": name} | attempt(name, folder, seed)), flush=True)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    for part in sys.argv[1:]:
+        subject, begin, end = part.split(":")
+        main(subject, int(begin), int(end))
+    print(json.dumps({"end": "done", "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}), flush=True)

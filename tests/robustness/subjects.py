@@ -70,7 +70,8 @@ def calibrate_evs(folder):
 
 def calibration(folder):
     """A calibration of a whole small sensor, and the sensor that points at it."""
-    from hesim_render.calibrate import calibrate_aps as frames, calibrate_evs as events
+    from hesim_render.calibrate import calibrate_aps as frames
+    from hesim_render.calibrate import calibrate_evs as events
 
     capture_sets.write_frames(folder / "set", size=32, frames=16)
     capture_sets.write_events(folder / "set", size=32, trials=100000)
