@@ -104,11 +104,10 @@ def read_arrays(
                 continue
             with archive.open(f"{member}.npy") as stream:
                 shape, fortran_order, dtype = read_header(stream, member, file)
+                _require_kind(shape, dtype, member, file, (shapes or {}).get(member), kinds)
                 total += math.prod(shape) * dtype.itemsize
                 require_memory(total, "all arrays together", file)
-                found[member] = _values(
-                    stream, shape, fortran_order, dtype, member, file, (shapes or {}).get(member), kinds
-                )
+                found[member] = _values(stream, shape, fortran_order, dtype, member, file)
     return found
 
 
@@ -122,7 +121,8 @@ def read_array(file: Path, shape: tuple[int, ...] | None = None, kinds: str = ""
     """
     with reading(file, "as an .npy file of numbers"), file.open("rb") as stream:
         found = read_header(stream, "the array", file)
-        return _values(stream, *found, "the array", file, shape, kinds)
+        _require_kind(found[0], found[2], "the array", file, shape, kinds)
+        return _values(stream, *found, "the array", file)
 
 
 def require_names(archive: zipfile.ZipFile, file: Path, required: Iterable[str]) -> list[str]:
@@ -183,15 +183,19 @@ def read_header(stream: IO[bytes], name: str, file: Path) -> tuple[tuple[int, ..
     return tuple(int(n) for n in shape), bool(fortran_order), dtype
 
 
-def _values(
-    stream: IO[bytes], shape: tuple[int, ...], fortran_order: bool, dtype: np.dtype, name: str, file: Path,
-    wanted: tuple[int, ...] | None, kinds: str,
-) -> NDArray:  # fmt: skip
-    """What follows a header that has been checked."""
+def _require_kind(
+    shape: tuple[int, ...], dtype: np.dtype, name: str, file: Path, wanted: tuple[int, ...] | None, kinds: str
+) -> None:
     if kinds and dtype.kind not in kinds:
         raise SpecError(f"{name} holds {dtype.name}; expected {_KINDS[kinds[-1]]}", file=file)
     if wanted is not None and shape != wanted:
         raise SpecError(f"{name} has shape {shape}; expected {wanted}", file=file)
+
+
+def _values(
+    stream: IO[bytes], shape: tuple[int, ...], fortran_order: bool, dtype: np.dtype, name: str, file: Path
+) -> NDArray:
+    """What follows a header that has been checked."""
     size = math.prod(shape) * dtype.itemsize
     require_memory(size, name, file, MOST_BYTES)
     buffer = bytearray(size)

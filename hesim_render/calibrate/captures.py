@@ -21,6 +21,11 @@ from hesim_render.specs.files import Strict, load_yaml, validate
 from hesim_render.specs.geometry import Region
 from hesim_render.specs.sensor import SensorSpec, read_sensor
 
+#: Largest clean signal of an event pixel: a thousand times the largest DN of 16 bits, for bright lights.
+BRIGHTEST_DN = 65535e3
+SIGNAL_RANGE = (
+    f"signal_dn must be 0 or above (the clean light signal, black subtracted), and at most {BRIGHTEST_DN:g} DN"
+)
 #: Largest number that a capture may state, and in which doubles are still whole.
 _MOST = 2.0**53
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.captures import CaptureSet, count_maps, number
+from hesim_render.calibrate.captures import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, count_maps, number
 from hesim_render.errors import SpecError
 from hesim_render.npzfile import read_arrays
 
@@ -111,8 +111,8 @@ def read_contrast(
     if signal.dtype.kind not in "uif" or signal.size == 0 or signal.ndim not in (0, 1, 2):
         raise SpecError("signal_dn must be a number, or numbers [row, col]", file=file)
     signal = signal.astype(np.float64)
-    if not np.all(np.isfinite(signal)) or signal.min() < 0:
-        raise SpecError("signal_dn must be 0 or above (the clean light signal, black subtracted)", file=file)
+    if not np.all((signal >= 0) & (signal <= BRIGHTEST_DN)):
+        raise SpecError(SIGNAL_RANGE, file=file)
     return contrast.astype(np.float64), signal, small
 
 

@@ -77,10 +77,10 @@ class MapFile(Strict):
         with reading(self.file):
             is_archive = zipfile.is_zipfile(self.file)
         if not is_archive:
-            return read_array(self.file)
+            return read_array(self.file, kinds="uif")
         if self.name is None:
             raise SpecError("holds several arrays: say which one by 'name'", file=self.file)
-        return read_arrays(self.file, (self.name,), only=(self.name,))[self.name]
+        return read_arrays(self.file, (self.name,), only=(self.name,), kinds="uif")[self.name]
 
 
 class BlackLevel(Strict):

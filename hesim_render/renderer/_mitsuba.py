@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hesim_render import backend
 from hesim_render.errors import SpecError
-from hesim_render.renderer.scene_files import require_inside, require_state_inside
+from hesim_render.renderer.scene_files import check_xml, require_state_inside
 from hesim_render.spectra import Spectrum
 
 _LEAST_THREADS = 2
@@ -109,8 +109,8 @@ def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], N
         inner.prepend(str(source.resolve().parent))
         mi.set_file_resolver(inner)
     try:
-        if root is not None and isinstance(source, Path):
-            require_inside(source, root, lambda name: str(inner.resolve(name)))
+        if isinstance(source, Path):
+            check_xml(source, root, lambda name: str(inner.resolve(name)))
         state = (
             parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
         )

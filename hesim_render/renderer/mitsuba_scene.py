@@ -21,6 +21,7 @@ from hesim_render.renderer.plugins import (
     set_depth,
     used_plugins,
 )
+from hesim_render.renderer.scene_files import require_short_number
 from hesim_render.specs.scene import MitsubaSpec, SceneSpec
 
 #: Path length for a scene without an integrator of its own.
@@ -135,6 +136,7 @@ def _plugin_dict(
     """
     content: dict[str, Any] = {}
     for name, value in node.items():
+        require_short_number(str(name), file)
         if name == "type":
             require_known(value, file, key)
         if isinstance(value, Mapping):

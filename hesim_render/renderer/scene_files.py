@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,14 +12,17 @@ from typing import Any
 from hesim_render.errors import SpecError
 from hesim_render.guard import leads_out, reading
 
+#: Mitsuba 3.9 orders parameters by the numbers in their names, and crashes where one does not fit.
+_LONG_NUMBER = re.compile(r"\d{10,}")
 OUTSIDE = "lies outside of the scene's folder {root}; put it there, or let it (--allow-outside, allow_outside=True)"
 
 
-def require_inside(file: Path, root: Path, find: Callable[[str], str]) -> None:
-    """Refuse an XML scene that names files outside of `root`, before Mitsuba reads any of them.
+def check_xml(file: Path, root: Path | None, find: Callable[[str], str]) -> None:
+    """Refuse an XML scene that names files outside of `root`, before Mitsuba reads any of them, or would crash it.
 
     Parameters
     ----------
+    root : None lets them lie anywhere.
     find : where Mitsuba looks for a name.
 
     Raises
@@ -34,11 +38,26 @@ def require_inside(file: Path, root: Path, find: Callable[[str], str]) -> None:
         for element in _elements(current):
             if element.tag == "default":
                 defaults.setdefault(element.get("name", ""), element.get("value", ""))
+            require_short_number(element.get("name", ""), current)
             for name in _names(element):
-                path = Path(find(Template(name).safe_substitute(defaults)))
-                _require(path, root, name, current)
-                if element.tag == "include" and path.is_file() and path.resolve() not in seen:
-                    waiting.append(path)
+                with reading(current, "as a scene"):
+                    path = Path(find(Template(name).safe_substitute(defaults)))
+                    if root is not None:
+                        _require(path, root, name, current)
+                    if element.tag == "include" and path.is_file() and path.resolve() not in seen:
+                        waiting.append(path)
+
+
+def require_short_number(name: str, file: Path | None) -> None:
+    """Refuse the name of a parameter at whose number Mitsuba's parser ends the process.
+
+    Raises
+    ------
+    SpecError
+        If it holds a number that is no 32-bit one.
+    """
+    if _LONG_NUMBER.search(name):
+        raise SpecError(f"the name {name[:40]!r} holds too large a number", file=file)
 
 
 def require_state_inside(mi: Any, state: Any, root: Path, find: Callable[[str], str], file: Path | None) -> None:

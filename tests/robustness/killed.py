@@ -29,11 +29,10 @@ def main(step, side, exchange, arguments):
             try:
                 if count == step and side == "before":
                     os.kill(os.getpid(), signal.SIGKILL)
-                found = call(*given, **named)
+                return call(*given, **named)
+            finally:
                 if count == step and side == "after":
                     os.kill(os.getpid(), signal.SIGKILL)
-                return found
-            finally:
                 inside = False
 
         return wrapper

@@ -134,7 +134,7 @@ class Trial:
 
 
 def kill_at_every_step(trial, exchange=True, most=12):
-    """Steps from the last to the first would need their number; so from the first until a run is not killed."""
+    """From the first step until a run has not as many."""
     for step in range(1, most + 1):
         for side in ("before", "after") if exchange else ("after",):
             child = start(trial.folder, trial.before if step % 2 else trial.arguments, step, side, exchange)
