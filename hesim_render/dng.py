@@ -8,7 +8,10 @@ makes its pixels. Tags follow DNG 1.4 and TIFF/EP (ISO 12234-2).
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.errors import SpecError
+from hesim_render.guard import printable, reading
 from hesim_render.mosaic import Mosaic
 
 PHOTOMETRIC_CFA = 32803
@@ -75,19 +80,53 @@ def write_dng(
             page.tags[_PHOTOMETRIC_TAG].overwrite(PHOTOMETRIC_LINEAR_RAW)
 
 
+def read_dng(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """The DN of a frame that `write_dng` wrote, [row, col].
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, or is not uncompressed uint16 of that `shape`.
+    """
+    import tifffile
+
+    with reading(path, "as a DNG file"), _quiet("tifffile"), tifffile.TiffFile(path) as file:
+        page = file.pages[0].aspage()
+        if page.shape != shape or page.dtype != np.uint16 or page.compression != 1:
+            raise SpecError(
+                f"holds {page.dtype} of {page.shape}; expected uncompressed uint16 of {shape}, as the manifest says",
+                file=path,
+            )
+        if sum(page.databytecounts) != 2 * shape[0] * shape[1]:
+            raise SpecError("holds fewer or more pixels than it says", file=path)
+        return page.asarray()
+
+
+@contextlib.contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """A library's log, off: what it would say of a damaged file is in our one error."""
+    log = logging.getLogger(name)
+    before = log.disabled
+    log.disabled = True
+    try:
+        yield
+    finally:
+        log.disabled = before
+
+
 def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:
     """Extra tags as tifffile takes them: (code, type, count, value, write once)."""
     exposure = Fraction(exposure_us, 1_000_000).limit_denominator(1_000_000)
     tags = [
         (271, _ASCII, 0, "hesim_render", True),
-        (272, _ASCII, 0, mosaic.sensor, True),
+        (272, _ASCII, 0, _ascii(mosaic.sensor), True),
         (274, _SHORT, 1, 1, True),  # Orientation: row 0 at the top
         (33434, _RATIONAL, 1, (exposure.numerator, exposure.denominator), True),
         (33437, _RATIONAL, 1, _rational(mosaic.f_number), True),
         (37386, _RATIONAL, 1, _rational(mosaic.focal_length_mm), True),
         (50706, _BYTE, 4, bytes((1, 4, 0, 0)), True),  # DNGVersion
         (50707, _BYTE, 4, bytes((1, 1, 0, 0)), True),  # DNGBackwardVersion
-        (50708, _ASCII, 0, f"hesim_render {mosaic.sensor}", True),  # UniqueCameraModel
+        (50708, _ASCII, 0, f"hesim_render {_ascii(mosaic.sensor)}", True),  # UniqueCameraModel
         (50714, _RATIONAL, 1, _rational(mosaic.black_level_dn), True),
         (50717, _SHORT, 1, mosaic.white_level_dn, True),
     ]
@@ -107,6 +146,11 @@ def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:
         (50728, _RATIONAL, neutral.size, _rationals(neutral), True),  # AsShotNeutral
         (50778, _SHORT, 1, _D65, True),  # CalibrationIlluminant1
     ]
+
+
+def _ascii(text: str) -> str:
+    """What an ASCII tag can hold of a name."""
+    return printable(text).encode("ascii", "backslashreplace").decode("ascii")
 
 
 def _by_plane(mosaic: Mosaic, planes: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""What ``recording.json`` says: which specs, seed, versions and units made a recording."""
+"""``recording.json``: which specs, seed, versions and units made a recording; written, read and checked."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from pydantic import BaseModel, ValidationError
 
 from hesim_render import mosaic
 from hesim_render.errors import SpecError
-from hesim_render.mosaic import Mosaic
-from hesim_render.specs.files import content_hash
+from hesim_render.guard import inside, read_text, reading
+from hesim_render.recording_spec import RecordingSpec
+from hesim_render.specs.files import content_hash, validate
 from hesim_render.specs.light import mixed_light
+from hesim_render.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     from hesim_render.sensor import Sensor
@@ -124,27 +126,42 @@ def to_text(value: Any, indent: str = "") -> str:
     return f"{begin}{body}\n{indent}{end}"
 
 
-def read(folder: Path) -> tuple[dict[str, Any], Mosaic]:
-    """Manifest and mosaic of a recording folder.
+def read(folder: Path) -> dict[str, Any]:
+    """The manifest of a recording folder, as `RecordingSpec` has checked it.
 
     Raises
     ------
     SpecError
-        If it is not a recording, or one of a newer schema.
+        If it is not a recording, or one of another schema; with the key that is wrong.
     """
     file = folder / MANIFEST_NAME
     if not file.is_file():
         raise SpecError(f"is not a recording (no {MANIFEST_NAME} in it)", file=folder)
-    try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SpecError(f"cannot be read ({error})", file=file) from None
+    text = read_text(inside(folder, MANIFEST_NAME))
+    with reading(file):
+        manifest = json.loads(text)
     found = manifest.get("schema_version") if isinstance(manifest, dict) else None
-    if found != SCHEMA_VERSION:
+    if found != SCHEMA_VERSION or isinstance(found, bool):
         raise SpecError(f"schema_version is {found!r}; this version reads {SCHEMA_VERSION}", file=file)
+    return validate(RecordingSpec, manifest, file, {}).model_dump(mode="json", exclude_unset=True)
+
+
+def sensor_spec(manifest: Mapping[str, Any], folder: Path | None = None) -> SensorSpec:
+    """The sensor of a recording, without the place of its calibration.
+
+    Parameters
+    ----------
+    folder : of the recording, for the error.
+
+    Raises
+    ------
+    SpecError
+        If the manifest holds none that this version knows.
+    """
     try:
-        return manifest, Mosaic.model_validate(manifest.get("mosaic"))
+        return SensorSpec.model_validate(manifest["sensor"]["spec"])
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
-        key = ".".join(["mosaic", *map(str, problem["loc"])])
-        raise SpecError(problem["msg"], file=file, key=key) from None
+        key = ".".join(["sensor", "spec", *map(str, problem["loc"])])
+        place = None if folder is None else folder / MANIFEST_NAME
+        raise SpecError(problem["msg"].removeprefix("Value error, "), file=place, key=key) from None

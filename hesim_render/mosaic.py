@@ -6,11 +6,11 @@ shown and exported without the sensor file it was made with.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
 
 from hesim_render import spectra
 from hesim_render.colorimetry import responses_to, tristimulus, xyz_to_linear_srgb
@@ -43,23 +43,46 @@ class Mosaic(BaseModel):
     f_number, focal_length_mm : the lens in use.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     sensor: str
     tile_filter: list[list[str]]
     tile_aps: list[list[bool]]
     tile_evs: list[list[bool]]
     cfa_code: dict[str, int]
-    bit_depth: int
+    bit_depth: int = Field(ge=1, le=16)
     black_level_dn: float
-    white_level_dn: int
-    system_gain_dn_per_e: float
+    white_level_dn: int = Field(ge=0, le=65535)
+    system_gain_dn_per_e: PositiveFloat
     channels: list[str]
     neutral: list[float]
     camera_to_srgb: list[list[float]]
     xyz_to_camera: list[list[float]]
-    f_number: float
-    focal_length_mm: float
+    f_number: PositiveFloat
+    focal_length_mm: PositiveFloat
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Mosaic:
+        tables: list[list[list[Any]]] = [self.tile_filter, self.tile_aps, self.tile_evs]
+        if not all(map(_is_even, tables)) or len({np.shape(table) for table in tables}) != 1:
+            raise ValueError("tile_filter: it, tile_aps and tile_evs must be tables of one size, of at least one pixel")
+        for name in {name for row in self.tile_filter for name in row}:
+            if not 0 <= self.cfa_code.get(name, -1) < len(COLOUR_NAMES):
+                raise ValueError(f"cfa_code: expected a code from 0 to {len(COLOUR_NAMES) - 1} for filter {name!r}")
+        with_frames = {name for names, aps in zip(self.tile_filter, self.tile_aps, strict=True)
+                       for name, has in zip(names, aps, strict=True) if has}  # fmt: skip
+        count = len(self.channels)
+        if not count or len(set(self.channels)) != count or not with_frames <= set(self.channels):
+            raise ValueError(f"channels: expected each of {', '.join(sorted(with_frames)) or 'the filters'} once")
+        if len(self.neutral) != count or min(self.neutral) < 0 or max(self.neutral) <= 0:
+            raise ValueError(f"neutral: expected {count} numbers of 0 or more, one per channel, not all 0")
+        for key, shape in (("camera_to_srgb", (3, count)), ("xyz_to_camera", (count, 3))):
+            table = getattr(self, key)
+            if not _is_even(table) or np.shape(table) != shape:
+                raise ValueError(f"{key}: expected {shape[0]} rows of {shape[1]} numbers")
+        if self.white_level_dn <= self.black_level_dn:
+            raise ValueError("white_level_dn: must be above black_level_dn")
+        return self
 
     @property
     def tile_shape(self) -> tuple[int, int]:
@@ -88,6 +111,11 @@ class Mosaic(BaseModel):
         """A tile repeated over an image of `shape` [row, col]."""
         rows, cols = np.ogrid[: shape[0], : shape[1]]
         return tile[rows % tile.shape[0], cols % tile.shape[1]]
+
+
+def _is_even(table: list[list[Any]]) -> bool:
+    """Whether all rows are of one length, at least 1."""
+    return bool(table) and bool(table[0]) and len({len(row) for row in table}) == 1
 
 
 def cfa_code(response: Spectrum) -> int:

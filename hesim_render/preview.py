@@ -216,4 +216,6 @@ def contact_sheet(panels: Sequence[Panel], title: str, width_px: int, columns: i
 def save_animation(path: str, pictures: Sequence[Picture], frame_ms: int = 80) -> None:
     """An endless animated GIF."""
     images = [Image.fromarray(picture).quantize(96) for picture in pictures]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=frame_ms, loop=0, optimize=False)
+    images[0].save(
+        path, format="GIF", save_all=True, append_images=images[1:], duration=frame_ms, loop=0, optimize=False
+    )

@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, Protocol, TextIO
 
+from hesim_render.guard import printable
+
 #: Called with (done, total, what): µs of simulated time, or rays while a static scene renders.
 Progress = Callable[[float, float, str], None]
 
@@ -270,7 +272,7 @@ def progress_report(title: str, stream: TextIO | None = None) -> ProgressReport:
     title : of the run.
     stream : default stderr.
     """
-    target = sys.stderr if stream is None else stream
+    target, title = sys.stderr if stream is None else stream, printable(title)
     if in_notebook():
         return ProgressReport(_Notebook(title))
     return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target))

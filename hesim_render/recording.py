@@ -24,11 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render import manifest as manifests
+from hesim_render.dng import read_dng, write_dng
 from hesim_render.errors import SpecError
 from hesim_render.eventfile import EventFileWriter, read_events
 from hesim_render.events import no_events
 from hesim_render.frame import Frame
+from hesim_render.guard import inside
 from hesim_render.mosaic import Mosaic
+from hesim_render.npzfile import read_array, read_arrays
 from hesim_render.output import OutputFolder, output_errors
 
 if TYPE_CHECKING:
@@ -48,12 +51,12 @@ class EventTruth:
 class StoredFrames(Sequence[Frame]):
     """Frames of a recording on disk; each is read when asked for and not kept."""
 
-    def __init__(self, folder: Path, entries: Sequence[Mapping[str, Any]]) -> None:
-        self._folder, self._entries = folder, list(entries)
+    def __init__(self, folder: Path, entries: Sequence[Mapping[str, Any]], shape: tuple[int, int]) -> None:
+        self._folder, self._entries, self._shape = folder, list(entries), shape
 
     @cached_property
     def _valid(self) -> NDArray[np.bool_]:
-        return _load_array(self._folder / "truth" / "valid.npy")
+        return read_array(inside(self._folder, "truth/valid.npy"), self._shape, "b")
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -64,11 +67,13 @@ class StoredFrames(Sequence[Frame]):
     def __getitem__(self, index: slice) -> StoredFrames: ...
     def __getitem__(self, index: int | slice) -> Frame | StoredFrames:
         if isinstance(index, slice):
-            return StoredFrames(self._folder, self._entries[index])
+            return StoredFrames(self._folder, self._entries[index], self._shape)
         entry = dict(self._entries[index])
-        truth = _load_array(self._folder / entry.pop("truth"))
-        raw = _load_raw(self._folder / entry.pop("file"))
-        return Frame(raw, self._valid, truth["electrons_mean"], truth["electrons_stderr"], **entry)
+        manifest, key = self._folder / manifests.MANIFEST_NAME, f"frames.{range(len(self))[index]}"
+        truth_file = inside(self._folder, entry.pop("truth"), file=manifest, key=f"{key}.truth")
+        raw = read_dng(inside(self._folder, entry.pop("file"), file=manifest, key=f"{key}.file"), self._shape)
+        mean, stderr = _read_maps(truth_file, ("electrons_mean", "electrons_stderr"), self._shape)
+        return Frame(raw, self._valid, mean, stderr, **entry)
 
 
 class Recording:
@@ -99,13 +104,18 @@ class Recording:
     def events(self) -> NDArray:
         """All events, `EVENT_DTYPE`, in order of time; `event_slice` reads a part of them."""
         if self._events is None:
-            self._events = no_events() if self.path is None else read_events(self.path / "events.h5")
+            self._events = no_events() if self.path is None else self._read_events(None, None)
         return self._events
+
+    def _read_events(self, begin_us: int | None, end_us: int | None) -> NDArray:
+        assert self.path is not None
+        count = self.manifest["counts"]["events"]
+        return read_events(inside(self.path, "events.h5"), begin_us, end_us, shape=self.event_shape, count=count)
 
     def event_slice(self, begin_us: int, end_us: int) -> NDArray:
         """Events with begin_us <= t_us < end_us; from disk, only that part is read."""
         if self._events is None and self.path is not None:
-            return read_events(self.path / "events.h5", begin_us, end_us)
+            return self._read_events(begin_us, end_us)
         low, high = np.searchsorted(self.events["t_us"], [begin_us, end_us], side="left")
         return self.events[low:high]
 
@@ -113,8 +123,9 @@ class Recording:
     def event_truth(self) -> EventTruth | None:
         """Noise-free flux of the event pixels, None where the sensor has none."""
         if self._event_truth is None and self.path is not None and (self.path / "truth" / "events.npz").is_file():
-            arrays = _load_array(self.path / "truth" / "events.npz")
-            self._event_truth = EventTruth(arrays["flux_mean_e_per_s"], arrays["flux_stderr_e_per_s"])
+            names = ("flux_mean_e_per_s", "flux_stderr_e_per_s")
+            maps = _read_maps(inside(self.path, "truth/events.npz"), names, self.event_shape)
+            self._event_truth = EventTruth(*maps)
         return self._event_truth
 
     @cached_property
@@ -160,8 +171,9 @@ class Recording:
         folder = Path(path).expanduser().resolve()
         if not folder.is_dir():
             raise SpecError("no such folder", file=str(path))
-        manifest, _ = manifests.read(folder)
-        return cls(StoredFrames(folder, manifest["frames"]), manifest, path=folder)
+        manifest = manifests.read(folder)
+        shape = manifest["roi"]["height_px"], manifest["roi"]["width_px"]
+        return cls(StoredFrames(folder, manifest["frames"], shape), manifest, path=folder)
 
 
 class FolderWriter:
@@ -200,7 +212,6 @@ class FolderWriter:
         return self._mosaic.tiled(np.array(self._mosaic.tile_aps), (roi["height_px"], roi["width_px"]))
 
     def add_frame(self, frame: Frame) -> None:
-        from hesim_render.dng import write_dng
         from hesim_render.preview import thumbnail
 
         number = len(self.manifest["frames"])
@@ -371,17 +382,7 @@ class RecordingWriter:
             self._folder.__exit__(*error)
 
 
-def _load_array(path: Path) -> Any:
-    try:
-        return np.load(path)
-    except (OSError, ValueError) as error:
-        raise SpecError(f"cannot be read ({error})", file=path) from None
-
-
-def _load_raw(path: Path) -> NDArray[np.uint16]:
-    import tifffile
-
-    try:
-        return tifffile.imread(path, key=0)
-    except (OSError, ValueError) as error:
-        raise SpecError(f"cannot be read ({error})", file=path) from None
+def _read_maps(file: Path, names: tuple[str, ...], shape: tuple[int, int]) -> list[NDArray[np.float32]]:
+    """Maps of float32 of one size, in the order of their names."""
+    found = read_arrays(file, names, only=names, shapes=dict.fromkeys(names, shape), kinds="f")
+    return [found[name].astype(np.float32, copy=False) for name in names]

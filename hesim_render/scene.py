@@ -67,6 +67,7 @@ class Scene:
         plane_normal: Sequence[float] | None = None,
         waveforms: Mapping[str, Any] | None = None,
         name: str = "mitsuba",
+        allow_outside: bool = False,
     ) -> Scene:
         """A scene that Mitsuba itself can load.
 
@@ -82,6 +83,7 @@ class Scene:
         illuminance_lux, irradiance_w_m2 : in its place: the level that all light of the scene together makes, lx or
             W m⁻² (360 to 830 nm), on the plane through `plane_point_m` [3] with the normal `plane_normal` [3].
         waveforms : flicker of emitters (keys of a scene file's ``waveform``), by the id of their shape or their own.
+        allow_outside : let an XML file name files outside of its folder; a dictionary may.
 
         Raises
         ------
@@ -110,6 +112,7 @@ class Scene:
             "camera": camera,
             "motion": list(motion),
             "max_depth": max_depth,
+            "allow_outside": allow_outside,
         }
         try:
             return cls(SceneSpec.model_validate(content))
@@ -117,16 +120,19 @@ class Scene:
             raise spec_error(error, SceneSpec, content) from None
 
 
-def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(
+    name_or_path: str | Path, overrides: Mapping[str, Any] | None = None, *, allow_outside: bool = False
+) -> Scene:
     """A scene by shipped name (``hesim-render list scenes``) or path of a YAML file.
 
     Parameters
     ----------
     overrides : dotted keys and their values, applied before validation (``camera.f_number``).
+    allow_outside : let the scene name files (spectra, meshes, textures, includes) outside of its folder.
 
     Raises
     ------
     SpecError
         With file, line and key of what is wrong.
     """
-    return Scene(read_scene(name_or_path, overrides))
+    return Scene(read_scene(name_or_path, overrides, allow_outside))

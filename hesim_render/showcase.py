@@ -10,6 +10,8 @@ from PIL import Image
 
 from hesim_render import dng, preview
 from hesim_render.events import no_events
+from hesim_render.guard import printable
+from hesim_render.output import replacing
 from hesim_render.preview import Panel, Picture
 
 if TYPE_CHECKING:
@@ -23,23 +25,29 @@ _ZOOM = 8
 
 
 def write_previews(recording: Recording, folder: Path) -> list[Path]:
-    """Write ``preview.png`` and, where they apply, ``preview.dng`` and ``preview.gif``; returns their paths."""
+    """Write ``preview.png`` and, where they apply, ``preview.dng`` and ``preview.gif``; returns their paths.
+
+    Each takes the place of an earlier one in one step; a link of its name is replaced, not followed.
+    """
     written = [folder / "preview.png"]
-    contact_sheet(recording).save(written[0])
+    with replacing(written[0]) as temporary:
+        contact_sheet(recording).save(temporary, format="PNG")
     if len(recording.frames):
         frame = _middle(recording)
         smaller = dng.binned(frame.raw, recording.mosaic)
         if smaller is not None:
             raw, mosaic = smaller
             written.append(folder / "preview.dng")
-            dng.write_dng(
-                written[-1], raw, mosaic, exposure_us=frame.exposure_us, description=frame.times,
-                thumbnail=preview.thumbnail(raw, mosaic),
-            )  # fmt: skip
+            with replacing(written[-1]) as temporary:
+                dng.write_dng(
+                    temporary, raw, mosaic, exposure_us=frame.exposure_us, description=frame.times,
+                    thumbnail=preview.thumbnail(raw, mosaic),
+                )  # fmt: skip
     pictures = animation(recording) if moves(recording) else []
     if len(pictures) > 1:
         written.append(folder / "preview.gif")
-        preview.save_animation(str(written[-1]), pictures)
+        with replacing(written[-1]) as temporary:
+            preview.save_animation(str(temporary), pictures)
     return written
 
 
@@ -93,7 +101,7 @@ def contact_sheet(recording: Recording) -> Image.Image:
         )
         if part
     )  # fmt: skip
-    return preview.contact_sheet(panels, title, width_px)
+    return preview.contact_sheet(panels, printable(title), width_px)
 
 
 def _mosaic_panels(frame: Frame, recording: Recording, colour: Picture, width_px: int, step: int) -> list[Panel]:

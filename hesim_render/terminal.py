@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hesim_render.errors import RangeError
+from hesim_render.guard import printable
 
 if TYPE_CHECKING:
     from hesim_render.recording import Recording
@@ -70,7 +71,7 @@ def complain(*lines: str) -> None:
     """Lines on stderr, each with the program's name, if there is anyone to read them."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         for line in lines:
-            sys.stderr.write(f"hesim-render: {' '.join(line.split())}\n")
+            sys.stderr.write(f"hesim-render: {printable(' '.join(line.split()))}\n")
         sys.stderr.flush()
 
 
@@ -98,7 +99,7 @@ def summary(recording: Recording) -> str:
     if recording.path is not None:
         pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
         lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def _reached(render: dict[str, Any] | None) -> list[str]:

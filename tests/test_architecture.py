@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "hesim_render"
 
 # lowest first; a module may import its own layer and those below. Names are modules or packages.
 LAYERS = [
-    {"errors", "units", "rng", "backend", "progress", "spectra", "colorimetry", "events", "frame", "output"}
+    {"errors", "units", "rng", "backend", "progress", "spectra", "colorimetry", "events", "frame", "output", "guard", "npzfile"}
     | {"bands", "transfer", "waveform", "render_error"},
     {"specs"},
     {"optics", "layout", "noise"},
@@ -19,7 +19,7 @@ LAYERS = [
     {"radiometry", "scene", "flicker", "renderer", "video"},
     {"aps", "evs"},
     {"capture"},
-    {"eventfile", "npzfile", "dng", "preview", "manifest", "showcase", "recording"},
+    {"eventfile", "dng", "preview", "manifest", "recording_spec", "showcase", "recording"},
     {"simulation", "video_simulation", "calibrate", "bench", "lab", "isp"},
     {"cli", "terminal"},
 ]

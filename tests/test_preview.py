@@ -147,7 +147,7 @@ def test_contact_sheet_of_any_size(name, width, height, tmp_path):
 
 def test_moving_scene_gets_an_animation(tmp_path):
     recording = recordings.make("gen2", width=128, height=96)
-    recording.manifest["scene"] = {"name": "s", "sha256": "", "spec": {"motion": [{"object": "target"}]}}
+    recording.manifest["scene"] = {"name": "s", "sha256": 64 * "0", "spec": {"motion": [{"object": "target"}]}}
     recording.save(tmp_path / "r")
     with Image.open(tmp_path / "r" / "preview.gif") as picture:
         assert picture.n_frames >= 20 and picture.size == (128, 96)

@@ -22,7 +22,7 @@ from hesim_render.calibrate.composite import (
 from hesim_render.calibrate.dark import ADC_VARIANCE_DN2, DarkModel, fit_dark
 from hesim_render.calibrate.moments import Moments, Progress, measure
 from hesim_render.calibrate.photon_transfer import linearity, photon_transfer
-from hesim_render.calibrate.result import write_section
+from hesim_render.calibrate.result import check_calibration, check_report, write_section
 from hesim_render.calibrate.variance import Pooled, VarianceFit, fit_variance, join, pool, variance_map
 from hesim_render.errors import SpecError
 
@@ -61,7 +61,11 @@ class ApsCalibration:
 
 
 def calibrate_aps(
-    folder: str | Path, out: str | Path, report: str | Path | None = None, progress: Progress | None = None
+    folder: str | Path,
+    out: str | Path,
+    report: str | Path | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
 ) -> Path:
     """Calibrate the frames of a capture set and write (or update) a ``calibration.yaml``.
 
@@ -69,8 +73,9 @@ def calibrate_aps(
     ----------
     folder : capture set with ``capture.yaml``, ``aps_dark.npz`` and ``aps_lit.npz``.
     out : the calibration; its section ``aps`` is written, others are kept.
-    report : HTML file, if one is wanted; it covers every section of `out`.
+    report : HTML file, if one is wanted; it covers every section of `out`, and a report of `out` is replaced.
     progress : called with what is being done and the fraction done.
+    overwrite : replace a report of another calibration.
 
     Returns
     -------
@@ -86,6 +91,9 @@ def calibrate_aps(
     from hesim_render.calibrate.aps_output import content, maps
 
     captures = read_captures(folder)
+    check_calibration(out, describe(captures))
+    if report is not None:
+        check_report(out, report, overwrite)
     stacks = captures.frames("aps_dark"), captures.frames("aps_lit")
     if stacks[0].shape[2:] != stacks[1].shape[2:]:
         sizes = " and ".join(f"{s.shape[2]}×{s.shape[3]}" for s in stacks)
@@ -96,7 +104,7 @@ def calibrate_aps(
     if report is not None:
         from hesim_render.calibrate.report import write_report
 
-        write_report(out, report)
+        write_report(out, report, overwrite)
     return Path(out)
 
 

@@ -5,25 +5,29 @@ Frames are decompressed one at a time, so a capture set larger than memory can b
 
 from __future__ import annotations
 
-import math
-import zipfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from hesim_render.errors import SpecError
+from hesim_render.guard import inside
+from hesim_render.npzfile import member_header, read_arrays, stream_member
 from hesim_render.specs.files import Strict, load_yaml, validate
+from hesim_render.specs.geometry import Region
 from hesim_render.specs.sensor import SensorSpec, read_sensor
 
-_BROKEN = (OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
-#: Largest array that is read whole: a map of float64 over a sensor of 256 Mpx.
-_MOST_BYTES = 1 << 31
+#: Largest clean signal of an event pixel: a thousand times the largest DN of 16 bits, for bright lights.
+BRIGHTEST_DN = 65535e3
+SIGNAL_RANGE = (
+    f"signal_dn must be 0 or above (the clean light signal, black subtracted), and at most {BRIGHTEST_DN:g} DN"
+)
+#: Largest number that a capture may state, and in which doubles are still whole.
+_MOST = 2.0**53
 
 
 class SignalReference(Strict):
@@ -32,15 +36,6 @@ class SignalReference(Strict):
     k: PositiveFloat
     t_ref_us: PositiveFloat
     filter: str = "own"
-
-
-class Region(Strict):
-    """What part of the sensor was read out, in frame pixels; maps belong to it."""
-
-    x: NonNegativeInt
-    y: NonNegativeInt
-    width_px: PositiveInt
-    height_px: PositiveInt
 
 
 class CaptureSpec(Strict):
@@ -98,7 +93,7 @@ class CaptureSet:
         SpecError
             If the file or one of the `required` arrays is missing, or cannot be read.
         """
-        return small_arrays(self._file(name), required)
+        return read_arrays(self._file(name), required)
 
     def has(self, name: str) -> bool:
         return (self.folder / f"{name}.npz").is_file()
@@ -132,8 +127,8 @@ def read_captures(folder: str | Path) -> CaptureSet:
     spec = validate(CaptureSpec, load_yaml(file), file, {})
     sensor = None
     if spec.sensor is not None:
-        beside = path / spec.sensor
-        sensor = read_sensor(beside if beside.is_file() else spec.sensor)
+        is_name = Path(spec.sensor).name == spec.sensor.removesuffix(".yaml") and not (path / spec.sensor).exists()
+        sensor = read_sensor(spec.sensor if is_name else inside(path, spec.sensor, file=file, key="sensor"))
         tile = len(sensor.tile_rows), len(sensor.tile_rows[0])
         if tile != (spec.tile_rows, spec.tile_cols):
             raise SpecError(
@@ -156,27 +151,12 @@ class FrameStack:
 
     def __init__(self, file: Path, spec: CaptureSpec) -> None:
         self.file, self._full = file, spec.full_scale_dn
-        try:
-            with zipfile.ZipFile(file) as archive:
-                _require(file, ("frames", "exposures_us"), [Path(name).stem for name in archive.namelist()])
-                with archive.open("exposures_us.npy") as stream:
-                    exposures = np.lib.format.read_array(stream, allow_pickle=False)
-                with archive.open("frames.npy") as stream:
-                    self.shape, self._dtype = self._header(stream)
-        except SpecError:
-            raise
-        except _BROKEN as error:
-            raise _unreadable(file, error) from None
-        self.exposures_us = self._check(np.asarray(exposures), spec)
+        exposures = read_arrays(file, ("frames", "exposures_us"), only=("exposures_us",))["exposures_us"]
+        self.shape, self._dtype = self._header()
+        self.exposures_us = self._check(exposures, spec)
 
-    def _header(self, stream: IO[bytes]) -> tuple[tuple[int, int, int, int], np.dtype]:
-        shape, dtype = _read_header(stream, self.file)
-        if dtype.hasobject:
-            raise SpecError(
-                "frames is an array of objects, as NumPy makes of frames of different sizes; all frames must be "
-                "[exposure, frame, row, col] of one size",
-                file=self.file,
-            )
+    def _header(self) -> tuple[tuple[int, int, int, int], np.dtype]:
+        shape, dtype = member_header(self.file, "frames")
         if dtype.kind not in "ui":
             raise SpecError(
                 f"frames holds {dtype.name}, not whole DN; save the RAW values as uint16, not scaled, averaged or "
@@ -185,7 +165,8 @@ class FrameStack:
             )
         if len(shape) != 4 or 0 in shape:
             raise SpecError(f"frames has shape {shape}; expected [exposure, frame, row, col]", file=self.file)
-        return shape, dtype
+        count, frames, rows, cols = shape
+        return (count, frames, rows, cols), dtype
 
     def _check(self, exposures: NDArray, spec: CaptureSpec) -> NDArray[np.int64]:
         count, frames, rows, cols = self.shape
@@ -210,42 +191,23 @@ class FrameStack:
                 f"frames of {rows}×{cols} pixels are not whole tiles of {spec.tile_rows}×{spec.tile_cols}",
                 file=self.file,
             )
+        if spec.roi is not None and (rows, cols) != (spec.roi.height_px, spec.roi.width_px):
+            raise SpecError(
+                f"frames of {rows}×{cols} pixels are not the roi of capture.yaml, "
+                f"{spec.roi.height_px}×{spec.roi.width_px}",
+                file=self.file,
+            )
         return exposures.astype(np.int64)
 
     def __iter__(self) -> Iterator[NDArray]:
         """Frames [row, col] of all exposures in order; each is valid until the next is asked for."""
         shape = self.shape[2:]
-        for frame in _stream(self.file, "frames", int(np.prod(self.shape[:2])), shape):
+        for frame in stream_member(self.file, "frames", int(np.prod(self.shape[:2])), shape):
             if int(frame.max()) > self._full or (self._dtype.kind == "i" and int(frame.min()) < 0):
                 raise SpecError(
                     f"holds values outside 0 to {self._full}, the range of bit_depth in capture.yaml", file=self.file
                 )
             yield frame
-
-
-def small_arrays(file: Path, required: tuple[str, ...], skip: tuple[str, ...] = ()) -> dict[str, NDArray]:
-    """Arrays of an ``.npz`` file but those to `skip`, which are only looked for.
-
-    Raises
-    ------
-    SpecError
-        If the file or a `required` array is missing, cannot be read, or would take more memory than a map can.
-    """
-    found: dict[str, NDArray] = {}
-    try:
-        with zipfile.ZipFile(file) as archive:
-            names = [Path(name).stem for name in archive.namelist()]
-            _require(file, required, names)
-            for member in names:
-                if member in skip:
-                    continue
-                with archive.open(f"{member}.npy") as stream:
-                    found[member] = _read_values(stream, member, file)
-    except SpecError:
-        raise
-    except _BROKEN as error:
-        raise _unreadable(file, error) from None
-    return found
 
 
 def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least: float = 0.0) -> float:
@@ -254,93 +216,22 @@ def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least:
     Raises
     ------
     SpecError
-        If it holds text, several values, or a number that is not finite or too small.
+        If it holds text, several values, or a number that is not finite, too small or too large.
     """
     kind = "whole number" if whole else "number"
-    wrong = SpecError(f"{name} must be one {kind} of {least:g} or more", file=file)
+    wrong = SpecError(f"{name} must be one {kind} of {least:g} or more, up to {_MOST:g}", file=file)
     if value.size != 1 or value.dtype.kind not in "uif":
         raise wrong
     found = float(value.item())
-    if not np.isfinite(found) or found < least or (whole and found != int(found)):
+    if not least <= found <= _MOST or (whole and found != int(found)):
         raise wrong
     return found
-
-
-def _check_size(shape: tuple[int, ...], dtype: np.dtype, name: str, file: Path) -> None:
-    if dtype.hasobject:
-        raise SpecError(f"{name} is an array of objects; save numbers", file=file)
-    size = math.prod(int(n) for n in shape) * dtype.itemsize
-    if size > _MOST_BYTES:
-        raise SpecError(f"{name} would take {size / 1e9:.3g} GB, more than a map of any sensor", file=file)
-
-
-def _read_values(stream: IO[bytes], name: str, file: Path) -> NDArray:
-    shape, fortran_order, dtype = _npy_header(stream)
-    _check_size(shape, dtype, name, file)
-    buffer = bytearray(math.prod(shape) * dtype.itemsize)
-    _fill(stream, memoryview(buffer))
-    values = np.frombuffer(buffer, dtype=dtype)
-    return values.reshape(shape[::-1]).T if fortran_order else values.reshape(shape)
 
 
 def count_maps(captures: CaptureSet, name: str, member: str) -> Iterator[NDArray]:
     """Maps [row, col] of a member [k, row, col], one at a time."""
     file = captures.folder / f"{name}.npz"
-    try:
-        with zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
-            shape, _ = _read_header(stream, file)
-    except _BROKEN as error:
-        raise _unreadable(file, error) from None
+    shape, _ = member_header(file, member)
     if len(shape) != 3:
         raise SpecError(f"{member} has shape {shape}; expected [contrast, row, col]", file=file)
-    yield from _stream(file, member, shape[0], shape[1:])
-
-
-def _stream(file: Path, member: str, count: int, shape: tuple[int, ...]) -> Iterator[NDArray]:
-    """`count` consecutive arrays of `shape` from a member, through one buffer."""
-    try:
-        with zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
-            _, dtype = _read_header(stream, file)
-            _check_size(shape, dtype, member, file)
-            buffer = bytearray(math.prod(shape) * dtype.itemsize)
-            for _ in range(count):
-                _fill(stream, memoryview(buffer))
-                yield np.frombuffer(buffer, dtype=dtype).reshape(shape)
-    except SpecError:
-        raise
-    except _BROKEN as error:
-        raise _unreadable(file, error) from None
-
-
-def _fill(stream: IO[bytes], view: memoryview, piece: int = 1 << 18) -> None:
-    filled = 0
-    while filled < len(view):
-        data = stream.read(min(piece, len(view) - filled))
-        if not data:
-            raise EOFError("the file ends early")
-        view[filled : filled + len(data)] = data
-        filled += len(data)
-
-
-def _read_header(stream: IO[bytes], file: Path) -> tuple[tuple[int, ...], np.dtype]:
-    shape, fortran_order, dtype = _npy_header(stream)
-    if fortran_order and len(shape) > 1:
-        raise SpecError("arrays must be in C order (use numpy.ascontiguousarray before saving)", file=file)
-    return shape, dtype
-
-
-def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    return read(stream)
-
-
-def _require(file: Path, required: tuple[str, ...], found: list[str]) -> None:
-    for name in required:
-        if name not in found:
-            raise SpecError(f"holds no array {name!r} (found: {', '.join(found) or 'none'})", file=file)
-
-
-def _unreadable(file: Path, error: BaseException) -> SpecError:
-    reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
-    return SpecError(f"cannot be read as an .npz file of plain arrays ({reason})", file=file)
+    yield from stream_member(file, member, shape[0], shape[1:])

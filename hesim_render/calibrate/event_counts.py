@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.captures import CaptureSet, number
+from hesim_render.calibrate.captures import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, number
 from hesim_render.calibrate.result import read_calibration, read_maps
 from hesim_render.errors import SpecError
 from hesim_render.units import S_PER_US
@@ -96,8 +96,8 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
             "there is an event in nearly every trial, which tells nothing of the noise; raise the threshold", file=file
         )
     signal = signal.astype(np.float64)
-    if np.any(signal[np.isfinite(signal)] < 0) or not np.any(np.isfinite(signal)):
-        raise SpecError("signal_dn must be 0 or above (the clean light signal, black subtracted)", file=file)
+    if np.any(signal < 0) or np.any(signal > BRIGHTEST_DN) or not np.any(np.isfinite(signal)):
+        raise SpecError(SIGNAL_RANGE, file=file)
     return StaticCapture(
         signal,
         maps["n_on"],

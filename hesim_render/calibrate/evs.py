@@ -18,6 +18,7 @@ def calibrate_evs(
     progress: Progress | None = None,
     bootstrap: int = 0,
     seed: int = 0,
+    overwrite: bool = False,
 ) -> Path:
     """Calibrate the events of a capture set and write (or update) a ``calibration.yaml``.
 
@@ -26,10 +27,11 @@ def calibrate_evs(
     folder : capture set with ``capture.yaml``, ``evs_static.npz`` and, for θ, ``evs_steps.npz``.
     out : the calibration; its section ``evs`` is written, others are kept. Where ``evs_static.npz`` has no
         ``signal_dn``, the composite in its section ``aps`` is the signal: frames of the same scene.
-    report : HTML file, if one is wanted; it covers every section of `out`.
+    report : HTML file, if one is wanted; it covers every section of `out`, and a report of `out` is replaced.
     progress : called with what is being done and the fraction done.
     bootstrap : number of resamplings of the pixels for a second opinion on the standard errors.
     seed : of the multi-start study and the bootstrap.
+    overwrite : replace a report of another calibration.
 
     Returns
     -------
@@ -43,9 +45,12 @@ def calibrate_evs(
         If a result cannot be written.
     """
     from hesim_render.calibrate.evs_output import content, maps
-    from hesim_render.calibrate.result import write_section
+    from hesim_render.calibrate.result import check_calibration, check_report, write_section
 
     captures = read_captures(folder)
+    check_calibration(out, describe(captures))
+    if report is not None:
+        check_report(out, report, overwrite)
     tell = progress or (lambda what, fraction: None)
     tell("reading event counts", 0.0)
     static = read_static(captures, out)
@@ -56,6 +61,6 @@ def calibrate_evs(
     if report is not None:
         from hesim_render.calibrate.report import write_report
 
-        write_report(out, report)
+        write_report(out, report, overwrite)
     tell("done", 1.0)
     return Path(out)

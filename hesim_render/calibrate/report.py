@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.result import read_calibration, read_maps, write_text
+from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning
 from hesim_render.calibrate.svg import COLOURS, Plot, number, picture, table
 from hesim_render.calibrate.variance import polynomial
+from hesim_render.output import replacing
+from hesim_render.specs.calibration import as_written
 
 #: Mean number of events of which a chance of 5 % is left that none is counted: −ln 0.05.
 _UPPER_OF_NONE = 3.0
@@ -28,28 +30,36 @@ svg .grid{stroke:#e4e4e4;fill:none}svg .axis{stroke:#555;fill:none}
 """
 
 
-def write_report(calibration: str | Path, report: str | Path) -> Path:
+def write_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:
     """Draw every section of a ``calibration.yaml`` into one HTML file.
+
+    Parameters
+    ----------
+    overwrite : replace a report that is there.
 
     Raises
     ------
     SpecError
         If the calibration or its maps cannot be read.
     OutputError
-        If the report cannot be written.
+        If the report cannot be written, or something is there that must not be replaced.
     """
+    path = check_report(calibration, report, overwrite)
     data = read_calibration(calibration)
-    parts = [_introduction(data)]
-    if "aps" in data:
-        parts.append(_aps(data["aps"], read_maps(calibration, "aps", data)))
-    if "evs" in data:
-        parts.append(_evs(data["evs"], read_maps(calibration, "evs", data)))
+    with as_written(calibration):
+        parts = [_introduction(data)]
+        if "aps" in data:
+            parts.append(_aps(data["aps"], read_maps(calibration, "aps", data)))
+        if "evs" in data:
+            parts.append(_evs(data["evs"], read_maps(calibration, "evs", data)))
     body = "\n".join(parts)
     page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Noise calibration</title>'
+        f'{report_beginning(calibration)}"><title>Noise calibration</title>'
         f"<style>{_STYLE}</style></head><body>{body}</body></html>\n"
     )
-    return write_text(report, page)
+    with replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return Path(report)
 
 
 def _introduction(data: dict[str, Any]) -> str:

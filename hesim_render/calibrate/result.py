@@ -1,30 +1,38 @@
-"""``calibration.yaml`` and the map files beside it: written whole or not at all, read back checked."""
+"""``calibration.yaml``, the map files beside it and the place of its report: written whole or not at all."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
-import tempfile
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from hesim_render.errors import SpecError
-from hesim_render.output import output_errors
-from hesim_render.specs.calibration import SCHEMA_VERSION, read_calibration, read_maps
+from hesim_render.errors import OutputError, SpecError
+from hesim_render.guard import read_text
+from hesim_render.npzfile import NpzWriter
+from hesim_render.output import check_place, output_errors, replacing
+from hesim_render.specs.calibration import SCHEMA_VERSION, file_digest, read_calibration, read_maps
 
-__all__ = ["plain", "read_calibration", "read_maps", "write_section", "write_text"]
+__all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]
 
 _SIGNIFICANT = 9
+_REPORT = '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="calibration" content="'
 
 
 def write_section(
     file: str | Path, section: str, capture: Mapping[str, Any], content: Mapping[str, Any], maps: Mapping[str, NDArray]
 ) -> Path:
-    """Add or replace a section of a calibration, with its maps in ``<name>_<section>_maps.npz`` beside it.
+    """Add or replace a section of a calibration, with its maps in ``<name>_<section>_maps-<hash>.npz`` beside it.
+
+    The name of a map file goes with what is in it, and the calibration holds its hash: the one step in which the
+    calibration gets its name is also that in which new maps take the place of old ones.
 
     Raises
     ------
@@ -34,35 +42,98 @@ def write_section(
         If it cannot be written.
     """
     path = Path(file)
-    data: dict[str, Any] = {"schema_version": SCHEMA_VERSION, "capture": dict(capture)}
-    if path.exists():
-        previous = read_calibration(path)
-        for key in ("sensor", "roi", "tile_rows", "tile_cols"):
-            if previous["capture"].get(key) != capture.get(key):
-                raise SpecError(
-                    f"holds a calibration with {key} {previous['capture'].get(key)!r}, the captures have "
-                    f"{capture.get(key)!r}; give another --out",
-                    file=path,
-                )
-        data = previous
-        data["capture"] = {**previous["capture"], **capture}
+    data = check_calibration(path, capture)
     names = [name for name in maps if not name.startswith("figure_")]
-    map_file = path.with_name(f"{path.stem}_{section}_maps.npz")
-    data[section] = {**content, "maps": {"file": map_file.name, **{name: name for name in names}}}
-    arrays: dict[str, Any] = dict(maps)
-    with output_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _replace(map_file, lambda stream: np.savez(stream, **arrays))
-        _replace(path, lambda stream: _yaml().dump(plain(data), stream))
+    target = path.with_name(f"{path.stem}_{section}_maps-{_digest(maps)[:12]}.npz")
+    try:
+        with replacing(target) as temporary, NpzWriter(temporary) as archive:
+            for name, array in maps.items():
+                archive.add(name, np.asarray(array))
+        about = {"file": target.name, "sha256": file_digest(target), **{name: name for name in names}}
+        data[section] = {**content, "maps": about}
+        with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
+            _yaml().dump(plain(data), stream)
+    finally:
+        with contextlib.suppress(OSError, SpecError):  # not what was asked for, and the next run does it
+            _remove_unnamed(path, section)
     return path
 
 
-def write_text(file: str | Path, text: str) -> Path:
-    """Write a text file whole or not at all."""
+def check_calibration(file: str | Path, capture: Mapping[str, Any]) -> dict[str, Any]:
+    """What a calibration holds to which a section of such captures is added, the captures among it.
+
+    Raises
+    ------
+    SpecError
+        If `file` exists and is not a calibration, or is one of another sensor.
+    OutputError
+        If there can be no file.
+    """
     path = Path(file)
-    with output_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _replace(path, lambda stream: stream.write(text.encode("utf-8")))
+    check_place(path)
+    if not path.exists():
+        return {"schema_version": SCHEMA_VERSION, "capture": dict(capture)}
+    previous = read_calibration(path)
+    for key in ("sensor", "roi", "tile_rows", "tile_cols"):
+        if previous["capture"].get(key) != capture.get(key):
+            raise SpecError(
+                f"holds a calibration with {key} {previous['capture'].get(key)!r}, the captures have "
+                f"{capture.get(key)!r}; give another --out",
+                file=path,
+            )
+    return {**previous, "capture": {**previous["capture"], **capture}}
+
+
+def _digest(maps: Mapping[str, NDArray]) -> str:
+    """SHA-256 of arrays and their names."""
+    digest = hashlib.sha256()
+    for name, array in maps.items():
+        values = np.ascontiguousarray(array)
+        digest.update(f"{name} {values.dtype.str} {values.shape} ".encode())
+        digest.update(values.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
+
+
+def _remove_unnamed(path: Path, section: str) -> None:
+    """Remove map files of a section that no calibration in the folder names, those of killed runs among them."""
+    ours = re.compile(rf"{re.escape(path.stem)}_{section}_maps(-[0-9a-f]{{12}})?\.npz")
+    found = [other for other in path.parent.iterdir() if ours.fullmatch(other.name)]
+    texts = [read_text(other) for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if found else []
+    for other in found:
+        if not any(other.name in text for text in texts):
+            other.unlink(missing_ok=True)
+
+
+def report_beginning(calibration: str | Path) -> str:
+    """How the report of a calibration begins: with the hash of the calibration's place."""
+    return _REPORT + hashlib.sha256(os.fsencode(Path(calibration).expanduser().resolve())).hexdigest()[:16]
+
+
+def check_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:
+    """Whether a report may be written; returns its absolute path.
+
+    The report of this very calibration is brought up to date without being asked; that of another one only with
+    `overwrite`, and no other file is touched.
+
+    Raises
+    ------
+    OutputError
+        If it may not.
+    """
+    path, own = check_place(report), report_beginning(calibration)
+    if path.resolve() == Path(calibration).expanduser().resolve():
+        raise OutputError(f"{report}: is the calibration itself; give the report another name")
+    if not path.is_file() or path.stat().st_size == 0:
+        return path
+    with output_errors(path), path.open("rb") as stream:
+        start = stream.read(len(own)).decode("utf-8", "replace")
+    if not start.startswith(_REPORT):
+        raise OutputError(f"{report}: exists and is no report of a calibration; give the name of a new file")
+    if start != own and not overwrite:
+        raise OutputError(
+            f"{report}: exists and is of another calibration; give another name, or overwrite it (--overwrite, "
+            "overwrite=True)"
+        )
     return path
 
 
@@ -87,17 +158,3 @@ def _yaml() -> YAML:
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # ruamel declares None
     yaml.width = 110
     return yaml
-
-
-def _replace(path: Path, write: Callable[[IO[bytes]], Any]) -> None:
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            write(stream)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.captures import CaptureSet, count_maps, number, small_arrays
+from hesim_render.calibrate.captures import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, count_maps, number
 from hesim_render.errors import SpecError
+from hesim_render.npzfile import read_arrays
 
 #: Groups of pixels whose sums are kept apart, so that they can be left out in turn (jackknife).
 GROUPS = 100
@@ -100,7 +101,7 @@ def read_contrast(
         If one is missing or is not of numbers.
     """
     file = captures.folder / "evs_steps.npz"
-    small = small_arrays(file, ("contrast", "signal_dn", "n_on", "n_off", *more), skip=("n_on", "n_off"))
+    small = read_arrays(file, ("contrast", "signal_dn", "n_on", "n_off", *more), skip=("n_on", "n_off"))
     contrast = small["contrast"]
     if contrast.dtype.kind not in "uif" or contrast.ndim != 1 or not np.all(np.isfinite(contrast)):
         raise SpecError("contrast must be a list of finite numbers, ln I₁/I₀ of each step", file=file)
@@ -110,8 +111,8 @@ def read_contrast(
     if signal.dtype.kind not in "uif" or signal.size == 0 or signal.ndim not in (0, 1, 2):
         raise SpecError("signal_dn must be a number, or numbers [row, col]", file=file)
     signal = signal.astype(np.float64)
-    if not np.all(np.isfinite(signal)) or signal.min() < 0:
-        raise SpecError("signal_dn must be 0 or above (the clean light signal, black subtracted)", file=file)
+    if not np.all((signal >= 0) & (signal <= BRIGHTEST_DN)):
+        raise SpecError(SIGNAL_RANGE, file=file)
     return contrast.astype(np.float64), signal, small
 
 

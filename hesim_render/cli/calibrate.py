@@ -65,6 +65,7 @@ def calibrate(
     captures: Annotated[Path, typer.Argument(help="folder of a capture set")],
     out: Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")],
     report: Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace a report of another calibration")] = False,
 ) -> None:
     """Noise parameters from captures, into a file that a sensor file can point at."""
     from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
@@ -72,7 +73,7 @@ def calibrate(
 
     run = calibrate_aps if part is Part.aps else calibrate_evs
     with progress_report(f"calibrate {part.value}") as move:
-        run(captures, out, report, lambda what, fraction: move(fraction, 1.0, what))
+        run(captures, out, report, lambda what, fraction: move(fraction, 1.0, what), overwrite=overwrite)
     lines = summary_lines(read_calibration(out), part.value)
     where = [f"in {out}"] if report is None else [f"in {out}", f"report: {report}"]
     say("\n".join([*lines, *where]))

@@ -57,6 +57,9 @@ def simulate(
     ] = None,
     clean: Clean = False,
     without: Without = None,
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a scene and record it: RAW frames, events and their ground truth.
@@ -69,7 +72,7 @@ def simulate(
         scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
         overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
         max_minutes=None if yes else LONG_MINUTES,
-        clean=clean, without=without or (),
+        clean=clean, without=without or (), allow_outside=allow_outside,
     )  # fmt: skip
     say(summary(recording))
     if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
@@ -100,13 +103,14 @@ def _simulate(
     sensor_changes: dict[str, Any] | None = None,
     roi: str | None = None,
     overwrite: bool = False,
+    allow_outside: bool = False,
     **options: Any,
 ) -> Recording:
     check_output(out, overwrite)
     import hesim_render as hr
 
     loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
-    loaded_scene = hr.load_scene(scene, scene_changes)
+    loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
     with progress_report(f"{scene} → {sensor}") as progress:
         return hr.simulate(
             loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,

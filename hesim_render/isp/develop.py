@@ -17,7 +17,6 @@ from hesim_render.layout import Layout
 from hesim_render.optics import Lens, relative_illumination
 from hesim_render.output import OutputFolder, output_errors
 from hesim_render.recording import Recording
-from hesim_render.specs.sensor import SensorSpec
 
 #: File that tells a folder of pictures.
 MARKER = "isp.json"
@@ -65,7 +64,7 @@ def develop_recording(
     camera = Camera.of(recording.mosaic)
     noise = None
     if any(item.step == "denoise" for item in chain.steps):
-        noise = FrameNoise.of_recording(recording.manifest, calibration)
+        noise = FrameNoise.of_recording(recording.manifest, calibration, recording.path)
     elif calibration is not None:
         raise RangeError("calibration", str(calibration), "none, as no step of the pipeline reduces noise")
     target = OutputFolder(out or recording.path.with_name(f"{recording.path.name}-pictures"), MARKER, overwrite)
@@ -125,7 +124,7 @@ def write_picture(path: Path, picture: NDArray) -> None:
 
 def _illumination(recording: Recording) -> NDArray[np.float32]:
     """Relative illumination of the recording's own lens over its region, as the manifest describes them."""
-    spec = SensorSpec.model_validate(recording.manifest["sensor"]["spec"])
+    spec = manifests.sensor_spec(recording.manifest, recording.path)
     roi, used = recording.manifest["roi"], recording.manifest["lens"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
     axis_x, axis_y = used.get("axis_mm", (0.0, 0.0))  # recordings of before it was told have theirs in the middle

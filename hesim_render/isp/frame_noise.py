@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.bands import in_bands
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.layout import Layout
+from hesim_render.manifest import sensor_spec
 from hesim_render.noise.aps import ADC_VARIANCE_DN2, APS_TERMS, ApsNoise
-from hesim_render.specs.calibration import NoiseFile, read_calibration, read_maps
+from hesim_render.specs.calibration import NoiseFile, as_written, read_calibration, read_maps
 from hesim_render.specs.sensor import SensorSpec
 from hesim_render.units import S_PER_US
 
@@ -93,7 +94,9 @@ class FrameNoise:
         )
 
     @classmethod
-    def of_recording(cls, manifest: Mapping[str, Any], calibration: str | Path | None = None) -> FrameNoise:
+    def of_recording(
+        cls, manifest: Mapping[str, Any], calibration: str | Path | None = None, folder: Path | None = None
+    ) -> FrameNoise:
         """Of the sensor that made a recording, less the terms that were switched off.
 
         Parameters
@@ -101,13 +104,14 @@ class FrameNoise:
         manifest : of the recording.
         calibration : the ``calibration.yaml`` of a calibrated sensor, whose maps a recording does not hold; without
             it the maps are taken as unknown.
+        folder : of the recording, for errors.
 
         Raises
         ------
         SpecError
-            If the calibration is not the one that the sensor had.
+            If the manifest holds no sensor that this version knows, or the calibration is not the one it had.
         """
-        spec = SensorSpec.model_validate(manifest["sensor"]["spec"])
+        spec = sensor_spec(manifest, folder)
         settings, roi = manifest.get("settings", {}), manifest["roi"]
         without = (name.removeprefix("aps.") for name in settings.get("without", ()) if name.startswith("aps."))
         off = frozenset(APS_TERMS) if settings.get("clean") else frozenset(without)
@@ -128,11 +132,11 @@ class FrameNoise:
         path = Path(file)
         data = read_calibration(path)
         maps = read_maps(path, "aps", data, ("n_row", "n_blc", "n_dp"))
-        try:
-            beta = np.array([[[b or 0.0 for b in cell] for cell in row] for row in data["aps"]["beta"]])
+        with as_written(path):
+            beta = np.array([[[b or 0.0 for b in cell] for cell in row] for row in data["aps"]["beta"]], np.float64)
             offset, dark = maps["n_row"][:, None] + maps["n_blc"], maps["n_dp"]
-        except (KeyError, TypeError) as error:
-            raise SpecError(f"is not as 'calibrate aps' writes it; it lacks {error}", file=path) from None
+        if not (np.isfinite(offset).all() and np.isfinite(dark).all()):
+            raise SpecError("its maps hold values that are not finite", file=path)
         return cls(beta, exposure_us, offset_dn=offset.astype(np.float32), dark_dn_per_s=dark.astype(np.float32))
 
     def at(self, exposure_us: float) -> FrameNoise:

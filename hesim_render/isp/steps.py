@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,11 +13,13 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from hesim_render.camera import Camera
 from hesim_render.errors import RangeError, SpecError
+from hesim_render.guard import reading
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
 from hesim_render.isp.demosaicing import demosaic
 from hesim_render.isp.denoise import denoise
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.rows import row_offsets
+from hesim_render.npzfile import read_array, read_arrays
 from hesim_render.specs.files import Strict
 from hesim_render.transfer import Depth, Transfer, encode
 
@@ -71,18 +74,13 @@ class MapFile(Strict):
         SpecError
             If it cannot be read.
         """
-        try:
-            found = np.load(self.file, allow_pickle=False)
-            if isinstance(found, np.ndarray):
-                return found
-            with found:
-                if self.name not in found.files:
-                    raise SpecError(f"no array {self.name!r}; it has {', '.join(found.files)}", file=self.file)
-                return found[self.name]
-        except (OSError, ValueError, EOFError) as error:
-            if isinstance(error, SpecError):
-                raise
-            raise SpecError(f"cannot be read ({error})", file=self.file) from None
+        with reading(self.file):
+            is_archive = zipfile.is_zipfile(self.file)
+        if not is_archive:
+            return read_array(self.file, kinds="uif")
+        if self.name is None:
+            raise SpecError("holds several arrays: say which one by 'name'", file=self.file)
+        return read_arrays(self.file, (self.name,), only=(self.name,), kinds="uif")[self.name]
 
 
 class BlackLevel(Strict):

@@ -334,7 +334,8 @@ class ApsNoise:
         full_well_dn = self.spec.full_well_e * self.spec.system_gain_dn_per_e
         level = dr.minimum(dr.fma(gain, counts, fixed), full_well_dn) + pixels.offset_dn
         level = dr.fma(dr.sqrt(types.Float(gaussian)), deviate, level)
-        return types.UInt32(dr.clip(dr.round(level), 0.0, float(self.full_scale_dn)))
+        # not clip: of a level that is no number it makes the largest integer, which no ADC of fewer bits gives
+        return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(self.full_scale_dn)), 0.0))
 
     @cached_property
     def _keys(self) -> Any:

@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 
 from hesim_render.errors import SpecError
 from hesim_render.layout import Layout
-from hesim_render.specs.calibration import read_calibration, read_maps
+from hesim_render.specs.calibration import as_written, read_calibration, read_maps
+from hesim_render.specs.geometry import Region
+
+#: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
+_EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "bad_pixels": ("b", 1.0)}
+_THRESHOLD = ("fiu", 1e3)  # relative to the mean
 
 
 def require_region(layout: Layout) -> None:
@@ -88,6 +93,11 @@ def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[dict[st
                 "where only a part of the sensor was captured",
                 file=noise.path,
             )
+        kind, largest = _EXPECTED.get(name, _THRESHOLD)
+        if values.dtype.kind not in kind:
+            raise SpecError(f"map {name} holds {values.dtype.name}", file=noise.path)
+        if not np.all(np.abs(values) <= largest):
+            raise SpecError(f"map {name} holds values that are not finite, or beyond {largest:g}", file=noise.path)
     return maps, offset
 
 
@@ -96,7 +106,10 @@ def _region(layout: Layout, data: dict[str, Any]) -> tuple[int, int, int, int]:
     roi = data["capture"].get("roi")
     if roi is None:
         return 0, 0, layout.spec.geometry.rows, layout.spec.geometry.cols
-    return roi["y"], roi["x"], roi["height_px"], roi["width_px"]
+    assert layout.spec.noise is not None
+    with as_written(layout.spec.noise.path):
+        region = Region.model_validate(roi)
+    return region.y, region.x, region.height_px, region.width_px
 
 
 def _offset(layout: Layout, data: dict[str, Any]) -> tuple[int, int]:

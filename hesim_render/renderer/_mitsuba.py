@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hesim_render import backend
 from hesim_render.errors import SpecError
+from hesim_render.renderer.scene_files import check_xml, require_state_inside
 from hesim_render.spectra import Spectrum
 
 _LEAST_THREADS = 2
@@ -91,12 +92,13 @@ def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[N
         raise SpecError(f"Mitsuba cannot read this scene: {' '.join(lines)[:400]}", file=file, key=key) from None
 
 
-def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], None]) -> Any:
+def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], None], root: Path | None = None) -> Any:
     """A scene from an XML file or a dictionary, nothing merged.
 
     Parameters
     ----------
     review : called with the `ParserState` of what was read, before anything is made of it; it may change that.
+    root : folder in which all files that it names must lie; None lets them lie anywhere.
     """
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
@@ -107,9 +109,15 @@ def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], N
         inner.prepend(str(source.resolve().parent))
         mi.set_file_resolver(inner)
     try:
+        if isinstance(source, Path):
+            check_xml(source, root, lambda name: str(inner.resolve(name)))
         state = (
             parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
         )
+        if root is not None:
+            find = mi.file_resolver().resolve
+            file = source if isinstance(source, Path) else None
+            require_state_inside(mi, state, root, lambda name: str(find(name)), file)
         parser.transform_all(config, state)
         review(state)
         return parser.instantiate(config, state)

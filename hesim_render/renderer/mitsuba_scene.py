@@ -21,6 +21,7 @@ from hesim_render.renderer.plugins import (
     set_depth,
     used_plugins,
 )
+from hesim_render.renderer.scene_files import require_short_number
 from hesim_render.specs.scene import MitsubaSpec, SceneSpec
 
 #: Path length for a scene without an integrator of its own.
@@ -65,12 +66,18 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
             raise SpecError(f"no such Mitsuba scene file: {path}", file=spec.file, key="mitsuba.file")
         where = (path, None)
 
+    root: Path | None = None  # a dictionary that a program gave is its own
+    if not spec.allow_outside and spec.file is not None:
+        root = spec.folder
+    elif not spec.allow_outside and source.file is not None:
+        root = path.parent
+
     def load(review: Callable[[Any], None]) -> Any:
         with as_spec_error(*where):
             if source.file is not None:
-                return load_scene(mi, path, review)
+                return load_scene(mi, path, review, root)
             own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {}, spec.file)
-            return load_scene(mi, {"type": "scene", **own}, review)
+            return load_scene(mi, {"type": "scene", **own}, review, root)
 
     moving = [track.object for track in spec.motion]
     reason: str | None = None
@@ -129,6 +136,7 @@ def _plugin_dict(
     """
     content: dict[str, Any] = {}
     for name, value in node.items():
+        require_short_number(str(name), file)
         if name == "type":
             require_known(value, file, key)
         if isinstance(value, Mapping):

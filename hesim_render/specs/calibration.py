@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
-import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
-from hesim_render.errors import SpecError
-from hesim_render.specs.files import Strict, load_yaml
+from hesim_render.errors import HesimError, SpecError
+from hesim_render.guard import inside, reading, reason
+from hesim_render.npzfile import read_arrays
+from hesim_render.specs.files import Strict
+from hesim_render.specs.yamlfile import read_yaml
 from hesim_render.units import S_PER_US
 
 SCHEMA_VERSION = 1
+_SECTIONS = ("aps", "evs")
 
 
 def read_calibration(file: str | Path) -> dict[str, Any]:
@@ -28,18 +29,55 @@ def read_calibration(file: str | Path) -> dict[str, Any]:
     Raises
     ------
     SpecError
-        If it cannot be read or is of another schema.
+        If it cannot be read, is of another schema, or lacks what every calibration has.
     """
     path = Path(file)
-    try:
-        data = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, YAMLError):
-        data = load_yaml(path)  # slower, but its errors carry the line
-    if not isinstance(data, dict):
-        raise SpecError("expected a mapping of keys to values at the top level", file=path)
+    data = read_yaml(path, with_lines=False)
     if data.get("schema_version") != SCHEMA_VERSION:
         raise SpecError(f"expected {SCHEMA_VERSION}, a calibration of this version", file=path, key="schema_version")
+    if not isinstance(data.get("capture"), dict):
+        raise SpecError("expected a mapping, what 'calibrate' says of the captures", file=path, key="capture")
+    for section in _SECTIONS:
+        part = data.get(section, {"maps": {"file": ""}})
+        maps = part.get("maps") if isinstance(part, dict) else None
+        if not isinstance(maps, dict) or not isinstance(maps.get("file"), str):
+            raise SpecError("expected a mapping with the maps' file", file=path, key=f"{section}.maps")
+        if not isinstance(maps.get("sha256", ""), str):
+            raise SpecError("expected a SHA-256 in hexadecimal digits", file=path, key=f"{section}.maps.sha256")
     return data
+
+
+@contextlib.contextmanager
+def as_written(file: str | Path) -> Iterator[None]:
+    """Turn what comes of a calibration that lacks a part, or has another in its place, into a `SpecError`."""
+    try:
+        yield
+    except HesimError:
+        raise
+    except KeyError as error:
+        raise SpecError(f"is not as 'calibrate' writes it; it lacks {error}", file=file) from None
+    except (TypeError, ValueError, AttributeError, IndexError, OverflowError, ZeroDivisionError) as error:
+        raise SpecError(f"is not as 'calibrate' writes it ({reason(error)})", file=file) from None
+
+
+def map_file(file: Path, data: Mapping[str, Any], section: str) -> Path:
+    """The map file of a section, in the calibration's own folder.
+
+    Raises
+    ------
+    SpecError
+        If it is not there, or elsewhere.
+    """
+    name = data[section]["maps"]["file"]
+    if not (file.parent / name).exists():
+        raise SpecError(f"no such file; it belongs to {file.name}: copy it along", file=file.parent / name)
+    return inside(file.parent, name, file=file, key=f"{section}.maps.file")
+
+
+def file_digest(file: Path) -> str:
+    """SHA-256 of a file."""
+    with reading(file), file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def read_maps(
@@ -55,18 +93,16 @@ def read_maps(
     Raises
     ------
     SpecError
-        If the section or its map file is missing or cannot be read.
+        If the section or its map file is missing, cannot be read, or is not the one the calibration was written with.
     """
     path = Path(file)
     data = read_calibration(path) if data is None else data
     if section not in data:
         raise SpecError(f"holds no section {section!r}; run 'calibrate {section}'", file=path)
-    maps = path.parent / data[section]["maps"]["file"]
-    try:
-        with np.load(maps, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files if names is None or name in names}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise SpecError(f"cannot be read ({error}); it belongs to {path.name}", file=maps) from None
+    maps, digest = map_file(path, data, section), data[section]["maps"].get("sha256")
+    if digest is not None and digest != file_digest(maps):
+        raise SpecError(f"is not the one that {path.name} was written with; run 'calibrate {section}' again", file=maps)
+    return read_arrays(maps, only=names, kinds="bifu")
 
 
 class NoiseFile(Strict):
@@ -91,14 +127,10 @@ class NoiseFile(Strict):
 
     def digest(self) -> str:
         data = read_calibration(self.path)
-        files = [self.path, *(self.path.parent / data[s]["maps"]["file"] for s in ("aps", "evs") if s in data)]
+        files = [self.path, *(map_file(self.path, data, section) for section in _SECTIONS if section in data)]
         digest = hashlib.sha256()
         for file in files:
-            try:
-                with file.open("rb") as stream:
-                    digest.update(hashlib.file_digest(stream, "sha256").digest())
-            except OSError as error:
-                raise SpecError(f"cannot be read ({error.strerror})", file=file) from None
+            digest.update(bytes.fromhex(file_digest(file)))
         return digest.hexdigest()
 
     def read(self) -> dict[str, Any]:
@@ -110,7 +142,7 @@ class NoiseFile(Strict):
             If it cannot be read, or is not the one that `sha256` names.
         """
         data = read_calibration(self.path)
-        if not any(section in data for section in ("aps", "evs")):
+        if not any(section in data for section in _SECTIONS):
             raise SpecError("holds neither a section 'aps' nor 'evs'", file=self.path)
         if self.sha256 is not None and self.sha256 != self.digest():
             raise SpecError("it, or a map of it, is not the one this sensor was written with", file=self.path)
@@ -129,10 +161,8 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile) -> None:
     SpecError
         If the calibration cannot be read, does not fit the sensor, or lacks a parameter that a simulation needs.
     """
-    try:
+    with as_written(noise.path):
         _apply(sensor, noise, noise.read())
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
-        raise SpecError(f"is not as 'calibrate' writes it; it lacks {error}", file=noise.path) from None
 
 
 def _apply(sensor: dict[str, Any], noise: NoiseFile, data: Mapping[str, Any]) -> None:

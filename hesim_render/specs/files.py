@@ -10,14 +10,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, core_schema
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import YAMLError
 
 from hesim_render.errors import SpecError, did_you_mean
 from hesim_render.specs.problems import spec_error
+from hesim_render.specs.yamlfile import read_yaml
 
 
 def _with_true_numbers(schema: Any) -> Any:
@@ -42,7 +44,7 @@ def _is_checked(schema: dict[str, Any]) -> bool:
 
 def _a_number(value: Any) -> Any:
     """Refuses what pydantic would make a number of; other texts it refuses itself."""
-    if isinstance(value, bool):
+    if isinstance(value, bool | np.bool_ | bytes):
         raise ValueError("expected a number, not true or false")
     if isinstance(value, str):
         try:
@@ -107,29 +109,10 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
 
 def load_yaml(file: Path) -> CommentedMap:
     """The mapping in a YAML file, with line numbers kept."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise SpecError(f"cannot be read ({error.strerror})", file=file) from None
-    except UnicodeDecodeError:
-        raise SpecError("is not a UTF-8 text file", file=file) from None
-    try:
-        data = YAML(typ="rt").load(text)
-    except MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        raise SpecError(
-            f"not valid YAML: {error.problem or error.context}",
-            file=file,
-            line=mark.line + 1 if mark else None,
-        ) from None
-    except YAMLError as error:
-        raise SpecError(f"not valid YAML: {str(error).splitlines()[0]}", file=file) from None
-    if not isinstance(data, CommentedMap):
-        raise SpecError("expected a mapping of keys to values at the top level", file=file, line=1)
-    return data
+    return read_yaml(file)
 
 
-def apply_overrides(data: CommentedMap, overrides: Mapping[str, Any]) -> None:
+def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> None:
     """Set dotted keys (``aps.read_noise_e``; list items by number) in place, before validation."""
     for dotted, value in overrides.items():
         node: Any = data
@@ -166,7 +149,7 @@ def parse_override(text: str) -> tuple[str, Any]:
         raise SpecError(f"--set {text!r}: the value is not valid YAML") from None
 
 
-def validate(model: type[Model], data: CommentedMap, file: Path | None, overrides: Mapping[str, Any]) -> Model:
+def validate(model: type[Model], data: dict[str, Any], file: Path | None, overrides: Mapping[str, Any]) -> Model:
     """Apply overrides and build the model; what is wrong becomes one `SpecError`."""
     apply_overrides(data, overrides)
     try:

@@ -1,4 +1,4 @@
-"""Vectors and rigid poses as files write them."""
+"""Vectors, rigid poses and regions as files write them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,29 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator
+from pydantic import AfterValidator, NonNegativeInt, PositiveInt, model_validator
+
+from hesim_render.guard import MOST_PIXELS
+from hesim_render.specs.files import Strict
 
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
+
+
+class Region(Strict):
+    """What part of a sensor was read out, in frame pixels."""
+
+    x: NonNegativeInt
+    y: NonNegativeInt
+    width_px: PositiveInt
+    height_px: PositiveInt
+
+    @model_validator(mode="after")
+    def _check(self) -> Region:
+        if self.width_px * self.height_px > MOST_PIXELS:
+            raise ValueError(f"width_px and height_px: more than {MOST_PIXELS} pixels, as no sensor has")
+        return self
+
 
 #: Largest departure of RᵀR from 1 that counts as rounding of the file's numbers.
 _RIGID_TOLERANCE = 1e-4

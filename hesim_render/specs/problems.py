@@ -138,8 +138,10 @@ def _models_in(annotation: Any) -> set[type[BaseModel]]:
     return set()
 
 
-def line_of(data: Any, location: Iterable[Any]) -> int:
-    """1-based line of the deepest part of `location` that exists in `data`; 1 where none does."""
+def line_of(data: Any, location: Iterable[Any]) -> int | None:
+    """1-based line of the deepest part of `location` that exists in `data`; 1 where none does, None for JSON."""
+    if not isinstance(data, CommentedMap):
+        return None
     line = 1
     node = data
     for key in location:

@@ -6,7 +6,7 @@ face towards +z; the camera looks at it along −z with +x to the right of the i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,7 +24,9 @@ from pydantic import (
     model_validator,
 )
 
-from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.errors import SpecError
+from hesim_render.guard import leads_out
+from hesim_render.specs.files import Strict, apply_overrides, line_of, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_matrix_about, rotation_vector
 from hesim_render.specs.light import LightSpec
 from hesim_render.specs.spectrum import SpectrumSpec
@@ -263,12 +265,13 @@ class SceneSpec(Strict):
     )
     folder: Path = Field(Path(), exclude=True)
     file: Path | None = Field(None, exclude=True)
+    allow_outside: bool = Field(False, exclude=True)
 
     @model_validator(mode="before")
     @classmethod
     def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
         if isinstance(data, dict) and info.context:
-            for key in ("folder", "file"):
+            for key in ("folder", "file", "allow_outside"):
                 if key in data:
                     raise ValueError(f"unknown key '{key}'")
         return data
@@ -311,8 +314,14 @@ class SceneSpec(Strict):
         return (self.light,) if isinstance(self.light, LightSpec) else self.light
 
 
-def read_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SceneSpec:
+def read_scene(
+    name_or_path: str | Path, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False
+) -> SceneSpec:
     """A scene file, by shipped name or path, with dotted `overrides` applied before validation.
+
+    Parameters
+    ----------
+    allow_outside : let the scene name files (spectra, meshes, textures, includes) outside of its folder.
 
     Raises
     ------
@@ -320,5 +329,28 @@ def read_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
         With file, line and key of the first thing wrong.
     """
     file = locate(name_or_path, "scenes")
-    spec = validate(SceneSpec, load_yaml(file), file, overrides or {})
-    return spec.model_copy(update={"folder": file.parent, "file": file})
+    data, changes = load_yaml(file), overrides or {}
+    if not allow_outside:
+        apply_overrides(data, changes)
+        for location, name in _named_files(data):
+            if leads_out(file.parent, name):
+                raise SpecError(
+                    f"{name!r} lies outside of the scene's folder; put it there, or let it (--allow-outside, "
+                    "allow_outside=True)",
+                    file=file,
+                    line=line_of(data, location),
+                    key=".".join(map(str, location)),
+                )
+    spec = validate(SceneSpec, data, file, changes)
+    return spec.model_copy(update={"folder": file.parent, "file": file, "allow_outside": allow_outside})
+
+
+def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], str]]:
+    """Every file that a scene file names, with its place in it."""
+    if isinstance(node, Mapping | list):
+        for key, value in node.items() if isinstance(node, Mapping) else enumerate(node):
+            yield from _named_files(value, (*location, key))
+    elif isinstance(node, str):
+        key = location[-1] if location else None
+        if key in ("csv", "mesh", "filename") or location == ("mitsuba", "file") or node.endswith(".csv"):
+            yield location, node

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.errors import RangeError, SpecError
+from hesim_render.guard import reading
 from hesim_render.video.colours import ColourTags
 from hesim_render.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
 
@@ -83,10 +84,8 @@ class ArrayVideo:
         self.name = "array" if self._path is None else str(self._path)
         array: Any = source
         if self._path is not None:
-            try:
+            with reading(self._path, "as an .npy file of numbers"):
                 array = np.load(self._path, mmap_mode="r", allow_pickle=False)
-            except (OSError, ValueError, EOFError) as error:
-                raise SpecError(f"cannot be read ({error})", file=self._path) from None
         if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in (1, 3, 4)) or 0 in array.shape:
             raise SpecError(
                 f"has shape {array.shape}; expected [time, row, col] or [time, row, col, 1, 3 or 4 channels]",

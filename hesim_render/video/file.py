@@ -64,6 +64,8 @@ class FileVideo:
             self.close()
             raise SpecError("has no video in it", file=self._path)
         self._stream = self._container.streams.video[0]
+        if self._stream.codec_context is None:
+            raise SpecError("has a video that no decoder here reads", file=self._path)
         # frames decoded ahead would log their checksums when nobody listens, see _checksum_errors
         self._stream.thread_type = "SLICE" if self._stream.codec_context.name == "ffv1" else "AUTO"
         self._stream.codec_context.options = {"err_detect": "crccheck+explode"}

@@ -1,0 +1,83 @@
+"""Reading a YAML file without trust in its size, its depth or its aliases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
+
+from hesim_render.errors import SpecError
+from hesim_render.guard import read_text, reading
+
+#: Values that a file may hold once every alias is written out; a calibration of a 16 x 16 tile has a few thousand.
+_MOST_VALUES = 1_000_000
+
+
+def read_yaml(file: Path, with_lines: bool = True) -> Any:
+    """The mapping in a YAML file.
+
+    Parameters
+    ----------
+    with_lines : keep line numbers (a `CommentedMap`), which takes longer; else plain dictionaries.
+
+    Raises
+    ------
+    SpecError
+        If it is not one, or says little and means a lot.
+    """
+    text = read_text(file)
+    with reading(file, "as YAML"):
+        try:
+            if "*" in text:
+                _check_aliases(text, file)
+            data = YAML(typ="rt" if with_lines else "safe").load(text)
+        except MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            raise SpecError(
+                f"not valid YAML: {error.problem or error.context}", file=file, line=mark.line + 1 if mark else None
+            ) from None
+        except YAMLError as error:
+            raise SpecError(f"not valid YAML: {str(error).splitlines()[0]}", file=file) from None
+    if not isinstance(data, CommentedMap if with_lines else dict):
+        raise SpecError("expected a mapping of keys to values at the top level", file=file, line=1)
+    return data
+
+
+def _check_aliases(text: str, file: Path) -> None:
+    """Refuse a file whose aliases, written out, make it a thousand times as large, or for ever."""
+    sizes: dict[str, int] = {}
+    open_nodes: list[tuple[str | None, int]] = [(None, 0)]  # anchor, values so far
+    for event in YAML(typ="rt").parse(text):
+        if isinstance(event, CollectionStartEvent):
+            open_nodes.append((event.anchor, 1))
+            continue
+        if isinstance(event, AliasEvent):
+            if any(anchor == event.anchor for anchor, _ in open_nodes):
+                raise SpecError(
+                    f"the alias *{event.anchor} stands inside of what it means", file=file, line=_line(event)
+                )
+            size = sizes.get(event.anchor, 1)
+        elif isinstance(event, ScalarEvent):
+            size = 1
+            if event.anchor:
+                sizes[event.anchor] = size
+        elif isinstance(event, CollectionEndEvent):
+            anchor, size = open_nodes.pop()
+            if anchor:
+                sizes[anchor] = size
+        else:
+            continue
+        name, before = open_nodes[-1]
+        open_nodes[-1] = name, before + size
+        if before + size > _MOST_VALUES:
+            raise SpecError(
+                f"its aliases, written out, make more than {_MOST_VALUES} values", file=file, line=_line(event)
+            )
+
+
+def _line(event: NodeEvent) -> int | None:
+    return event.start_mark.line + 1 if event.start_mark is not None else None

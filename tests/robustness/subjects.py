@@ -1,0 +1,244 @@
+"""What is damaged: valid inputs of every kind of file, small, and what reads each of them, as users do."""
+
+import contextlib
+import io
+import shutil
+import tempfile
+from pathlib import Path
+
+import capture_sets
+import numpy as np
+import recordings
+from PIL import Image
+
+import hesim_render as hr
+
+#: Light of the small scenes.
+_LIGHT = "light: {type: uniform, illuminance_lux: 100}\n"
+
+
+def recording(folder):
+    recordings.make("eiger", folder / "r", width=32, height=32, duration_us=60_000)
+
+
+def read_recording(folder):
+    from hesim_render.showcase import write_previews
+    from hesim_render.terminal import summary
+
+    loaded = hr.Recording.load(folder / "r")
+    summary(loaded)
+    for frame in loaded.frames:
+        assert frame.raw.shape == frame.valid.shape == frame.electrons_mean.shape
+    _ = loaded.events, loaded.event_truth
+    hr.Recording.load(folder / "r").event_slice(12_000, 40_000)
+    with tempfile.TemporaryDirectory() as other:
+        write_previews(loaded, Path(other))
+
+
+def develop(folder):
+    from hesim_render.isp.develop import develop_recording
+
+    with tempfile.TemporaryDirectory() as other:
+        develop_recording(folder / "r", Path(other) / "out")
+
+
+def captures_aps(folder):
+    capture_sets.write_frames(folder / "set", size=16, frames=8, sensor="reference-bayer", bit_depth=12)
+
+
+def captures_evs(folder):
+    capture_sets.write_events(folder / "set", size=16, trials=4000)
+    contrast = np.linspace(-0.4, 0.4, 7)
+    on = np.random.default_rng(1).binomial(200, (contrast[:, None, None] > 0) * 0.8 + np.zeros((7, 16, 16)) + 0.1)
+    np.savez(folder / "set" / "evs_steps.npz", contrast=contrast, signal_dn=20.0, n_on=on, n_off=(200 - on) // 2,
+             n_trials=200)  # fmt: skip
+
+
+def calibrate_aps(folder):
+    from hesim_render.calibrate import calibrate_aps as run
+
+    with tempfile.TemporaryDirectory() as other:
+        run(folder / "set", Path(other) / "c.yaml", Path(other) / "r.html")
+
+
+def calibrate_evs(folder):
+    from hesim_render.calibrate import calibrate_evs as run
+
+    with tempfile.TemporaryDirectory() as other:
+        run(folder / "set", Path(other) / "c.yaml", Path(other) / "r.html")
+
+
+def calibration(folder):
+    """A calibration of a whole small sensor, and the sensor that points at it."""
+    from hesim_render.calibrate import calibrate_aps as frames
+    from hesim_render.calibrate import calibrate_evs as events
+
+    capture_sets.write_frames(folder / "set", size=32, frames=16)
+    capture_sets.write_events(folder / "set", size=32, trials=100000)
+    text = (Path(__file__).parents[2] / "sensors" / "reference-mono.yaml").read_text()
+    for old, new in (("rows: 1024", "rows: 32"), ("cols: 1024", "cols: 32"), ("bit_depth: 12", "bit_depth: 10")):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "plain.yaml").write_text(text)
+    with (folder / "set" / "capture.yaml").open("a") as stream:
+        stream.write("signal_reference: {k: 0.25, t_ref_us: 1000, filter: own}\n")
+    lines = (folder / "set" / "capture.yaml").read_text().replace("tile_rows: 2", "tile_rows: 1")
+    (folder / "set" / "capture.yaml").write_text(lines.replace("tile_cols: 2", "tile_cols: 1"))
+    frames(folder / "set", folder / "c.yaml")
+    events(folder / "set", folder / "c.yaml")
+    shutil.rmtree(folder / "set")
+    (folder / "s.yaml").write_text(text + "\nnoise: c.yaml\n")
+
+
+def use_calibration(folder):
+    from hesim_render.calibrate import write_report
+    from hesim_render.calibrate.summary import summary_lines
+    from hesim_render.isp.frame_noise import FrameNoise
+    from hesim_render.specs.calibration import as_written, read_calibration
+
+    data = read_calibration(folder / "c.yaml")
+    with as_written(folder / "c.yaml"):
+        for section in ("aps", "evs"):
+            summary_lines(data, section)
+    write_report(folder / "c.yaml", folder / "r.html", overwrite=True)
+    FrameNoise.of_calibration(folder / "c.yaml", 1000).corrected(np.zeros((32, 32), np.float32))
+    use_sensor(folder, "s.yaml")
+
+
+def sensor(folder):
+    text = (Path(__file__).parents[2] / "sensors" / "reference-mono.yaml").read_text()
+    (folder / "s.yaml").write_text(text.replace("clear: {flat: 1.0, band_nm: [400, 700]}", "clear: curve.csv"))
+    (folder / "curve.csv").write_text("# nm, 1\nnm,a\n400,0\n450,0.5\n550,0.9\n700,0\n")
+
+
+def use_sensor(folder, name="s.yaml"):
+    made = hr.load_sensor(folder / name)
+    if made.spec.geometry.rows > 8 and made.spec.geometry.cols > 8:
+        made = made.crop(8, 8)
+    if made.aps is not None:
+        raw = made.aps.sample(np.full(made.layout.shape, 100.0), made.spec.aps.exposure_us, seed=1)
+        assert raw.max() < 2**made.spec.aps.bit_depth
+    if made.evs is not None:
+        _ = made.evs.threshold_on_map, made.evs.threshold_off_map
+
+
+def scene(folder):
+    (folder / "plate.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 1 1 0\nf 1 2 3\n")
+    (folder / "curve.csv").write_text("360,0.4\n830,0.5\n")
+    (folder / "s.yaml").write_text(
+        "schema_version: 1\nname: plate\ndescription: one triangle\nobjects:\n"
+        "  - {name: plate, shape: mesh, mesh: plate.obj, reflectance: curve.csv}\n"
+        "  - {name: ball, shape: sphere, size_m: [0.1, 0.1, 0.1], position_m: [0, 0, 0.2]}\n"
+        "motion:\n  - object: ball\n    keyframes:\n      - {t_us: 0}\n"
+        "      - {t_us: 1000, translation_m: [0.1, 0, 0], rotation_axis: [0, 1, 0], rotation_deg: 90}\n"
+        f"{_LIGHT}camera:\n  origin_m: [0, 0, 1]\n  target_m: [0, 0, 0]\n  f_number: 4\nmax_depth: 3\n"
+    )
+
+
+def build_scene(folder):
+    from hesim_render.renderer._mitsuba import mitsuba
+    from hesim_render.renderer.builder import build
+
+    made = build(mitsuba(), hr.load_scene(folder / "s.yaml").spec)
+    made.pose(500)
+
+
+def foreign_scene(folder):
+    Image.fromarray(np.full((8, 8, 3), 128, np.uint8)).save(folder / "t.png")
+    (folder / "plate.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 1 1 0\nf 1 2 3\n")
+    (folder / "part.xml").write_text(
+        '<scene version="3.0.0">\n<shape type="sphere"><float name="radius" value="0.3"/>\n'
+        '<emitter type="area"><spectrum name="radiance" value="2"/></emitter></shape>\n</scene>\n'
+    )
+    (folder / "main.xml").write_text(
+        '<scene version="3.0.0">\n<default name="part" value="part.xml"/>\n<include filename="$part"/>\n'
+        '<integrator type="path"><integer name="max_depth" value="4"/></integrator>\n'
+        '<shape type="obj"><string name="filename" value="plate.obj"/>\n<bsdf type="diffuse">\n'
+        '<texture type="bitmap" name="reflectance"><string name="filename" value="t.png"/></texture>\n</bsdf></shape>\n'
+        '<sensor type="perspective"><float name="fov" value="45"/></sensor>\n</scene>\n'
+    )
+    (folder / "s.yaml").write_text(
+        "schema_version: 1\nname: x\ndescription: d\nmitsuba: {file: main.xml, radiance_scale: 0.5}\n"
+        "camera: {origin_m: [0, 0, 2]}\n"
+    )
+
+
+def pictures(folder):
+    rng = np.random.default_rng(4)
+    (folder / "pictures").mkdir()
+    for k in range(3):
+        Image.fromarray(rng.integers(0, 255, (16, 16, 3), dtype=np.uint8)).save(folder / "pictures" / f"{k:04d}.png")
+
+
+def array_video(folder):
+    np.save(folder / "v.npy", np.random.default_rng(4).integers(0, 255, (3, 16, 16), dtype=np.uint8))
+
+
+def video(folder):
+    import av
+
+    with av.open(str(folder / "v.mkv"), "w") as out:
+        stream = out.add_stream("ffv1", rate=100)
+        stream.width = stream.height = 16
+        stream.pix_fmt = "yuv420p"
+        for k in range(4):
+            image = np.full((16, 16, 3), 60 * k, np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        out.mux(stream.encode())
+
+
+def play(folder):
+    source = next(p for p in folder.iterdir() if p.name in ("v.npy", "v.mkv", "pictures"))
+    tags = {"transfer": "srgb", "primaries": "bt709", "matrix": "bt709", "range": "limited"}
+    own = hr.load_sensor("reference-mono").crop(8, 8)
+    fps = None if source.name == "v.mkv" else 1000
+    given = tags if source.name == "v.mkv" else {"transfer": "srgb"}
+    hr.simulate_video(source, own, fps=fps, duration_s=0.002, white_lux=300, **given)
+
+
+def pipeline(folder):
+    np.savez(folder / "maps.npz", rows=np.zeros(16), pixels=np.zeros((16, 16)))
+    (folder / "p.yaml").write_text(
+        "schema_version: 1\nsteps:\n  - step: black_level\n    row_map: {file: maps.npz, name: rows}\n"
+        "    pixel_map: {file: maps.npz, name: pixels}\n  - {step: white_balance, method: given, gains: [1, 1, 1]}\n"
+        "  - {step: demosaic}\n  - {step: colour_matrix}\n  - {step: exposure, auto: true}\n  - {step: encode}\n"
+    )
+    (folder / "c.yaml").write_text(
+        "channels: [red, green, blue]\ntile: |\n  red green\n  green blue\nblack_level_dn: 64\nwhite_level_dn: 1023\n"
+        "white_balance: [2, 1, 1.5]\nmatrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\ntransfer: srgb\n"
+    )
+
+
+def run_pipeline(folder):
+    from hesim_render.camera import load_camera
+    from hesim_render.isp import load_pipeline, process
+
+    raw = np.random.default_rng(1).integers(64, 1023, (16, 16), dtype=np.uint16)
+    process(raw, load_camera(folder / "c.yaml"), load_pipeline(folder / "p.yaml"))
+
+
+#: name: (makes valid files in a folder, reads them, files that are damaged)
+SUBJECTS = {
+    "recording": (recording, read_recording, "r/*.json r/events.h5 r/frames/*.dng r/truth/*"),
+    "developed": (recording, develop, "r/*.json r/frames/*.dng"),
+    "aps": (captures_aps, calibrate_aps, "set/*"),
+    "evs": (captures_evs, calibrate_evs, "set/*"),
+    "calibration": (calibration, use_calibration, "c.yaml c_*.npz s.yaml"),
+    "sensor": (sensor, use_sensor, "s.yaml curve.csv"),
+    "scene": (scene, build_scene, "s.yaml plate.obj curve.csv"),
+    "mitsuba": (foreign_scene, build_scene, "s.yaml main.xml part.xml plate.obj t.png"),
+    "pictures": (pictures, play, "pictures/*"),
+    "array": (array_video, play, "v.npy"),
+    "video": (video, play, "v.mkv"),
+    "isp": (pipeline, run_pipeline, "p.yaml c.yaml maps.npz"),
+}
+
+
+def files_of(name, folder):
+    """The files of a subject that are damaged, in order."""
+    return sorted(path for pattern in SUBJECTS[name][2].split() for path in folder.glob(pattern) if path.is_file())
+
+
+def quiet():
+    """Nothing that libraries print stands in the way of what is to be seen."""
+    return contextlib.redirect_stdout(io.StringIO())

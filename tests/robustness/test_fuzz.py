@@ -1,0 +1,93 @@
+"""Damaged files of every kind: each costs one clear error, or is read. No traceback, no hang, no crash, no flood of
+memory. The mutations are a pure function of their numbers: a failure names what to run again."""
+
+import json
+import os
+import selectors
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+#: A try takes 0.05 to 0.5 s; longer than this is a hang.
+HANG_S = 20
+#: Tries of each subject in the whole run, 3600 in all.
+WHOLE = {
+    "recording": 1300, "developed": 60, "aps": 250, "evs": 200, "calibration": 240, "sensor": 300, "scene": 250,
+    "mitsuba": 300, "pictures": 200, "array": 200, "video": 200, "isp": 300,
+}  # fmt: skip
+#: Interpreter, libraries and small inputs take 0.4 GB; no damage may ask for gigabytes.
+PEAK_MB = 1500
+
+
+def lines_of(*parts):
+    """What fuzz.py prints; its end, of itself or by us, is the last line."""
+    child = subprocess.Popen(
+        [sys.executable, HERE / "fuzz.py", *parts], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": f"{HERE.parents[1]}:{HERE.parent}"},
+    )  # fmt: skip
+    try:
+        with selectors.DefaultSelector() as ready:
+            ready.register(child.stdout, selectors.EVENT_READ)
+            while True:
+                waited = time.monotonic()
+                if not ready.select(HANG_S + 40):  # the first try of a subject waits for imports and valid files
+                    yield {"end": "hang"}
+                    return
+                line = child.stdout.readline()
+                if not line:
+                    break
+                found = json.loads(line)
+                yield found | {"seconds": time.monotonic() - waited}
+        if child.wait(timeout=30):
+            yield {"end": f"status {child.returncode}", "error": child.stderr.read().decode()[-2000:]}
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def check(parts, wanted):
+    """Run, and name what broke; a subject goes on behind a hang or a crash."""
+    bad, ends, waiting = [], {"fine": 0, "refused": 0}, list(parts)
+    while waiting:
+        subject, first, last = waiting.pop(0).split(":")
+        place = int(first)
+        for line in lines_of(f"{subject}:{first}:{last}"):
+            if line["end"] in ends:
+                ends[line["end"]] += 1
+            elif line["end"] == "done":
+                if line["peak_mb"] > PEAK_MB:
+                    bad.append({"subject": subject, "first": first, "last": last, **line})
+                continue
+            else:
+                bad.append({"subject": subject, "seed": place, **line})
+                if "seed" not in line and place + 1 < int(last):  # it is gone
+                    waiting.insert(0, f"{subject}:{place + 1}:{last}")
+            if line.get("seconds", 0) > HANG_S and place > int(first):
+                bad.append(line)
+            place += 1
+    assert not bad, "\n".join(map(str, bad[:20]))
+    assert sum(ends.values()) == wanted
+    return ends
+
+
+def test_some_damaged_files():
+    parts = ["recording:0:60", "sensor:0:30", "isp:0:30", "array:0:20"]
+    ended = {}
+    for line in lines_of(*parts):
+        ended.setdefault(line["end"], []).append(line)
+    assert set(ended) == {"fine", "refused", "done"}, [v for k, v in ended.items() if k not in ("fine", "refused")]
+    assert len(ended["fine"]) + len(ended["refused"]) == 140
+    assert ended["done"][0]["peak_mb"] < PEAK_MB
+    # most damage is noticed: what is not lies in a comment, a name, a margin of a file, or makes another valid value
+    assert len(ended["refused"]) > 70
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("subject", WHOLE)
+def test_damaged_files(subject):
+    assert sum(WHOLE.values()) >= 3000
+    check([f"{subject}:1000:{1000 + WHOLE[subject]}"], WHOLE[subject])

@@ -1,0 +1,176 @@
+"""Every command that writes, killed at random and at every step of its work on files.
+
+Afterwards the old result stands there whole, or the new one; the next run succeeds and leaves nothing behind. Results
+are told apart by their bytes: a run of one seed always gives the same ones.
+"""
+
+import hashlib
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import capture_sets
+import numpy as np
+import pytest
+import recordings
+
+from hesim_render.calibrate import read_calibration, read_maps
+from hesim_render.output import check_target
+
+HERE = Path(__file__).parent
+PIXELS = ["--sensor", "reference-mono", "--roi", "16x16", "--duration", "0.02", "--out", "out", "--overwrite"]
+#: name: (arguments of a run, what tells the new run from the old one, folder that it writes, its marker)
+COMMANDS = {
+    "view": (["view", "out"], None, "out", "recording.json"),
+    "isp": (["isp", "rec", "--out", "out", "--overwrite"], ["--no-denoise"], "out", "isp.json"),
+    "aps": (["calibrate", "aps", "set", "--out", "c.yaml", "--report", "r.html"], None, None, None),
+    "evs": (["calibrate", "evs", "set", "--out", "c.yaml", "--report", "r.html"], None, None, None),
+    "lab": (["lab", "reference-mono", "--out", "out", "--roi", "16x16", "--frames", "8", "--ticks", "500", "--dark-ms",
+             "1,5", "--lit-ms", "1,5", "--overwrite"], ["--seed", "8"], "out", "capture.yaml"),
+    "video": (["video", "v.npy", "--fps", "100", "--transfer", "srgb", *PIXELS], ["--seed", "8"], "out",
+              "recording.json"),
+    "simulate": (["simulate", "flat-field", *PIXELS], ["--seed", "8"], "out", "recording.json"),
+}  # fmt: skip
+
+
+def prepare(name, folder):
+    if name == "view":
+        recordings.make("eiger", folder / "out", width=32, height=32, duration_us=60_000)
+    elif name == "isp":
+        recordings.make("eiger", folder / "rec", width=32, height=32, duration_us=60_000)
+    elif name == "aps":
+        capture_sets.write_frames(folder / "set", size=32, frames=8)
+    elif name == "evs":
+        capture_sets.write_events(folder / "set", size=32, trials=20000)
+    elif name == "video":
+        np.save(folder / "v.npy", np.full((4, 16, 16), 128, np.uint8))
+
+
+def start(folder, arguments, step=None, side="before", exchange=True):
+    how = ["-m", "hesim_render.cli"]
+    if step is not None:
+        how = [HERE / "killed.py", step, side, "yes" if exchange else "no"]
+    return subprocess.Popen(
+        [str(part) for part in [sys.executable, *how, *arguments]], cwd=folder, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(HERE.parents[1])},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+
+
+def finish(folder, arguments):
+    child = start(folder, arguments)
+    out, err = child.communicate(timeout=120)
+    assert child.returncode == 0, err + out
+    return out
+
+
+def files_in(folder):
+    """Relative paths of all files, hidden ones too."""
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def digest(name, folder):
+    """Of the whole result, which must be readable."""
+    target = COMMANDS[name][2]
+    found = hashlib.sha256()
+    if target is None:
+        data = read_calibration(folder / "c.yaml")
+        maps = read_maps(folder / "c.yaml", name, data)  # checks that they are the calibration's own
+        assert maps
+        found.update((folder / "c.yaml").read_bytes())
+        return found.hexdigest()
+    for path in files_in(folder / target):
+        if name == "view" and ".partial" in path:
+            continue  # in the recording itself; the next run removes it
+        found.update(path.encode() + (folder / target / path).read_bytes())
+    return found.hexdigest()
+
+
+class Trial:
+    """One command in a folder that holds the result of an earlier run of it."""
+
+    def __init__(self, name, folder):
+        self.name, self.folder = name, folder
+        self.arguments, other, self.target, self.marker = COMMANDS[name]
+        folder.mkdir()
+        prepare(name, folder)
+        known = []
+        began = time.monotonic()
+        for arguments in ([*self.arguments, *(other or [])], self.arguments):
+            finish(folder, arguments)
+            known.append(digest(name, folder))
+        self.seconds = (time.monotonic() - began) / 2
+        self.known = set(known)
+        self.whole = self.names()
+        self.before = [*self.arguments, *(other or [])]
+        self.kills = 0
+
+    def names(self):
+        """Files of a finished run; the hash in the name of a map file is not compared."""
+        return {re.sub(r"-[0-9a-f]{12}\.npz", ".npz", path) for path in files_in(self.folder)}
+
+    def check(self, child):
+        """What a killed run has left is whole, once the next run has put back what was moved away."""
+        _, err = child.communicate(timeout=60)
+        assert "Traceback" not in err, err
+        if child.returncode != 0:
+            self.kills += 1
+        if self.target is not None:
+            check_target(self.folder / self.target, self.marker, overwrite=True)
+        assert digest(self.name, self.folder) in self.known
+        return child.returncode
+
+    def end(self):
+        finish(self.folder, self.arguments)
+        assert self.names() == self.whole
+        assert digest(self.name, self.folder) in self.known
+        shutil.rmtree(self.folder)
+
+
+def kill_at_every_step(trial, exchange=True, most=12):
+    """From the first step until a run has not as many."""
+    for step in range(1, most + 1):
+        for side in ("before", "after") if exchange else ("after",):
+            child = start(trial.folder, trial.before if step % 2 else trial.arguments, step, side, exchange)
+            if trial.check(child) == 0:
+                return
+            assert child.returncode == -signal.SIGKILL
+
+
+def kill_at_random(trial, times, seed):
+    rng = random.Random(seed)
+    for k in range(times):
+        child = start(trial.folder, trial.before if k % 2 else trial.arguments)
+        time.sleep(rng.uniform(0.1, 1.0) * trial.seconds)
+        number = rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+        child.send_signal(number)
+        status = trial.check(child)
+        # 130 is an interrupted command; before Python has its own handlers the signal itself ends it
+        assert status in (0, 130, -number), status
+
+
+def test_view_killed_at_every_step(tmp_path):
+    trial = Trial("view", tmp_path / "view")
+    kill_at_every_step(trial, most=2)
+    trial.end()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_killed_command_loses_nothing(name, tmp_path):
+    trial = Trial(name, tmp_path / name)
+    kill_at_every_step(trial)
+    at_steps = trial.kills
+    kill_at_random(trial, 12, seed=sum(map(ord, name)))
+    if trial.target is not None and name != "view":
+        kill_at_every_step(trial, exchange=False)
+    # over all commands more than 100
+    print(f"{name}: {at_steps} kills at steps, {trial.kills} in all")
+    assert at_steps >= 4 and trial.kills >= 12
+    trial.end()
