@@ -105,7 +105,7 @@ def test_cells_without_an_event_are_arrows_and_no_cell_is_missing(tmp_path, monk
     drawn = {"points": [], "arrows_down": []}
     for name in drawn:
         monkeypatch.setattr(
-            f"hesim_render.calibrate.report.Plot.{name}",
+            f"hesim_render.calibrate.report_events.Plot.{name}",
             lambda self, x, y, *rest, name=name, **more: drawn[name].append((self, x, y)) or self,
         )
     capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=120.0, c=0.001)
