@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from hesim_render.calibrate import calibrate_aps, common_mode, frame_checks, read_calibration
+from hesim_render.calibrate import (
+    calibrate_aps,
+    calibrate_evs,
+    common_mode,
+    event_checks,
+    frame_checks,
+    read_calibration,
+)
 from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.summary import summary_lines
 
@@ -134,3 +141,62 @@ def test_drift_of_black_and_of_light_are_told_apart_to_the_number():
     assert drift.black.variance == pytest.approx(black[1:].var(ddof=1), rel=0.05)
     assert drift.light.variance == pytest.approx(light[1:].var(ddof=1), rel=0.02)
     assert drift.light.p_value < 1e-100 and drift.black.p_value < 1e-100
+
+
+def events_of(folder, **keys):
+    """Section of the calibration of `broken_captures.events`, and the report."""
+    broken_captures.events(folder / "set", **keys)
+    calibrate_evs(folder / "set", folder / "c.yaml", folder / "r.html")
+    return read_calibration(folder / "c.yaml")["evs"], (folder / "r.html").read_text(encoding="utf-8")
+
+
+BROKEN_EVENTS = {
+    "noise of a t law": ({"noise": "t"}, {"S-curve width", "S-curve floor", "event counts"}, "longer tails"),
+    "a floor in both polarities": ({"floor": 2e-4}, {"S-curve floor"}, "come by themselves"),
+    "an S-curve that tops at 0.9": ({"ceiling": 0.9}, {"S-curve ceiling", "S-curve width"}, "read-out"),
+}
+
+
+@pytest.mark.parametrize("keys, checks, advice", BROKEN_EVENTS.values(), ids=BROKEN_EVENTS.keys())
+def test_events_that_break_the_model_are_named(tmp_path, keys, checks, advice):
+    section, report = events_of(tmp_path, size=64, **keys)
+    found = {f["check"]: f for f in section["findings"]}
+    assert checks <= set(found) and advice in report
+    assert all(found[check]["p_value"] < 1e-6 for check in checks)
+    if "floor" in keys:
+        for name in ("floor_on", "floor_off"):
+            level = section["s_curve"][name]
+            assert abs(level["value"] - 2e-4) < 4.5 * level["standard_error"] < 1e-4  # two values: 1e-5
+    if "ceiling" in keys:
+        level = section["s_curve"]["ceiling"]
+        assert abs(level["value"] - 0.9) < 4.5 * level["standard_error"] < 2e-3
+
+
+GOOD_EVENTS = {"plain": {"mismatch": 0.0}, "mismatch": {}, "wide mismatch": {"mismatch": 0.15},
+               "leak": {"leak": 2e-4}, "asymmetry": {"rho": 0.01}}  # fmt: skip
+
+
+@pytest.mark.parametrize("keys", GOOD_EVENTS.values(), ids=GOOD_EVENTS.keys())
+def test_good_events_are_not_blamed(tmp_path, keys):
+    """4 checks of a chance of 1e-4 each: a false alarm of all in 0.2 % of changed seeds."""
+    section, report = events_of(tmp_path, size=64, **keys)
+    assert section["findings"] == [] and "nothing was found" in report
+    # floors and ceiling: 4.5 standard errors, and the chance of one event in far steps
+    for name, true in (("floor_on", keys.get("leak", 0.0)), ("floor_off", 0.0), ("ceiling", 1.0 + keys.get("leak", 0))):
+        level = section["s_curve"][name]
+        assert abs(level["value"] - true) < 4.5 * level["standard_error"] + 2e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("keys", GOOD_EVENTS.values(), ids=GOOD_EVENTS.keys())
+def test_good_events_give_false_alarms_at_the_stated_rate(tmp_path, monkeypatch, keys):
+    """With each check at 5 % on 60 seeds. 11 or more of 60 have a chance of 1e-4 at 5 %; 20 checks are looked at."""
+    monkeypatch.setattr(event_checks, "ALARM", 0.05)
+    for name in ("_LEAST_FLOOR", "_LEAST_LOSS"):
+        monkeypatch.setattr(event_checks, name, 0.0)
+    seeds, count = 60, {}
+    for seed in range(seeds):
+        for finding in events_of(tmp_path, size=64, seed=1000 + seed, **keys)[0]["findings"]:
+            count[finding["check"]] = count.get(finding["check"], 0) + 1
+    assert binom.sf(10, seeds, 0.05) < 2e-4
+    assert max(count.values(), default=0) < 11, count

@@ -11,6 +11,7 @@ from hesim_render.calibrate.captures import CaptureSet
 from hesim_render.calibrate.estimate import estimated, not_identifiable
 from hesim_render.calibrate.event_analysis import DECISIVE, EvsCalibration
 from hesim_render.calibrate.event_cells import Cells, PixelThresholds, pool_events
+from hesim_render.calibrate.event_checks import check_events
 from hesim_render.calibrate.event_counts import StaticCapture
 from hesim_render.calibrate.event_estimate import EventFit
 from hesim_render.calibrate.event_model import both_probabilities
@@ -30,7 +31,9 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     other = "sqrt" if fit.law == "linear" else "linear"
     tile = result.static.tile
     theta = not_identifiable(result.thresholds_reason)
+    findings, levels = check_events(result, captures.spec.contrast_of)
     section: dict[str, Any] = {
+        "findings": [finding.described() for finding in findings],
         "model": _MODEL,
         "theta_hardware_v": captures.spec.theta_hardware_v
         or not_identifiable("not stated in capture.yaml; 1 V is taken as its unit"),
@@ -54,6 +57,10 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
             "theta": estimated(thresholds.theta, thresholds.theta_error, "ln"),
             "theta_on": estimated(thresholds.theta_on, error[0], "ln"),
             "theta_off": estimated(thresholds.theta_off, error[1], "ln"),
+        }
+    if levels is not None:
+        section["s_curve"] = {
+            name: estimated(*getattr(levels, name), "events per trial") for name in ("floor_on", "floor_off", "ceiling")
         }
     section["threshold_mismatch"] = result.mismatch.described() | {
         "from": "static counts" if thresholds is None else "steps"
