@@ -20,6 +20,8 @@ from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.variance import TERMS, VarianceFit, variance_map
 
 _FIGURE_PX = 320
+#: Points of pooled variances that are drawn of a position, about.
+_POINTS = 240
 
 
 def content(captures: CaptureSet, result: ApsCalibration, dark_moments: Moments, lit: Moments) -> dict[str, Any]:
@@ -140,13 +142,16 @@ def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[in
     }
     points = []
     for (i, j), bins in result.bins.items():
-        group = np.cumsum(bins.pixels) // (bins.pixels.sum() / 240)
-        for t, is_lit in {(t, lit_) for t, lit_ in zip(bins.exposure_s, bins.lit, strict=True)}:
+        size = bins.pixels.sum() / _POINTS
+        for t, is_lit in sorted({(t, lit_) for t, lit_ in zip(bins.exposure_s, bins.lit, strict=True)}):
+            of = np.flatnonzero((bins.exposure_s == t) & (bins.lit == is_lit))
+            # as many pixels a point; what is left at the end joins the point before, as a few would scatter widely
+            total = np.cumsum(bins.pixels[of])
+            group = np.minimum(np.floor((total - bins.pixels[of]) / size), max(np.floor(total[-1] / size) - 1, 0))
             for g in np.unique(group):
-                use = (bins.exposure_s == t) & (bins.lit == is_lit) & (group == g)
-                if use.any():
-                    n = bins.pixels[use].sum()
-                    points.append((i, j, t, is_lit, bins.powers[use, 1].sum() / n, bins.products[use, 0].sum() / n, n))
+                use = of[group == g]
+                n = bins.pixels[use].sum()
+                points.append((i, j, t, is_lit, bins.powers[use, 1].sum() / n, bins.products[use, 0].sum() / n, n))
     figures["figure_variance_points"] = np.array(points)
     for name, moments, signal, mask in (
         ("dark", dark, None, ~(result.bad | result.dark.bad | result.dark.hot)[None] & np.ones(dark.mean.shape, bool)),

@@ -19,11 +19,13 @@ _LEAST_FLOOR, _LEAST_LOSS = 1e-5, 1e-3
 #: Relative error of the width of the S-curve beside its own: the curve is taken as one normal law whose width changes
 #: in proportion to the step, which is off by 1.5 % at θ = 0.2.
 _MODEL_ERROR = 0.02
+#: Standard errors apart from which two searches end at different points.
+_APART = 0.3
 
 
 def check_events(result: EvsCalibration, contrast_of: str) -> tuple[list[Finding], CurveLevels | None]:
     """Every check of the events, and the levels of the S-curves where they were captured."""
-    found = [_counts(result)]
+    found = [_counts(result), _starts(result)]
     levels = None
     if result.thresholds is not None and result.steps is not None:
         levels = curve_levels(result.steps, result.thresholds)
@@ -43,6 +45,21 @@ def _counts(result: EvsCalibration) -> Finding | None:
         "are off. Look at the curves of P against brightness: events that come by themselves, noise with longer tails "
         "than a normal law, a scene that moves, or a signal_dn that is not that of the event pixels.",
         p_value,
+    )
+
+
+def _starts(result: EvsCalibration) -> Finding | None:
+    """Searches from other starts that end elsewhere: several fits describe the counts about as well."""
+    free = np.array(result.together.free[:4]) & (result.starts_standard_error > 0)
+    away = np.abs(result.starts - np.median(result.starts, axis=0))[:, free] / result.starts_standard_error[free]
+    apart = np.any(away > _APART, axis=1)
+    if not apart.any():
+        return None
+    return Finding(
+        "starts",
+        f"{int(apart.sum())} of {apart.size} searches from other starts end elsewhere, by up to {away.max():.2g} "
+        "standard errors: the counts do not tell A … D in one way only. Capture more trials, and brighter scenes.",
+        None,
     )
 
 
@@ -86,7 +103,8 @@ def _floor(result: EvsCalibration, levels: CurveLevels) -> Finding | None:
 def _width(result: EvsCalibration, contrast_of: str) -> Finding | None:
     """Noise by the width of the S-curve against noise by the static counts."""
     thresholds, steps, fit = result.thresholds, result.steps, result.together
-    if thresholds is None or steps is None or not (fit.identified("A") and fit.identified("B")):
+    # without C the static counts do not tell the noise in the light of the steps
+    if thresholds is None or steps is None or not all(fit.identified(name) for name in "ABC"):
         return None
     theta = thresholds.theta
     measured, error = thresholds.noise

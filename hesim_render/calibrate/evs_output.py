@@ -18,6 +18,8 @@ from hesim_render.calibrate.event_model import both_probabilities
 from hesim_render.calibrate.thresholds import curve
 
 _FIGURE_PX = 320
+#: Most bins of a histogram of counts.
+_BINS = 64
 _UNITS = {"A": "1/(V DN)", "B": "1/V", "C": "1/DN", "D": ""}
 _MODEL = (
     "theta/sigma_n = Theta (A I + B) / sqrt(2 (1 + 2 D y + y^2)), y = C I (linear) or C sqrt(I) (sqrt); "
@@ -60,7 +62,7 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
         }
     if levels is not None:
         section["s_curve"] = {
-            name: estimated(*getattr(levels, name), "events per trial") for name in ("floor_on", "floor_off", "ceiling")
+            name: estimated(value, error, "events per trial") for name, (value, error) in vars(levels).items()
         }
     section["threshold_mismatch"] = result.mismatch.described() | {
         "from": "static counts" if thresholds is None else "steps"
@@ -184,8 +186,11 @@ def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, 
         ]
     )
     for name, (_, on_map, off_map) in zip(("lit", "dark"), static.sessions, strict=False):
-        top = max(4.0, float(np.quantile(np.maximum(on_map, off_map)[good], 0.999)) * 1.15)
-        edges = np.linspace(-0.5, top, min(64, int(top) + 1) + 1)
+        most = max(4, int(np.quantile(np.maximum(on_map, off_map)[good], 0.999) * 1.15))
+        # bins of whole counts, so that every bin can hold as many of them
+        wide = -(-(most + 1) // _BINS)
+        edges = np.arange(-(-(most + 1) // wide) + 1) * wide - 0.5
+        top = float(edges[-1])
         figures[f"figure_on_off_{name}"] = np.histogram2d(off_map[good], on_map[good], bins=(edges, edges))[0]
         figures[f"figure_on_off_{name}_top"] = np.array(top)
     figures["figure_starts"] = result.starts

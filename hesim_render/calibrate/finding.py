@@ -16,12 +16,12 @@ class Finding:
     Attributes
     ----------
     check : its name. text : what was seen, what it spoils, and what to look at.
-    p_value : chance of it where all is as the model supposes.
+    p_value : chance of it where all is as the model supposes; None where it is no matter of chance.
     """
 
     check: str
     text: str
-    p_value: float
+    p_value: float | None
 
     def described(self) -> dict[str, Any]:
         return {"check": self.check, "p_value": self.p_value, "text": self.text}

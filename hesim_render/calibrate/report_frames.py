@@ -24,7 +24,7 @@ def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
         "<h2>Frames (APS)</h2>",
         findings(section),
         row_of(
-            picture("Row bias", band[::step, ::step], "DN", 130),
+            picture("Row bias", band[::step, ::step], "DN", 390),
             profile.svg(),
             picture(f"Temporal variance per pixel, lit, {exposure:g} ms", maps["figure_variance_map"], "DN²", 330),
         ),
@@ -69,10 +69,10 @@ def _variance_panels(section: dict[str, Any], points: NDArray) -> str:
                 span_of(x),
                 (0, 1.05 * y.max()),
                 size=(300, 210),
-                legend="left",
             )
             relative = 100 * (y / polynomial(beta, x, here[:, 2]) - 1)
-            lower = Plot("", "light signal, DN", "residual, %", span_of(x), (-6, 6), size=(300, 130))
+            reach = max(3.0, 1.05 * float(np.abs(relative).max()))
+            lower = Plot("", "light signal, DN", "residual, %", span_of(x), (-reach, reach), size=(300, 130))
             for k, t in enumerate(np.unique(here[:, 2])):
                 colour, use = COLOURS[k % len(COLOURS)], here[:, 2] == t
                 upper.points(x[use], y[use], colour, f"{1e3 * t:g} ms", 1.5)

@@ -17,10 +17,13 @@ def findings(section: Mapping[str, Any]) -> str:
     found = section.get("findings", [])
     if not found:
         return "<p>Checks of the captures: nothing was found that is not as the noise model supposes.</p>"
-    lines = "".join(
-        f"<li><b>{escape(f['check'])}</b> (p = {f['p_value']:.1g}): {escape(f['text'])}</li>" for f in found
-    )
+    lines = "".join(f"<li><b>{escape(f['check'])}</b>{_chance(f['p_value'])}: {escape(f['text'])}</li>" for f in found)
     return f'<div class="findings">Look at this first; figures below may be off:<ul>{lines}</ul></div>'
+
+
+def _chance(p_value: float | None) -> str:
+    text = p_text(p_value)
+    return f" (p {text if text[:1] == '<' else '= ' + text})" if text else ""
 
 
 def plain_text(value: Any) -> str:
