@@ -37,6 +37,7 @@ class Stream(IntEnum):
     AUDIT_PILOT = 42
     LIGHT_LEVEL = 43
     LIGHT_LEVEL_PILOT = 44
+    ROW_NOISE = 45
 
 
 def stream_key(seed: int, stream: Stream) -> int:

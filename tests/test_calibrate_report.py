@@ -10,7 +10,7 @@ import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
 from hesim_render.calibrate.result import plain
-from hesim_render.calibrate.svg import number, ticks
+from hesim_render.calibrate.svg import Plot, number, ticks
 from hesim_render.errors import OutputError, SpecError
 
 
@@ -105,7 +105,7 @@ def test_cells_without_an_event_are_arrows_and_no_cell_is_missing(tmp_path, monk
     drawn = {"points": [], "arrows_down": []}
     for name in drawn:
         monkeypatch.setattr(
-            f"hesim_render.calibrate.report.Plot.{name}",
+            f"hesim_render.calibrate.report_events.Plot.{name}",
             lambda self, x, y, *rest, name=name, **more: drawn[name].append((self, x, y)) or self,
         )
     capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=120.0, c=0.001)
@@ -157,3 +157,86 @@ def test_axis_ticks_are_round():
     assert ticks(0, 1, 5) == [0, 0.2, 0.4, 0.6, 0.8, 1.0]
     assert ticks(-0.011, 0.011) == [-0.01, -0.005, 0.0, 0.005, 0.01]
     assert [number(v) for v in (0, 1234567, 0.25, 2e-4)] == ["0", "1.2e6", "0.25", "2.0e-4"]
+
+
+def _texts(svg):
+    """Each text of a drawing: its words, class and box (left, top, right, bottom), turned ones where they stand."""
+    found = []
+    for attributes, words in re.findall(r"<text ([^>]*)>([^<]*)</text>", svg):
+        kind = re.search(r'class="([^"]*)"', attributes).group(1)
+        if words == "":
+            continue
+        turned = re.search(r"translate\(([\d.-]+) ([\d.-]+)\)", attributes)
+        wide = 6.6 * len(words)
+        if turned:
+            x, y = float(turned.group(1)), float(turned.group(2))
+            found.append((words, kind, (x - 10, y - wide / 2, x + 2, y + wide / 2)))
+            continue
+        x, y = (float(re.search(rf'\b{name}="([\d.-]+)"', attributes).group(1)) for name in "xy")
+        left = x - (wide if "end" in kind else 0 if "start" in kind or kind == "title" else wide / 2)
+        found.append((words, kind, (left, y - 9, left + wide, y + 2)))
+    return found
+
+
+def test_no_text_of_a_drawing_lies_on_another_or_beyond_its_edge(both):
+    page = (both[0] / "both.html").read_text(encoding="utf-8")
+    drawings = re.findall(r"<svg .*?</svg>", page, re.S)
+    assert len(drawings) > 12
+    for svg in drawings:
+        width, height = (int(n) for n in re.search(r'width="(\d+)" height="(\d+)"', svg).groups())
+        texts = _texts(svg)
+        for k, (words, kind, (left, top, right, bottom)) in enumerate(texts):
+            assert left > -2 and top > -2 and bottom < height + 2, words
+            assert right < width + (40 if kind == "title" else 6), words
+            for other, _, box in texts[:k]:
+                apart = right <= box[0] or box[2] <= left or bottom <= box[1] or box[3] <= top
+                assert apart, (words, other)
+
+
+def test_the_legend_stands_below_what_is_drawn():
+    plot = Plot("t", "x", "y", (0, 1), (0, 1), size=(300, 200))
+    for k in range(9):
+        plot.points(np.array([0.5]), np.array([0.5]), "#000", f"{k} milliseconds")
+    svg = plot.svg()
+    boxes = [box for words, _, box in _texts(svg) if "milliseconds" in words]
+    assert len(boxes) == 9 and min(box[1] for box in boxes) > 190 and max(box[2] for box in boxes) < 300
+    assert max(box[3] for box in boxes) < int(re.search(r'height="(\d+)"', svg).group(1))
+
+
+def test_no_dictionary_is_printed(tmp_path):
+    keys = {"roi": "{x: 0, y: 4, width_px: 32, height_px: 32}", "signal_reference": "{k: 0.25, t_ref_us: 1000}"}
+    capture_sets.write_events(tmp_path / "set", size=32, **keys)
+    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "r.html")
+    page = re.sub(r"<style>.*?</style>", "", (tmp_path / "r.html").read_text(), flags=re.S)
+    text = re.sub(r"<[^>]*>", " ", page)
+    assert not re.search(r"[{}\[\]]|\b(None|True|False|dict|array)\b", text)
+    assert "x 0, y 4, width_px 32, height_px 32" in text and "k 0.25, t_ref_us 1000.0, filter own" in text
+
+
+def test_residuals_beyond_the_usual_are_drawn(both, monkeypatch):
+    """Every point handed to a panel lies within its axes."""
+    outside = []
+    points = Plot.points
+
+    def checked(self, x, y, *rest, **more):
+        outside.append(len(x) - len(self._inside(x, y)))
+        return points(self, x, y, *rest, **more)
+
+    monkeypatch.setattr(Plot, "points", checked)
+    write_report(both[0] / "c.yaml", both[0] / "again.html")
+    (both[0] / "again.html").unlink()
+    assert len(outside) > 10 and not any(outside)
+
+
+def test_histograms_of_counts_have_bins_of_whole_counts(both):
+    maps = read_maps(both[0] / "c.yaml", "evs")
+    with np.load(both[0] / "set" / "evs_static.npz") as data:
+        on, off = data["n_on"], data["n_off"]
+    good = ~maps["bad_pixels"]
+    table, top = maps["figure_on_off_lit"], float(maps["figure_on_off_lit_top"])
+    wide = (top + 0.5) / len(table)
+    assert wide == int(wide) >= 1
+    counted = np.zeros(table.shape)
+    inside = good & (on < top) & (off < top)
+    np.add.at(counted, ((off[inside] // wide).astype(int), (on[inside] // wide).astype(int)), 1)
+    np.testing.assert_array_equal(table, counted)

@@ -106,6 +106,15 @@ def test_terms_switched_off_are_not_looked_for():
     assert not np.any(clean.offset_dn) and not np.any(clean.dark_dn_per_s) and np.all(np.asarray(clean.response) == 1)
 
 
+def test_temporal_row_noise_is_in_no_map():
+    sensor = hr.load_sensor("eiger", {"aps.row_noise_dn": 1.5}).crop(64, 64)
+    noise = FrameNoise.of_sensor(sensor.spec, sensor.layout)
+    assert noise.unknown_rows_dn == 1.5 and noise.describe() == {"maps": "known", "row_std_dn": 1.5, "clean": False}
+    unknown = FrameNoise.of_sensor(sensor.spec, sensor.layout, maps=False)
+    assert unknown.unknown_rows_dn == pytest.approx(np.hypot(1.5, sensor.spec.aps.row_offset_std_dn))
+    assert FrameNoise.of_sensor(sensor.spec, sensor.layout, frozenset({"row_noise"})).unknown_rows_dn == 0
+
+
 def test_without_maps_what_they_would_tell_counts_as_noise():
     sensor = hr.load_sensor("eiger").crop(64, 64)
     aps = sensor.spec.aps

@@ -318,7 +318,7 @@ def test_sampling_accepts_numbers_images_and_device_arrays():
 NOISY = {
     "aps__prnu_rel": 0.05, "aps__dsnu_e": 20.0, "aps__row_offset_std_dn": 5.0, "aps__dark_current_e_per_s": 4000.0,
     "aps__dark_current_nonuniformity_rel": 0.3, "aps__residual_noise_dn": 3.0, "aps__read_noise_e": 20.0,
-    "aps__system_gain_dn_per_e": 1.0,
+    "aps__system_gain_dn_per_e": 1.0, "aps__row_noise_dn": 4.0,
 }  # fmt: skip
 
 
@@ -340,7 +340,7 @@ def test_each_term_can_be_switched_off():
     maps = noise.fixed_pattern
     electrons, t = 1000.0, EXPOSURE_US * 1e-6
     temporal = {"shot": maps.response.mean() * electrons, "dark_current": maps.dark_e_per_s.mean() * t,
-                "read": 400.0, "residual": 9.0}  # fmt: skip
+                "read": 400.0, "row_noise": 16.0, "residual": 9.0}  # fmt: skip
     spatial = {"prnu": (electrons * maps.response).var(), "row": maps.offset_dn.mean(axis=1).var(),
                "dsnu": (maps.offset_dn - maps.offset_dn.mean(axis=1)[:, None]).var(),
                "dark_current": (maps.dark_e_per_s * t).var()}  # fmt: skip
@@ -350,16 +350,45 @@ def test_each_term_can_be_switched_off():
         less = noise.without(term)
         stack = np.stack([less.sample(electrons, EXPOSURE_US, seed=5, frame=k) for k in range(60)]).astype(float)
         left = sum(v for k, v in temporal.items() if k != term)
-        # 60·16384 samples: 0.15 % standard error of a variance; z = 5.5
-        assert stack.var(axis=0, ddof=1).mean() == pytest.approx(left + 1 / 12, rel=5.5 * 0.0015), term
+        # 60·16384 samples: 0.15 % standard error of a variance; z = 5.5; of row noise 60·128 ones, 1.6 % of 16 DN²
+        rows = 0 if term == "row_noise" else 5.5 * 16 * 0.016
+        assert stack.var(axis=0, ddof=1).mean() == pytest.approx(
+            left + 1 / 12, abs=5.5 * 0.0015 * float(left) + rows
+        ), term
         assert less.variance_dn2(np.full((128, 128), electrons), EXPOSURE_US).mean() == pytest.approx(left, rel=1e-5)
         fixed = stack.mean(axis=0).var() - left / 60
         # rows are 128 draws that columns share; their empirical variance is used, so only pixel noise is left
         assert fixed == pytest.approx(sum(v for k, v in spatial.items() if k != term), rel=0.1), term
-    with pytest.raises(RangeError, match="shot, dark_current, read, prnu, dsnu, row, residual"):
+    with pytest.raises(RangeError, match="shot, dark_current, read, prnu, dsnu, row, row_noise, residual"):
         noise.without("photon")
     np.testing.assert_allclose(noise.without("read").to_polynomial()[0][0][:3], [0, 1.0, 4000.0])
     np.testing.assert_allclose(noise.without("shot", "dark_current").to_polynomial()[0][0][:3], [400.0, 0, 0])
+
+
+def test_temporal_row_noise_is_shared_by_a_row_and_by_nothing_else():
+    """4 DN over 300 frames of 64 rows: bounds of 5 standard errors, five comparisons, a false alarm in 3e-6."""
+    noise = model("eiger", crop=(128, 64), aps__row_noise_dn=4.0)
+    frames, electrons = 300, 500.0
+    stack = np.stack([noise.sample(electrons, EXPOSURE_US, seed=9, frame=k) for k in range(frames)]).astype(float)
+    left, right = stack[:, :, :64].mean(axis=2), stack[:, :, 64:].mean(axis=2)
+    left, right = left - left.mean(axis=0), right - right.mean(axis=0)
+    n = frames * 64
+    # halves of a row share nothing else: their covariance is N_tr's variance
+    assert abs((left * right).sum() / (n - 64) - 16) < 5 * 17 * np.sqrt(2 / n)
+    for other in (np.roll(right, 1, axis=1), np.roll(right, 1, axis=0), np.roll(right, 2, axis=1)):
+        assert abs(np.mean(left * other)) < 5 * 17 / np.sqrt(n)
+    pixel = noise.without("row_noise")
+    assert noise.variance_dn2(electrons, EXPOSURE_US) - pixel.variance_dn2(electrons, EXPOSURE_US) == pytest.approx(16)
+    assert noise.noise_equivalent_e(np.array([0.0]), 1000.0) > pixel.noise_equivalent_e(np.array([0.0]), 1000.0)
+    assert noise.to_polynomial() == pixel.to_polynomial()
+    # a crop and a piece have the rows' own numbers
+    crop = ApsNoise(noise.spec, noise.layout.crop(16, 8), noise.device_seed)
+    row, col = crop.layout.row0 - noise.layout.row0, crop.layout.col0 - noise.layout.col0
+    cut = np.s_[row : row + crop.layout.rows, col : col + crop.layout.cols]
+    np.testing.assert_array_equal(crop.sample(electrons, EXPOSURE_US, 9, 3), stack[3][cut])
+    types, first = jit(), 7 * 64 + 3
+    piece = noise.sample_dn(dr.full(types.Float, electrons, 500), EXPOSURE_US, 9, 3, first_pixel=first)
+    np.testing.assert_array_equal(piece.numpy(), stack[3].ravel()[first : first + 500])
 
 
 def test_position_of_numbers():

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import rank_filter
 
 from hesim_render.calibrate.captures import CaptureSet, FrameStack, read_captures
+from hesim_render.calibrate.common_mode import Shared, row_noise, without_rows
 from hesim_render.calibrate.composite import (
     Composite,
     clear_of_clipping,
@@ -40,6 +41,7 @@ class ApsCalibration:
     bad : pixels [row, col] left out: clipped in the dark, dead, stuck, or of a variance unlike their kind's.
     signals : float32 [exposure, row, col], light above black, DN.
     usable : [exposure, row, col], lit values clear of clipping.
+    rows : temporal row noise.
     """
 
     dark: DarkModel
@@ -50,7 +52,7 @@ class ApsCalibration:
     signals: NDArray[np.float32]
     usable: NDArray[np.bool_]
     transfer: dict[str, Any]
-    drift: float
+    rows: Shared
 
     def beta(self, tile: tuple[int, int]) -> NDArray[np.float64]:
         """[tile_row, tile_col, 6] with 0 for terms and positions without a number."""
@@ -98,9 +100,12 @@ def calibrate_aps(
     if stacks[0].shape[2:] != stacks[1].shape[2:]:
         sizes = " and ".join(f"{s.shape[2]}×{s.shape[3]}" for s in stacks)
         raise SpecError(f"dark and lit frames are of different sizes, {sizes} pixels", file=captures.folder)
-    dark, lit = _read(stacks, progress)
-    result = analyse(captures, dark, lit)
-    write_section(out, "aps", describe(captures), content(captures, result, lit), maps(captures, result, lit, dark))
+    used = used_pixels(captures, stacks[0].shape[2:])
+    dark, lit = _read(stacks, used, captures.spec.full_scale_dn, progress)
+    result, dark, lit = analyse(captures, dark, lit, used)
+    write_section(
+        out, "aps", describe(captures), content(captures, result, dark, lit), maps(captures, result, lit, dark)
+    )
     if report is not None:
         from hesim_render.calibrate.report import write_report
 
@@ -113,14 +118,42 @@ def describe(captures: CaptureSet) -> dict[str, Any]:
     return captures.spec.model_dump(exclude_none=True, mode="json")
 
 
-def _read(stacks: tuple[FrameStack, FrameStack], progress: Progress | None) -> list[Moments]:
+def _read(
+    stacks: tuple[FrameStack, FrameStack], used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None
+) -> list[Moments]:
     """Both stacks at once: inflating, which releases Python's lock, takes most of the time."""
     with ThreadPoolExecutor(2) as pool_of_two:
-        return list(pool_of_two.map(lambda stack: measure(stack, progress), stacks))
+        return list(pool_of_two.map(lambda stack: measure(stack, used, full_scale_dn, progress), stacks))
 
 
-def analyse(captures: CaptureSet, dark_moments: Moments, lit: Moments) -> ApsCalibration:
+def frame_positions(captures: CaptureSet) -> list[Position]:
+    """Tile positions that have an APS value: all, where no sensor is named."""
+    spec = captures.spec
+    if captures.sensor is not None:
+        return captures.sensor.positions("aps")
+    return list(np.ndindex(spec.tile_rows, spec.tile_cols))
+
+
+def used_pixels(captures: CaptureSet, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Pixels [row, col] that have an APS value."""
+    used = np.zeros(shape, bool)
+    for i, j in frame_positions(captures):
+        used[i :: captures.spec.tile_rows, j :: captures.spec.tile_cols] = True
+    return used
+
+
+def analyse(
+    captures: CaptureSet, dark_moments: Moments, lit: Moments, used: NDArray[np.bool_]
+) -> tuple[ApsCalibration, Moments, Moments]:
     """Everything the frames' moments tell.
+
+    Parameters
+    ----------
+    used : [row, col], pixels that have an APS value.
+
+    Returns
+    -------
+    The calibration, and the moments of dark and lit frames without what rows share from frame to frame.
 
     Raises
     ------
@@ -128,12 +161,12 @@ def analyse(captures: CaptureSet, dark_moments: Moments, lit: Moments) -> ApsCal
         As `calibrate_aps`.
     """
     spec = captures.spec
-    tile = spec.tile_rows, spec.tile_cols
-    positions = captures.sensor.positions("aps") if captures.sensor is not None else list(np.ndindex(tile))
-    used = np.zeros(lit.mean.shape[1:], bool)
-    for i, j in positions:
-        used[i :: tile[0], j :: tile[1]] = True
-    dark = fit_dark(dark_moments, used, spec.full_scale_dn)
+    tile, positions = (spec.tile_rows, spec.tile_cols), frame_positions(captures)
+    rows = row_noise(dark_moments, used)
+    row_variance = rows.variance if rows.significant else 0.0
+    if row_variance:
+        dark_moments, lit = (without_rows(m, used, spec.full_scale_dn, row_variance) for m in (dark_moments, lit))
+    dark = fit_dark(dark_moments, used, spec.full_scale_dn, row_variance)
     signals = np.stack([light_signal(lit, dark, k) for k in range(lit.exposures_s.size)])
     good = used & ~dark.bad & ~dark.hot
     _check_light(dark, lit, signals, good, spec.full_scale_dn)
@@ -144,11 +177,16 @@ def analyse(captures: CaptureSet, dark_moments: Moments, lit: Moments) -> ApsCal
     bad = used & dark.bad
     for _ in range(2):
         usable = np.stack(
-            [clear_of_clipping(lit, signals[k], k, beta, spec.full_scale_dn, saturation) for k in range(len(signals))]
+            [
+                clear_of_clipping(lit, signals[k], k, beta, spec.full_scale_dn, saturation, row_variance)
+                for k in range(len(signals))
+            ]
         )
         usable &= used
         for _ in range(2):
-            fits, bins = _fit(positions, tile, dark, dark_moments, lit, signals, good & ~bad, dark_clear, usable)
+            fits, bins = _fit(
+                positions, tile, dark, dark_moments, lit, signals, good & ~bad, dark_clear, usable, row_variance
+            )
             beta = np.zeros((*tile, 6))
             for position, fit in fits.items():
                 beta[position] = fit.beta
@@ -162,7 +200,7 @@ def analyse(captures: CaptureSet, dark_moments: Moments, lit: Moments) -> ApsCal
     reached = saturation is not None or bool(np.mean(lit.highest[:, used] >= spec.full_scale_dn) > 1e-4)
     linear = linearity(lit, signals, usable & good, composite, top)
     transfer = photon_transfer(spec, dark, composite, fits, bins, saturation, reached, linear)
-    return ApsCalibration(dark, composite, fits, bins, bad, signals, usable, transfer, _drift(lit))
+    return ApsCalibration(dark, composite, fits, bins, bad, signals, usable, transfer, rows), dark_moments, lit
 
 
 def _check_light(dark: DarkModel, lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int) -> None:
@@ -188,6 +226,7 @@ def _fit(
     good: NDArray[np.bool_],
     dark_clear: NDArray[np.bool_],
     usable: NDArray[np.bool_],
+    row_variance: float,
 ) -> tuple[dict[Position, VarianceFit], dict[Position, Pooled]]:
     bins = {}
     for position in positions:
@@ -196,12 +235,11 @@ def _fit(
         for k, t in enumerate(dark_moments.exposures_s):
             take = good[cut] & dark_clear[k][cut]
             variance = dark_moments.variance[k][cut][take]
-            parts.append(pool(np.zeros(variance.size), variance, t, 0.0, dark_moments.frames, lit=False))
+            parts.append(pool(np.zeros(variance.size), variance, t, 0.0, dark_moments.frames, False, row_variance))
         for k, t in enumerate(lit.exposures_s):
             take = good[cut] & usable[k][cut]
-            parts.append(
-                pool(signals[k][cut][take], lit.variance[k][cut][take], t, dark.mean_variance(t), lit.frames, lit=True)
-            )
+            light, variance = signals[k][cut][take], lit.variance[k][cut][take]
+            parts.append(pool(light, variance, t, dark.mean_variance(t), lit.frames, True, row_variance))
         bins[position] = join(parts)
         if not np.any(bins[position].lit):
             raise SpecError(
@@ -244,9 +282,3 @@ def _unresponsive(composite: Composite, tile: tuple[int, int]) -> NDArray[np.boo
         around = rank_filter(np.nan_to_num(rate, nan=0.0), 2, size=3)
         unresponsive[i :: tile[0], j :: tile[1]] = (rate < 0.02 * around) & (around - rate > 10 * error)
     return unresponsive
-
-
-def _drift(lit: Moments) -> float:
-    """Relative rms change of the frames' mean light over an exposure's frames, the largest of all exposures."""
-    level = lit.frame_means.mean(axis=1)
-    return float(np.max(lit.frame_means.std(axis=1, ddof=1) / level))

@@ -11,15 +11,20 @@ from scipy.special import ndtr
 
 from hesim_render.calibrate.aps import ApsCalibration, Position
 from hesim_render.calibrate.captures import CaptureSet
+from hesim_render.calibrate.common_mode import Shared
 from hesim_render.calibrate.composite import signal_at_event_pixels
 from hesim_render.calibrate.dark import ADC_VARIANCE_DN2
+from hesim_render.calibrate.estimate import estimated
+from hesim_render.calibrate.frame_checks import check_frames
 from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.variance import TERMS, VarianceFit, variance_map
 
 _FIGURE_PX = 320
+#: Points of pooled variances that are drawn of a position, about.
+_POINTS = 240
 
 
-def content(captures: CaptureSet, result: ApsCalibration, lit: Moments) -> dict[str, Any]:
+def content(captures: CaptureSet, result: ApsCalibration, dark_moments: Moments, lit: Moments) -> dict[str, Any]:
     tile = captures.spec.tile_rows, captures.spec.tile_cols
 
     def table(value: Callable[[VarianceFit], Any], missing: Any) -> list[list[Any]]:
@@ -36,12 +41,9 @@ def content(captures: CaptureSet, result: ApsCalibration, lit: Moments) -> dict[
             notes.append(f"position ({i}, {j}): the data do not identify the terms {', '.join(missing)}")
         if fit.hidden_pixels:
             notes.append(f"position ({i}, {j}): {fit.hidden_pixels} values left out, their noise is hidden by rounding")
-    good = result.fits.keys()
-    top = max(float(result.bins[p].signal_dn.max()) for p in good)
-    if result.drift * top > 0.3 * np.sqrt(max(float(result.bins[p].variance_dn2.max()) for p in good)):
-        notes.append(f"the light drifted by {100 * result.drift:.2f} % rms, which adds to the variance; steady it")
-    dark = result.dark
+    dark, checks = result.dark, check_frames(result, dark_moments, lit)
     return {
+        "findings": [finding.described() for finding in checks.findings],
         "terms": list(TERMS),
         "units": "DN (light above black) and seconds; the ADC's 1/12 DN² is taken out",
         "beta": table(lambda f: [b if ok else None for b, ok in zip(f.beta, f.identified, strict=True)], nothing),
@@ -51,6 +53,8 @@ def content(captures: CaptureSet, result: ApsCalibration, lit: Moments) -> dict[
         ),
         "goodness": {
             "chi2_per_dof": table(lambda f: f.chi2_per_dof, None),
+            "p_value": table(lambda f: f.p_value, None),
+            "cubic_per_dn": table(lambda f: None if f.cubic is None else list(f.cubic), None),
             "dof": table(lambda f: f.dof, None),
             "dark_line_chi2_per_dof": dark.chi2_per_dof,
         },
@@ -60,14 +64,34 @@ def content(captures: CaptureSet, result: ApsCalibration, lit: Moments) -> dict[
         },
         "black_dn": dark.black,
         "n_row_std_dn": float(dark.n_row.std()),
+        "row_noise_dn": _row_noise(result),
         "n_dp_median_dn_per_s": float(np.median(dark.n_dp[~result.bad & ~dark.bad])),
         "hot_limit_dn_per_s": dark.hot_limit_dn_per_s,
         "hot_pixels": int(dark.hot.sum()),
         "bad_pixels": int(result.bad.sum()),
-        "light_drift": result.drift,
+        "drift": {
+            "black_dn_rms": {
+                name: max((d.black.rms if d.black.significant else 0.0 for d in drifts), default=0.0)
+                for name, drifts in (("dark", checks.dark), ("lit", checks.lit))
+            },
+            "light_rms": max(
+                (d.light.rms for d in checks.lit if d.light is not None and d.light.significant), default=0.0
+            ),
+            "light_from_proportion": {p.exposure_us: p.deviation for p in checks.proportions},
+            "black_from_dark_dn": {p.exposure_us: p.shift_dn for p in checks.proportions},
+        },
         **result.transfer,
         "notes": notes,
     }
+
+
+def _row_noise(result: ApsCalibration) -> dict[str, Any]:
+    """Temporal row noise; 0 with a limit where rows share nothing that is significant."""
+    rows = result.rows
+    if rows.significant:
+        return estimated(rows.rms, rows.error / (2 * rows.rms), "DN")
+    limit = float(np.sqrt(max(rows.variance, 0.0) + 2 * rows.error))
+    return {"value": 0.0, "upper_limit": limit, "unit": "DN", "note": "rows share no more than chance makes them"}
 
 
 def _ranges(result: ApsCalibration, lit: Moments, tile: tuple[int, int]) -> list[list[Any]]:
@@ -118,13 +142,16 @@ def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[in
     }
     points = []
     for (i, j), bins in result.bins.items():
-        group = np.cumsum(bins.pixels) // (bins.pixels.sum() / 240)
-        for t, is_lit in {(t, lit_) for t, lit_ in zip(bins.exposure_s, bins.lit, strict=True)}:
+        size = bins.pixels.sum() / _POINTS
+        for t, is_lit in sorted({(t, lit_) for t, lit_ in zip(bins.exposure_s, bins.lit, strict=True)}):
+            of = np.flatnonzero((bins.exposure_s == t) & (bins.lit == is_lit))
+            # as many pixels a point; what is left at the end joins the point before, as a few would scatter widely
+            total = np.cumsum(bins.pixels[of])
+            group = np.minimum(np.floor((total - bins.pixels[of]) / size), max(np.floor(total[-1] / size) - 1, 0))
             for g in np.unique(group):
-                use = (bins.exposure_s == t) & (bins.lit == is_lit) & (group == g)
-                if use.any():
-                    n = bins.pixels[use].sum()
-                    points.append((i, j, t, is_lit, bins.powers[use, 1].sum() / n, bins.products[use, 0].sum() / n, n))
+                use = of[group == g]
+                n = bins.pixels[use].sum()
+                points.append((i, j, t, is_lit, bins.powers[use, 1].sum() / n, bins.products[use, 0].sum() / n, n))
     figures["figure_variance_points"] = np.array(points)
     for name, moments, signal, mask in (
         ("dark", dark, None, ~(result.bad | result.dark.bad | result.dark.hot)[None] & np.ones(dark.mean.shape, bool)),
@@ -132,19 +159,20 @@ def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[in
     ):
         k = len(moments.exposures_us) - 1
         figures[f"figure_noise_{name}"] = _noise_histogram(
-            moments, k, None if signal is None else signal[k], mask[k], beta
+            moments, k, None if signal is None else signal[k], mask[k], beta, result.rows
         )
     return figures
 
 
 def _noise_histogram(
-    moments: Moments, k: int, signal: NDArray | None, mask: NDArray, beta: NDArray
+    moments: Moments, k: int, signal: NDArray | None, mask: NDArray, beta: NDArray, rows: Shared
 ) -> NDArray[np.float64]:
     """Distribution of single values about their mean: rows of (deviation DN, measured, predicted density)."""
     n = moments.frames
     deviation = (moments.first[k].astype(np.float32) - moments.mean[k])[mask] * np.sqrt(n / (n - 1))
     light = np.zeros(mask.shape, np.float32) if signal is None else signal
     variance = np.maximum(variance_map(beta, light, moments.exposures_s[k])[mask], 0) + ADC_VARIANCE_DN2
+    variance += rows.variance if rows.significant else 0.0
     sigma = np.sqrt(np.quantile(variance, (np.arange(200) + 0.5) / 200))
     reach = 5 * float(sigma.max())
     edges = np.linspace(-reach, reach, 2 * min(60, max(12, int(reach))) + 1)

@@ -59,7 +59,13 @@ def saturation_dn(lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_
 
 
 def clear_of_clipping(
-    lit: Moments, signal: NDArray, k: int, beta: NDArray | None, full_scale_dn: int, saturation: float | None
+    lit: Moments,
+    signal: NDArray,
+    k: int,
+    beta: NDArray | None,
+    full_scale_dn: int,
+    saturation: float | None,
+    row_variance_dn2: float = 0.0,
 ) -> NDArray[np.bool_]:
     """Pixels [row, col] of exposure k whose values stay clear of 0, full scale and full well.
 
@@ -71,7 +77,7 @@ def clear_of_clipping(
         clear = (lit.highest[k] < full_scale_dn) & (lit.lowest[k] > 0)
     else:
         variance = variance_map(beta, signal, lit.exposures_s[k])
-        margin = _CLEAR_SIGMAS * np.sqrt(np.maximum(variance, 0) + ADC_VARIANCE_DN2)
+        margin = _CLEAR_SIGMAS * np.sqrt(np.maximum(variance, 0) + ADC_VARIANCE_DN2 + row_variance_dn2)
         clear = (lit.mean[k] + margin < full_scale_dn) & (lit.mean[k] > margin)
     return clear if saturation is None else clear & (signal + margin < saturation)
 

@@ -50,12 +50,13 @@ class DarkModel:
         return float(line @ self.covariance @ line)
 
 
-def fit_dark(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int) -> DarkModel:
+def fit_dark(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, row_variance_dn2: float = 0.0) -> DarkModel:
     """Straight lines through the dark means, one per pixel, exposures weighted by their median variance.
 
     Parameters
     ----------
     used : [row, col], pixels that have an APS value.
+    row_variance_dn2 : of temporal row noise, which was taken out of the moments' variances.
 
     Raises
     ------
@@ -74,7 +75,7 @@ def fit_dark(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int) -> D
         )
     spread = np.array(
         [
-            np.median(v[used & ok]) if np.any(used & ok) else np.nan
+            np.median(v[used & ok]) + row_variance_dn2 if np.any(used & ok) else np.nan
             for v, ok in zip(moments.variance, valid, strict=True)
         ]
     )

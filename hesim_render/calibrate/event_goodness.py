@@ -87,10 +87,15 @@ def _groups(signal_dn: NDArray, events: NDArray) -> NDArray[np.intp]:
     order = np.argsort(signal_dn, kind="stable")
     events = np.cumsum(events[order])
     enough = float(np.clip(events[-1] / _GROUPS, _FEWEST_EVENTS, _LEAST_EVENTS))
-    reached = np.minimum(events / enough, np.arange(1, order.size + 1) / _LEAST_PIXELS)
-    number = np.maximum(np.floor(reached - 1e-9).astype(np.intp), 0)
+    ends: list[int] = []
+    start, before = 0, 0.0
+    while start < order.size:
+        end = max(int(np.searchsorted(events, before + enough)) + 1, start + _LEAST_PIXELS)
+        if end > order.size:
+            break
+        ends.append(end)
+        start, before = end, float(events[end - 1])
     # what is left at the end joins the group before
-    _, number = np.unique(np.minimum(number, max(int(number[-1]) - 1, 0)), return_inverse=True)
     group = np.empty(order.size, np.intp)
-    group[order] = number
+    group[order] = np.searchsorted(np.array(ends[:-1], np.intp), np.arange(order.size), side="right")
     return group

@@ -11,12 +11,15 @@ from hesim_render.calibrate.captures import CaptureSet
 from hesim_render.calibrate.estimate import estimated, not_identifiable
 from hesim_render.calibrate.event_analysis import DECISIVE, EvsCalibration
 from hesim_render.calibrate.event_cells import Cells, PixelThresholds, pool_events
+from hesim_render.calibrate.event_checks import check_events
 from hesim_render.calibrate.event_counts import StaticCapture
 from hesim_render.calibrate.event_estimate import EventFit
 from hesim_render.calibrate.event_model import both_probabilities
 from hesim_render.calibrate.thresholds import curve
 
 _FIGURE_PX = 320
+#: Most bins of a histogram of counts.
+_BINS = 64
 _UNITS = {"A": "1/(V DN)", "B": "1/V", "C": "1/DN", "D": ""}
 _MODEL = (
     "theta/sigma_n = Theta (A I + B) / sqrt(2 (1 + 2 D y + y^2)), y = C I (linear) or C sqrt(I) (sqrt); "
@@ -30,7 +33,9 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     other = "sqrt" if fit.law == "linear" else "linear"
     tile = result.static.tile
     theta = not_identifiable(result.thresholds_reason)
+    findings, levels = check_events(result, captures.spec.contrast_of)
     section: dict[str, Any] = {
+        "findings": [finding.described() for finding in findings],
         "model": _MODEL,
         "theta_hardware_v": captures.spec.theta_hardware_v
         or not_identifiable("not stated in capture.yaml; 1 V is taken as its unit"),
@@ -54,6 +59,10 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
             "theta": estimated(thresholds.theta, thresholds.theta_error, "ln"),
             "theta_on": estimated(thresholds.theta_on, error[0], "ln"),
             "theta_off": estimated(thresholds.theta_off, error[1], "ln"),
+        }
+    if levels is not None:
+        section["s_curve"] = {
+            name: estimated(value, error, "events per trial") for name, (value, error) in vars(levels).items()
         }
     section["threshold_mismatch"] = result.mismatch.described() | {
         "from": "static counts" if thresholds is None else "steps"
@@ -177,8 +186,11 @@ def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, 
         ]
     )
     for name, (_, on_map, off_map) in zip(("lit", "dark"), static.sessions, strict=False):
-        top = max(4.0, float(np.quantile(np.maximum(on_map, off_map)[good], 0.999)) * 1.15)
-        edges = np.linspace(-0.5, top, min(64, int(top) + 1) + 1)
+        most = max(4, int(np.quantile(np.maximum(on_map, off_map)[good], 0.999) * 1.15))
+        # bins of whole counts, so that every bin can hold as many of them
+        wide = -(-(most + 1) // _BINS)
+        edges = np.arange(-(-(most + 1) // wide) + 1) * wide - 0.5
+        top = float(edges[-1])
         figures[f"figure_on_off_{name}"] = np.histogram2d(off_map[good], on_map[good], bins=(edges, edges))[0]
         figures[f"figure_on_off_{name}_top"] = np.array(top)
     figures["figure_starts"] = result.starts

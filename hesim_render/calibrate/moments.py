@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.captures import FrameStack
 
 Progress = Callable[[str, float], None]
+#: Part of full scale up to which the first frame's value counts a pixel to the dim or to the bright half.
+_CLEAR = 0.9
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,10 @@ class Moments:
     mean, variance : float32 [exposure, row, col], DN and DN² (ddof 1, the ADC's 1/12 still in).
     lowest, highest : uint16 [exposure, row, col], extremes over the frames: they tell clipping.
     first : uint16 [exposure, row, col], the first frame, for distributions of single values.
-    frame_means : float64 [exposure, frame], to see the light drift.
+    row_means : float64 [exposure, frame, row], mean over the used pixels of a row; 0 where it has none.
+    half_means : float64 [exposure, frame, 2], mean over the dimmer and over the brighter half of the used pixels, by
+        the first frame of the exposure; without those near an end of the ADC's range.
+    half : int8 [exposure, row, col], 0 or 1 of a pixel of either half, −1 of others.
     """
 
     exposures_us: NDArray[np.int64]
@@ -34,42 +39,73 @@ class Moments:
     lowest: NDArray[np.uint16]
     highest: NDArray[np.uint16]
     first: NDArray[np.uint16]
-    frame_means: NDArray[np.float64]
+    row_means: NDArray[np.float64]
+    half_means: NDArray[np.float64]
+    half: NDArray[np.int8]
 
     @property
     def exposures_s(self) -> NDArray[np.float64]:
         return self.exposures_us.astype(np.float64) * 1e-6
 
 
-def measure(stack: FrameStack, progress: Progress | None = None) -> Moments:
-    """Read a stack once. Sums of differences from the first frame are whole numbers, hence exact."""
+def measure(
+    stack: FrameStack, used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None = None
+) -> Moments:
+    """Read a stack once. Sums of differences from the first frame are whole numbers, hence exact.
+
+    Parameters
+    ----------
+    used : [row, col], pixels that have an APS value.
+    """
     exposures, frames, rows, cols = stack.shape
     place = np.argsort(np.argsort(stack.exposures_us))
     mean = np.empty((exposures, rows, cols), np.float32)
     variance = np.empty_like(mean)
     lowest, highest, first = (np.empty((exposures, rows, cols), np.uint16) for _ in range(3))
-    frame_means = np.empty((exposures, frames))
+    row_means, half_means = np.empty((exposures, frames, rows)), np.empty((exposures, frames, 2))
+    half = np.empty((exposures, rows, cols), np.int8)
     total = np.empty((rows, cols), np.int32)
     squares = np.empty((rows, cols), np.int64)
     difference = np.empty((rows, cols), np.int32)
+    taken = used.astype(np.int32)
+    row_pixels = np.maximum(used.sum(axis=1), 1)
     for number, frame in enumerate(stack):
         source, index = divmod(number, frames)
         k = place[source]
         if index == 0:
             first[k] = lowest[k] = highest[k] = frame
             total[:], squares[:] = 0, 0
+            half[k] = _halves(first[k], used, full_scale_dn)
+            halves = [(half[k] == side).astype(np.int32) for side in (0, 1)]
+            half_pixels = [max(int(mask.sum()), 1) for mask in halves]
+            row_first = (first[k] * taken).sum(axis=1) / row_pixels
+            row_means[k, 0] = row_first
+            half_first = [float((first[k] * m).sum()) / n for m, n in zip(halves, half_pixels, strict=True)]
+            half_means[k, 0] = half_first
         else:
             np.subtract(frame, first[k], out=difference, dtype=np.int32)
+            row_means[k, index] = row_first + np.einsum("ij,ij->i", difference, taken) / row_pixels
+            for side, mask in enumerate(halves):
+                change = np.einsum("ij,ij->i", difference, mask).sum(dtype=np.int64)
+                half_means[k, index, side] = half_first[side] + change / half_pixels[side]
             total += difference
             np.multiply(difference, difference, out=difference)
             squares += difference
             np.minimum(lowest[k], frame, out=lowest[k], casting="unsafe")
             np.maximum(highest[k], frame, out=highest[k], casting="unsafe")
-        frame_means[k, index] = frame.mean()
         if index == frames - 1:
             shift = total / frames
             mean[k] = shift + first[k]
             variance[k] = (squares - shift * total) / (frames - 1)
             if progress is not None:
                 progress(f"reading {stack.file.name}", (source + 1) / exposures)
-    return Moments(np.sort(stack.exposures_us), frames, mean, variance, lowest, highest, first, frame_means)
+    return Moments(
+        np.sort(stack.exposures_us), frames, mean, variance, lowest, highest, first, row_means, half_means, half
+    )  # fmt: skip
+
+
+def _halves(first: NDArray[np.uint16], used: NDArray[np.bool_], full_scale_dn: int) -> NDArray[np.int8]:
+    """Which half of the used pixels a pixel is of: 0 the dimmer, 1 the brighter, −1 neither."""
+    clear = used & (first > 0) & (first < _CLEAR * full_scale_dn)
+    middle = np.median(first[clear]) if clear.any() else 0.0
+    return np.where(clear, (first > middle).astype(np.int8), np.int8(-1)).astype(np.int8)

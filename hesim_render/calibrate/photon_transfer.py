@@ -35,7 +35,8 @@ def system_gain(bins: Pooled, top_dn: float) -> tuple[float, float]:
     for _ in range(4):
         # Weights from the line, not from the bins' own variances: those would favour the low ones.
         expected = bins.variance_dn2[base] + gain * bins.signal_dn[lit]
-        weight = bins.freedom[lit] / (2 * np.maximum(expected, 0.1) ** 2)
+        expected = np.maximum(expected, 0.1)
+        weight = bins.freedom[lit] / (2 * (expected**2 + 2 * expected * bins.row_variance[lit]))
         bottom = float(weight @ x2)
         if bottom <= 0:
             return float("nan"), float("nan")

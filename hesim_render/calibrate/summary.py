@@ -13,6 +13,7 @@ _APS = {
     "dsnu_e": "DSNU",
     "prnu_percent": "PRNU",
     "linearity_error": "linearity error",
+    "row_noise_dn": "temporal row noise",
 }
 _EVS = {
     **{name: name for name in "ABCD"},
@@ -32,13 +33,15 @@ def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
     section : ``aps`` or ``evs``.
     """
     content = calibration[section]
-    lines = [_line(text, content[key]) for key, text in (_APS if section == "aps" else _EVS).items()]
+    names = _APS if section == "aps" else _EVS
+    lines = [_line(text, content[key]) for key, text in names.items() if key in content]
     if section == "aps":
         values = [c for row in content["goodness"]["chi2_per_dof"] for c in row if c is not None]
         lines.append(f"{'β, χ²/dof':<20} {min(values):.3f} to {max(values):.3f} over {len(values)} tile positions")
     else:
         lines.append(f"{'shot law':<20} {content['shot_law']}; χ²/dof {content['goodness']['chi2_per_dof']:.3f}")
-    return [*lines, f"{'bad pixels':<20} {content['bad_pixels']}"]
+    lines.append(f"{'bad pixels':<20} {content['bad_pixels']}")
+    return lines + [f"look at: {finding['check']}: {finding['text']}" for finding in content.get("findings", [])]
 
 
 def _line(text: str, item: Mapping[str, Any]) -> str:

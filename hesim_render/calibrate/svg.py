@@ -13,7 +13,9 @@ from PIL import Image
 
 #: Colours told apart with any colour vision (Okabe and Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6b6b", "#000000")
-_MARGIN = (54, 12, 30, 40)  # left, right, top, bottom
+_MARGIN = (68, 12, 30, 40)  # left, right, top, bottom
+#: Height of a line of the legend, and width of a character of it, px.
+_LINE, _CHARACTER = 15, 6.4
 
 
 class Plot:
@@ -22,8 +24,8 @@ class Plot:
     Parameters
     ----------
     x_range, y_range : ends of the axes. log_x, log_y : logarithmic axes; what lies below the start of a
-        logarithmic x axis, such as 0, is drawn at its start. legend : the side it stands on.
-    ticks_x : whether the x axis has numbers.
+        logarithmic x axis, such as 0, is drawn at its start. ticks_x : whether the x axis has numbers.
+    The legend stands below the axis, where it hides nothing.
     """
 
     def __init__(
@@ -35,12 +37,11 @@ class Plot:
         y_range: tuple[float, float],
         log_y: bool = False,
         size: tuple[int, int] = (420, 290),
-        legend: str = "right",
         ticks_x: bool = True,
         log_x: bool = False,
     ) -> None:
         self.width, self.height = size
-        self._log, self._log_x, self._legend_side = log_y, log_x, legend
+        self._log, self._log_x = log_y, log_x
         left, right, top, bottom = _MARGIN
         x0, x1 = (float(np.log10(v)) for v in x_range) if log_x else _widened(*x_range)
         y0, y1 = y_range if log_y else _widened(*y_range)
@@ -152,28 +153,32 @@ class Plot:
         return self
 
     def svg(self) -> str:
-        left, top, width, _ = self._clip
-        at_left = self._legend_side == "left"
-        x, text, side = (left + 6, left + 18, "start") if at_left else (left + width - 8, left + width - 12, "end")
-        for k, (label, colour) in enumerate(self._legend):
-            y = top + 12 + 13 * k
-            self._parts.append(f'<rect x="{x}" y="{y - 7}" width="8" height="8" fill="{colour}"/>')
-            self._parts.append(f'<text x="{text}" y="{y}" class="tick {side}">{escape(label)}</text>')
+        left, _, width, _ = self._clip
+        x, y, parts = float(left), self.height + 4.0, []
+        for label, colour in self._legend:
+            size = 22 + _CHARACTER * len(label)
+            if x > left and x + size > left + width:
+                x, y = float(left), y + _LINE
+            parts.append(f'<rect x="{x:.0f}" y="{y - 1:.0f}" width="8" height="8" fill="{colour}"/>')
+            parts.append(f'<text x="{x + 12:.0f}" y="{y + 7:.0f}" class="tick start">{escape(label)}</text>')
+            x += size
+        height = round(y) + _LINE if parts else self.height
         return (
-            f'<svg viewBox="0 0 {self.width} {self.height}" width="{self.width}" height="{self.height}" '
-            f'xmlns="http://www.w3.org/2000/svg" role="img">{"".join(self._parts)}</svg>'
+            f'<svg viewBox="0 0 {self.width} {height}" width="{self.width}" height="{height}" '
+            f'xmlns="http://www.w3.org/2000/svg" role="img">{"".join(self._parts + parts)}</svg>'
         )
 
 
 def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> str:
-    """A map with a colour bar; colours span the 1st to the 99th percentile."""
+    """A map with a colour bar, its longer side `size_px`; colours span the 1st to the 99th percentile."""
     finite = values[np.isfinite(values)]
     low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if finite.size else (0.0, 1.0)
     rows, cols = values.shape
-    width, height = size_px, max(24, round(size_px * rows / cols))
+    scale = size_px / max(rows, cols)
+    width, height = max(24, round(scale * cols)), max(24, round(scale * rows))
     bar = data_uri(np.linspace(1, 0, 64)[:, None], (0.0, 1.0))
     return (
-        f'<svg viewBox="0 0 {width + 70} {height + 26}" width="{width + 70}" height="{height + 26}" '
+        f'<svg viewBox="0 0 {width + 84} {height + 26}" width="{width + 84}" height="{height + 26}" '
         f'xmlns="http://www.w3.org/2000/svg" role="img"><text x="0" y="14" class="title">{escape(title)}</text>'
         f'<image x="0" y="24" width="{width}" height="{height}" preserveAspectRatio="none" '
         f'style="image-rendering:pixelated" href="{data_uri(values, (low, high))}"/>'

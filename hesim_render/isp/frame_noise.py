@@ -32,7 +32,8 @@ class FrameNoise:
     exposure_us : exposure of the frame, µs.
     residual_dn2 : variance beside it, DN²: what no term of `beta` has, and pixel offsets of which there is no map.
     response_std : relative spread of responses of which there is no map.
-    row_std_dn : standard deviation over rows of offsets of which there is no map, DN.
+    row_std_dn : standard deviation over rows of fixed offsets of which there is no map, DN.
+    row_noise_dn : standard deviation of offsets that rows have in this frame alone (temporal row noise), DN.
     offset_dn : N_FP less the black level, [row, col], DN; 0 where it is not known.
     dark_dn_per_s : N_DP, mean signal of the dark current, [row, col] or a number, DN/s.
     response : relative response of each pixel, [row, col] or 1.
@@ -43,6 +44,7 @@ class FrameNoise:
     residual_dn2: float = 0.0
     response_std: float = 0.0
     row_std_dn: float = 0.0
+    row_noise_dn: float = 0.0
     offset_dn: Map = 0.0
     dark_dn_per_s: Map = 0.0
     response: Map = 1.0
@@ -75,6 +77,7 @@ class FrameNoise:
             "beta": np.array(model.to_polynomial(), dtype=np.float64),
             "exposure_us": float(aps.exposure_us),
             "residual_dn2": 0.0 if "residual" in off else aps.residual_noise_dn**2,
+            "row_noise_dn": model.row_noise_dn,
         }
         gain = aps.system_gain_dn_per_e
         if not maps:
@@ -135,9 +138,13 @@ class FrameNoise:
         with as_written(path):
             beta = np.array([[[b or 0.0 for b in cell] for cell in row] for row in data["aps"]["beta"]], np.float64)
             offset, dark = maps["n_row"][:, None] + maps["n_blc"], maps["n_dp"]
+            row_noise_dn = data["aps"].get("row_noise_dn", {}).get("value") or 0.0
         if not (np.isfinite(offset).all() and np.isfinite(dark).all()):
             raise SpecError("its maps hold values that are not finite", file=path)
-        return cls(beta, exposure_us, offset_dn=offset.astype(np.float32), dark_dn_per_s=dark.astype(np.float32))
+        return cls(
+            beta, exposure_us, row_noise_dn=row_noise_dn,
+            offset_dn=offset.astype(np.float32), dark_dn_per_s=dark.astype(np.float32),
+        )  # fmt: skip
 
     def at(self, exposure_us: float) -> FrameNoise:
         """The same sensor at another exposure."""
@@ -153,6 +160,11 @@ class FrameNoise:
         )
 
     @property
+    def unknown_rows_dn(self) -> float:
+        """Standard deviation over rows of all offsets that only the picture itself can tell."""
+        return float(np.hypot(self.row_std_dn, self.row_noise_dn))
+
+    @property
     def is_clean(self) -> bool:
         """Whether there is nothing to smooth: no temporal noise, no pixel pattern without a map."""
         return not (self.beta.any() or self.residual_dn2 or self.response_std)
@@ -163,8 +175,8 @@ class FrameNoise:
         unknown = self.row_std_dn > 0 or self.response_std > 0
         return {
             "maps": "unknown" if unknown else "known" if known else "none",
-            "row_std_dn": self.row_std_dn,
-            "clean": self.is_clean and not self.row_std_dn,
+            "row_std_dn": self.unknown_rows_dn,
+            "clean": self.is_clean and not self.unknown_rows_dn,
         }
 
     def variance(self, position: tuple[int, int]) -> tuple[float, float, float]:

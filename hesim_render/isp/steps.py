@@ -135,7 +135,7 @@ class Denoise(Strict):
             raise RangeError("tile of the noise model", noise.beta.shape[:2], f"the camera's {state.tile.shape}")
         saturated = state.image >= 1
         signal = noise.corrected(state.image * np.float32(span))
-        row_std_dn = noise.row_std_dn if self.row_std_dn is None else self.row_std_dn
+        row_std_dn = noise.unknown_rows_dn if self.row_std_dn is None else self.row_std_dn
         if row_std_dn > 0:
             offsets = row_offsets(signal, state.tile, noise, row_std_dn)
             state.note(row_offsets_rms_dn=float(np.sqrt(np.mean(offsets**2))))

@@ -3,15 +3,16 @@
 Physical form, per pixel, I_e light electrons, D dark current in e⁻/s, t exposure in s, K gain in DN/e⁻::
 
     N_e = min( Poisson( (1 + PRNU)·I_e + D·t ), full well ) + N(0, σ_r²)
-    DN  = clip( round( K·N_e + N_FP + N_res ), 0, 2^bits − 1 )
+    DN  = clip( round( K·N_e + N_FP + N_tr + N_res ), 0, 2^bits − 1 )
 
 Polynomial form (``aps.beta`` given), I = K·(1 + PRNU)·I_e in DN, per tile position::
 
     mean = I + t·N_DP + N_FP
-    Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC
+    Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC, without N_tr
 
 Both are one model: a count of mean m, Poisson or Gaussian with variance m, is worth `gain` DN each and
-sits on `fixed` DN; a Gaussian is added to the sum. N_FP = black + N_row + N_BLC. The ADC rounds once:
+sits on `fixed` DN; a Gaussian is added to the sum. N_FP = black + N_row + N_BLC. N_tr is one Gaussian
+number of every row of a frame, shared by its pixels (temporal row noise). The ADC rounds once:
 no uniform noise is added, and every variance here leaves out its q²/12.
 """
 
@@ -37,7 +38,7 @@ from hesim_render.rng import Stream, philox
 from hesim_render.specs.sensor import ApsSpec
 from hesim_render.units import S_PER_US
 
-APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "residual", "crosstalk")
+APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk")
 
 ADC_VARIANCE_DN2 = 1.0 / 12.0
 
@@ -83,8 +84,8 @@ class ApsNoise:
         """The same model with terms of `APS_TERMS` switched off.
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
-        ``read`` is σ_r (β0), ``prnu``, ``dsnu`` and ``row`` are the fixed maps, ``residual`` is N_res,
-        ``crosstalk`` is what these pixels get of their neighbours' light.
+        ``read`` is σ_r (β0), ``prnu``, ``dsnu`` and ``row`` are the fixed maps, ``row_noise`` is N_tr, ``residual``
+        N_res, ``crosstalk`` is what these pixels get of their neighbours' light.
 
         Raises
         ------
@@ -101,6 +102,11 @@ class ApsNoise:
     def crosstalk(self) -> float:
         """Part of the electrons that comes from the four neighbours, not from the pixel itself."""
         return 0.0 if "crosstalk" in self.off else self.layout.spec.geometry.crosstalk
+
+    @property
+    def row_noise_dn(self) -> float:
+        """Standard deviation of N_tr, DN."""
+        return 0.0 if "row_noise" in self.off else self.spec.row_noise_dn
 
     @property
     def full_scale_dn(self) -> int:
@@ -229,14 +235,15 @@ class ApsNoise:
     ) -> NDArray[np.float64]:
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
-        In the physical form K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res². Near full well and full scale
+        In the physical form K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr². Near full well and full scale
         the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the variance
         itself is above 0.24 DN².
         """
         values = self._checked(electrons, exposure_us)
         pixels = self._host_pixels(position, values.ndim > 0)
         _, gain, mean, gaussian = self._parts(values, exposure_us * S_PER_US, pixels, np)
-        return np.asarray(gain * gain * mean + gaussian + (ADC_VARIANCE_DN2 if adc else 0.0), dtype=np.float64)
+        shared = self.row_noise_dn**2 + (ADC_VARIANCE_DN2 if adc else 0.0)
+        return np.asarray(gain * gain * mean + gaussian + shared, dtype=np.float64)
 
     def noise_equivalent_e(self, electrons: NDArray, exposure_us: float) -> NDArray[np.float64]:
         """Standard deviation of a frame pixel in electrons at its input, PRNU included.
@@ -254,14 +261,14 @@ class ApsNoise:
         """
         signal = np.maximum(np.asarray(electrons, dtype=np.float64), 0.0)
         _, gain, mean, gaussian = self._parts(signal, exposure_us * S_PER_US, self._host_pixels(None, False), np)
-        temporal_dn2 = gain * gain * mean + gaussian + ADC_VARIANCE_DN2
+        temporal_dn2 = gain * gain * mean + gaussian + self.row_noise_dn**2 + ADC_VARIANCE_DN2
         fixed_e = self.spec.prnu_rel * signal
         return np.sqrt(temporal_dn2 / self.spec.system_gain_dn_per_e**2 + fixed_e**2)
 
     def to_polynomial(self) -> list[list[list[float]]]:
         """The variance as [tile_row][tile_col][β0 … β5] in DN and s; exact for the physical form.
 
-        β0 = K²σ_r², β1 = K, β2 = K²D, the others 0: PRNU is spatial and never enters β3. N_res is not in it.
+        β0 = K²σ_r², β1 = K, β2 = K²D, the others 0: PRNU is spatial and never enters β3. N_res and N_tr are not in it.
         """
         gain, spec = self.spec.system_gain_dn_per_e, self.spec
         physical = [gain**2 * spec.read_noise_e**2, gain, gain**2 * spec.dark_current_now_e_per_s, 0.0, 0.0, 0.0]
@@ -323,7 +330,8 @@ class ApsNoise:
         t = dr.opaque(types.Float, exposure_us * S_PER_US)
         fixed, gain, mean, gaussian = self._parts(electrons, t, pixels, dr)
 
-        generator = philox(seed, Stream.APS, self._pixel_key(index), frame)
+        key = self._pixel_key(index)
+        generator = philox(seed, Stream.APS, key, frame)
         word = generator.next_uint32x4()
         if self.spec.law == "poisson":
             counts = poisson(mean, generator, (word[0], word[1]))
@@ -334,6 +342,11 @@ class ApsNoise:
         full_well_dn = self.spec.full_well_e * self.spec.system_gain_dn_per_e
         level = dr.minimum(dr.fma(gain, counts, fixed), full_well_dn) + pixels.offset_dn
         level = dr.fma(dr.sqrt(types.Float(gaussian)), deviate, level)
+        if self.row_noise_dn > 0:
+            # of the row on the full sensor: every pixel of it draws the same number
+            row = key // dr.opaque(types.UInt32, self.layout.spec.geometry.cols)
+            word = philox(seed, Stream.ROW_NOISE, row, frame).next_uint32x4()
+            level = dr.fma(dr.opaque(types.Float, self.row_noise_dn), normal_pair(word[0], word[1])[0], level)
         # not clip: of a level that is no number it makes the largest integer, which no ADC of fewer bits gives
         return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(self.full_scale_dn)), 0.0))
 

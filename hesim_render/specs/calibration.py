@@ -200,6 +200,7 @@ def _aps_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) 
         "system_gain_dn_per_e": _needed(aps["K"], "aps.K", file),
         "black_level_dn": aps["black_dn"],
         "row_offset_std_dn": aps["n_row_std_dn"],
+        "row_noise_dn": aps.get("row_noise_dn", {}).get("value") or 0.0,
         "beta": [[[b or 0.0 for b in cell] for cell in row] for row in aps["beta"]],
     }
     if aps["full_well_e"].get("limited_by") == "full well":

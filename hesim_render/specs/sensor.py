@@ -98,6 +98,7 @@ class ApsSpec(Strict):
     prnu_rel: float = Field(0.0, ge=0, lt=0.3)
     dsnu_e: float = Field(0.0, ge=0, description="std over pixels of the fixed offset N_BLC, in electrons")
     row_offset_std_dn: float = Field(0.0, ge=0, description="std over rows of the fixed offset N_row")
+    row_noise_dn: float = Field(0.0, ge=0, description="temporal: std of what a row gets anew in each frame")
     residual_noise_dn: float = Field(0.0, ge=0, description="N_res: extra Gaussian temporal noise")
     law: Literal["poisson", "gaussian"] = "poisson"
     exposure_us: PositiveInt

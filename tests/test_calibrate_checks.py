@@ -1,0 +1,202 @@
+"""Captures that break what the noise models suppose: each is named in the report; good ones are not."""
+
+import broken_captures
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from hesim_render.calibrate import (
+    calibrate_aps,
+    calibrate_evs,
+    common_mode,
+    event_checks,
+    frame_checks,
+    read_calibration,
+)
+from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.summary import summary_lines
+
+
+def frames_of(folder, **keys):
+    """Section of the calibration of `broken_captures.frames`, and the report."""
+    broken_captures.frames(folder / "set", **keys)
+    calibrate_aps(folder / "set", folder / "c.yaml", folder / "r.html")
+    return read_calibration(folder / "c.yaml")["aps"], (folder / "r.html").read_text(encoding="utf-8")
+
+
+BROKEN_FRAMES = {
+    "row noise": ({"row_noise": 1.5}, "row noise", "supply"),
+    "black level over the session": ({"black_drift": 3.0}, "black level between", "in turn"),
+    "black level of the dark frames": ({"black_drift": 3.0}, "dark line", "warm up"),
+    "black level within an exposure": ({"black_drift": 3.0, "drift_over": "exposure"}, "black level, dark", "clamp"),
+    "black level of lit frames": ({"black_drift": 3.0, "drift_over": "exposure"}, "black level, lit", "black clamp"),
+    "light over the session": ({"light_ramp": 0.02}, "light between", "light drifted"),
+    "light within an exposure": ({"light_ramp": 0.02, "ramp_over": "exposure"}, "light", "lamp"),
+    "cubic variance": ({"cubic": 1e-7}, "curvature", "smaller range"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("keys, check, advice", BROKEN_FRAMES.values(), ids=BROKEN_FRAMES.keys())
+def test_frames_that_break_the_model_are_named(tmp_path, keys, check, advice):
+    section, report = frames_of(tmp_path, **keys)
+    found = {f["check"]: f for f in section["findings"]}
+    assert check in found and advice in found[check]["text"] and found[check]["p_value"] < 1e-6
+    assert advice in report and "Look at this first" in report
+    assert any(line.startswith(f"look at: {check}") for line in summary_lines({"aps": section}, "aps"))
+    # what is whole is not blamed
+    blamed = {"row noise"} if "row_noise" in keys else set()
+    assert {"row noise"} & set(found) == blamed
+    if "black_drift" in keys:
+        assert "light" not in found
+    if "light_ramp" in keys or "cubic" in keys:
+        assert not any(name.startswith("black") or name == "dark line" for name in found)
+
+
+def test_the_sizes_of_drifts_are_told(tmp_path):
+    section, _ = frames_of(tmp_path / "a", black_drift=3.0, drift_over="exposure")
+    # a ramp of 3 DN over 32 frames: 3·sqrt((1 − 1/32²)/12) rms; the mean over 4096 pixels is good to 0.03 DN
+    assert section["drift"]["black_dn_rms"]["dark"] == pytest.approx(3 / np.sqrt(12), abs=0.05)
+    section, _ = frames_of(tmp_path / "b", light_ramp=0.02, ramp_over="exposure", size=96)
+    assert section["drift"]["light_rms"] == pytest.approx(0.02 / np.sqrt(12), abs=0.0015)
+    section, _ = frames_of(tmp_path / "c", light_ramp=0.02)
+    deviation = section["drift"]["light_from_proportion"]
+    # the light of exposure k is 1 + 0.02 (k + ½)/5: from 1 to 20 ms it rises by 1.6 %
+    assert deviation[20000] - deviation[1000] == pytest.approx(0.016, abs=0.003)
+
+
+def test_row_noise_is_measured_and_taken_out_of_the_variance(tmp_path):
+    """Four seeds of 1.5 DN and 64 rows: z of row noise, of β0 and β1 of four positions; 4.5 sigma (36 values, 2e-4)."""
+    z = []
+    for seed in range(4):
+        section, _ = frames_of(tmp_path / str(seed), row_noise=1.5, seed=seed)
+        rows = section["row_noise_dn"]
+        assert rows["unit"] == "DN" and rows["standard_error"] < 0.02
+        z.append((rows["value"] - 1.5) / rows["standard_error"])
+        beta, error = np.array(section["beta"], float), np.array(section["beta_standard_error"], float)
+        z += list(((beta - [2.25, 0.25, 0, 0, 0, 0]) / error)[..., :2].ravel())
+        chi2 = np.array(section["goodness"]["chi2_per_dof"])
+        # 10,240 sample variances with their product with the row's: std of χ²/dof 0.016
+        assert np.abs(chi2 - 1).max() < 0.08
+        assert section["read_noise_e"]["value_dn"] == pytest.approx(1.5, abs=0.02)
+    assert np.abs(z).max() < 4.5
+    section, _ = frames_of(tmp_path / "none", row_noise=0.0)
+    assert section["row_noise_dn"]["value"] == 0 and section["row_noise_dn"]["upper_limit"] < 0.15
+
+
+def test_a_flat_field_has_a_chi2(tmp_path):
+    """Terms that one round of weights tells and the next does not made the fit go to and fro: χ²/dof of 3858."""
+    section, _ = frames_of(tmp_path, flat=True)
+    # 10,240 sample variances: std 0.015 of each
+    assert np.abs(np.array(section["goodness"]["chi2_per_dof"]) - 1).max() < 0.08
+    assert section["findings"] == []
+
+
+def _every_p(monkeypatch, alarm):
+    """Findings at a chance of `alarm` each, however small what they tell."""
+    for module in (frame_checks, common_mode):
+        monkeypatch.setattr(module, "ALARM", alarm)
+    for name in ("_LEAST_PART", "_LEAST_ERRORS", "_LEAST_SHIFT", "_LEAST_DEVIATION", "_WIDE"):
+        monkeypatch.setattr(frame_checks, name, 0.0)
+
+
+GOOD_FRAMES = {"Gaussian": {}, "Poisson": {"poisson": True}, "flat": {"flat": True},
+               "few electrons": {"poisson": True, "gain": 2.0}}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("keys", GOOD_FRAMES.values(), ids=GOOD_FRAMES.keys())
+def test_good_frames_give_false_alarms_at_the_stated_rate(tmp_path, monkeypatch, keys):
+    """With each check at 2 % on 250 seeds. 16 or more of 250 have a chance of 5e-5 at 2 %; 36 checks are looked at."""
+    _every_p(monkeypatch, 0.02)
+    seeds, count = 250, {}
+    for seed in range(seeds):
+        for finding in frames_of(tmp_path, size=32, count=16, seed=1000 + seed, **keys)[0]["findings"]:
+            count[finding["check"]] = count.get(finding["check"], 0) + 1
+    assert binom.sf(15, seeds, 0.02) < 1e-4
+    assert max(count.values()) < 16, count
+
+
+@pytest.mark.parametrize("keys", GOOD_FRAMES.values(), ids=GOOD_FRAMES.keys())
+def test_good_frames_are_not_blamed(tmp_path, keys):
+    """4 seeds, 9 checks of a chance of 1e-4: a false alarm in 0.4 % of changed seeds."""
+    for seed in range(4):
+        section, report = frames_of(tmp_path, size=32, count=16, seed=seed, **keys)
+        assert section["findings"] == []
+    assert "nothing was found" in report
+
+
+def test_drift_of_black_and_of_light_are_told_apart_to_the_number():
+    """Means of a dim and a bright half written out: black moves both, light each by its signal."""
+    rng = np.random.default_rng(1)
+    frames, size, levels = 400, 64, np.array([50.0, 450.0])
+    black, light = rng.normal(0, 0.4, frames), rng.normal(0, 0.01, frames)
+    half = np.repeat(np.array([[0, 1]], np.int8), size, 0).repeat(size // 2, 1)
+    noise = rng.normal(0, 3.0 / np.sqrt(size * size / 2), (frames, 2))
+    means = levels * (1 + light[:, None]) + black[:, None] + noise
+    flat = np.full((1, size, size), 9.0, np.float32)
+    empty = np.zeros((1, size, size), np.uint16)
+    rows = np.zeros((1, frames, size))
+    moments = Moments(np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None])
+    drift = common_mode.frame_drift(moments, 0, 0.0, levels[half])
+    assert drift.black.variance == pytest.approx(black[1:].var(ddof=1), rel=0.05)
+    assert drift.light.variance == pytest.approx(light[1:].var(ddof=1), rel=0.02)
+    assert drift.light.p_value < 1e-100 and drift.black.p_value < 1e-100
+
+
+def events_of(folder, **keys):
+    """Section of the calibration of `broken_captures.events`, and the report."""
+    broken_captures.events(folder / "set", **keys)
+    calibrate_evs(folder / "set", folder / "c.yaml", folder / "r.html")
+    return read_calibration(folder / "c.yaml")["evs"], (folder / "r.html").read_text(encoding="utf-8")
+
+
+BROKEN_EVENTS = {
+    "noise of a t law": ({"noise": "t"}, {"S-curve width", "S-curve floor", "event counts"}, "longer tails"),
+    "a floor in both polarities": ({"floor": 2e-4}, {"S-curve floor"}, "come by themselves"),
+    "an S-curve that tops at 0.9": ({"ceiling": 0.9}, {"S-curve ceiling", "S-curve width"}, "read-out"),
+}
+
+
+@pytest.mark.parametrize("keys, checks, advice", BROKEN_EVENTS.values(), ids=BROKEN_EVENTS.keys())
+def test_events_that_break_the_model_are_named(tmp_path, keys, checks, advice):
+    section, report = events_of(tmp_path, size=64, **keys)
+    found = {f["check"]: f for f in section["findings"]}
+    assert checks <= set(found) and advice in report
+    assert all(found[check]["p_value"] < 1e-6 for check in checks)
+    if "floor" in keys:
+        for name in ("floor_on", "floor_off"):
+            level = section["s_curve"][name]
+            assert abs(level["value"] - 2e-4) < 4.5 * level["standard_error"] < 1e-4  # two values: 1e-5
+    if "ceiling" in keys:
+        level = section["s_curve"]["ceiling"]
+        assert abs(level["value"] - 0.9) < 4.5 * level["standard_error"] < 2e-3
+
+
+GOOD_EVENTS = {"plain": {"mismatch": 0.0}, "mismatch": {}, "wide mismatch": {"mismatch": 0.15},
+               "leak": {"leak": 2e-4}, "asymmetry": {"rho": 0.01}}  # fmt: skip
+
+
+@pytest.mark.parametrize("keys", GOOD_EVENTS.values(), ids=GOOD_EVENTS.keys())
+def test_good_events_are_not_blamed(tmp_path, keys):
+    """4 checks of a chance of 1e-4 each: a false alarm of all in 0.2 % of changed seeds."""
+    section, report = events_of(tmp_path, size=64, **keys)
+    assert section["findings"] == [] and "nothing was found" in report
+    # floors and ceiling: 4.5 standard errors, and the chance of one event in far steps
+    for name, true in (("floor_on", keys.get("leak", 0.0)), ("floor_off", 0.0), ("ceiling", 1.0 + keys.get("leak", 0))):
+        level = section["s_curve"][name]
+        assert abs(level["value"] - true) < 4.5 * level["standard_error"] + 2e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("keys", GOOD_EVENTS.values(), ids=GOOD_EVENTS.keys())
+def test_good_events_give_false_alarms_at_the_stated_rate(tmp_path, monkeypatch, keys):
+    """With each check at 5 % on 60 seeds. 11 or more of 60 have a chance of 1e-4 at 5 %; 20 checks are looked at."""
+    monkeypatch.setattr(event_checks, "ALARM", 0.05)
+    for name in ("_LEAST_FLOOR", "_LEAST_LOSS"):
+        monkeypatch.setattr(event_checks, name, 0.0)
+    seeds, count = 60, {}
+    for seed in range(seeds):
+        for finding in events_of(tmp_path, size=64, seed=1000 + seed, **keys)[0]["findings"]:
+            count[finding["check"]] = count.get(finding["check"], 0) + 1
+    assert binom.sf(10, seeds, 0.05) < 2e-4
+    assert max(count.values(), default=0) < 11, count
