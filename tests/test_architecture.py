@@ -11,8 +11,8 @@ PACKAGE = Path(__file__).parent.parent / "hesim_render"
 
 # lowest first; a module may import its own layer and those below. Names are modules or packages.
 LAYERS = [
-    {"errors", "units", "rng", "backend", "progress", "spectra", "colorimetry", "events", "frame", "output", "guard", "npzfile"}
-    | {"bands", "transfer", "waveform", "render_error"},
+    {"errors", "units", "rng", "backend", "progress", "spectra", "colorimetry", "events", "frame", "output"}
+    | {"guard", "npzfile", "bands", "transfer", "waveform", "render_error"},
     {"specs"},
     {"optics", "layout", "noise"},
     {"sensor", "flux", "crosstalk", "mosaic", "camera", "schedule"},

@@ -26,9 +26,10 @@ from pydantic import (
 
 from hesim_render.errors import SpecError
 from hesim_render.guard import leads_out
-from hesim_render.specs.files import Strict, apply_overrides, line_of, load_yaml, locate, validate
+from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_matrix_about, rotation_vector
 from hesim_render.specs.light import LightSpec
+from hesim_render.specs.problems import line_of
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.target import ReflectanceSpec, TargetSpec
 from hesim_render.specs.waveform import WaveformSpec
