@@ -81,7 +81,7 @@ MISTAKES = [
     ("relative_illumination: cos4", "relative_illumination: {image_height_mm: [0, 1], relative: [1, 2]}",
      "lens.relative_illumination", "[0, 1]"),
     ("window_us: 1000", "window_us: 2000", "evs.window_us", "longer than tick_us"),
-    ("beta2: 5.0e-3", "beta2: 0", "evs.coefficients.0.beta2", "greater than 0"),
+    ("beta2: 5.0e-3", "beta2: 0", "evs.coefficients.0.beta2", "greater than or equal to"),
     ("filter: own", "filter: ultraviolet", "evs.signal_reference.filter", "no filter 'ultraviolet'"),
     ("  evs.shot_law:", "  evs.shoot_law:", "sources.evs.shoot_law", "no such key"),
     ("schema_version: 1", "schema_version: 2", "schema_version", "should be 1"),
@@ -104,7 +104,7 @@ def test_a_wrong_sensor_file_names_file_line_and_key(old, new, key, text, tmp_pa
     [
         ("type: flat", "type: flatt", "target.type", "type:", "flatt"),
         ("width_m: 0.3", "width: 0.3", "target.width", "width_m", "unknown key"),
-        ("width_m: 0.3", "width_m: -1", "target.width_m", "width_m", "greater than 0"),
+        ("width_m: 0.3", "width_m: -1", "target.width_m", "width_m", "greater than or equal to"),
         ("  illuminance_lux: 1000\n", "", "light", "light:", "exactly one of"),
         ("illuminance_lux: 1000", "illuminance_lux: -1", "light.illuminance_lux", "illuminance_lux", "or equal to 0"),
         ("fit: target", "fit: all", "camera.fit", "fit:", "should be 'target'"),

@@ -16,6 +16,9 @@ from hesim_render.specs.sensor import ApsSpec
 
 Map = float | NDArray[np.float32]
 
+#: A relative spread below this is none in 32 bit, and its gamma law would have a shape beyond all figures.
+_LEAST_SPREAD_REL = 1e-6
+
 
 @dataclass(frozen=True)
 class FixedPattern:
@@ -83,7 +86,7 @@ class FixedPattern:
             rate = self._measured["n_dp"] / np.float32(spec.system_gain_dn_per_e) * np.float32(spec.dark_current_growth)
             # an estimate near 0 may lie below it; a count of the physical form may not
             return rate if spec.beta is not None else np.maximum(rate, np.float32(0.0))
-        if spec.dark_current_nonuniformity_rel == 0 or spec.dark_current_now_e_per_s == 0:
+        if spec.dark_current_nonuniformity_rel < _LEAST_SPREAD_REL or spec.dark_current_now_e_per_s == 0:
             return spec.dark_current_now_e_per_s
         # the quantile function, tabulated over the normal deviate: linear in between it is good to 1e-6
         shape = spec.dark_current_nonuniformity_rel**-2.0

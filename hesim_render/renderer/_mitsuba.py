@@ -23,6 +23,8 @@ from hesim_render.spectra import Spectrum
 _LEAST_THREADS = 2
 #: Largest departure of a wavelength from an even grid, relative, that counts as rounding.
 _EVEN = 1e-9
+#: Values below are none in 32 bit; Mitsuba's reader of numbers refuses them.
+_NOTHING = 1e-37
 
 
 def mitsuba() -> Any:
@@ -39,8 +41,20 @@ def mitsuba() -> Any:
     if mi.variant() != wanted:
         mi.set_variant(wanted)
     mi.set_log_level(mi.LogLevel.Error)
+    resolver = mi.file_resolver()
+    if list(resolver)[:1] != [str(_home(mi))]:
+        resolver.prepend(str(_home(mi)))
     _have_threads()
     return mi
+
+
+def _home(mi: Any) -> Path:
+    """Folder of Mitsuba's own plugins and data.
+
+    It comes first wherever files are looked for: Mitsuba takes ``plugins/TYPE.so`` from the first folder that has it,
+    by default the working folder, so that files beside a scene, or where a program is started, would run as its code.
+    """
+    return Path(mi.__file__).resolve().parent
 
 
 def _have_threads() -> None:
@@ -104,10 +118,11 @@ def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], N
     config = parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
     resolver = mi.file_resolver()
+    inner = mi.FileResolver(resolver)
     if isinstance(source, Path):
-        inner = mi.FileResolver(resolver)
         inner.prepend(str(source.resolve().parent))
-        mi.set_file_resolver(inner)
+    inner.prepend(str(_home(mi)))
+    mi.set_file_resolver(inner)
     try:
         if isinstance(source, Path):
             check_xml(source, root, lambda name: str(inner.resolve(name)))
@@ -119,6 +134,7 @@ def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], N
             file = source if isinstance(source, Path) else None
             require_state_inside(mi, state, root, lambda name: str(find(name)), file)
         parser.transform_all(config, state)
+        mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> of the file has put its own folder first
         review(state)
         return parser.instantiate(config, state)
     finally:
@@ -167,6 +183,7 @@ def spectrum_dict(spectrum: Spectrum) -> dict[str, Any]:
     (A bare number as radiance would mean a spectrum shaped like D65, and ``d65`` is normalised.) On an evenly
     spaced grid, ``regular``: the same values without the search that makes ``irregular`` 15-30 % of a render.
     """
+    spectrum = Spectrum(spectrum.wavelength_nm, np.where(np.abs(spectrum.values) < _NOTHING, 0.0, spectrum.values))
     if not np.any(spectrum.values):
         return {"type": "uniform", "value": 0.0}  # an all-zero table is refused
     low, high = spectrum.support_nm

@@ -178,7 +178,7 @@ def require_known(name: Any, file: Path | None, key: str) -> None:
     SpecError
         With its place.
     """
-    if name not in _KINDS and name not in _BESIDE_PLUGINS:
+    if not isinstance(name, str) or (name not in _KINDS and name not in _BESIDE_PLUGINS):
         raise SpecError(f"type {name!r} is no plugin of Mitsuba's that is known here", file=file, key=key)
 
 

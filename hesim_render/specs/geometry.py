@@ -6,13 +6,17 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, NonNegativeInt, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
 
 from hesim_render.guard import MOST_PIXELS
 from hesim_render.specs.files import Strict
 
-Vector = tuple[float, float, float]
-Row = tuple[float, float, float, float]
+#: Largest coordinate, m, and largest and smallest size: beyond them squares leave the range of 32 bit.
+LARGEST_M, SMALLEST_M = 1e9, 1e-9
+Coordinate = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
+Size = Annotated[float, Field(ge=SMALLEST_M, le=LARGEST_M)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Region(Strict):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, PositiveFloat, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hesim_render.specs.files import Strict
-from hesim_render.specs.geometry import Direction, Vector
+from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.waveform import WaveformSpec
 from hesim_render.spectra import Spectrum, scale_to_irradiance, scale_to_lux, summed
@@ -30,10 +30,10 @@ class LightSpec(Strict):
 
     type: Literal["uniform", "point", "area", "directional", "none"]
     illuminant: Annotated[SpectrumSpec, AfterValidator(_not_negative)] = SpectrumSpec(illuminant="D65")
-    illuminance_lux: float | None = Field(None, ge=0)
-    irradiance_w_m2: float | None = Field(None, ge=0, description="integrated over the illuminant's table")
+    illuminance_lux: float | None = Field(None, ge=0, le=1e9)
+    irradiance_w_m2: float | None = Field(None, ge=0, le=1e7, description="integrated over the illuminant's table")
     position_m: Vector | None = Field(None, description="point and area lights")
-    size_m: tuple[PositiveFloat, PositiveFloat] | None = Field(None, description="area light: width, height")
+    size_m: tuple[Size, Size] | None = Field(None, description="area light: width, height")
     direction: Direction | None = Field(None, description="directional light: the way the light travels")
     plane_point_m: Vector = (0.0, 0.0, 0.0)
     plane_normal: Direction = (0.0, 0.0, 1.0)

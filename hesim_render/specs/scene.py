@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from pydantic import (
     Discriminator,
     Field,
-    PositiveFloat,
-    PositiveInt,
     Tag,
     ValidationInfo,
     field_serializer,
@@ -27,12 +25,15 @@ from pydantic import (
 from hesim_render.errors import SpecError
 from hesim_render.guard import leads_out
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
-from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_matrix_about, rotation_vector
+from hesim_render.specs.geometry import Direction, RigidMatrix, Size, Vector, rotation_matrix_about, rotation_vector
 from hesim_render.specs.light import LightSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.target import ReflectanceSpec, TargetSpec
 from hesim_render.specs.waveform import WaveformSpec
+
+#: How often something repeats.
+Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
 class ObjectSpec(Strict):
@@ -43,10 +44,10 @@ class ObjectSpec(Strict):
     size_m: Vector = Field((0.1, 0.1, 0.1), description="extent along x, y, z before rotation")
     position_m: Vector = (0.0, 0.0, 0.0)
     rotation_axis: Direction = (0.0, 1.0, 0.0)
-    rotation_deg: float = 0.0
+    rotation_deg: float = Field(0.0, ge=-1e9, le=1e9)
     reflectance: ReflectanceSpec = SpectrumSpec(flat=0.5)
     pattern: ReflectanceSpec | None = Field(None, description="second reflectance: checks over the shape's own u, v")
-    pattern_count: tuple[PositiveInt, PositiveInt] = (8, 8)
+    pattern_count: tuple[Count, Count] = (8, 8)
     mesh: str | None = Field(None, description="OBJ or PLY file, relative to this file")
 
     @model_validator(mode="after")
@@ -67,16 +68,16 @@ class CameraSpec(Strict):
     """
 
     fit: Literal["target"] | None = None
-    fit_margin: float = Field(1.0, gt=0, description="target size over view size; below 1 leaves a border")
+    fit_margin: float = Field(1.0, ge=1e-3, le=1e3, description="target size over view size; below 1 leaves a border")
     origin_m: Vector = (0.0, 0.0, 1.0)
     target_m: Vector = (0.0, 0.0, 0.0)
     up: Vector = (0.0, 1.0, 0.0)
-    focal_length_mm: PositiveFloat | None = None
-    f_number: PositiveFloat | None = None
+    focal_length_mm: float | None = Field(None, ge=0.01, le=1e5)
+    f_number: float | None = Field(None, ge=0.1, le=1000)
     horizontal_fov_deg: float | None = Field(
-        None, gt=0, lt=170, description="view across the read-out region; replaces the focal length"
+        None, ge=1e-4, lt=170, description="view across the read-out region; replaces the focal length"
     )
-    focus_distance_m: PositiveFloat | None = Field(None, description="default: distance from origin to target")
+    focus_distance_m: Size | None = Field(None, description="default: distance from origin to target")
 
     @model_validator(mode="after")
     def _check(self) -> CameraSpec:
@@ -94,10 +95,10 @@ class KeyframeSpec(Strict):
     a rotation by the shortest way from the keyframe before, and a translation.
     """
 
-    t_us: int = Field(description="time, µs from the start")
+    t_us: int = Field(ge=-(10**15), le=10**15, description="time, µs from the start")
     translation_m: Vector = (0.0, 0.0, 0.0)
     rotation_axis: Direction = (0.0, 0.0, 1.0)
-    rotation_deg: float = 0.0
+    rotation_deg: float = Field(0.0, ge=-1e9, le=1e9)
     matrix: RigidMatrix | None = Field(None, description="4×4 by rows, instead of translation and rotation")
 
     @model_validator(mode="after")
@@ -182,9 +183,9 @@ class MitsubaSpec(Strict):
     file: str | None = None
     builtin: Literal["cornell_box"] | None = None
     inline: Mapping[str, Any] | None = None
-    radiance_scale: PositiveFloat = 1.0
-    illuminance_lux: PositiveFloat | None = None
-    irradiance_w_m2: PositiveFloat | None = Field(None, description="integrated over 360 to 830 nm")
+    radiance_scale: float = Field(1.0, ge=1e-30, le=1e30)
+    illuminance_lux: float | None = Field(None, ge=1e-9, le=1e9)
+    irradiance_w_m2: float | None = Field(None, ge=1e-12, le=1e7, description="integrated over 360 to 830 nm")
     plane_point_m: Vector | None = Field(None, description="where the level holds")
     plane_normal: Direction | None = Field(None, description="of the plane there, to the side that is lit")
     waveforms: dict[str, WaveformSpec] = Field({}, description="flicker of emitters; their radiance is the time mean")

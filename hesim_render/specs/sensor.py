@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, PositiveFloat, PositiveInt, field_validator, model_validator
+from pydantic import Field, PositiveInt, field_validator, model_validator
 
 from hesim_render.errors import SpecError
 from hesim_render.specs.calibration import NoiseFile, apply_calibration
@@ -24,10 +24,10 @@ NonNegative = Field(ge=0)
 
 
 class GeometrySpec(Strict):
-    rows: PositiveInt
-    cols: PositiveInt
+    rows: int = Field(ge=1, le=65_535)
+    cols: int = Field(ge=1, le=65_535)
     pitch_um: float = Field(ge=0.1, le=1000)
-    fill_factor: float = Field(1.0, gt=0, le=1)
+    fill_factor: float = Field(1.0, ge=1e-6, le=1)
     crosstalk: float = Field(0.0, ge=0, le=0.5, description="part of a pixel's electrons its 4 neighbours collect")
 
 
@@ -73,38 +73,42 @@ class LensSpec(Strict):
     f_number: float = Field(ge=0.1, le=1000)
     focal_length_mm: float = Field(ge=0.01, le=1e5)
     transmittance: SpectrumSpec = SpectrumSpec(flat=1.0)
-    magnification: float | Literal["focus"] = Field(
+    magnification: Annotated[float, Field(ge=-100, le=100)] | Literal["focus"] = Field(
         "focus", description="m; 'focus' derives it from focal length and the scene's focus distance"
     )
     relative_illumination: Literal["cos4", "none"] | IlluminationTable = "cos4"
-    psf_fwhm_um: float = Field(0.0, ge=0, description="Gaussian point-spread function on the sensor")
+    psf_fwhm_um: float = Field(0.0, ge=0, le=1e4, description="Gaussian point-spread function on the sensor")
 
 
 class ApsSpec(Strict):
     """Frames: N_e = min(Poisson((1 + PRNU) I_e + D Δt), full well) + N(0, σ_r²); DN = clip(round(K N_e + N_FP))."""
 
-    full_well_e: PositiveFloat
-    system_gain_dn_per_e: PositiveFloat
+    full_well_e: float = Field(ge=1e-3, le=1e12)
+    system_gain_dn_per_e: float = Field(ge=1e-9, le=1e6)
     bit_depth: int = Field(ge=1, le=16)
     black_level_dn: float = Field(ge=0)
-    read_noise_e: float = Field(ge=0)
-    dark_current_e_per_s: float = Field(ge=0)
-    dark_current_nonuniformity_rel: float = Field(0.0, ge=0, description="std / mean of a gamma law over pixels")
-    dark_current_doubling_c: float | None = Field(None, ge=2, description="warming that doubles the dark current")
+    read_noise_e: float = Field(ge=0, le=1e6)
+    dark_current_e_per_s: float = Field(ge=0, le=1e9)
+    dark_current_nonuniformity_rel: float = Field(
+        0.0, ge=0, le=100, description="std / mean of a gamma law over pixels"
+    )
+    dark_current_doubling_c: float | None = Field(
+        None, ge=2, le=1000, description="warming that doubles the dark current"
+    )
     dark_current_reference_c: float | None = Field(
         None, ge=-100, le=125, description="temperature dark_current_e_per_s holds at; default temperature_c"
     )
     temperature_c: float | None = Field(None, ge=-100, le=125, description="of the sensor; default the reference's")
     prnu_rel: float = Field(0.0, ge=0, lt=0.3)
-    dsnu_e: float = Field(0.0, ge=0, description="std over pixels of the fixed offset N_BLC, in electrons")
-    row_offset_std_dn: float = Field(0.0, ge=0, description="std over rows of the fixed offset N_row")
-    row_noise_dn: float = Field(0.0, ge=0, description="temporal: std of what a row gets anew in each frame")
-    residual_noise_dn: float = Field(0.0, ge=0, description="N_res: extra Gaussian temporal noise")
+    dsnu_e: float = Field(0.0, ge=0, le=1e6, description="std over pixels of the fixed offset N_BLC, in electrons")
+    row_offset_std_dn: float = Field(0.0, ge=0, le=65_535, description="std over rows of the fixed offset N_row")
+    row_noise_dn: float = Field(0.0, ge=0, le=65_535, description="temporal: std of what a row gets anew in each frame")
+    residual_noise_dn: float = Field(0.0, ge=0, le=65_535, description="N_res: extra Gaussian temporal noise")
     law: Literal["poisson", "gaussian"] = "poisson"
     exposure_us: PositiveInt
-    frame_rate_hz: PositiveFloat
+    frame_rate_hz: float = Field(ge=1e-4, le=1e6)
     shutter: Literal["rolling", "global"]
-    line_time_us: float = Field(0.0, ge=0)
+    line_time_us: float = Field(0.0, ge=0, le=1e6)
     beta: list[list[list[float]]] | None = Field(
         None,
         description="[tile_row][tile_col][6] variance polynomial in 1, I, t, I², I·t, t² (DN, s), ADC variance "
@@ -154,8 +158,8 @@ class ApsSpec(Strict):
 class SignalReferenceSpec(Strict):
     """Unit of the EVS signal: I = k · Φ · t_ref, in DN of this exposure seen through `filter`."""
 
-    k_dn_per_e: PositiveFloat
-    t_ref_us: PositiveFloat
+    k_dn_per_e: float = Field(ge=1e-9, le=1e6)
+    t_ref_us: float = Field(ge=1e-3, le=1e9)
     filter: str = Field(
         "own",
         description="'own', or a filter: Φ is then scaled by the ratio of responses to an equal-energy light",
@@ -165,20 +169,22 @@ class SignalReferenceSpec(Strict):
 class EvsCoefficients(Strict):
     """Noise of one event position: x = β1 I + β2, s² from β3 (shot), β4 (dark), β5 (their correlation)."""
 
-    beta1: float = Field(ge=0, description="V/DN, slope of the voltage map")
-    beta2: float = Field(gt=0, description="V, V_PD: the photodiode's baseline voltage")
-    beta3: float = Field(ge=0, description="shot noise: V/DN for the linear law, V/√DN for the sqrt law")
-    beta4: float = Field(ge=0, description="V, dark-current shot noise")
+    beta1: float = Field(ge=0, le=1e9, description="V/DN, slope of the voltage map")
+    beta2: float = Field(ge=1e-12, le=1e9, description="V, V_PD: the photodiode's baseline voltage")
+    beta3: float = Field(ge=0, le=1e9, description="shot noise: V/DN for the linear law, V/√DN for the sqrt law")
+    beta4: float = Field(ge=0, le=1e9, description="V, dark-current shot noise")
     beta5: float = Field(0.0, ge=-1, le=1, description="correlation of the two")
 
 
 class PhotoreceptorSpec(Strict):
     """Second-order low-pass of ln x before it is compared: two equal poles, −3 dB together at the corner."""
 
-    cutoff_hz: PositiveFloat = Field(description="corner at signal_dn and above, where the bias current limits it")
+    cutoff_hz: float = Field(
+        ge=1e-3, le=1e6, description="corner at signal_dn and above, where the bias current limits it"
+    )
     follows_light: bool = Field(True, description="below signal_dn the corner is proportional to the signal")
-    signal_dn: PositiveFloat | None = Field(None, description="signal of which the corner is cutoff_hz")
-    min_cutoff_hz: PositiveFloat | None = Field(None, description="corner in the dark")
+    signal_dn: float | None = Field(None, ge=1e-9, le=1e9, description="signal of which the corner is cutoff_hz")
+    min_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="corner in the dark")
 
     @model_validator(mode="after")
     def _check(self) -> PhotoreceptorSpec:
@@ -196,23 +202,30 @@ class EvsSpec(Strict):
     """Events: compare ΔV = ln x₁/x₀ + noise with θ₊ and θ₋ (ln units)."""
 
     reference: Literal["previous_sample", "last_event"]
-    tick_us: PositiveInt | None = Field(None, description="period of the fixed comparisons (previous_sample)")
-    window_us: PositiveInt = Field(description="integration window that ends at each sample")
-    contrast_threshold_on: PositiveFloat
-    contrast_threshold_off: PositiveFloat
+    tick_us: int | None = Field(None, ge=1, le=10**9, description="period of the fixed comparisons (previous_sample)")
+    window_us: int = Field(ge=1, le=10**9, description="integration window that ends at each sample")
+    contrast_threshold_on: float = Field(ge=1e-3, le=100)
+    contrast_threshold_off: float = Field(ge=1e-3, le=100)
     threshold_mismatch_std: float = Field(0.0, ge=0, lt=0.5, description="std over pixels of θ, relative")
-    threshold_hardware_v: PositiveFloat | None = Field(None, description="Θ; β0 = θ/Θ where it is known")
+    threshold_hardware_v: float | None = Field(None, ge=1e-9, le=1e6, description="Θ; β0 = θ/Θ where it is known")
     signal_reference: SignalReferenceSpec
     coefficients: list[EvsCoefficients] = Field(min_length=1, description="one for all, or one per event position")
     shot_law: Literal["linear", "sqrt"]
     noise_mode: Literal["per_instant", "independent"] = "per_instant"
-    leak_rate_hz: float = Field(0.0, ge=0, description="Poisson process of ON events, per pixel")
-    photoreceptor_cutoff_hz: PositiveFloat | None = Field(None, description="noise bandwidth (last_event)")
+    leak_rate_hz: float = Field(0.0, ge=0, le=1e6, description="Poisson process of ON events, per pixel")
+    photoreceptor_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="noise bandwidth (last_event)")
     photoreceptor: PhotoreceptorSpec | None = Field(None, description="bandwidth of the signal; default unlimited")
-    refractory_period_us: PositiveInt | None = Field(None, description="no event so long after a pixel's last one")
-    readout_max_events_per_s: PositiveFloat | None = Field(None, description="events beyond are lost; default no limit")
-    readout_buffer_events: PositiveInt | None = Field(
-        None, description="events that can wait for the read-out; default what it takes in tick_us, or in 1 ms"
+    refractory_period_us: int | None = Field(
+        None, ge=1, le=10**9, description="no event so long after a pixel's last one"
+    )
+    readout_max_events_per_s: float | None = Field(
+        None, ge=1e-3, le=1e12, description="events beyond are lost; default no limit"
+    )
+    readout_buffer_events: int | None = Field(
+        None,
+        ge=1,
+        le=10**12,
+        description="events that can wait for the read-out; default what it takes in tick_us, or in 1 ms",
     )
 
     @model_validator(mode="after")
@@ -240,7 +253,7 @@ class SensorSpec(Strict):
     schema_version: Literal[1]
     name: str = Field(min_length=1)
     description: str
-    device_seed: int = Field(ge=0)
+    device_seed: int = Field(ge=0, lt=2**64)
     geometry: GeometrySpec
     tile: str
     pixels: dict[str, PixelSpec] = Field(min_length=1)

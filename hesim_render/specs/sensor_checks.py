@@ -89,6 +89,10 @@ def _filters(spec: SensorSpec) -> Iterator[str]:
     if quantum_efficiency.values.min() < 0 or quantum_efficiency.values.max() > 1:
         yield "quantum_efficiency must lie in [0, 1] electrons per photon"
         return
+    transmittance = spec.lens.transmittance.load().values
+    if transmittance.min() < 0 or transmittance.max() > 1.0 + 1e-9:
+        yield "lens.transmittance must lie in [0, 1]"
+        return
     for name, filter_ in spec.filters.items():
         if name not in used:
             yield f"filters.{name}: no pixel has this filter; give it to one under 'pixels', or remove it here"

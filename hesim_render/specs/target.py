@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from hesim_render.specs.files import Strict
+from hesim_render.specs.geometry import Size
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectra import colorchecker
 
@@ -22,8 +23,8 @@ ReflectanceSpec = Annotated[SpectrumSpec, AfterValidator(_diffuse)]
 
 
 class _Target(Strict):
-    width_m: PositiveFloat = 0.3
-    height_m: PositiveFloat = 0.2
+    width_m: Size = 0.3
+    height_m: Size = 0.2
 
 
 class FlatTarget(_Target):
@@ -37,8 +38,8 @@ class ColorCheckerTarget(_Target):
     """24 measured patches, 4 rows of 6, on a dark surround."""
 
     type: Literal["colorchecker"]
-    width_m: PositiveFloat = 0.279
-    height_m: PositiveFloat = 0.186
+    width_m: Size = 0.279
+    height_m: Size = 0.186
     dataset: str = Field("ISO 17321-1", description="measured reflectances of colour-science")
     patch_fill: float = Field(0.86, gt=0, le=1, description="patch width over patch pitch")
     surround: ReflectanceSpec = SpectrumSpec(flat=0.035)
@@ -69,8 +70,8 @@ class CheckerboardTarget(_Target):
     """Squares of two reflectances; the top-left one is light."""
 
     type: Literal["checkerboard"]
-    rows: PositiveInt = 8
-    cols: PositiveInt = 12
+    rows: int = Field(8, ge=1, le=10_000)
+    cols: int = Field(12, ge=1, le=10_000)
     light: ReflectanceSpec = SpectrumSpec(flat=0.8)
     dark: ReflectanceSpec = SpectrumSpec(flat=0.05)
 
@@ -88,7 +89,7 @@ class SiemensStarTarget(_Target):
     """Dark sectors on a light field, as many as `spokes`."""
 
     type: Literal["siemens-star"]
-    width_m: PositiveFloat = 0.2
+    width_m: Size = 0.2
     spokes: int = Field(36, ge=2, le=720)
     light: ReflectanceSpec = SpectrumSpec(flat=0.8)
     dark: ReflectanceSpec = SpectrumSpec(flat=0.05)
