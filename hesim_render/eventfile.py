@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,52 @@ _LARGEST_CHUNK_BYTES = 1 << 26
 _BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event and its columns as they are read
 #: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
 _FILTERS = {1, 2, 3, 32000, 32001}
+
+
+class _Disk:
+    """The file under HDF5, which crashes where it cannot close: it never hears that the disk is full, `check` tells.
+
+    What cannot be written is dropped; the file is of no use then and about to be removed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w+b", buffering=0)
+        self._error: OSError | None = None
+        self.read, self.seek, self.tell, self.close = (
+            getattr(self._file, name) for name in ("read", "seek", "tell", "close")
+        )
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        place, done = self._file.tell(), 0
+        try:
+            while done < len(view):
+                done += self._file.write(view[done:])
+        except OSError as error:
+            self._error = self._error or error
+            self._file.seek(place + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        found = self._file.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)  # what was dropped
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return size
+
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
+    def check(self) -> None:
+        """Raise what was kept from HDF5."""
+        if self._error is not None:
+            raise self._error
 
 
 class EventFileWriter:
@@ -51,7 +99,8 @@ class EventFileWriter:
         self._written = 0
         self._last_us = begin_us
         self._first_of_ms = np.zeros(1, dtype=np.uint64)
-        self._file = h5py.File(path, "w")
+        self._disk = _Disk(path)
+        self._file = h5py.File(self._disk, "w")
         compression = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
         for name, kind in _COLUMNS.items():
             self._file.create_dataset(
@@ -72,7 +121,8 @@ class EventFileWriter:
         self._pending.append(events)
         self._pending_count += events.size
         if self._pending_count >= _CHUNK:
-            self._flush()
+            with self._told():
+                self._flush()
 
     def _flush(self) -> None:
         if not self._pending:
@@ -93,20 +143,28 @@ class EventFileWriter:
 
     def close(self) -> None:
         """Write what is pending and the millisecond index."""
-        try:
+        with self._told():
             self._flush()
             missing = self._duration_us // 1000 + 2 - self._first_of_ms.size
             rest = np.full(max(0, missing), self._written, dtype=np.uint64)
             self._file["ms_to_idx"] = np.concatenate([self._first_of_ms, rest])
-        finally:
             self._file.close()
+            self._disk.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """What the disk said comes before what HDF5 makes of it."""
+        try:
+            yield
+        except (OSError, RuntimeError):
+            self._disk.check()
+            raise
+        self._disk.check()
 
     def abandon(self) -> None:
         """Close without finishing; the file is about to be removed."""
-        try:
-            self._file.close()
-        except (OSError, RuntimeError):
-            return  # the disk is full: there is nothing left to save
+        self._file.close()
+        self._disk.close()
 
 
 def read_events(

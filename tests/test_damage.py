@@ -508,6 +508,14 @@ def test_frames_must_be_of_the_region(tmp_path):
     refused(lambda: calibrate_aps(tmp_path / "set", tmp_path / "c.yaml"), "frames of 16×16 pixels are not the roi")
 
 
+def test_events_must_be_of_the_region(tmp_path):
+    capture_sets.write_events(tmp_path / "set", size=16, roi="{x: 0, y: 0, width_px: 32, height_px: 16}")
+    refused(lambda: calibrate_evs(tmp_path / "set", tmp_path / "c.yaml"), r"capture\.yaml: roi: event maps of 16×16")
+    text = (tmp_path / "set" / "capture.yaml").read_text()
+    (tmp_path / "set" / "capture.yaml").write_text(text + "evs_tile_rows: 2\nevs_tile_cols: 1\n")
+    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")
+
+
 @pytest.mark.parametrize("line", ["bit_depth: '10'", "bit_depth: true", "tile_rows: yes", "theta_hardware_v: '0.1'"])
 def test_text_and_truth_values_are_no_numbers(tmp_path, line):
     key, value = line.split(": ")

@@ -297,6 +297,32 @@ else:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("limit", [20_000, 250_000, 900_000])
+def test_a_disk_that_is_full_of_events_is_one_clear_error(limit, tmp_path):
+    """HDF5 by itself cannot close such a file: it ends in messages of its own, and in a crash."""
+    code = """
+import resource, signal, sys
+import recordings
+from hesim_render.errors import OutputError
+from hesim_render.recording import RecordingWriter
+sensor = recordings.sensor_like("eiger")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
+try:
+    with RecordingWriter(sys.argv[1], sensor, seed=1, duration_us=10**6) as writer:
+        recordings.fill(writer, sensor, 0, 10**6, count=300_000)
+except OutputError as error:
+    print(error)
+else:
+    sys.exit("no error")
+"""
+    child = run(code, tmp_path / "r", limit)
+    out, err = child.communicate(timeout=60)
+    assert child.returncode == 0 and err == ""
+    assert len(out.splitlines()) == 1 and "cannot be written (File too large)" in out
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_killed_run_leaves_no_recording_and_the_next_one_tidies_up(tmp_path):
     code = """
 import sys, time

@@ -173,4 +173,12 @@ def event_tile(captures: CaptureSet, shape: tuple[int, ...]) -> tuple[int, int]:
             "capture.yaml",
             file=captures.folder,
         )
+    roi, wanted = spec.roi, (shape[0] // tile[0] * spec.tile_rows, shape[1] // tile[1] * spec.tile_cols)
+    if roi is not None and wanted != (roi.height_px, roi.width_px):
+        raise SpecError(
+            f"event maps of {shape[0]}×{shape[1]} pixels belong to {wanted[0]}×{wanted[1]} frame pixels, not to the "
+            f"roi of {roi.height_px}×{roi.width_px}; change it, or state evs_tile_rows and evs_tile_cols",
+            file=captures.folder / "capture.yaml",
+            key="roi",
+        )
     return tile
