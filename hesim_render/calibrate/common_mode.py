@@ -20,6 +20,8 @@ from hesim_render.calibrate.moments import Moments
 _LEAST_CLEAR = 0.2
 #: Times the median noise of a row from which it counts less.
 _BUSY = 2.0
+#: Difference of the halves' light, as a part of the brighter, that tells light from black.
+_LEAST_BETWEEN = 0.2
 
 
 @dataclass(frozen=True)
@@ -137,38 +139,37 @@ def frame_drift(moments: Moments, k: int, row_variance: float, signal_dn: NDArra
     """
     halves = [moments.half[k] == side for side in (0, 1)]
     pixels = np.array([max(int(mask.sum()), 1) for mask in halves])
-    noise = np.array([float(np.sum(moments.variance[k][m], dtype=np.float64)) for m in halves]) / pixels**2
-    rows = row_variance / moments.mean.shape[1]
+    own = np.array([float(np.sum(moments.variance[k][m], dtype=np.float64)) for m in halves]) / pixels**2
+    # halves may lie in different rows: what rows add does not cancel in their difference
+    part = np.stack([mask.sum(axis=1) for mask in halves]) / pixels[:, None]
+    covariance = np.diag(own) + row_variance * (part @ part.T)
     change = moments.half_means[k, 1:] - moments.half_means[k, 1:].mean(axis=0)
-    exposure = int(moments.exposures_us[k])
-    together = change @ pixels / pixels.sum()
-    both = float(noise @ pixels**2 / pixels.sum() ** 2 + rows)
-    alone = FrameDrift(exposure, _excess(together, both, pixels.sum()), None, float(np.ptp(together)), 0.0)
+    exposure, count = int(moments.exposures_us[k]), float(pixels.sum())
+
+    def series(weight: NDArray) -> tuple[NDArray[np.float64], Shared]:
+        values = change @ weight
+        return values, _excess(values, float(weight @ covariance @ weight), count)
+
+    together, shared = series(pixels / count)
+    alone = FrameDrift(exposure, shared, None, float(np.ptp(together)), 0.0)
     if signal_dn is None:
         return alone
     levels = [float(signal_dn[m].mean()) if m.any() else 0.0 for m in halves]
     between = levels[1] - levels[0]
-    if between < 0.2 * max(levels[1], 1e-9) or between <= 0:
+    if between < _LEAST_BETWEEN * max(levels[1], 1e-9) or between <= 0:
         return alone
-    light = (change[:, 1] - change[:, 0]) / between
-    black = change[:, 0] - light * levels[0]
-    light_noise = float(noise.sum()) / between**2
-    # black = change of the dim half · (1 + r) − that of the bright half · r
-    r = levels[0] / between
-    black_noise = float((1 + r) ** 2 * noise[0] + r * r * noise[1]) + rows
-    count = pixels.sum()
-    return FrameDrift(
-        exposure, _excess(black, black_noise, count), _excess(light, light_noise, count), float(np.ptp(black)),
-        float(np.ptp(light)),
-    )  # fmt: skip
+    light, of_light = series(np.array([-1.0, 1.0]) / between)
+    # the dim half's change less the light's part of it
+    black, of_black = series(np.array([1 + levels[0] / between, -levels[0] / between]))
+    return FrameDrift(exposure, of_black, of_light, float(np.ptp(black)), float(np.ptp(light)))
 
 
-def _excess(change: NDArray, noise: float, pixels: int) -> Shared:
+def _excess(change: NDArray, noise: float, pixels: float) -> Shared:
     """Variance of a series beyond that of its noise, which is known from many pixels."""
     freedom = change.size - 1
     noise = max(noise, 1e-30)
     ratio = float(change @ change) / freedom / noise
     return Shared(
         noise * (ratio - 1), noise * ratio * float(np.sqrt(2 / freedom)), ratio,
-        float(f_law.sf(ratio, freedom, freedom * float(pixels))),
+        float(f_law.sf(ratio, freedom, freedom * pixels)),
     )  # fmt: skip

@@ -182,6 +182,7 @@ def _proportions(result: ApsCalibration, lit: Moments, rows: float) -> list[Prop
         expected = result.composite.rate_dn_per_s[use].astype(np.float64) * t
         residual = result.signals[k][use] - expected
         noise = np.maximum(lit.variance[k][use].astype(np.float64), ADC_VARIANCE_DN2) / lit.frames
+        noise += result.dark.mean_variance(t)
         # from the light, not from a pixel's own sample
         weight = 1 / np.polynomial.Polynomial.fit(expected, noise, 1)(expected).clip(min=0.1 * noise.mean())
         design = np.stack([np.ones_like(expected), expected])
@@ -190,7 +191,11 @@ def _proportions(result: ApsCalibration, lit: Moments, rows: float) -> list[Prop
             continue
         inverse = np.linalg.inv(matrix)
         value = inverse @ ((design * weight) @ residual)
-        error = np.sqrt(np.diag(inverse) + np.array([rows / lit.mean.shape[1] / lit.frames, 0.0]))
+        # what a row adds, to the lit mean and to the dark one that was taken off, is the same for all its pixels
+        row = np.nonzero(use)[0]
+        scores = np.stack([np.bincount(row, weight * x) for x in design])
+        shared = rows / lit.frames + result.dark.mean_variance(t) * rows / (_dark_variance(result) + rows)
+        error = np.sqrt(np.diag(inverse + shared * inverse @ (scores @ scores.T) @ inverse))
         found.append(
             Proportion(int(lit.exposures_us[k]), float(value[0]), float(error[0]), float(value[1]), float(error[1]))
         )

@@ -41,7 +41,7 @@ def mitsuba() -> Any:
     if mi.variant() != wanted:
         mi.set_variant(wanted)
     mi.set_log_level(mi.LogLevel.Error)
-    resolver = mi.file_resolver()
+    resolver = mi.file_resolver()  # type: ignore[operator]  # its stubs have it as a plain object
     if list(resolver)[:1] != [str(_home(mi))]:
         resolver.prepend(str(_home(mi)))
     _have_threads()
@@ -117,7 +117,7 @@ def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], N
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
-    resolver = mi.file_resolver()
+    resolver = mi.file_resolver()  # type: ignore[operator]  # its stubs have it as a plain object
     inner = mi.FileResolver(resolver)
     if isinstance(source, Path):
         inner.prepend(str(source.resolve().parent))
