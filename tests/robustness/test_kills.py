@@ -171,7 +171,7 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
     kill_at_random(trial, 12, seed=sum(map(ord, name)))
     if trial.target is not None and name != "view":
         kill_at_every_step(trial, exchange=False)
-    # over all commands more than 100
+    # seven commands: more than 100 kills
     print(f"{name}: {at_steps} kills at steps, {trial.kills} in all")
-    assert at_steps >= 4 and trial.kills >= 12
+    assert at_steps >= 4 and trial.kills >= 16
     trial.end()
