@@ -151,8 +151,9 @@ def kill_at_random(trial, times, seed):
         number = rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
         child.send_signal(number)
         status = trial.check(child)
-        # 130 is an interrupted command; before Python has its own handlers the signal itself ends it
-        assert status in (0, 130, -number), status
+        # 130 is an interrupted command. CPython ends by SIGINT itself, which shells call 130 as well, where the
+        # interrupt came up through code that an extension runs; before we have handlers the signal itself ends it.
+        assert status in (0, 130, -signal.SIGINT, -number), status
 
 
 def test_view_killed_at_every_step(tmp_path):
@@ -170,7 +171,7 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
     kill_at_random(trial, 12, seed=sum(map(ord, name)))
     if trial.target is not None and name != "view":
         kill_at_every_step(trial, exchange=False)
-    # over all commands more than 100
+    # seven commands: more than 100 kills
     print(f"{name}: {at_steps} kills at steps, {trial.kills} in all")
-    assert at_steps >= 4 and trial.kills >= 12
+    assert at_steps >= 4 and trial.kills >= 16
     trial.end()
