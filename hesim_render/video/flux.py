@@ -144,7 +144,7 @@ class VideoFlux:
         if spec is not None and self._is_held and spec.tick_us is None:
             found.append(
                 "the sensor's event pixels are asynchronous: their ln x goes in a straight line from the middle of one "
-                "picture to the middle of the next, so that events are not half a picture late; frames see held pictures"
+                "picture to that of the next, so that events are not half a picture late; frames see held pictures"
             )
         if self._is_irregular:
             found.append("the video's time stamps are irregular and were kept; fps makes them regular")
@@ -245,6 +245,10 @@ class VideoFlux:
         dr.eval(flux)
         self._maps[number] = flux
         return flux
+
+    def start_digest(self) -> None:
+        """Hash the input beside what follows; `describe` waits for it."""
+        self._reader.start_digest()
 
     def describe(self) -> dict[str, Any]:
         """What the manifest says of the video: the input and its hash, colours, scale, times, interpolation."""
