@@ -27,6 +27,10 @@ class HesimError(Exception):
     """Base of all errors with a message meant for the user."""
 
 
+class HesimWarning(UserWarning):
+    """Something that may be meant, and may be a mistake."""
+
+
 class SpecError(HesimError, ValueError):
     """A sensor file, scene file, spectrum or override is wrong.
 

@@ -129,7 +129,6 @@ def simulate_video(
         settings = {
             "clean": clean,
             "without": list(without),
-            "video": flux.describe(),
             "backend": backend.select().describe(),
         }
         capture = Capture(flux, sensor, aps, evs, duration_us, seed)
@@ -145,7 +144,9 @@ def simulate_video(
             with shown(progress, f"{Path(name).name} → {sensor.name}") as told:
                 if isinstance(told, ProgressReport):
                     told.expect(expected.seconds)
+                flux.start_digest()
                 capture.record(writer, told)
+            writer.add_settings({"video": flux.describe()})
             return writer.finish()
     finally:
         flux.close()

@@ -115,6 +115,15 @@ def test_a_run_goes_on_where_nobody_reads_what_it_says(tmp_path):
     assert (done.returncode, done.stderr) == (0, "") and (tmp_path / "o" / "recording.json").is_file()
 
 
+def test_what_no_pixel_uses_after_a_change_is_noted(capsys, tmp_path):
+    status, out, err = call(
+        capsys, "simulate", "dark", "--sensor", "eiger", "--roi", "8x8", "--duration", "0.002", "--out", tmp_path / "o",
+        "--set", "sensor.pixels.W={filter: green, roles: [aps]}",
+    )  # fmt: skip
+    assert status == 0 and "RAW frames" in out and err.count("\n") == 1
+    assert err.startswith("hesim-render: note: ") and "pixels.W: no pixel of the tile has this letter" in err
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

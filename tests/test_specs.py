@@ -2,12 +2,13 @@
 
 import re
 import typing
+import warnings
 from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
 
-from hesim_render.errors import RangeError, SpecError
+from hesim_render.errors import HesimWarning, RangeError, SpecError
 from hesim_render.layout import Layout
 from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene, read_sensor
 from hesim_render.specs.files import Strict, content_hash, data_folder, list_names, parse_override
@@ -309,15 +310,26 @@ def test_whole_floats_are_still_whole_numbers_and_texts_no_booleans():
         read_scene("rotating-star", {"motion.0.repeat": "no"})
 
 
-def test_what_no_pixel_uses_is_refused():
-    with pytest.raises(SpecError, match=r"filters\.spare: no pixel has this filter"):
-        read_sensor("eiger", {"filters.spare": {"flat": 0.5, "band_nm": [400, 700]}})
+def test_what_no_pixel_uses_is_an_error_of_a_file_and_a_warning_of_an_override(tmp_path):
+    spare = "filters:\n  spare: {flat: 0.5, band_nm: [400, 700]}\n"
+    text = SENSOR.replace("filters:\n", spare).replace("pixels:\n", "pixels:\n  W: {filter: green, roles: [aps]}\n")
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(SpecError) as caught:
+        read_sensor(tmp_path / "mine.yaml")
+    told = [(problem.key, problem.line) for problem in caught.value.problems]
+    assert sorted(told) == [("filters.spare", line_with(text, "spare:")), ("pixels.W", line_with(text, "W: {filter"))]
     # a comparison that defines a new white pixel, and leaves the tile as it was
-    with pytest.raises(SpecError, match=r"pixels\.W: no pixel of the tile has this letter"):
+    with pytest.warns(HesimWarning, match=r"pixels\.W: no pixel of the tile has this letter"):
         read_sensor("eiger", {"pixels.W": {"filter": "green", "roles": ["aps"]}})
-    # used only as the reference of the events' signal
-    spare = {"filters.spare": {"flat": 0.5, "band_nm": [400, 700]}, "evs.signal_reference.filter": "spare"}
-    assert "spare" in read_sensor("eiger", spare).filters
+    with pytest.warns(HesimWarning, match=r"filters\.spare: no pixel has this filter"):
+        read_sensor("eiger", {"filters.spare": {"flat": 0.5, "band_nm": [400, 700]}})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # a filter that is only the reference of the events' signal is used
+        change = {"filters.spare": {"flat": 0.5, "band_nm": [400, 700]}, "evs.signal_reference.filter": "spare"}
+        assert "spare" in read_sensor("eiger", change).filters
+        for name in list_names("sensors"):
+            read_sensor(name)
 
 
 @pytest.mark.parametrize(

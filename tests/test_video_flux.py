@@ -44,7 +44,7 @@ def test_edges_are_the_pictures_limits():
     np.testing.assert_allclose(flux.slice_edges_us(0, 4000), [1000, 2000, 3000])
     np.testing.assert_allclose(flux.slice_edges_us(1000, 3000), [2000])
     assert not flux.is_static and flux.clock.end_us == 4000
-    np.testing.assert_allclose(flux.sample_times_us(0, 4000), [1000, 2000, 3000])
+    np.testing.assert_allclose(flux.sample_times_us(0, 4000), [500, 1500, 2500, 3500])
 
 
 def test_slow_motion_divides_the_clock():
@@ -273,6 +273,31 @@ def test_sensors_without_a_tick_follow_the_pictures():
     theta = sensor.spec.evs.contrast_threshold_on
     stamps = np.unique(recording.events["t_us"])
     assert np.log(5) / theta - 2 < stamps.size < np.log(5) / theta + 1 and np.any(stamps % 1000)
+
+
+@pytest.mark.parametrize("duty", [1.0, 0.4])
+@pytest.mark.parametrize("way", ["none", "linear"])
+def test_events_of_asynchronous_sensors_are_not_late(way, duty):
+    """Light that grows as exp(t/τ): the k-th event of a pixel is due when the light has grown by exp(k θ)."""
+    period_us, tau_us = 10_000, 200_000
+    sensor = hr.load_sensor(
+        "davis346", {"evs.window_us": 1, "evs.contrast_threshold_on": 0.1, "evs.coefficients.0.beta2": 1e-9}
+    ).crop(8, 8)
+    begin = np.arange(60) * period_us
+    end = begin + duty * period_us  # each picture is the mean over its exposure, in closed form
+    level = tau_us * (np.exp(end / tau_us) - np.exp(begin / tau_us)) / (end - begin)
+    options = {"fps": 1e6 / period_us, "transfer": "linear", "white_lux": 100, "duty": duty, "interpolation": way}
+    recording = hr.simulate_video(grey(level / level[-1], 8, 8), sensor, clean=True, **options)
+    stamps = np.unique(recording.events["t_us"])
+    # the reference is the light at the first sample, 1 µs after the begin: held there until the first middle
+    first_us = duty * period_us / 2
+    due = first_us + 0.1 * tau_us * np.arange(1, stamps.size + 1)
+    late_us = stamps - due
+    assert stamps.size >= 28
+    # half a picture would be 5000 µs; a straight line between means of an exponential is off by (Δt/τ)²/24 · τ
+    assert abs(late_us.mean()) < 60 and np.abs(late_us).max() < 200
+    notes = recording.manifest["settings"]["video"]["notes"]
+    assert any("not half a picture late" in note for note in notes) == (way == "none")
 
 
 def test_the_same_seed_gives_the_same_recording():

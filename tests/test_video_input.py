@@ -1,5 +1,7 @@
 """What comes in: every kind of input read to the last code, every kind of broken input refused in one sentence."""
 
+import hashlib
+import time
 import warnings
 
 import av
@@ -13,7 +15,11 @@ from videos import TAGS, encode, grey_frames, moving_bar, rgb_frames, yuv_frame
 import hesim_render as hr
 from hesim_render.errors import HesimError, RangeError, SpecError
 from hesim_render.video import VideoFlux, VideoOptions, open_video
+from hesim_render.video.colours import ColourTags
+from hesim_render.video.digest import Digest
 from hesim_render.video.folder import FolderVideo
+from hesim_render.video.linear import Lineariser
+from hesim_render.video.picture import PictureFormat
 
 
 def opened(source, **options):
@@ -552,3 +558,47 @@ def test_pictures_smaller_than_the_mosaic_are_enlarged_or_refused():
     assert any("enlarged 16 times" in note for note in recording.manifest["settings"]["video"]["notes"])
     with pytest.raises(HesimError, match="at least the 64x48 px read out"):
         hr.simulate_video(pictures, sensor, fps=10, transfer="srgb", fit="pixel")
+
+
+@pytest.mark.parametrize("size", [(5, 4), (4, 4), (1, 1), (3, 7)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("offset", [0, 1, 2, 3])
+def test_pictures_of_any_size_at_any_address_are_read_as_they_are(size, dtype, offset):
+    """Words are taken where they lie if they are whole and aligned; the last pixel's bytes end where the array ends."""
+    rng = np.random.default_rng(5)
+    count = 2 * size[0] * size[1] * 3
+    store = rng.integers(0, 256, count * np.dtype(dtype).itemsize + offset, dtype=np.uint8)
+    pictures = store[offset:].view(dtype).reshape(2, *size, 3)
+    top = np.iinfo(dtype).max
+    for number in range(2):
+        found = Lineariser(
+            PictureFormat("interleaved", size[1], size[0], 8 * np.dtype(dtype).itemsize),
+            ColourTags("linear", None, "bt709", "rgb", "full"),
+        ).linear((pictures[number],))
+        for channel in range(3):
+            expected = pictures[number][..., channel].ravel() / top
+            np.testing.assert_allclose(np.array(found[channel]), expected, atol=1e-6)
+
+
+def test_the_hash_is_made_beside_the_run_and_its_errors_are_told():
+    pieces = [b"abc", np.arange(5, dtype=np.uint8).data]
+    assert Digest(lambda: pieces).hexdigest() == hashlib.sha256(b"abc" + bytes(range(5))).hexdigest()
+
+    def broken():
+        yield b"abc"
+        raise OSError("gone")
+
+    with pytest.raises(OSError, match="gone"):
+        Digest(broken).hexdigest()
+    seen = []
+
+    def endless():
+        while True:
+            seen.append(1)
+            yield b"x" * 1000
+
+    digest = Digest(endless)
+    digest.stop()
+    count = len(seen)
+    time.sleep(0.05)
+    assert len(seen) == count

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
-from hesim_render.errors import HesimError
+from hesim_render.errors import HesimError, HesimWarning
 from hesim_render.output import discard_unfinished
 from hesim_render.terminal import complain, silence_stdout
 
@@ -22,12 +23,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     more (``| head``) a run goes on to its end, and has the status it has.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    with Interrupts() as interrupts:
+    with Interrupts() as interrupts, warnings.catch_warnings():
+        warnings.showwarning = _note(warnings.showwarning)
         status = _run(given, interrupts)
         if status == INTERRUPTED:  # newer typer turns the exception into this status itself
             discard_unfinished()
             complain("interrupted")
     sys.exit(status)
+
+
+def _note(otherwise: Callable[..., None]) -> Callable[..., None]:
+    """Shows warnings of ours as a line each, and those of others as `otherwise` does."""
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, HesimWarning):
+            complain(f"note: {message}")
+        else:
+            otherwise(message, category, *where, **more)
+
+    return show
 
 
 def _run(given: list[str], interrupts: Interrupts) -> int:

@@ -41,8 +41,8 @@ def mitsuba() -> Any:
     if mi.variant() != wanted:
         mi.set_variant(wanted)
     mi.set_log_level(mi.LogLevel.Error)
-    resolver = mi.file_resolver()  # type: ignore[operator]  # its stubs have it as a plain object
-    if list(resolver)[:1] != [str(_home(mi))]:
+    resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs know it as an object
+    if str(resolver[0]) != str(_home(mi)):
         resolver.prepend(str(_home(mi)))
     _have_threads()
     return mi

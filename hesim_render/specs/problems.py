@@ -14,6 +14,9 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from hesim_render.errors import SpecError, closest, did_you_mean
 
+#: Characters of a wrong value that a message repeats.
+_LONGEST = 60
+
 
 def spec_error(
     error: ValidationError,
@@ -69,7 +72,10 @@ def _told_once(problems: Iterable[Any], data: Any) -> list[Any]:
     found: list[Any] = []
     for branches in groups.values():
         found += max(branches.values(), key=lambda branch: max(map(_telling, branch)))
-    return found
+    once: dict[tuple[Any, ...], Any] = {}
+    for problem in sorted(found, key=_telling):  # one value has one thing wrong with it, that which says most
+        once[tuple(_keys_of(problem, data))] = problem
+    return list(once.values())
 
 
 def _telling(problem: Any) -> tuple[bool, bool, int]:
@@ -100,7 +106,8 @@ def _one(
         location += inside
         given = problem.get("input")
         if not isinstance(given, dict | list | BaseModel) and "," not in str(given):
-            message += f" (got {given!r})"
+            shown = repr(given)
+            message += f" (got {shown if len(shown) <= _LONGEST else shown[:_LONGEST] + '…'})"
     dotted = ".".join(str(key) for key in location)
     if any(dotted == key or dotted.startswith(f"{key}.") or key.startswith(f"{dotted}.") for key in overrides):
         return SpecError(f"{message}; set by an override", file=file, key=dotted)

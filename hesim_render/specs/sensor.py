@@ -6,16 +6,18 @@ from or why it was assumed.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, PositiveInt, field_validator, model_validator
 
-from hesim_render.errors import SpecError
+from hesim_render.errors import HesimWarning, SpecError
 from hesim_render.specs.calibration import NoiseFile, apply_calibration
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
-from hesim_render.specs.sensor_checks import sensor_problems
+from hesim_render.specs.problems import line_of
+from hesim_render.specs.sensor_checks import sensor_problems, unused
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectra import Spectrum
 
@@ -319,7 +321,8 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     Raises
     ------
     SpecError
-        With file, line and key of the first thing wrong.
+        With file, line and key of all that is wrong. A letter or filter of the file that no pixel uses is an error; one
+        that no pixel uses after `overrides` is a `HesimWarning`.
     """
     file = locate(name_or_path, "sensors")
     data, changes = load_yaml(file), dict(overrides or {})
@@ -333,4 +336,10 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
         validate(SensorSpec, data, file, changes)
         apply_calibration(data, NoiseFile(file=given["file"], sha256=given.get("sha256"), folder=folder))
         data["noise"] = {**given, "folder": folder}
-    return validate(SensorSpec, data, file, changes)
+    spec = validate(SensorSpec, data, file, changes)
+    problems = [SpecError(text, file=file, line=line_of(data, key.split(".")), key=key) for key, text in unused(spec)]
+    if problems and not changes:
+        raise SpecError.together(problems)
+    for problem in problems:  # of an override that may be meant: what was replaced stays in the file
+        warnings.warn(str(problem), HesimWarning, stacklevel=3)
+    return spec

@@ -41,8 +41,6 @@ def _tile(spec: SensorSpec) -> Iterator[str]:
     for letter, pixel in spec.pixels.items():
         if len(letter) != 1:
             yield f"pixels: {letter!r} must be a single letter"
-        elif letter not in drawn:
-            yield f"pixels.{letter}: no pixel of the tile has this letter; draw it there, or remove it here"
         if pixel.filter not in spec.filters:
             known = ", ".join(spec.filters)
             yield (
@@ -81,9 +79,6 @@ def _roles(spec: SensorSpec) -> Iterator[str]:
 
 
 def _filters(spec: SensorSpec) -> Iterator[str]:
-    used = {pixel.filter for pixel in spec.pixels.values()}
-    if spec.evs is not None:
-        used.add(spec.evs.signal_reference.filter)
     said: set[str] = set()
     quantum_efficiency = spec.quantum_efficiency.load()
     if quantum_efficiency.values.min() < 0 or quantum_efficiency.values.max() > 1:
@@ -94,8 +89,6 @@ def _filters(spec: SensorSpec) -> Iterator[str]:
         yield "lens.transmittance must lie in [0, 1]"
         return
     for name, filter_ in spec.filters.items():
-        if name not in used:
-            yield f"filters.{name}: no pixel has this filter; give it to one under 'pixels', or remove it here"
         values = filter_.load().values
         if values.min() < 0 or values.max() > 1.0 + 1e-9:
             yield f"filters.{name}: transmittance must lie in [0, 1]"
@@ -111,6 +104,20 @@ def _filters(spec: SensorSpec) -> Iterator[str]:
             yield f"filters.{name}: filter, quantum efficiency and lens share no wavelength"
         else:
             yield from _outside(name, response)
+
+
+def unused(spec: SensorSpec) -> Iterator[tuple[str, str]]:
+    """Letters that are not in the tile and filters that no pixel has: their keys, and what is to be done."""
+    drawn = set("".join(spec.tile_rows))
+    for letter in spec.pixels:
+        if letter not in drawn:
+            yield f"pixels.{letter}", "no pixel of the tile has this letter; draw it there, or remove it here"
+    used = {pixel.filter for letter, pixel in spec.pixels.items() if letter in drawn}
+    if spec.evs is not None:
+        used.add(spec.evs.signal_reference.filter)
+    for name in spec.filters:
+        if name not in used:
+            yield f"filters.{name}", "no pixel has this filter; give it to one under 'pixels', or remove it here"
 
 
 def _outside(name: str, response: Spectrum) -> Iterator[str]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.guard import reading
 from hesim_render.video.colours import ColourTags
+from hesim_render.video.digest import Digest
 from hesim_render.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
 
 
@@ -92,6 +92,7 @@ class ArrayVideo:
                 file=self.name,
             )
         self._array = array
+        self._digest: Digest | None = None
         self._bits = picture_bits(array.dtype, bit_depth, self.name)
         self.count, height, width = array.shape[:3]
         layout: PictureLayout = "grey" if array.ndim == 3 or array.shape[3] == 1 else "interleaved"
@@ -104,13 +105,21 @@ class ArrayVideo:
         image = without_alpha(np.asarray(self._array[index]), self._bits, where)
         return check_values((image.astype(np.float32) if image.dtype == np.float64 else image,), where)
 
-    def describe(self) -> Mapping[str, Any]:
-        digest = hashlib.sha256(f"{self._array.dtype.str}{self._array.shape}".encode())
+    def _pieces(self) -> Iterator[Any]:
+        yield f"{self._array.dtype.str}{self._array.shape}".encode()
         for picture in self._array:
-            digest.update(np.ascontiguousarray(picture).data)
+            yield np.ascontiguousarray(picture).data
+
+    def start_digest(self) -> None:
+        self._digest = Digest(self._pieces)
+
+    def describe(self) -> Mapping[str, Any]:
+        if self._digest is None:
+            self.start_digest()
+        assert self._digest is not None
         return {
             "source": self.name,
-            "sha256": digest.hexdigest(),
+            "sha256": self._digest.hexdigest(),
             "pictures": self.count,
             "size_px": [self.format.width, self.format.height],
             "values": str(self._array.dtype),
@@ -118,4 +127,6 @@ class ArrayVideo:
         }
 
     def close(self) -> None:
+        if self._digest is not None:
+            self._digest.stop()
         self._array = None

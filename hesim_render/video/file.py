@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import re
 from array import array
 from collections.abc import Iterator, Mapping
@@ -13,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from hesim_render.errors import SpecError
+from hesim_render.video.digest import Digest
 from hesim_render.video.picture import Planes, Timing
 from hesim_render.video.pyav import frame_format, planes_of, reason, tags_of
+
+_PIECE_BYTES = 1 << 20
 
 
 class FileVideo:
@@ -38,6 +40,7 @@ class FileVideo:
         self.name = str(path)
         self._path = Path(path)
         self._container: Any = None
+        self._digest: Digest | None = None
         self._open()
         self._pts, timing, self.count = self._scan()
         if fps is not None:
@@ -55,13 +58,13 @@ class FileVideo:
     def _open(self) -> None:
         import av
 
-        self.close()
+        self._close_container()
         try:
             self._container = av.open(self.name)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise SpecError(f"cannot be opened as a video ({reason(error)})", file=self._path) from None
         if not self._container.streams.video:
-            self.close()
+            self._close_container()
             raise SpecError("has no video in it", file=self._path)
         self._stream = self._container.streams.video[0]
         if self._stream.codec_context is None:
@@ -175,12 +178,21 @@ class FileVideo:
             )
         return planes_of(frame, self.format, self._target, where)
 
-    def describe(self) -> Mapping[str, Any]:
+    def _pieces(self) -> Iterator[bytes]:
         with self._path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+            while piece := file.read(_PIECE_BYTES):
+                yield piece
+
+    def start_digest(self) -> None:
+        self._digest = Digest(self._pieces)
+
+    def describe(self) -> Mapping[str, Any]:
+        if self._digest is None:
+            self.start_digest()
+        assert self._digest is not None
         return {
             "source": self.name,
-            "sha256": digest,
+            "sha256": self._digest.hexdigest(),
             "pictures": self.count,
             "size_px": [self.format.width, self.format.height],
             "codec": self._codec,
@@ -189,6 +201,11 @@ class FileVideo:
         }
 
     def close(self) -> None:
+        if self._digest is not None:
+            self._digest.stop()
+        self._close_container()
+
+    def _close_container(self) -> None:
         if self._container is not None:
             self._container.close()
         self._container = None

@@ -141,6 +141,11 @@ class VideoFlux:
                 f"pictures come every {period_us:.0f} µs, event comparisons every {spec.tick_us} µs: events gather "
                 "where pictures change; interpolation spreads them"
             )
+        if spec is not None and self._is_held and spec.tick_us is None:
+            found.append(
+                "the sensor's event pixels are asynchronous: their ln x goes in a straight line from the middle of one "
+                "picture to that of the next, so that events are not half a picture late; frames see held pictures"
+            )
         if self._is_irregular:
             found.append("the video's time stamps are irregular and were kept; fps makes them regular")
         return found
@@ -150,8 +155,12 @@ class VideoFlux:
         return self.clock.inner(self._edges, begin_us, end_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """The same times: between them the flux stands still or goes in a straight line."""
-        return self.slice_edges_us(begin_us, end_us)
+        """Middles of the exposures: times at which a picture is what the scene was, held or not.
+
+        Who goes in a straight line from sample to sample follows the scene then. Sampled where a held picture ends, it
+        would come half a picture late.
+        """
+        return self.clock.inner(self.clock.middle_us, begin_us, end_us)
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
         """Mean Φ of each listed pixel over its own interval, which may span several pictures.
@@ -236,6 +245,10 @@ class VideoFlux:
         dr.eval(flux)
         self._maps[number] = flux
         return flux
+
+    def start_digest(self) -> None:
+        """Hash the input beside what follows; `describe` waits for it."""
+        self._reader.start_digest()
 
     def describe(self) -> dict[str, Any]:
         """What the manifest says of the video: the input and its hash, colours, scale, times, interpolation."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from hesim_render.errors import SpecError
 from hesim_render.transfer import InputTransfer
 from hesim_render.video.arrays import picture_bits, without_alpha
 from hesim_render.video.colours import ColourTags
+from hesim_render.video.digest import Digest
 from hesim_render.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
 from hesim_render.video.pyav import decode_picture
 
@@ -78,6 +79,7 @@ class FolderVideo:
         self.name = str(folder)
         self._files = numbered_pictures(self._folder)
         self._bit_depth = bit_depth
+        self._digest: Digest | None = None
         self.count = len(self._files)
         self.timing = None if fps is None else Timing.regular(self.count, fps)
         self.format, self.tags, planes = self._open(self._files[0])
@@ -114,14 +116,21 @@ class FolderVideo:
         self._kept = (index, planes)
         return planes
 
-    def describe(self) -> Mapping[str, Any]:
-        digest = hashlib.sha256()
+    def _pieces(self) -> Iterator[bytes]:
         for path in self._files:
             with path.open("rb") as file:
-                digest.update(f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+                yield f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode()
+
+    def start_digest(self) -> None:
+        self._digest = Digest(self._pieces)
+
+    def describe(self) -> Mapping[str, Any]:
+        if self._digest is None:
+            self.start_digest()
+        assert self._digest is not None
         return {
             "source": self.name,
-            "sha256": digest.hexdigest(),
+            "sha256": self._digest.hexdigest(),
             "pictures": self.count,
             "first": self._files[0].name,
             "last": self._files[-1].name,
@@ -131,6 +140,8 @@ class FolderVideo:
         }
 
     def close(self) -> None:
+        if self._digest is not None:
+            self._digest.stop()
         self._kept = None
 
 

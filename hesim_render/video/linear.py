@@ -90,7 +90,9 @@ class Lineariser:
         words = types.UInt32(_words(picture))
         first = self._index * 3
         word, shift = first >> 2, (first & 3) << 3
-        low, high = dr.gather(types.UInt32, words, word), dr.gather(types.UInt32, words, word + 1)
+        # of the last word all three bytes of a pixel are in that word itself
+        last = dr.width(words) - 1
+        low, high = dr.gather(types.UInt32, words, word), dr.gather(types.UInt32, words, dr.minimum(word + 1, last))
         # a shift by 32 is undefined: two shifts that never reach it
         both = (low >> shift) | ((high << 1) << (31 - shift))
         return [types.Float((both >> (8 * channel)) & 0xFF) for channel in range(3)]
@@ -168,7 +170,12 @@ class Lineariser:
 
 
 def _words(values: NDArray) -> NDArray[np.uint32]:
-    """The bytes of an array as 32-bit words (little-endian), filled up with zeros to one word more than they need."""
-    flat = values.reshape(-1)
-    per_word = 4 // flat.itemsize
-    return np.append(flat, np.zeros(per_word + -flat.size % per_word, flat.dtype)).view(np.uint32)
+    """The bytes of an array as 32-bit words (little-endian); filled up with zeros where the last is not full.
+
+    In place where they are whole words that lie on word boundaries.
+    """
+    flat = np.ascontiguousarray(values).reshape(-1)
+    missing = -flat.size % (4 // flat.itemsize)
+    if missing or flat.ctypes.data % 4:
+        flat = np.append(flat, np.zeros(missing, flat.dtype))
+    return flat.view(np.uint32)

@@ -117,6 +117,9 @@ class MotionVideo:
         ]
         return (found[1], found[0], found[2]) if self.format.layout == "planar" else tuple(found)
 
+    def start_digest(self) -> None:
+        self._reader.start_digest()
+
     def describe(self) -> Mapping[str, Any]:
         return self._reader.describe()
 

@@ -78,8 +78,12 @@ class Reader(Protocol):
         """The picture of this number, 0 first."""
         ...
 
+    def start_digest(self) -> None:
+        """Begin to hash the input, beside what follows."""
+        ...
+
     def describe(self) -> Mapping[str, Any]:
-        """What the manifest says of the input: name, hash, size, format; plain values."""
+        """What the manifest says of the input: name, hash, size, format; plain values. Waits for the hash."""
         ...
 
     def close(self) -> None: ...
