@@ -280,7 +280,7 @@ def test_options_reach_simulate(capsys, tmp_path, monkeypatch):
         return recordings.make("eiger", options["out"])
 
     monkeypatch.setitem(hr.__dict__, "simulate", simulate)
-    monkeypatch.setitem(hr.__dict__, "load_scene", lambda name, changes: (name, changes))
+    monkeypatch.setitem(hr.__dict__, "load_scene", lambda name, changes, allow_outside=False: (name, changes))
     monkeypatch.setitem(hr.__dict__, "load_sensor", lambda name, changes: Cropped(name, changes))
     status, out, _ = call(
         capsys, "simulate", "dark", "--sensor", "gen2", "--out", tmp_path / "o", "--duration", "0.25", "--roi",

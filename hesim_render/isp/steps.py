@@ -80,7 +80,7 @@ class MapFile(Strict):
             return read_array(self.file, kinds="uif")
         if self.name is None:
             raise SpecError("holds several arrays: say which one by 'name'", file=self.file)
-        return read_arrays(self.file, (self.name,), only=(self.name,), kinds="uif")[self.name]
+        return read_arrays(self.file, (self.name,), only=(self.name,), kinds="buif")[self.name]
 
 
 class BlackLevel(Strict):

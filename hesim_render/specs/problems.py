@@ -40,7 +40,7 @@ def spec_error(
     meant: set[tuple[Any, ...]] = set()
     for problem, place in zip(problems, places, strict=True):
         if problem["type"] == "extra_forbidden":
-            guess = closest(str(place[-1]), _known_keys(model, place[:-1]))
+            guess = closest(str(problem["loc"][-1]), _known_keys(model, place[:-1]))
             meant.add((*place[:-1], guess))
     for problem, place in zip(problems, places, strict=True):
         if problem["type"] == "missing" and tuple(place) in meant:
@@ -96,7 +96,7 @@ def _one(
 ) -> SpecError:
     location = _keys_of(problem, data)
     if problem["type"] == "extra_forbidden":
-        message = f"unknown key{did_you_mean(str(location[-1]), _known_keys(model, location[:-1]))}"
+        message = f"unknown key{did_you_mean(str(problem['loc'][-1]), _known_keys(model, location[:-1]))}"
     elif _is_short_list(problem):
         message = "the list is too short"
     elif problem["type"] == "missing":
