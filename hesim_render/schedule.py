@@ -8,8 +8,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.errors import RangeError
 from hesim_render.specs.sensor import ApsSpec, EvsSpec
 from hesim_render.units import US_PER_S
+
+#: Longest run with events, µs: their times are stored in 32 bit. Without events, and most frames and comparisons.
+_MOST_EVENT_US, _MOST_US = 2**32 - 1, 10**12
+_MOST_FRAMES, _MOST_TICKS = 2_000_000, 20_000_000
+
+
+def require_countable(aps: ApsSpec | None, evs: EvsSpec | None, duration_us: int) -> None:
+    """Refuse a run that is too long to be listed, before anything of it is.
+
+    Raises
+    ------
+    RangeError
+        With the longest duration that would do.
+    """
+    limits = {"a run": _MOST_US}
+    if evs is not None:
+        limits["a recording of events"] = _MOST_EVENT_US
+        if evs.tick_us is not None:
+            limits[f"{_MOST_TICKS} comparisons, one every {evs.tick_us} µs"] = _MOST_TICKS * evs.tick_us
+    if aps is not None:
+        limits[f"{_MOST_FRAMES} frames at {aps.frame_rate_hz:g} Hz"] = int(_MOST_FRAMES * US_PER_S / aps.frame_rate_hz)
+    what, most_us = min(limits.items(), key=lambda item: item[1])
+    if duration_us > most_us:
+        raise RangeError("duration_s", duration_us / US_PER_S, f"at most {most_us / US_PER_S:.10g}: so long is {what}")
 
 
 @dataclass(frozen=True)

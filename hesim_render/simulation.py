@@ -22,6 +22,7 @@ from hesim_render.renderer.light_level import in_absolute_light
 from hesim_render.renderer.moving import NeedsExactMode
 from hesim_render.renderer.notes import NotedFlux
 from hesim_render.scene import Scene
+from hesim_render.schedule import require_countable
 from hesim_render.sensor import Sensor
 from hesim_render.units import US_PER_S
 
@@ -98,6 +99,7 @@ def simulate(
             f"give --quality or --{other} (quality, {other}), not both: --quality asks for an error and gives each "
             f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number"
         )
+    require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     noise = noise_models(sensor, clean, without)
     settings: dict[str, Any] = {"clean": clean, "without": list(without)}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
@@ -233,7 +235,7 @@ def _ray_progress(
 
 
 def _duration_us(duration_s: float) -> int:
-    if not duration_s > 0 or duration_s > 1e6:
+    if not 0 < duration_s < float("inf"):
         raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
     duration_us = round(duration_s * US_PER_S)
     if duration_us < 1:

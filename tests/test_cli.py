@@ -217,6 +217,16 @@ def test_wrong_usage_is_one_line(arguments, text, capsys):
         (["--duration", "-1"], "--duration is -1.0"),
         (["--duration", "nan"], "--duration is nan"),
         (["--duration", "soon"], "--duration"),
+        (["--duration", "1e300"], "expected at most 4294.967295: so long is a recording of events"),
+        (["--duration", "1e5"], "expected at most 4294.967295: so long is a recording of events"),
+        (
+            ["--duration", "3000", "--set", "sensor.evs.tick_us=100", "--set", "sensor.evs.window_us=50"],
+            "expected at most 2000: so long is 20000000 comparisons, one every 100 µs",
+        ),
+        (
+            ["--duration", "4000", "--set", "sensor.aps.frame_rate_hz=1000", "--set", "sensor.aps.exposure_us=500"],
+            "expected at most 2000: so long is 2000000 frames at 1000 Hz",
+        ),
         (["--roi", "512"], "--roi is '512'; expected WIDTHxHEIGHT"),
         (["--roi", "axb"], "expected WIDTHxHEIGHT"),
         (["--roi", "٨x8"], "expected WIDTHxHEIGHT"),
