@@ -106,7 +106,7 @@ def _row_changes(moments: Moments, k: int, used: NDArray[np.bool_]) -> tuple[NDA
     change = change - change[:, rows].mean(axis=1)[:, None]
     total = np.sum(np.where(used, moments.variance[k], 0.0), axis=1, dtype=np.float64)
     pixels = np.maximum(used.sum(axis=1), 2)
-    # a pixel's own variance holds what the row shares: Σ (s² − s_row²)/n² with s_row² = (of the row − Σ s²/n²)·n/(n − 1)
+    # a pixel's own variance holds what the row shares: Σ (s² − R)/n² with R = (variance of the row − Σ s²/n²)·n/(n − 1)
     of_row = np.sum(change**2, axis=0) / (moments.frames - 1) * rows.sum() / max(int(rows.sum()) - 1, 1)
     shared = (of_row - total / pixels**2) * pixels / (pixels - 1)
     return change, (total - pixels * shared) / pixels**2
