@@ -11,7 +11,7 @@ _GAIN, _READ_DN, _DARK_DN_PER_S, _BLACK = 0.25, 1.5, 40.0, 64.0
 def frames(
     folder, *, size=64, count=32, row_noise=0.0, black_drift=0.0, drift_over="session", light_ramp=0.0,
     ramp_over="session", cubic=0.0, flat=False, gain=_GAIN, brightest=40_000.0, seed=5, poisson=False, full_scale=1023,
-    down=False,
+    down=False, restless=0.0,
 ):  # fmt: skip
     """A ramp of light through five exposures, Var = σ² + K (I + D t) + cubic I³, in DN.
 
@@ -20,11 +20,13 @@ def frames(
     row_noise : DN, of each row in each frame anew. black_drift : DN from first to last frame of `drift_over`: the
         ``session`` (dark, then lit), or each ``exposure``. light_ramp : relative, likewise. cubic : DN⁻¹.
     brightest : DN/s. down : the ramp goes from row to row, not from column to column.
+    restless : part of the pixels with 1.2 times the noise.
     """
     rng = np.random.default_rng(seed)
     place = np.mgrid[0:size, 0:size][0 if down else 1] / (size - 1)
     rate = brightest * (np.ones((size, size)) if flat else 0.02 + 0.98 * place)
     offset = _BLACK + 0.6 * rng.standard_normal((size, size)) + 0.8 * rng.standard_normal(size)[:, None]
+    wide = np.where(rng.random((size, size)) < restless, 1.2, 1.0) if restless else 1.0
     total, done = count * (len(DARK_S) + len(LIT_S)), 0
     capture_sets.write_description(folder)
     for name, exposures_s, light in (("aps_dark", DARK_S, 0.0), ("aps_lit", LIT_S, 1.0)):
@@ -39,7 +41,7 @@ def frames(
                     value = gain * rng.poisson(clean / gain) + _READ_DN * rng.standard_normal((size, size))
                 else:
                     variance = _READ_DN**2 + gain * clean + cubic * signal**3
-                    value = clean + np.sqrt(variance) * rng.standard_normal((size, size))
+                    value = clean + wide * np.sqrt(variance) * rng.standard_normal((size, size))
                 value += row_noise * rng.standard_normal(size)[:, None] + black
                 stack[k, f] = np.clip(np.rint(offset + value), 0, full_scale)
                 done += 1

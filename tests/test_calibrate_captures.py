@@ -36,12 +36,22 @@ def test_moments_are_those_of_numpy_in_any_order_of_exposures(frames):
     stack, exposures = load(frames, "aps_lit")
     order = [2, 0, 1]
     capture_sets.save_frames(frames, "aps_lit", stack[order], exposures[order])
-    moments = measure(read_captures(frames).frames("aps_lit"), np.ones(stack.shape[2:], bool), 1023)
+    used = np.ones(stack.shape[2:], bool)
+    used[::2, 1::2] = used[3] = False
+    moments = measure(read_captures(frames).frames("aps_lit"), used, 1023)
     assert list(moments.exposures_us) == [2000, 5000, 20000]
     np.testing.assert_allclose(moments.mean, stack.mean(axis=1), rtol=1e-6)
     np.testing.assert_allclose(moments.variance, stack.var(axis=1, ddof=1), rtol=1e-5)
     np.testing.assert_array_equal(moments.highest, stack.max(axis=1))
     np.testing.assert_array_equal(moments.lowest, stack.min(axis=1))
+    rows = (stack * used).sum(axis=3) / np.maximum(used.sum(axis=1), 1)
+    np.testing.assert_allclose(moments.row_means, rows, rtol=1e-12)
+    for k, first in enumerate(stack[:, 0]):
+        clear = used & (first < 0.9 * 1023)
+        bright = clear & (first > np.median(first[clear]))
+        np.testing.assert_array_equal(moments.half[k], np.where(clear, bright, -1))
+        for side, mask in enumerate((clear & ~bright, bright)):
+            np.testing.assert_allclose(moments.half_means[k, :, side], stack[k][:, mask].mean(axis=1), rtol=1e-12)
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])

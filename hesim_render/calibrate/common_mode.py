@@ -18,6 +18,8 @@ from hesim_render.calibrate.moments import Moments
 
 #: Least part of a row that is not clipped, where the row's own sample of its noise is taken.
 _LEAST_CLEAR = 0.2
+#: Of a row's mean: frames that are all alike have none.
+_LEAST_NOISE_DN2 = 1e-12
 #: Times the median noise of a row from which it counts less.
 _BUSY = 2.0
 #: Difference of the halves' light, as a part of the brighter, that tells light from black.
@@ -60,7 +62,7 @@ def row_noise(dark: Moments, used: NDArray[np.bool_]) -> Shared:
         return Shared(0.0, float("inf"), 1.0, 1.0)
     exposures = range(dark.exposures_us.size)
     parts = [_row_changes(dark, k, used) for k in exposures]
-    own = np.stack([noise[rows] for _, noise in parts])
+    own = np.maximum([noise[rows] for _, noise in parts], _LEAST_NOISE_DN2)
     found = np.stack([np.sum(change[:, rows] ** 2, axis=0) for change, _ in parts]) / (dark.frames - 1)
     found *= count / (count - 1)
     # a row with a pixel that flickers tells less; weights that follow the rows' own samples would bend the sum
@@ -104,8 +106,9 @@ def _row_changes(moments: Moments, k: int, used: NDArray[np.bool_]) -> tuple[NDA
     change = change - change[:, rows].mean(axis=1)[:, None]
     total = np.sum(np.where(used, moments.variance[k], 0.0), axis=1, dtype=np.float64)
     pixels = np.maximum(used.sum(axis=1), 2)
-    # a pixel's own variance holds what the row shares: Σ (s² − s_row²)/n² with s_row² = (change² − Σ s²/n²)·n/(n − 1)
-    shared = (np.sum(change**2, axis=0) / (moments.frames - 1) - total / pixels**2) * pixels / (pixels - 1)
+    # a pixel's own variance holds what the row shares: Σ (s² − R)/n² with R = (variance of the row − Σ s²/n²)·n/(n − 1)
+    of_row = np.sum(change**2, axis=0) / (moments.frames - 1) * rows.sum() / max(int(rows.sum()) - 1, 1)
+    shared = (of_row - total / pixels**2) * pixels / (pixels - 1)
     return change, (total - pixels * shared) / pixels**2
 
 

@@ -29,8 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.backend import jit
 from hesim_render.errors import RangeError, SpecError
 from hesim_render.layout import Layout
-from hesim_render.noise.arrays import take, to_device
-from hesim_render.noise.fixed_pattern import FixedPattern
+from hesim_render.noise.arrays import to_device
+from hesim_render.noise.fixed_pattern import FixedPattern, Pixels, gathered
 from hesim_render.noise.normal import normal_pair
 from hesim_render.noise.poisson import poisson
 from hesim_render.noise.terms import switched_off
@@ -41,16 +41,6 @@ from hesim_render.units import S_PER_US
 APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk")
 
 ADC_VARIANCE_DN2 = 1.0 / 12.0
-
-
-@dataclass(frozen=True)
-class _Pixels:
-    """What the formulas need of each pixel: floats, NumPy arrays or Dr.Jit arrays alike."""
-
-    response: Any  # 1 + PRNU
-    dark_e_per_s: Any
-    offset_dn: Any  # N_FP
-    beta: tuple[Any, ...] | None
 
 
 @dataclass(frozen=True)
@@ -118,7 +108,7 @@ class ApsNoise:
         return FixedPattern(self.spec, self.layout, self.device_seed, self.off)
 
     @cached_property
-    def _device_pixels(self) -> _Pixels:
+    def _device_pixels(self) -> Pixels:
         """The maps as Dr.Jit arrays (or opaque numbers), flat."""
         beta = None
         if self.spec.beta is not None:
@@ -127,9 +117,9 @@ class ApsNoise:
             tiled = self.layout.tiled(table)
             beta = tuple(to_device(table[0, 0, k] if uniform[k] else tiled[..., k]) for k in range(6))
         maps = self.fixed_pattern
-        return _Pixels(to_device(maps.response), to_device(maps.dark_e_per_s), to_device(maps.offset_dn), beta)
+        return Pixels(to_device(maps.response), to_device(maps.dark_e_per_s), to_device(maps.offset_dn), beta)
 
-    def _host_pixels(self, position: tuple[int, int] | None, image: bool) -> _Pixels:
+    def _host_pixels(self, position: tuple[int, int] | None, image: bool) -> Pixels:
         """The same for the formulas on the host: one position's nominal values, or the maps."""
         spec = self.spec
         table = None if spec.beta is None else np.array(spec.beta, dtype=np.float64)
@@ -138,13 +128,13 @@ class ApsNoise:
                 raise RangeError("position", position, "none, as an image has the position of each pixel")
             beta = None if table is None else tuple(np.moveaxis(self.layout.tiled(table), -1, 0))
             maps = self.fixed_pattern
-            return _Pixels(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
+            return Pixels(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
         known = self.layout.spec.positions("aps")
         chosen = known[0] if position is None else tuple(position)
         if chosen not in known:
             raise RangeError("position", position, "(tile_row, tile_col) of a frame pixel of the tile")
         dark = 0.0 if "dark_current" in self.off else spec.dark_current_now_e_per_s
-        return _Pixels(1.0, dark, spec.black_level_dn, None if table is None else tuple(table[chosen]))
+        return Pixels(1.0, dark, spec.black_level_dn, None if table is None else tuple(table[chosen]))
 
     # ---- the model --------------------------------------------------------------------------------
 
@@ -172,7 +162,7 @@ class ApsNoise:
                     )
         return ""
 
-    def _parts(self, electrons: Any, t: Any, pixels: _Pixels, xp: ModuleType) -> tuple[Any, Any, Any, Any]:
+    def _parts(self, electrons: Any, t: Any, pixels: Pixels, xp: ModuleType) -> tuple[Any, Any, Any, Any]:
         """(fixed DN, gain in DN per count, mean count, Gaussian variance in DN²) of the signal."""
         gain_dn_per_e = self.spec.system_gain_dn_per_e
         light = pixels.response * electrons
@@ -326,7 +316,7 @@ class ApsNoise:
         index = dr.arange(types.UInt32, count) + dr.opaque(types.UInt32, first_pixel)
         pixels = self._device_pixels
         if count != self.layout.rows * self.layout.cols:
-            pixels = _gathered(pixels, index)
+            pixels = gathered(pixels, index)
         t = dr.opaque(types.Float, exposure_us * S_PER_US)
         fixed, gain, mean, gaussian = self._parts(electrons, t, pixels, dr)
 
@@ -363,9 +353,3 @@ class ApsNoise:
         if self.layout.cols == sensor_cols:
             return index + dr.opaque(types.UInt32, self.layout.row0 * sensor_cols)
         return dr.gather(types.UInt32, self._keys, index)
-
-
-def _gathered(pixels: _Pixels, index: Any) -> _Pixels:
-    """Entries `index` of the maps; numbers stay numbers."""
-    beta = None if pixels.beta is None else tuple(take(b, index) for b in pixels.beta)
-    return _Pixels(take(pixels.response, index), take(pixels.dark_e_per_s, index), take(pixels.offset_dn, index), beta)
