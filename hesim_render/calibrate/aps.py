@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import rank_filter
 
+from hesim_render.calibrate.aps_fitted import ApsCalibration, Position
+from hesim_render.calibrate.aps_output import content, maps
 from hesim_render.calibrate.captures import CaptureSet, FrameStack, read_captures
-from hesim_render.calibrate.common_mode import Shared, row_noise, without_rows
+from hesim_render.calibrate.common_mode import row_noise, without_rows
 from hesim_render.calibrate.composite import (
     Composite,
     clear_of_clipping,
@@ -27,39 +28,7 @@ from hesim_render.calibrate.result import check_calibration, check_report, write
 from hesim_render.calibrate.variance import Pooled, VarianceFit, fit_variance, join, pool, variance_map
 from hesim_render.errors import SpecError
 
-Position = tuple[int, int]
 _POOR_FIT_SIGMAS = 8.0
-
-
-@dataclass(frozen=True)
-class ApsCalibration:
-    """What the frames tell.
-
-    Attributes
-    ----------
-    fits, bins : of each tile position with an APS value.
-    bad : pixels [row, col] left out: clipped in the dark, dead, stuck, or of a variance unlike their kind's.
-    signals : float32 [exposure, row, col], light above black, DN.
-    usable : [exposure, row, col], lit values clear of clipping.
-    rows : temporal row noise.
-    """
-
-    dark: DarkModel
-    composite: Composite
-    fits: dict[Position, VarianceFit]
-    bins: dict[Position, Pooled]
-    bad: NDArray[np.bool_]
-    signals: NDArray[np.float32]
-    usable: NDArray[np.bool_]
-    transfer: dict[str, Any]
-    rows: Shared
-
-    def beta(self, tile: tuple[int, int]) -> NDArray[np.float64]:
-        """[tile_row, tile_col, 6] with 0 for terms and positions without a number."""
-        beta = np.zeros((*tile, 6))
-        for position, fit in self.fits.items():
-            beta[position] = fit.beta
-        return beta
 
 
 def calibrate_aps(
@@ -90,8 +59,6 @@ def calibrate_aps(
     OutputError
         If a result cannot be written.
     """
-    from hesim_render.calibrate.aps_output import content, maps
-
     captures = read_captures(folder)
     check_calibration(out, describe(captures))
     if report is not None:

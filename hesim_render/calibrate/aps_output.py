@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from hesim_render.calibrate.aps import ApsCalibration, Position
+from hesim_render.calibrate.aps_fitted import ApsCalibration, Position
 from hesim_render.calibrate.captures import CaptureSet
 from hesim_render.calibrate.common_mode import Shared
 from hesim_render.calibrate.composite import signal_at_event_pixels

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
-from hesim_render.calibrate.aps import ApsCalibration
+from hesim_render.calibrate.aps_fitted import ApsCalibration
 from hesim_render.calibrate.common_mode import FrameDrift, Shared, frame_drift
 from hesim_render.calibrate.dark import ADC_VARIANCE_DN2
 from hesim_render.calibrate.finding import ALARM, Finding
 from hesim_render.calibrate.moments import Moments
-from hesim_render.calibrate.variance import polynomial
+from hesim_render.calibrate.polynomial import polynomial
 
 #: Part of the temporal variance, and of a parameter's standard error, below which a drift does no harm.
 _LEAST_PART, _LEAST_ERRORS = 1e-3, 0.5

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from hesim_render.calibrate.dark import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2
+from hesim_render.calibrate.polynomial import polynomial
 
 TERMS = ("1", "I", "t", "I^2", "I*t", "t^2")
 #: The order in which terms go where the data cannot tell them apart.
@@ -31,12 +32,6 @@ _FLOOR_DN2 = 0.05
 _USELESS = 0.25
 #: Rounds after which a term that is not told stays out.
 _SETTLED = 3
-
-
-def polynomial(beta: NDArray, signal_dn: NDArray, exposure_s: NDArray | float) -> NDArray:
-    """Temporal variance in DN² without the ADC's; `beta` has the six terms on its last axis."""
-    b = np.moveaxis(np.asarray(beta), -1, 0)
-    return b[0] + b[2] * exposure_s + b[5] * exposure_s**2 + signal_dn * (b[1] + b[4] * exposure_s + b[3] * signal_dn)
 
 
 def variance_map(beta: NDArray, signal_dn: NDArray, exposure_s: float) -> NDArray[np.float64]:
