@@ -18,10 +18,10 @@ import numpy as np
 from change_driven import SCENES, SENSOR, SPEEDS
 
 import hesim_render as hr
-from hesim_render.renderer.camera import place_camera
-from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.renderer.windows import Windows
-from hesim_render.rng import Stream
+from hesim_render.core.rng import Stream
+from hesim_render.sources.render.camera import place_camera
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.windows import Windows
 
 RAYS = (16, 64, 256, 1024)
 

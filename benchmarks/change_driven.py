@@ -32,16 +32,16 @@ import time
 import numpy as np
 
 import hesim_render as hr
-from hesim_render.renderer._mitsuba import mitsuba, spectrum_dict
-from hesim_render.renderer.builder import build
-from hesim_render.renderer.camera import place_camera
-from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.renderer.compare import compare_ticks
-from hesim_render.renderer.flux import RenderedFlux, used_responses
-from hesim_render.renderer.reference import WindowReference
-from hesim_render.renderer.specfilm import camera_at, perspective_dict
-from hesim_render.scene import Scene
-from hesim_render.schedule import tick_blocks
+from hesim_render.mosaic.schedule import tick_blocks
+from hesim_render.sources.render.audit.compare import compare_ticks
+from hesim_render.sources.render.camera import place_camera
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.exact import RenderedFlux, used_responses
+from hesim_render.sources.render.reference import WindowReference
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba, spectrum_dict
+from hesim_render.sources.render.specfilm import camera_at, perspective_dict
+from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 
 TICK_US, WINDOW_US = 1250.0, 1000.0

@@ -135,7 +135,7 @@ def by_hand(linear, gain, matrix, reference):
     from skimage.restoration import denoise_bilateral, denoise_nl_means
 
     from hesim_render.isp.colour import colour_matrix
-    from hesim_render.transfer import encode
+    from hesim_render.spectral.transfer import encode
 
     bright = linear * np.float32(gain)
     coded = encode(colour_matrix(bright, matrix))
@@ -184,7 +184,7 @@ def noisy():
 
 
 def recording_sensor(manifest):
-    from hesim_render.layout import Layout
+    from hesim_render.mosaic.layout import Layout
     from hesim_render.specs.sensor import SensorSpec
 
     spec, roi = SensorSpec.model_validate(manifest["sensor"]["spec"]), manifest["roi"]

@@ -43,9 +43,9 @@ WINDOW_ELECTRONS = 50.0
 
 
 def build(law):
-    from hesim_render.layout import Layout
-    from hesim_render.noise.aps import ApsNoise
-    from hesim_render.noise.evs import EvsNoise
+    from hesim_render.mosaic.layout import Layout
+    from hesim_render.pixels.aps.model import ApsNoise
+    from hesim_render.pixels.evs.model import EvsNoise
     from hesim_render.specs.sensor import read_sensor
 
     spec = read_sensor("reference-mono", {**OVERRIDES, "aps.law": law})
@@ -64,7 +64,7 @@ def scenes():
 def on_device(image):
     import drjit as dr
 
-    from hesim_render.backend import jit
+    from hesim_render.core.backend import jit
 
     array = jit().Float(image.ravel())
     dr.eval(array)
@@ -142,8 +142,8 @@ def report(name, ours_s, numpy_s, goal, goal_ratio):
 
 
 def run_speed(repetitions):
-    from hesim_render.backend import select
-    from hesim_render.evs import EVENT_DTYPE, EvsStage
+    from hesim_render.core.backend import select
+    from hesim_render.pixels.evs.stage import EVENT_DTYPE, EvsStage
 
     print(f"{ROWS * COLS / 1e6:.1f} Mpixel, {select().describe()}, {os.cpu_count()} cores, median of {repetitions}")
     print(f"{'':34s} {'ours':>8s} {'NumPy':>8s} {'ratio':>8s}   goal      (Mpixel/s)")
@@ -168,7 +168,7 @@ def run_speed(repetitions):
 
 def run_memory():
     """One slice through both stages, alone in its process."""
-    from hesim_render.evs import EvsStage
+    from hesim_render.pixels.evs.stage import EvsStage
 
     aps, evs = build("poisson")
     frames, window = scenes()

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 import hesim_render as hr
-from hesim_render.capture import Capture, noise_models
-from hesim_render.video import VideoFlux, VideoOptions
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.sources.video import VideoFlux, VideoOptions
 
 WIDTH, HEIGHT, FPS = 1296, 1024, 3200
 BOUND_APS, BOUND_EVS = 60, 80
@@ -99,7 +99,7 @@ def measure(source, options, repeat):
     """Reading time of a picture (s), and (wall-clock, processor) time per picture of each kind of work (s)."""
     import drjit as dr
 
-    from hesim_render.evs import EvsStage
+    from hesim_render.pixels.evs.stage import EvsStage
 
     colour = hr.load_sensor("eiger").crop(WIDTH, HEIGHT)
     mono = hr.load_sensor("reference-mono", {"geometry.rows": HEIGHT, "geometry.cols": WIDTH})

@@ -6,7 +6,7 @@ Run: python examples/colorchecker_electrons.py
 import numpy as np
 
 import hesim_render as hr
-from hesim_render import spectra
+from hesim_render.spectral import spectrum as spectra
 
 sensor = hr.load_sensor("reference-bayer").crop(384, 256)
 scene = hr.load_scene("flat-field", {"target.reflectance": {"colorchecker": "ISO 17321-1", "patch": 14}})  # green

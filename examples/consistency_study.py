@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 import hesim_render as hr
-from hesim_render import spectra, transfer
-from hesim_render.colorimetry import tristimulus, xyz_to_linear_srgb
-from hesim_render.renderer.flux import RenderedFlux
-from hesim_render.video.inversion import white_flux
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.video.inversion import white_flux
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral import transfer
+from hesim_render.spectral.colorimetry import tristimulus, xyz_to_linear_srgb
 
 SIZE = (144, 96)  # columns, rows
 FPS, SECONDS, LUX = 1600, 0.05, 1500

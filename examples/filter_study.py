@@ -8,7 +8,7 @@ Run: python examples/filter_study.py
 import numpy as np
 
 import hesim_render as hr
-from hesim_render import spectra
+from hesim_render.spectral import spectrum as spectra
 
 wavelength_nm = np.arange(380.0, 781.0, 1.0)
 light = spectra.scale_to_lux(spectra.illuminant("LED-B3"), 200)

@@ -12,10 +12,12 @@ import importlib
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-from hesim_render import backend as _backend
+from hesim_render import _moved
+from hesim_render.core import backend as _backend
 
 # Dr.Jit takes the first LLVM it finds when it is imported, and some abort the process: choose before.
 _backend.prepare()
+_moved.install()
 
 try:
     __version__ = version("hesim_render")
@@ -24,14 +26,14 @@ except PackageNotFoundError:  # run from a source tree that was never installed
 
 # Imported on first use: the command line must answer --help without loading a renderer.
 _HOMES = {
-    "Recording": "hesim_render.recording",
-    "Scene": "hesim_render.scene",
-    "Sensor": "hesim_render.sensor",
-    "load_scene": "hesim_render.scene",
-    "load_sensor": "hesim_render.sensor",
-    "photocurrent": "hesim_render.radiometry",
-    "simulate": "hesim_render.simulation",
-    "simulate_video": "hesim_render.video_simulation",
+    "Recording": "hesim_render.recording.recording",
+    "Scene": "hesim_render.sources.scene",
+    "Sensor": "hesim_render.sensor.sensor",
+    "load_scene": "hesim_render.sources.scene",
+    "load_sensor": "hesim_render.sensor.sensor",
+    "photocurrent": "hesim_render.sensor.photocurrent",
+    "simulate": "hesim_render.capture.simulate",
+    "simulate_video": "hesim_render.capture.simulate_video",
 }
 
 __all__ = [
@@ -47,12 +49,12 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from hesim_render.radiometry import photocurrent
-    from hesim_render.recording import Recording
-    from hesim_render.scene import Scene, load_scene
-    from hesim_render.sensor import Sensor, load_sensor
-    from hesim_render.simulation import simulate
-    from hesim_render.video_simulation import simulate_video
+    from hesim_render.capture.simulate import simulate
+    from hesim_render.capture.simulate_video import simulate_video
+    from hesim_render.recording.recording import Recording
+    from hesim_render.sensor.photocurrent import photocurrent
+    from hesim_render.sensor.sensor import Sensor, load_sensor
+    from hesim_render.sources.scene import Scene, load_scene
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.scene import Scene
+from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 
 #: Side of what the camera sees at z = 0, m.

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from random_scenes import DURATION_US, RandomScene
 
-from hesim_render.capture import Capture, noise_models
-from hesim_render.flicker import flickering
-from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.renderer.compare import Counted, compare_crossings, compare_ticks
-from hesim_render.renderer.reference import WindowReference
-from hesim_render.renderer.wish import Noise
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.sources.flicker import flickering
+from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
+from hesim_render.sources.render.change_driven.error_target import Noise
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.reference import WindowReference
 
 QUALITY = 0.5
 #: Samples in a row whose events are compared.

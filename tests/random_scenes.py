@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 import hesim_render as hr
-from hesim_render.scene import Scene
-from hesim_render.sensor import Sensor
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.scene import Scene
 
 #: Pixels of the region, and m of the plane z = 0 for one of them.
 COLS, ROWS = 40, 32

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from hesim_render.events import EVENT_DTYPE
-from hesim_render.layout import Layout
-from hesim_render.optics import Lens, response
-from hesim_render.recording import Frame, RecordingWriter
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.recording.recording import Frame, RecordingWriter
+from hesim_render.sensor.lens import Lens, response
 from hesim_render.specs import read_sensor
 
 

@@ -7,10 +7,10 @@ import numpy as np
 from scipy import constants
 
 import hesim_render as hr
-from hesim_render.renderer.flux import RenderedFlux, used_responses
-from hesim_render.renderer.pairs import PairTracer
-from hesim_render.renderer.windows import Windows
-from hesim_render.scene import Scene
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.exact import RenderedFlux, used_responses
+from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 
 # L = 1 W m⁻² sr⁻¹ nm⁻¹ from everywhere between 300 and 900 nm: E = π · 600 nm

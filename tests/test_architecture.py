@@ -1,41 +1,40 @@
-"""Imports point down only, and one package alone knows Mitsuba."""
+"""Imports point down only, nothing imports itself in a circle, and one package alone knows Mitsuba."""
 
 import ast
+import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parent.parent / "hesim_render"
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "hesim_render"
 
-# lowest first; a module may import its own layer and those below. Names are modules or packages.
-LAYERS = [
-    {"errors", "units", "rng", "backend", "progress", "spectra", "colorimetry", "events", "frame", "output"}
-    | {"guard", "npzfile", "bands", "transfer", "waveform", "render_error"},
-    {"specs"},
-    {"optics", "layout", "noise"},
-    {"sensor", "flux", "crosstalk", "mosaic", "camera", "schedule"},
-    {"radiometry", "scene", "flicker", "renderer", "video"},
-    {"aps", "evs"},
-    {"capture"},
-    {"eventfile", "dng", "preview", "manifest", "recording_spec", "showcase", "recording"},
-    {"simulation", "video_simulation", "calibrate", "bench", "lab", "isp"},
-    {"cli", "terminal"},
-]
-LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
+MAP = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+#: Lowest first; a module may import its own package and those before it.
+ORDER = re.findall(r"^\| `([a-z_.]+)` \|", MAP, re.MULTILINE)
+LEVEL = {name: level for level, name in enumerate(ORDER)}
 
 
-def modules():
-    return sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+def dotted(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def name_of(path):
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+#: Modules; `__init__` files only hand on what their packages have.
+MODULES = {dotted(path): path for path in sorted(PACKAGE.rglob("*.py")) if path.name != "__init__.py"}
+PACKAGES = {dotted(path) for path in PACKAGE.rglob("__init__.py")}
+EVERY = sorted(MODULES)
+
+
+def package_of(name):
+    return name.removeprefix("hesim_render").strip(".").rpartition(".")[0]
 
 
 def imports(path):
-    """Dotted names imported anywhere in a module but under TYPE_CHECKING."""
+    """Dotted names imported anywhere in a module but under TYPE_CHECKING; of packages, what is taken from them."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     typing_only = {
         id(child)
@@ -50,56 +49,102 @@ def imports(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            if node.module == "hesim_render":
-                yield from (f"hesim_render.{alias.name}" for alias in node.names)
-            else:
-                yield node.module or ""
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_down_only(path):
-    own = name_of(path)
-    assert own in LEVEL, f"{own} has no place in the house yet: add it to LAYERS"
-    for name in imports(path):
-        if not name.startswith("hesim_render."):
-            continue
-        other = name.split(".")[1]
-        if other.startswith("__") or other == own:
-            continue
-        if not (PACKAGE / other).exists() and not (PACKAGE / f"{other}.py").exists():
-            continue  # a name of the package's face, such as load_sensor, only imported by the command line
-        assert LEVEL[other] <= LEVEL[own], f"{own} imports {other}, which is above it"
+def modules_imported(name):
+    """Modules of ours; a package's own names are those of its `__init__`."""
+    found = set()
+    for full in imports(MODULES[name]):
+        if full in MODULES:
+            found.add(full)
+        elif full.rpartition(".")[0] in MODULES:
+            found.add(full.rpartition(".")[0])
+        elif full.rpartition(".")[0] in PACKAGES and full.startswith("hesim_render."):
+            found.add(full.rpartition(".")[0] + ".__init__")
+    return found - {name}
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_only_the_renderer_imports_mitsuba(path):
-    if name_of(path) != "renderer":
-        assert not [name for name in imports(path) if name.split(".")[0] == "mitsuba"]
+def test_the_map_has_every_package_and_no_other():
+    packages = {name.removeprefix("hesim_render.") for name in PACKAGES} - {"hesim_render"}
+    empty = {name for name in packages if not any(package_of(module) == name for module in EVERY)}
+    assert set(ORDER) == packages - empty and len(ORDER) == len(LEVEL)
 
 
-@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_no_module_picks_a_drjit_backend_itself(path):
-    """`hesim_render.backend.jit` probes the library first; importing drjit.llvm directly may abort the process."""
-    chosen = [name for name in imports(path) if name.startswith(("drjit.llvm", "drjit.cuda"))]
-    assert not chosen
+def test_the_map_names_modules_that_exist():
+    named = [name for name in re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", MAP) if not name.startswith("tests/")]
+    assert len(named) > 20
+    paths = [path.relative_to(ROOT).as_posix() for path in PACKAGE.rglob("*.py")]
+    for name in named:
+        assert any(path == name or path.endswith(f"/{name}") for path in paths), name
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_imports_point_down_only(name):
+    own = package_of(name)
+    if not own:
+        return  # the face of the package
+    for other in modules_imported(name):
+        there = package_of(other)
+        if there:
+            assert LEVEL[there] <= LEVEL[own], f"{name} imports {other}, which is above it"
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    waiting = {name: modules_imported(name) & set(MODULES) for name in EVERY}
+    while waiting:
+        free = [name for name, needed in waiting.items() if not needed & set(waiting)]
+        assert free, f"in a circle, or above one: {sorted(waiting)}"
+        for name in free:
+            del waiting[name]
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_only_the_renderer_imports_mitsuba(name):
+    if not package_of(name).startswith("sources.render"):
+        assert not [full for full in imports(MODULES[name]) if full.split(".")[0] == "mitsuba"]
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_no_module_picks_a_drjit_backend_itself(name):
+    """`backend.jit` probes the library first; importing drjit.llvm directly may abort the process."""
+    assert not [full for full in imports(MODULES[name]) if full.startswith(("drjit.llvm", "drjit.cuda"))]
 
 
 def test_importing_the_package_loads_nothing_heavy():
     """Dr.Jit above all: it takes an LLVM when it is imported, and the choice must come first."""
-    heavy = ("drjit", "mitsuba", "numpy", "scipy", "colour", "pydantic", "rich")
+    heavy = ("drjit", "mitsuba", "numpy", "scipy", "colour", "pydantic", "rich", "matplotlib")
     code = f"import sys, hesim_render; print([name for name in {heavy} if name in sys.modules])"
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert child.stdout.strip() == "[]"
 
 
-def test_layers_name_what_exists_once():
-    names = [name for layer in LAYERS for name in layer]
-    assert len(names) == len(set(names))
+def test_calibration_runs_where_drjit_and_mitsuba_cannot_be_imported():
+    """It must run on captures of real sensors, on any machine."""
+    code = (
+        "import sys; sys.modules['drjit'] = sys.modules['mitsuba'] = None; "
+        "import hesim_render.calibrate.aps.calibration, hesim_render.calibrate.evs.calibration"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    for name in EVERY:
+        if package_of(name).split(".")[0] == "calibrate":
+            used = {package_of(other).split(".")[0] for other in modules_imported(name)}
+            assert not used & {"sources", "capture", "sensor", "isp"}, name
 
 
-def test_calibration_runs_without_renderer_and_simulators():
-    """It must run on captures of real sensors."""
-    simulators = {"renderer", "scene", "flux", "capture", "simulation", "aps", "evs"}
-    for path in (PACKAGE / "calibrate").rglob("*.py"):
-        used = {name.split(".")[1] for name in imports(path) if name.startswith("hesim_render.")}
-        assert not used & simulators, path
+def test_names_of_before_give_the_modules_of_today():
+    from hesim_render._moved import MOVED
+
+    for old, new in MOVED.items():
+        assert f"hesim_render.{new}" in MODULES or f"hesim_render.{new}" in PACKAGES, new
+        assert not (PACKAGE / Path(*old.split("."))).with_suffix(".py").exists()
+    for old in ("spectra", "renderer.flux", "video.inversion", "errors"):
+        assert importlib.import_module(f"hesim_render.{old}") is importlib.import_module(f"hesim_render.{MOVED[old]}")
+    from hesim_render.renderer.reference import WindowReference
+
+    from hesim_render import spectra
+    from hesim_render.recording import Recording
+    from hesim_render.sensor import Sensor, load_sensor
+
+    assert spectra.__name__ == "hesim_render.spectral.spectrum" and spectra.__spec__.name == spectra.__name__
+    assert Recording.__module__ == "hesim_render.recording.recording" and Sensor and load_sensor and WindowReference

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.backend import jit
-from hesim_render.flux import Sample
-from hesim_render.renderer import audit as audit_module
-from hesim_render.renderer.audit import STRETCHES, Audit
-from hesim_render.renderer.compare import compare_crossings, compare_ticks
-from hesim_render.renderer.confidence import lower_bound, ratio_upper_bound, upper_bound
-from hesim_render.renderer.notes import NotedFlux
-from hesim_render.schedule import tick_blocks
+from hesim_render.core.backend import jit
+from hesim_render.mosaic.schedule import tick_blocks
+from hesim_render.sources.protocol import Sample
+from hesim_render.sources.render.audit import audit as audit_module
+from hesim_render.sources.render.audit.audit import STRETCHES, Audit
+from hesim_render.sources.render.audit.compare import compare_crossings, compare_ticks
+from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
+from hesim_render.sources.render.audit.units import NotedFlux
 
 ROWS, COLS, TICKS, TICK_US = 24, 32, 120, 1000
 QUALITY, UNIT = 0.5, 0.03

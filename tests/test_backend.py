@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from hesim_render import backend
-from hesim_render.backend import Candidate
-from hesim_render.errors import BackendError
+from hesim_render.core import backend
+from hesim_render.core.backend import Candidate
+from hesim_render.core.errors import BackendError
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hesim_render.renderer.bounds import fastest_m_per_s, places, places_seen, stays_in
-from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, places, places_seen, stays_in
 from hesim_render.specs.scene import TrackSpec
 
 CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (0.2, 0.4) for z in (-0.3, 0.0)])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
-from hesim_render.calibrate.captures import read_captures
 from hesim_render.calibrate.moments import measure
-from hesim_render.errors import SpecError
+from hesim_render.core.errors import SpecError
+from hesim_render.recording.capture_set import read_captures
 
 
 @pytest.fixture

@@ -7,20 +7,16 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from hesim_render.calibrate import (
-    calibrate_aps,
-    calibrate_evs,
-    common_mode,
-    event_analysis,
-    event_checks,
-    event_goodness,
-    frame_checks,
-    read_calibration,
-)
-from hesim_render.calibrate.captures import read_captures
-from hesim_render.calibrate.event_counts import read_static
+from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
+from hesim_render.calibrate.aps import checks as frame_checks
+from hesim_render.calibrate.aps import common_mode
+from hesim_render.calibrate.evs import analysis as event_analysis
+from hesim_render.calibrate.evs import checks as event_checks
+from hesim_render.calibrate.evs import goodness as event_goodness
+from hesim_render.calibrate.evs.counts import read_static
 from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.summary import summary_lines
+from hesim_render.recording.capture_set import read_captures
 
 
 def frames_of(folder, **keys):

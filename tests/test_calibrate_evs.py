@@ -9,10 +9,10 @@ from scipy.special import ndtr
 from scipy.stats import chi2, poisson
 
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
-from hesim_render.calibrate.captures import read_captures
-from hesim_render.calibrate.event_cells import PixelThresholds, pool_events
-from hesim_render.calibrate.event_counts import read_static
-from hesim_render.calibrate.event_model import mean_probability, probability_variance
+from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
+from hesim_render.calibrate.evs.counts import read_static
+from hesim_render.calibrate.evs.model import mean_probability, probability_variance
+from hesim_render.recording.capture_set import read_captures
 
 
 def curve(a, b, c, d, theta_v, light, mismatch=0.0, law="linear"):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
+from hesim_render.calibrate.report.svg import Plot, number, ticks
 from hesim_render.calibrate.result import plain
-from hesim_render.calibrate.svg import Plot, number, ticks
-from hesim_render.errors import OutputError, SpecError
+from hesim_render.core.errors import OutputError, SpecError
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_cells_without_an_event_are_arrows_and_no_cell_is_missing(tmp_path, monk
     drawn = {"points": [], "arrows_down": []}
     for name in drawn:
         monkeypatch.setattr(
-            f"hesim_render.calibrate.report_events.Plot.{name}",
+            f"hesim_render.calibrate.report.events.Plot.{name}",
             lambda self, x, y, *rest, name=name, **more: drawn[name].append((self, x, y)) or self,
         )
     capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=120.0, c=0.001)

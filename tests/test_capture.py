@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.backend import jit
-from hesim_render.capture import Capture, noise_models
-from hesim_render.errors import RangeError
-from hesim_render.schedule import exposures, ticks_us
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.mosaic.schedule import exposures, ticks_us
 
 
 class RampFlux:

@@ -7,10 +7,10 @@ from rendering import mono, pair_tracer, traced
 from test_renderer_pairs import DIFFUSE, LAMP, SKY, plane, sphere
 
 import hesim_render as hr
-from hesim_render.capture import Capture, noise_models
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.schedule import instant_blocks, tick_blocks
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.mosaic.schedule import instant_blocks, tick_blocks
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 # noise of 3 % of the signal, as a real hybrid sensor has it
 NOISE = {

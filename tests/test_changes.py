@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hesim_render.renderer.changes import changes, fill_in, longer
-from hesim_render.renderer.options import TUNING, Gain
-from hesim_render.renderer.pilot import Closer, Pilot, allocate
-from hesim_render.renderer.sites import REACH, Sites
+from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
+from hesim_render.sources.render.change_driven.pilot import Closer, Pilot, allocate
+from hesim_render.sources.render.change_driven.plan import changes, fill_in, longer
+from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 
 
 def marks(flux, least=1.0):

@@ -13,12 +13,13 @@ import pytest
 import recordings
 
 import hesim_render as hr
-from hesim_render import backend, cli
-from hesim_render.backend import Candidate
-from hesim_render.capture import NOISE_TERMS
-from hesim_render.errors import RangeError
+from hesim_render import cli
+from hesim_render.capture.loop import NOISE_TERMS
+from hesim_render.cli.terminal import parse_roi
+from hesim_render.core import backend
+from hesim_render.core.backend import Candidate
+from hesim_render.core.errors import RangeError
 from hesim_render.specs.files import data_folder, list_names
-from hesim_render.terminal import parse_roi
 
 
 def call(capsys, *arguments):
@@ -318,7 +319,7 @@ class Cropped:
 
 def test_a_run_that_is_not_what_was_asked_for_says_so_and_has_a_status_of_its_own(capsys, tmp_path, monkeypatch):
     """With a tolerance that no run of this quality meets; then with the usual one."""
-    from hesim_render.renderer import audit
+    from hesim_render.sources.render.audit import audit
 
     given = ("simulate", "rotating-star", "--sensor", "reference-mono", "--roi", "48x36", "--duration", 0.02)
     for tolerance, wanted in ((0.1, 3), (audit.TOLERANCE, 0)):

@@ -13,8 +13,8 @@ from rendering import make_scene
 from scipy import stats
 
 import hesim_render as hr
-from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.renderer.reference import WindowReference
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.reference import WindowReference
 
 COLS, ROWS = 72, 48
 ILLUMINANTS = ("A", "D65", "FL11", "LED-B3")

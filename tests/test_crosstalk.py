@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.backend import jit
-from hesim_render.capture import Capture, noise_models
-from hesim_render.crosstalk import CrosstalkFlux, mixed, with_crosstalk
-from hesim_render.frame import Frame
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core.backend import jit
+from hesim_render.recording.frame import Frame
+from hesim_render.sources.crosstalk import CrosstalkFlux, mixed, with_crosstalk
 
 PART = 0.12
 
@@ -156,7 +156,7 @@ def test_rolling_shutter_in_changing_light():
 
 
 def test_bench_of_the_lab_sees_it_too():
-    from hesim_render.bench import set_up
+    from hesim_render.capture.bench import set_up
 
     sensor = hr.load_sensor("eiger", {"geometry.crosstalk": PART}).crop(64, 64)
     bench = set_up(sensor, (1000, 4000))

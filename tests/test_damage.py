@@ -18,9 +18,9 @@ import tifffile
 import hesim_render as hr
 from hesim_render import cli
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
-from hesim_render.errors import SpecError
-from hesim_render.npzfile import read_array, read_arrays
-from hesim_render.recording import Recording
+from hesim_render.core.errors import SpecError
+from hesim_render.core.npz import read_array, read_arrays
+from hesim_render.recording.recording import Recording
 from hesim_render.specs.files import load_yaml
 
 ROOT = Path(__file__).parents[1]
@@ -178,8 +178,8 @@ def test_scenes_name_files_of_their_own_folder(tmp_path, body):
     ],
 )
 def test_mitsuba_files_name_files_of_their_own_folder(tmp_path, inside_xml):
-    from hesim_render.renderer._mitsuba import mitsuba
-    from hesim_render.renderer.builder import build
+    from hesim_render.sources.render.scene.builder import build
+    from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
     (tmp_path / "plate.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 1 1 0\nf 1 2 3\n")
     (tmp_path / "c.spd").write_text("400 0.5\n700 0.5\n")
@@ -565,8 +565,8 @@ def test_nothing_is_left_open(folder):
 
 @pytest.mark.parametrize("where", ["xml", "inline"])
 def test_numbers_in_names_that_would_end_the_process(tmp_path, where):
-    from hesim_render.renderer._mitsuba import mitsuba
-    from hesim_render.renderer.builder import build
+    from hesim_render.sources.render.scene.builder import build
+    from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
     body = "mitsuba: {file: main.xml}"
     if where == "inline":

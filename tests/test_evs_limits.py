@@ -6,17 +6,17 @@ import pytest
 from scipy import integrate, optimize, stats
 
 import hesim_render as hr
-from hesim_render.backend import jit
-from hesim_render.capture import Capture, noise_models
-from hesim_render.errors import SpecError
-from hesim_render.events import EVENT_DTYPE
-from hesim_render.evs import EvsStage
-from hesim_render.layout import Layout
-from hesim_render.noise import photoreceptor
-from hesim_render.noise.evs import EVS_TERMS, EvsNoise
-from hesim_render.noise.processes import BandNoise
-from hesim_render.noise.readout import EventReadout, scan_start_row
-from hesim_render.recording import Recording, RecordingWriter
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import SpecError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs import photoreceptor
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
+from hesim_render.pixels.evs.processes import BandNoise
+from hesim_render.pixels.evs.readout import EventReadout, scan_start_row
+from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.recording.recording import Recording, RecordingWriter
 from hesim_render.specs.sensor import read_sensor
 
 K, T_REF_US, WINDOW_US = 0.2, 10_000, 1000  # of reference-mono: I = 2 DN per electron of a window

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.backend import jit
-from hesim_render.errors import RangeError
-from hesim_render.events import EVENT_DTYPE
-from hesim_render.evs import EvsStage
-from hesim_render.layout import Layout
-from hesim_render.noise.evs import EvsNoise
-from hesim_render.noise.processes import BandNoise
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.processes import BandNoise
+from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.specs.sensor import read_sensor
 
 TICK_US = 1000

@@ -9,8 +9,8 @@ import pytest
 import recordings
 
 import hesim_render as hr
-from hesim_render.errors import ConflictError
-from hesim_render.simulation import simulate
+from hesim_render.capture.simulate import simulate
+from hesim_render.core.errors import ConflictError
 
 
 def test_dir_shows_the_public_names_and_no_others():

@@ -5,17 +5,17 @@ import pytest
 from rendering import make_scene, mono
 
 import hesim_render as hr
-from hesim_render.backend import jit
-from hesim_render.capture import Capture, noise_models
-from hesim_render.errors import SpecError
-from hesim_render.flicker import FlickerFlux, SampledFlickerFlux, flickering, light_parts
-from hesim_render.flux import Sample, SampledFlux
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.flux import RenderedFlux
-from hesim_render.renderer.specfilm import reference_flux
-from hesim_render.scene import Scene
-from hesim_render.schedule import Block
-from hesim_render.waveform import Mains, Pwm
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import SpecError
+from hesim_render.mosaic.schedule import Block
+from hesim_render.sources.flicker import FlickerFlux, SampledFlickerFlux, flickering, light_parts
+from hesim_render.sources.protocol import Sample, SampledFlux
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.specfilm import reference_flux
+from hesim_render.sources.scene import Scene
+from hesim_render.spectral.waveform import Mains, Pwm
 
 CARD = {"type": "flat", "width_m": 0.4, "height_m": 0.3, "reflectance": {"flat": 0.5}}
 MAINS = {"type": "mains", "frequency_hz": 50, "depth": 0.4, "phase_deg": 70}

@@ -10,8 +10,8 @@ import sys
 
 import pytest
 
-from hesim_render.renderer import plugins
-from hesim_render.renderer._mitsuba import mitsuba
+from hesim_render.sources.render.scene import plugins
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs a compiler to make the attempt")
 

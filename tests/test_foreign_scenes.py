@@ -11,21 +11,21 @@ import pytest
 from rendering import make_scene, mitsuba_scene, mono
 
 import hesim_render as hr
-from hesim_render.errors import HesimError, SpecError
+from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.isp.develop import _illumination
-from hesim_render.renderer import plugins
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.builder import build
-from hesim_render.renderer.camera import place_camera
-from hesim_render.renderer.clock import STEP_PX, MotionClock
-from hesim_render.renderer.flux import RenderedFlux, used_responses
-from hesim_render.renderer.mitsuba_scene import _plugin_dict
-from hesim_render.renderer.moving import NeedsExactMode
-from hesim_render.renderer.pairs import PairTracer, Windows
-from hesim_render.renderer.specfilm import reference_flux
-from hesim_render.renderer.trajectory import Trajectory
-from hesim_render.scene import Scene
-from hesim_render.schedule import CELL_US
+from hesim_render.mosaic.schedule import CELL_US
+from hesim_render.sources.render.camera import place_camera
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer, Windows
+from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
+from hesim_render.sources.render.exact import RenderedFlux, used_responses
+from hesim_render.sources.render.scene import plugins
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.specfilm import reference_flux
+from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
+from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import TrackSpec
 
 COLS, ROWS = 16, 12

@@ -13,13 +13,13 @@ import pytest
 from rendering import pair_tracer
 
 import hesim_render as hr
-from hesim_render.capture import Capture, noise_models
-from hesim_render.flicker import flickering
-from hesim_render.renderer.change_driven import ChangeDrivenFlux
-from hesim_render.renderer.compare import compare_ticks
-from hesim_render.renderer.windows import Windows
-from hesim_render.scene import Scene
-from hesim_render.schedule import tick_blocks
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.mosaic.schedule import tick_blocks
+from hesim_render.sources.flicker import flickering
+from hesim_render.sources.render.audit.compare import compare_ticks
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 
 TICKS, TICK_US, WINDOW_US, COLS, ROWS, QUALITY = 18, 1250, 1000, 40, 30, 0.5

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render import spectra
 from hesim_render.isp import Camera, Pipeline, chart, colour, develop
+from hesim_render.spectral import spectrum as spectra
 
 ROWS, COLS = 192, 288
 

@@ -23,8 +23,8 @@ from isp_images import (
     srgb,
 )
 
-from hesim_render import bands
-from hesim_render.errors import RangeError
+from hesim_render.core import bands
+from hesim_render.core.errors import RangeError
 from hesim_render.isp import Camera, Pipeline, demosaic, guide, kriging, process, remosaic
 
 RGBW = ((3, 0, 3, 1), (0, 3, 1, 3), (3, 1, 3, 2), (1, 3, 2, 3))
@@ -322,8 +322,8 @@ def test_a_decibel_more_is_not_there_on_natural_texture():
 
 
 def test_event_pixels_of_every_shipped_tile_are_those_of_the_sensor_files():
-    from hesim_render.mosaic import describe
-    from hesim_render.sensor import load_sensor
+    from hesim_render.mosaic.description import describe
+    from hesim_render.sensor.sensor import load_sensor
 
     for name, tile in (("eiger", EIGER), ("gen2", GEN2), ("mipi-hybridevs", MIPI), ("reference-bayer", BAYER)):
         np.testing.assert_array_equal(describe(load_sensor(name)).tile_channel, tile)

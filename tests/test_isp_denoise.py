@@ -6,8 +6,8 @@ from isp_images import BAYER, EIGER, MIPI, QUAD, images, mosaic_of
 from scipy.stats import chi2
 
 import hesim_render as hr
-from hesim_render import bands
-from hesim_render.errors import RangeError
+from hesim_render.core import bands
+from hesim_render.core.errors import RangeError
 from hesim_render.isp import FrameNoise
 from hesim_render.isp.denoise import denoise
 from hesim_render.isp.rows import row_offsets

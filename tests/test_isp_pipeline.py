@@ -5,8 +5,7 @@ import pytest
 import recordings
 from isp_images import PAPER_BALANCE, PAPER_MATRIX, QUAD, captured, images, mosaic_of, psnr
 
-from hesim_render import transfer
-from hesim_render.errors import RangeError, SpecError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import (
     Camera,
     Pipeline,
@@ -19,6 +18,7 @@ from hesim_render.isp import (
     load_pipeline,
     process,
 )
+from hesim_render.spectral import transfer
 
 CAMERA = """
 channels: [R, G, B]

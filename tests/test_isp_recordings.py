@@ -12,7 +12,7 @@ from PIL import Image
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
-from hesim_render.errors import OutputError, RangeError, SpecError
+from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.isp import (
     DEFAULT,
     DENOISED_PICTURE,
@@ -27,10 +27,10 @@ from hesim_render.isp import (
 )
 from hesim_render.isp.colour import colour_matrix
 from hesim_render.isp.smooth import reduce_noise
-from hesim_render.layout import Layout
-from hesim_render.recording import Recording
+from hesim_render.mosaic.layout import Layout
+from hesim_render.recording.recording import Recording
 from hesim_render.specs.sensor import SensorSpec
-from hesim_render.transfer import encode
+from hesim_render.spectral.transfer import encode
 
 
 @pytest.mark.parametrize("sensor", ["eiger", "gen2", "mipi-hybridevs", "davis346", "reference-bayer", "reference-mono"])

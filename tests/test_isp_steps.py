@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
-from hesim_render import transfer
-from hesim_render.errors import RangeError
+from hesim_render.core.errors import RangeError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
+from hesim_render.spectral import transfer
 
 RNG = np.random.default_rng(11)
 

@@ -9,15 +9,15 @@ from scipy.special import ndtr
 from scipy.stats import multivariate_normal
 
 import hesim_render as hr
-from hesim_render import spectra
-from hesim_render.bench import Bench, set_up, step_target
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
-from hesim_render.calibrate.captures import read_captures
-from hesim_render.capture import noise_models
-from hesim_render.errors import OutputError, RangeError, SpecError
-from hesim_render.lab import DARK_EXPOSURES_US, LIT_EXPOSURES_US, _describe, _Session, write_captures
-from hesim_render.noise.aps import APS_TERMS
-from hesim_render.npzfile import NpzWriter
+from hesim_render.capture.bench import Bench, set_up, step_target
+from hesim_render.capture.lab import DARK_EXPOSURES_US, LIT_EXPOSURES_US, _describe, _Session, write_captures
+from hesim_render.capture.loop import noise_models
+from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.core.npz import NpzWriter
+from hesim_render.pixels.aps.model import APS_TERMS
+from hesim_render.recording.capture_set import read_captures
+from hesim_render.spectral import spectrum as spectra
 
 # eiger with lower thresholds and a wider mismatch: a short session then holds enough events
 BUSY = {

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hesim_render.errors import RangeError
-from hesim_render.layout import Layout
+from hesim_render.core.errors import RangeError
+from hesim_render.mosaic.layout import Layout
 from hesim_render.specs import read_sensor
 from hesim_render.specs.files import list_names
 

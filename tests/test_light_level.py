@@ -7,12 +7,12 @@ from rendering import make_scene, mono
 from scipy import integrate
 
 import hesim_render as hr
-from hesim_render.errors import SpecError
-from hesim_render.renderer import light_level
-from hesim_render.renderer.flux import RenderedFlux
-from hesim_render.renderer.light_level import WISH, in_absolute_light
-from hesim_render.renderer.specfilm import reference_flux
-from hesim_render.scene import Scene
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render import light_level
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.light_level import WISH, in_absolute_light
+from hesim_render.sources.render.specfilm import reference_flux
+from hesim_render.sources.scene import Scene
 
 #: Past the lamps, at the plane's point.
 CAMERA = {"origin_m": [-0.8, -0.8, 1.0], "target_m": [0, 0, 0], "horizontal_fov_deg": 2}

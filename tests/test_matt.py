@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rendering import flux_image, make_scene, mono, pair_tracer, traced
 
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.irradiance import RectangleLight
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport.irradiance import RectangleLight
 
 CAMERA = {"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 22.62}
 SHAPES = [

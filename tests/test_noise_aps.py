@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.backend import jit
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.layout import Layout
-from hesim_render.noise.aps import APS_TERMS, ApsNoise
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.specs.sensor import read_sensor
 
 SIDE = 512

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.backend import jit
-from hesim_render.errors import RangeError
-from hesim_render.layout import Layout
-from hesim_render.noise.evs import EVS_TERMS, LEAST_THRESHOLD_REL, EvsNoise
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs.model import EVS_TERMS, LEAST_THRESHOLD_REL, EvsNoise
 from hesim_render.specs.sensor import read_sensor
 
 COEFFICIENTS = {"beta1": 0.8, "beta2": 3.0, "beta3": 0.1, "beta4": 0.05, "beta5": -0.3}

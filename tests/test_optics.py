@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render import optics
-from hesim_render.optics import Lens
+from hesim_render.sensor import lens as optics
+from hesim_render.sensor.lens import Lens
 
 
 def test_solid_angle_states_its_formula():

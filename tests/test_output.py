@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import recordings
 
-from hesim_render import cli, output
+from hesim_render import cli
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
-from hesim_render.errors import OutputError, SpecError
-from hesim_render.output import OutputFolder, check_target, discard_unfinished, output_errors, replacing
+from hesim_render.core import output
+from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.core.output import OutputFolder, check_target, discard_unfinished, output_errors, replacing
 
 KILLED = Path(__file__).parent / "robustness" / "killed.py"
 
@@ -254,7 +255,7 @@ def test_a_report_takes_no_other_files_place(captures, monkeypatch):
     assert report.read_bytes() == first
     (captures / "thesis.txt").write_text("x")
     (captures / "link").symlink_to("thesis.txt")
-    monkeypatch.setattr("hesim_render.calibrate.aps._read", lambda *_: pytest.fail("the work was begun"))
+    monkeypatch.setattr("hesim_render.calibrate.aps.calibration._read", lambda *_: pytest.fail("the work was begun"))
     for given, message in (
         ("thesis.txt", "is no report"), ("link", "is no report"), ("c.yaml", "is the calibration itself"),
         (".", "is a folder"), ("thesis.txt/r.html", "is not a folder"), ("a" * 300, "too long"),

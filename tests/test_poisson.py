@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from hesim_render.backend import jit
-from hesim_render.noise.normal import normal_pair
-from hesim_render.noise.poisson import _log_probability, poisson
-from hesim_render.rng import Stream, philox
+from hesim_render.core.backend import jit
+from hesim_render.core.rng import Stream, philox
+from hesim_render.pixels.aps.poisson import _log_probability, poisson
+from hesim_render.pixels.normal import normal_pair
 
 MEANS = (0.02, 0.7, 3.0, 9.99, 10.0, 10.3, 37.0, 500.0, 5000.0, 1e5, 1e6)
 # 33 comparisons (χ², mean, variance at 11 means) at 1e-7 each: a false alarm in 300,000 runs

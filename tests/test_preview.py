@@ -5,8 +5,11 @@ import pytest
 import recordings
 from PIL import Image
 
-from hesim_render import colorimetry, mosaic, preview, showcase, spectra
-from hesim_render.recording import Recording
+from hesim_render.mosaic import description as mosaic
+from hesim_render.recording import preview, showcase
+from hesim_render.recording.recording import Recording
+from hesim_render.spectral import colorimetry
+from hesim_render.spectral import spectrum as spectra
 
 
 def frame_under(name, light, reflectances, width=256, height=192):

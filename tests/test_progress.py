@@ -12,8 +12,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import hesim_render as hr
-from hesim_render import progress
-from hesim_render.progress import Pace, ProgressReport, in_words, progress_report
+from hesim_render.core import progress
+from hesim_render.core.progress import Pace, ProgressReport, in_words, progress_report
 
 
 class Clock:

@@ -8,8 +8,8 @@ import pytest
 from scipy import constants
 
 import hesim_render as hr
-from hesim_render.backend import jit
-from hesim_render.errors import RangeError, SpecError
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError, SpecError
 
 DATA = Path(__file__).parent / "data"
 

@@ -5,10 +5,10 @@ import pytest
 from rendering import D65_1000_LUX, FURNACE, flux_image, make_scene, mono
 
 import hesim_render as hr
-from hesim_render.errors import SpecError
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.camera import look_at, place_camera
-from hesim_render.scene import Scene
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.camera import look_at, place_camera
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.scene import Scene
 
 
 def spot(x, y, name="spot"):

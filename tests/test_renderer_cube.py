@@ -8,8 +8,8 @@ import pytest
 from rendering import D65_1000_LUX, d65_irradiance, flux_image, make_scene
 
 import hesim_render as hr
-from hesim_render.errors import OutputError, RangeError, SpecError
-from hesim_render.renderer import read_spectral_exr, render_cube, write_spectral_exr
+from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.sources.render import read_spectral_exr, render_cube, write_spectral_exr
 
 FLAT = {
     "target": {"type": "flat", "width_m": 5, "height_m": 5, "reflectance": {"flat": 0.4}},

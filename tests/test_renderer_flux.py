@@ -8,8 +8,8 @@ from rendering import D65_1000_LUX, FURNACE, d65_irradiance, electrons_per_s, fl
 from scipy import stats
 
 import hesim_render as hr
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.renderer.flux import RenderedFlux
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sources.render.exact import RenderedFlux
 
 WIDE_CARD = {"type": "flat", "width_m": 20, "height_m": 20, "reflectance": {"flat": 0.18}}
 

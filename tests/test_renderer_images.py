@@ -5,9 +5,9 @@ import pytest
 from rendering import flux_image, mitsuba_scene, mono, pair_tracer
 from rendering import traced as traced_pairs
 
-from hesim_render.renderer import paths
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.images import Cones, LampImages
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport import paths
+from hesim_render.sources.render.transport.mirrored_lamps import Cones, LampImages
 
 COLS, ROWS = 32, 24
 GREY = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}

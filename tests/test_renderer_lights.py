@@ -6,12 +6,12 @@ from rendering import d65_irradiance, make_scene
 from scipy import integrate
 
 import hesim_render as hr
-from hesim_render.errors import SpecError
-from hesim_render.renderer import render_cube
-from hesim_render.renderer._mitsuba import mitsuba, spectrum_dict
-from hesim_render.renderer.lights import area_light_frame, form_factor_integral, irradiance
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render import render_cube
+from hesim_render.sources.render.scene.lights import area_light_frame, form_factor_integral, irradiance
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba, spectrum_dict
 from hesim_render.specs.scene import LightSpec
-from hesim_render.spectra import Spectrum, summed
+from hesim_render.spectral.spectrum import Spectrum, summed
 
 AREA = {"type": "area", "illuminance_lux": 800, "position_m": (0.5, 1.2, 0.8), "size_m": (0.6, 0.9)}
 LIGHTS = {

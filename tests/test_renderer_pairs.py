@@ -8,12 +8,12 @@ import rendering
 from rendering import mono, pair_tracer, traced
 
 import hesim_render as hr
-from hesim_render.renderer import moving
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.flux import RenderedFlux
-from hesim_render.renderer.parts import meets_ball
-from hesim_render.renderer.sampler import sampler_class
-from hesim_render.renderer.windows import Windows
+from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.sampling.sampler import sampler_class
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport import moving_scene as moving
+from hesim_render.sources.render.transport.closed_form import meets_ball
 
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
 LAMP = {

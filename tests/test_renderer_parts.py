@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from rendering import mitsuba_scene, mono, pair_tracer, traced
 
-from hesim_render.renderer import moving, parts
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.parts import Part
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport import closed_form as parts
+from hesim_render.sources.render.transport import moving_scene as moving
+from hesim_render.sources.render.transport.closed_form import Part
 
 COUNT = 100_000
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hesim_render.backend import jit
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.sampler import permute, sampler_class, third_coordinates, zero_two_point
-from hesim_render.renderer.wavelengths import WavelengthSampler
-from hesim_render.spectra import Spectrum
+from hesim_render.core.backend import jit
+from hesim_render.sources.render.sampling.sampler import permute, sampler_class, third_coordinates, zero_two_point
+from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.spectral.spectrum import Spectrum
 
 
 def started(pixels, per_half, seed=11):

@@ -7,10 +7,10 @@ import pytest
 from rendering import FURNACE, flux_image, make_scene, mono
 
 import hesim_render as hr
-from hesim_render.errors import SpecError
-from hesim_render.renderer._mitsuba import mitsuba
-from hesim_render.renderer.flux import RenderedFlux
-from hesim_render.scene import Scene
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.scene import Scene
 from hesim_render.specs.files import content_hash, list_names
 
 XML = """<scene version="3.0.0">

@@ -6,9 +6,9 @@ from rendering import flux_image, make_scene
 from scipy import stats
 
 import hesim_render as hr
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.renderer import RenderedFlux, reference_flux
-from hesim_render.scene import Scene
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sources.render import RenderedFlux, reference_flux
+from hesim_render.sources.scene import Scene
 
 LIT_ROOM = {
     "target": {"type": "colorchecker"},

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from hesim_render.renderer.targets import build_target
+from hesim_render.sources.render.scene.targets import build_target
 from hesim_render.specs.target import TargetSpec
 
 TARGETS = [

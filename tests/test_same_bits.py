@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render import backend
+from hesim_render.core import backend
 
 HASHES = Path(__file__).parent / "data" / "same_bits.json"
 SIZE = 32, 24
@@ -43,7 +43,7 @@ def video(folder):
 
 
 def lab(folder):
-    from hesim_render import lab as laboratory
+    from hesim_render.capture import lab as laboratory
 
     given = hr.load_sensor("reference-mono").crop(*SIZE)
     laboratory.write_captures(given, folder, frames=8, ticks=200, seed=7)

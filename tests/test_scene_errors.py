@@ -6,9 +6,9 @@ from rendering import make_scene, mono
 
 import hesim_render as hr
 from hesim_render import cli
-from hesim_render.errors import SpecError
-from hesim_render.renderer.flux import require_finite
-from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.exact import require_finite
+from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.specs.scene import TrackSpec
 
 SCENE = """\
@@ -116,7 +116,7 @@ def test_a_mistake_in_a_mitsuba_scene_is_one_line_with_its_file(old, new, text, 
 
 
 def test_only_flux_that_is_not_finite_is_refused_and_its_pixel_named():
-    from hesim_render.backend import jit
+    from hesim_render.core.backend import jit
 
     types = jit()
     scene, layout = hr.load_scene("flat-field"), mono(8, 8).layout

@@ -5,7 +5,7 @@ import pytest
 from scipy import constants, stats
 
 import hesim_render as hr
-from hesim_render.errors import RangeError
+from hesim_render.core.errors import RangeError
 
 
 def run(scene, sensor, size, **options):

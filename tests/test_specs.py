@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from hesim_render.errors import HesimWarning, RangeError, SpecError
-from hesim_render.layout import Layout
+from hesim_render.core.errors import HesimWarning, RangeError, SpecError
+from hesim_render.mosaic.layout import Layout
 from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene, read_sensor
 from hesim_render.specs.files import Strict, content_hash, data_folder, list_names, parse_override
 from hesim_render.specs.sensor import ApsSpec, EvsSpec

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import constants, integrate
 
-from hesim_render import spectra
-from hesim_render.errors import SpecError
+from hesim_render.core.errors import SpecError
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.spectra import Spectrum, constant
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral.spectrum import Spectrum, constant
 
 
 def test_linear_between_samples_and_zero_outside():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from hesim_render.backend import jit
-from hesim_render.renderer.trajectory import Trajectory
+from hesim_render.core.backend import jit
+from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.specs.scene import TrackSpec
 
 

@@ -9,17 +9,17 @@ from scipy import constants
 from videos import srgb_to_linear, yuv_planes
 
 import hesim_render as hr
-from hesim_render import transfer
-from hesim_render.camera import Camera
-from hesim_render.errors import RangeError, SpecError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import DEFAULT, Pipeline, process
-from hesim_render.mosaic import describe
-from hesim_render.spectra import illuminant
-from hesim_render.video import VideoFlux, VideoOptions
-from hesim_render.video.colours import ColourTags, to_linear_srgb
-from hesim_render.video.inversion import camera_matrix, spectral_matrix, surface_basis, white_flux
-from hesim_render.video.linear import Lineariser
-from hesim_render.video.picture import PictureFormat
+from hesim_render.mosaic.colour_profile import Camera
+from hesim_render.mosaic.description import describe
+from hesim_render.sources.video import VideoFlux, VideoOptions
+from hesim_render.sources.video.colours import ColourTags, to_linear_srgb
+from hesim_render.sources.video.inversion import camera_matrix, spectral_matrix, surface_basis, white_flux
+from hesim_render.sources.video.linear import Lineariser
+from hesim_render.sources.video.picture import PictureFormat
+from hesim_render.spectral import transfer
+from hesim_render.spectral.spectrum import illuminant
 
 WEIGHTS = {"bt709": (0.2126, 0.0722), "bt601": (0.299, 0.114), "bt2020": (0.2627, 0.0593)}
 
@@ -214,8 +214,8 @@ def test_spectral_mode_gives_colours_that_the_observer_agrees_with():
 def test_spectral_mode_against_measured_surfaces():
     """24 ColorChecker patches through Nikon curves, from their sRGB alone: 3.1 % off on average, 22 % at most (the blue
     of orange, its darkest channel), greys 0.6 %. Metamers differ: that is the limit of any upsampling."""
-    from hesim_render.colorimetry import tristimulus, xyz_to_linear_srgb
-    from hesim_render.spectra import colorchecker, constant, integrate_product, scale_to_lux
+    from hesim_render.spectral.colorimetry import tristimulus, xyz_to_linear_srgb
+    from hesim_render.spectral.spectrum import colorchecker, constant, integrate_product, scale_to_lux
 
     sensor = hr.load_sensor("reference-bayer")
     light, names = illuminant("D65"), sensor.layout.filters

@@ -7,11 +7,11 @@ import pytest
 from videos import moving_bar, srgb_to_linear
 
 import hesim_render as hr
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.video import VideoFlux, VideoOptions
-from hesim_render.video.clock import Clock
-from hesim_render.video.geometry import mapping
-from hesim_render.video.picture import Timing
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sources.video import VideoFlux, VideoOptions
+from hesim_render.sources.video.clock import Clock
+from hesim_render.sources.video.geometry import mapping
+from hesim_render.sources.video.picture import Timing
 
 #: One e⁻/s per unit of a linear picture.
 UNIT = {"transfer": "linear", "white_e_per_s": 1.0, "white_filter": "clear"}
@@ -416,7 +416,7 @@ def test_a_long_file_runs_in_bounded_memory(tmp_path):
 
     from videos import encode, grey_frames
 
-    from hesim_render.capture import Capture, noise_models
+    from hesim_render.capture.loop import Capture, noise_models
 
     path = encode(tmp_path / "a.mp4", grey_frames(np.arange(10_000) % 200 + 20, 32, 32), "mpeg4", 30)
     sensor = hr.load_sensor("reference-bayer", {"aps.frame_rate_hz": 30, "aps.exposure_us": 10_000}).crop(16, 16)

@@ -13,13 +13,13 @@ from PIL import Image
 from videos import TAGS, encode, grey_frames, moving_bar, rgb_frames, yuv_frame
 
 import hesim_render as hr
-from hesim_render.errors import HesimError, RangeError, SpecError
-from hesim_render.video import VideoFlux, VideoOptions, open_video
-from hesim_render.video.colours import ColourTags
-from hesim_render.video.digest import Digest
-from hesim_render.video.folder import FolderVideo
-from hesim_render.video.linear import Lineariser
-from hesim_render.video.picture import PictureFormat
+from hesim_render.core.errors import HesimError, RangeError, SpecError
+from hesim_render.sources.video import VideoFlux, VideoOptions, open_video
+from hesim_render.sources.video.colours import ColourTags
+from hesim_render.sources.video.digest import Digest
+from hesim_render.sources.video.folder import FolderVideo
+from hesim_render.sources.video.linear import Lineariser
+from hesim_render.sources.video.picture import PictureFormat
 
 
 def opened(source, **options):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.specs.light import LightSpec
-from hesim_render.waveform import FOLLOW_TOLERANCE, Mains, Pwm, Table
+from hesim_render.spectral.waveform import FOLLOW_TOLERANCE, Mains, Pwm, Table
 
 TABLE_US, POWER = (200.0, 900.0, 1000.0, 3000.0, 4200.0), (1.0, 4.0, 2.0, 2.0, 0.5)
 WAVEFORMS = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.captures import FrameStack
+from hesim_render.recording.capture_set import FrameStack
 
 Progress = Callable[[str, float], None]
 #: Part of full scale up to which the first frame's value counts a pixel to the dim or to the bright half.

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from hesim_render.errors import OutputError, SpecError
-from hesim_render.guard import read_text
-from hesim_render.npzfile import NpzWriter
-from hesim_render.output import check_place, output_errors, replacing
+from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.core.guard import read_text
+from hesim_render.core.npz import NpzWriter
+from hesim_render.core.output import check_place, output_errors, replacing
 from hesim_render.specs.calibration import SCHEMA_VERSION, file_digest, read_calibration, read_maps
 
 __all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]

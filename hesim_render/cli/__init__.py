@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
-from hesim_render.errors import HesimError, HesimWarning
-from hesim_render.output import discard_unfinished
-from hesim_render.terminal import complain, silence_stdout
+from hesim_render.cli.terminal import complain, silence_stdout
+from hesim_render.core.errors import HesimError, HesimWarning
+from hesim_render.core.output import discard_unfinished
 
 #: Exit status where the user can help it.
 _REFUSED = 2

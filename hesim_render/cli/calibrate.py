@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, Without, cropped, names_of, sensor_keys_only
-from hesim_render.output import check_target
-from hesim_render.progress import progress_report
-from hesim_render.terminal import parse_exposures, say, split_overrides
+from hesim_render.cli.terminal import parse_exposures, say, split_overrides
+from hesim_render.core.output import check_target
+from hesim_render.core.progress import progress_report
 
 
 class Part(StrEnum):
@@ -42,8 +42,8 @@ def lab(
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     exposures = {"dark_exposures_us": parse_exposures(dark_ms), "lit_exposures_us": parse_exposures(lit_ms)}
     check_target(out, "capture.yaml", overwrite)
-    from hesim_render.lab import write_captures
-    from hesim_render.sensor import load_sensor
+    from hesim_render.capture.lab import write_captures
+    from hesim_render.sensor.sensor import load_sensor
 
     loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
     if loaded.spec.evs is not None and loaded.spec.evs.reference == "last_event":

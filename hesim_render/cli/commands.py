@@ -8,7 +8,7 @@ import typer
 
 from hesim_render import __version__
 from hesim_render.cli import calibrate, doctor, look, simulate, video
-from hesim_render.terminal import say
+from hesim_render.cli.terminal import say
 
 app = typer.Typer(
     name="hesim-render",

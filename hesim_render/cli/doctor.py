@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.terminal import complain, say
+from hesim_render.cli.terminal import complain, say
 
 
 class Kind(StrEnum):
@@ -21,8 +21,8 @@ class Kind(StrEnum):
 
 def doctor() -> None:
     """Say what this machine can run, and what to install where it can run nothing."""
-    from hesim_render import backend
-    from hesim_render.manifest import software_versions
+    from hesim_render.core import backend
+    from hesim_render.recording.manifest import software_versions
 
     for name, version in software_versions().items():
         say(f"{name:<14}{version}")
@@ -52,11 +52,11 @@ def list_(
 def _lines_of(kind: Kind) -> list[str]:
     """One line for each name of a kind, with what it is where a file says so."""
     if kind is Kind.illuminants:
-        from hesim_render.spectra import illuminant_names
+        from hesim_render.spectral.spectrum import illuminant_names
 
         return illuminant_names()
     if kind is Kind.noise:
-        from hesim_render.capture import NOISE_TERMS
+        from hesim_render.capture.loop import NOISE_TERMS
 
         return list(NOISE_TERMS)
     from hesim_render.specs.files import data_folder, list_names, load_yaml

@@ -8,7 +8,7 @@ import sys
 import threading
 from typing import Any
 
-from hesim_render.output import discard_unfinished
+from hesim_render.core.output import discard_unfinished
 
 #: Exit status of what was interrupted: 128 + SIGINT, as shells have it.
 INTERRUPTED = 130

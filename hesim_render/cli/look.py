@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import Overwrite
-from hesim_render.output import output_errors
-from hesim_render.progress import progress_report
-from hesim_render.terminal import say, summary
+from hesim_render.cli.terminal import say, summary
+from hesim_render.core.output import output_errors
+from hesim_render.core.progress import progress_report
 
 
 def isp(
@@ -41,8 +41,8 @@ def isp(
 
 def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:
     """Summarise a recording and write its previews anew."""
-    from hesim_render.recording import Recording
-    from hesim_render.showcase import write_previews
+    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.showcase import write_previews
 
     loaded = Recording.load(recording)
     assert loaded.path is not None

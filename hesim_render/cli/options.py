@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hesim_render.errors import RangeError
-from hesim_render.output import check_target
-from hesim_render.terminal import parse_roi, say
+from hesim_render.cli.terminal import parse_roi, say
+from hesim_render.core.errors import RangeError
+from hesim_render.core.output import check_target
 
 if TYPE_CHECKING:
-    from hesim_render.progress import ProgressReport
-    from hesim_render.sensor import Sensor
+    from hesim_render.core.progress import ProgressReport
+    from hesim_render.sensor.sensor import Sensor
 
 
 def names_of(kind: str) -> Callable[[str], list[str]]:
@@ -29,7 +29,7 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
 
 
 def _noise_terms(incomplete: str) -> list[str]:
-    from hesim_render.capture import NOISE_TERMS
+    from hesim_render.capture.loop import NOISE_TERMS
 
     return [name for name in NOISE_TERMS if name.startswith(incomplete)]
 
@@ -65,7 +65,7 @@ def check_duration(duration_s: float) -> None:
 
 def check_output(out: Path, overwrite: bool) -> None:
     """Refuse a bad output folder before anything is rendered."""
-    from hesim_render.manifest import MANIFEST_NAME
+    from hesim_render.recording.manifest import MANIFEST_NAME
 
     check_target(out, MANIFEST_NAME, overwrite)
 

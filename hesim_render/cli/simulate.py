@@ -21,11 +21,11 @@ from hesim_render.cli.options import (
     names_of,
     told_beside,
 )
-from hesim_render.progress import progress_report
-from hesim_render.terminal import is_short_of_wish, say, split_overrides, summary
+from hesim_render.cli.terminal import is_short_of_wish, say, split_overrides, summary
+from hesim_render.core.progress import progress_report
 
 if TYPE_CHECKING:
-    from hesim_render.recording import Recording
+    from hesim_render.recording.recording import Recording
 
 _NOT_MET = 3  # a recording is there, but worse than the quality that was asked for
 _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))

@@ -22,8 +22,8 @@ from hesim_render.cli.options import (
     sensor_keys_only,
     told_beside,
 )
-from hesim_render.progress import progress_report
-from hesim_render.terminal import say, split_overrides, summary
+from hesim_render.cli.terminal import say, split_overrides, summary
+from hesim_render.core.progress import progress_report
 
 
 def video(
@@ -76,7 +76,7 @@ def video(
     sensor_keys_only(scene_changes, "sensor.aps.exposure_us")
     check_output(out, overwrite)
     import hesim_render as hr
-    from hesim_render.camera import load_camera
+    from hesim_render.mosaic.colour_profile import load_camera
 
     loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
     with progress_report(f"{Path(source).name} → {sensor}") as progress:

@@ -4,11 +4,11 @@ Does not use the renderer, so that it works on frames of real sensors too. Dr.Ji
 device anew, for the noise reduction of its recordings.
 """
 
-from hesim_render.camera import Camera, load_camera
 from hesim_render.isp.demosaicing import demosaic, remosaic
 from hesim_render.isp.develop import develop_recording
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.pipeline import DEFAULT, DENOISED_PICTURE, PICTURE, Pipeline, develop, load_pipeline, process
+from hesim_render.mosaic.colour_profile import Camera, load_camera
 
 __all__ = [
     "DEFAULT",

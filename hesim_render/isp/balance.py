@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.bands import in_bands
-from hesim_render.errors import RangeError
+from hesim_render.core.bands import in_bands
+from hesim_render.core.errors import RangeError
 
 #: Samples outside this part of the range say nothing of the light: noise below, saturation above.
 _DARKEST, _BRIGHTEST = 0.01, 0.95

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render import spectra
-from hesim_render.colorimetry import tristimulus, xyz_to_linear_srgb
-from hesim_render.errors import RangeError
-from hesim_render.spectra import Spectrum, constant
+from hesim_render.core.errors import RangeError
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral.colorimetry import tristimulus, xyz_to_linear_srgb
+from hesim_render.spectral.spectrum import Spectrum, constant
 
 #: The grey patches of a ColorChecker but white and black: its last row, in the order of `patch_means`.
 NEUTRAL = slice(19, 23)

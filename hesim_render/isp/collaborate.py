@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.bands import in_bands
+from hesim_render.core.bands import in_bands
 from hesim_render.isp.kriging import ISOTROPIC
 
 #: Patches that are taken for alike, and how far they are looked for, blocks.

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.bands import in_bands
-from hesim_render.errors import RangeError
-from hesim_render.spectra import colour_science
+from hesim_render.core.bands import in_bands
+from hesim_render.core.errors import RangeError
+from hesim_render.spectral.spectrum import colour_science
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.bands import in_bands
-from hesim_render.errors import RangeError
+from hesim_render.core.bands import in_bands
+from hesim_render.core.errors import RangeError
 from hesim_render.isp import kriging
 from hesim_render.isp.blocks import BAND_BLOCKS, block_of, bordered, join, split
 from hesim_render.isp.guide import predict_guide
-from hesim_render.transfer import ROOT_TOE
+from hesim_render.spectral.transfer import ROOT_TOE
 
 #: Ridge of the regression on the guide, square-root units squared.
 _RIDGE = 1e-3

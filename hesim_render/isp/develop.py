@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render import manifest as manifests
-from hesim_render.camera import Camera
-from hesim_render.errors import RangeError, SpecError
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.pipeline import DENOISED_PICTURE, Pipeline, develop
-from hesim_render.layout import Layout
-from hesim_render.optics import Lens, relative_illumination
-from hesim_render.output import OutputFolder, output_errors
-from hesim_render.recording import Recording
+from hesim_render.mosaic.colour_profile import Camera
+from hesim_render.mosaic.layout import Layout
+from hesim_render.recording import manifest as manifests
+from hesim_render.recording.recording import Recording
+from hesim_render.sensor.lens import Lens, relative_illumination
 
 #: File that tells a folder of pictures.
 MARKER = "isp.json"

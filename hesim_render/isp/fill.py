@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.errors import RangeError
+from hesim_render.core.errors import RangeError
 
 #: Rise of a bridge that counts as none, units of white.
 _EVEN = 0.01

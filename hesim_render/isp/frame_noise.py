@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.bands import in_bands
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.layout import Layout
-from hesim_render.manifest import sensor_spec
-from hesim_render.noise.aps import ADC_VARIANCE_DN2, APS_TERMS, ApsNoise
+from hesim_render.core.bands import in_bands
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.units import S_PER_US
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps.model import ADC_VARIANCE_DN2, APS_TERMS, ApsNoise
+from hesim_render.recording.manifest import sensor_spec
 from hesim_render.specs.calibration import NoiseFile, as_written, read_calibration, read_maps
 from hesim_render.specs.sensor import SensorSpec
-from hesim_render.units import S_PER_US
 
 Map = float | NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameNoise:
-    """Noise of frames over the region read out, in the calibrated form (`hesim_render.noise.aps`).
+    """Noise of frames over the region read out, in the calibrated form (`hesim_render.pixels.aps.model`).
 
     Parameters
     ----------

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from hesim_render.camera import Camera
-from hesim_render.errors import RangeError
-from hesim_render.frame import Frame
+from hesim_render.core.errors import RangeError
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.steps import BEFORE_DENOISE, ON_MOSAIC, Demosaic, Denoise, Development, Encode, Step
-from hesim_render.mosaic import Mosaic
+from hesim_render.mosaic.colour_profile import Camera
+from hesim_render.mosaic.description import Mosaic
+from hesim_render.recording.frame import Frame
 from hesim_render.specs.files import Strict, load_yaml, validate
 
 

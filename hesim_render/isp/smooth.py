@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.errors import RangeError
-from hesim_render.transfer import ROOT_TOE
+from hesim_render.core.errors import RangeError
+from hesim_render.spectral.transfer import ROOT_TOE
 
 
 def guided_filter(

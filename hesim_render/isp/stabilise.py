@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import poisson
 
-from hesim_render.bands import in_bands
+from hesim_render.core.bands import in_bands
 
 _ENTRIES = 1 << 13
 #: Nodes of the quadrature over the noise; more change nothing in the fourth digit.

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
-from hesim_render.camera import Camera
-from hesim_render.errors import RangeError, SpecError
-from hesim_render.guard import reading
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.guard import reading
+from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
 from hesim_render.isp.demosaicing import demosaic
 from hesim_render.isp.denoise import denoise
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.rows import row_offsets
-from hesim_render.npzfile import read_array, read_arrays
+from hesim_render.mosaic.colour_profile import Camera
 from hesim_render.specs.files import Strict
-from hesim_render.transfer import Depth, Transfer, encode
+from hesim_render.spectral.transfer import Depth, Transfer, encode
 
 Corners = Annotated[list[tuple[float, float]], Field(min_length=4, max_length=4)]
 
@@ -242,7 +242,7 @@ class ColourMatrix(Strict):
         elif self.method == "chart":
             if self.corners is None:
                 raise SpecError("is required by method chart", key="colour_matrix.corners")
-            from hesim_render import spectra
+            from hesim_render.spectral import spectrum as spectra
 
             reference = chart.reference_linear_srgb(spectra.illuminant(self.illuminant))
             found = colour.fit_matrix(chart.patch_means(state.image, self.corners), reference)

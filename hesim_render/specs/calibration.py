@@ -12,12 +12,12 @@ from typing import Any
 from numpy.typing import NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from hesim_render.errors import HesimError, SpecError
-from hesim_render.guard import inside, reading, reason
-from hesim_render.npzfile import read_arrays
+from hesim_render.core.errors import HesimError, SpecError
+from hesim_render.core.guard import inside, reading, reason
+from hesim_render.core.npz import read_arrays
+from hesim_render.core.units import S_PER_US
 from hesim_render.specs.files import Strict
 from hesim_render.specs.yamlfile import read_yaml
-from hesim_render.units import S_PER_US
 
 SCHEMA_VERSION = 1
 _SECTIONS = ("aps", "evs")

@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
-from hesim_render.errors import SpecError, did_you_mean
+from hesim_render.core.errors import SpecError, did_you_mean
 from hesim_render.specs.problems import spec_error
 from hesim_render.specs.yamlfile import read_yaml
 

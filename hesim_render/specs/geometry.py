@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
 
-from hesim_render.guard import MOST_PIXELS
+from hesim_render.core.guard import MOST_PIXELS
 from hesim_render.specs.files import Strict
 
 #: Largest coordinate, m, and largest and smallest size: beyond them squares leave the range of 32 bit.

@@ -11,7 +11,7 @@ from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.waveform import WaveformSpec
-from hesim_render.spectra import Spectrum, scale_to_irradiance, scale_to_lux, summed
+from hesim_render.spectral.spectrum import Spectrum, scale_to_irradiance, scale_to_lux, summed
 
 
 def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:

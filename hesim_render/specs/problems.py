@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from hesim_render.errors import SpecError, closest, did_you_mean
+from hesim_render.core.errors import SpecError, closest, did_you_mean
 
 #: Characters of a wrong value that a message repeats.
 _LONGEST = 60

@@ -22,8 +22,8 @@ from pydantic import (
     model_validator,
 )
 
-from hesim_render.errors import SpecError
-from hesim_render.guard import leads_out
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import leads_out
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, RigidMatrix, Size, Vector, rotation_matrix_about, rotation_vector
 from hesim_render.specs.light import LightSpec

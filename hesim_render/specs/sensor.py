@@ -13,13 +13,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PositiveInt, field_validator, model_validator
 
-from hesim_render.errors import HesimWarning, SpecError
+from hesim_render.core.errors import HesimWarning, SpecError
 from hesim_render.specs.calibration import NoiseFile, apply_calibration
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor_checks import sensor_problems, unused
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.spectra import Spectrum
+from hesim_render.spectral.spectrum import Spectrum
 
 Role = Literal["aps", "evs"]
 NonNegative = Field(ge=0)
@@ -300,7 +300,7 @@ class SensorSpec(Strict):
 
     def filter_response(self, name: str) -> Spectrum:
         """τ_lens · C_f · η of a filter: electrons per photon that reaches the lens."""
-        from hesim_render.spectra import product
+        from hesim_render.spectral.spectrum import product
 
         return product(self.filters[name].load(), self.quantum_efficiency.load(), self.lens.transmittance.load())
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel
 
-from hesim_render.errors import SpecError, did_you_mean
-from hesim_render.spectra import RENDERABLE_NM, Spectrum, constant, coverage
+from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.spectral.spectrum import RENDERABLE_NM, Spectrum, constant, coverage
 
 if TYPE_CHECKING:
     from hesim_render.specs.sensor import SensorSpec

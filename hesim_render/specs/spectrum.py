@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, model_serializer, model_validator
 
-from hesim_render import spectra
-from hesim_render.errors import SpecError
+from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
-from hesim_render.spectra import Spectrum
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral.spectrum import Spectrum
 
 
 class SpectrumSpec(Strict):

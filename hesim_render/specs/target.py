@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Size
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.spectra import colorchecker
+from hesim_render.spectral.spectrum import colorchecker
 
 
 def _diffuse(spec: SpectrumSpec) -> SpectrumSpec:

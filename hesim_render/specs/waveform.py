@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from hesim_render import waveform
 from hesim_render.specs.files import Strict
+from hesim_render.spectral import waveform
 
 #: Times are whole µs downstream: a faster light is steady there.
 _Frequency = Annotated[float, Field(gt=0, le=100_000)]

@@ -10,8 +10,8 @@ from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
 
-from hesim_render.errors import SpecError
-from hesim_render.guard import read_text, reading
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import read_text, reading
 
 #: Values that a file may hold once every alias is written out; a calibration of a 16 x 16 tile has a few thousand.
 _MOST_VALUES = 1_000_000

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from mutations import mutate
 from subjects import SUBJECTS, files_of, quiet
 
-from hesim_render.errors import HesimError
+from hesim_render.core.errors import HesimError
 
 
 def attempt(name, folder, seed):

@@ -10,7 +10,7 @@ import shutil
 import signal
 import sys
 
-from hesim_render import output
+from hesim_render.core import output
 
 STEPS = ("rename", "replace", "mkdir", "unlink", "rmdir")
 

@@ -22,8 +22,8 @@ def recording(folder):
 
 
 def read_recording(folder):
-    from hesim_render.showcase import write_previews
-    from hesim_render.terminal import summary
+    from hesim_render.cli.terminal import summary
+    from hesim_render.recording.showcase import write_previews
 
     loaded = hr.Recording.load(folder / "r")
     summary(loaded)
@@ -136,8 +136,8 @@ def scene(folder):
 
 
 def build_scene(folder):
-    from hesim_render.renderer._mitsuba import mitsuba
-    from hesim_render.renderer.builder import build
+    from hesim_render.sources.render.scene.builder import build
+    from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 
     made = build(mitsuba(), hr.load_scene(folder / "s.yaml").spec)
     made.pose(500)
@@ -210,8 +210,8 @@ def pipeline(folder):
 
 
 def run_pipeline(folder):
-    from hesim_render.camera import load_camera
     from hesim_render.isp import load_pipeline, process
+    from hesim_render.mosaic.colour_profile import load_camera
 
     raw = np.random.default_rng(1).integers(64, 1023, (16, 16), dtype=np.uint16)
     process(raw, load_camera(folder / "c.yaml"), load_pipeline(folder / "p.yaml"))

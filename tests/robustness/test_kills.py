@@ -21,7 +21,7 @@ import pytest
 import recordings
 
 from hesim_render.calibrate import read_calibration, read_maps
-from hesim_render.output import check_target
+from hesim_render.core.output import check_target
 
 HERE = Path(__file__).parent
 PIXELS = ["--sensor", "reference-mono", "--roi", "16x16", "--duration", "0.02", "--out", "out", "--overwrite"]

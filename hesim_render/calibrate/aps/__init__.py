@@ -1,0 +1,1 @@
+"""From dark and lit frames to maps, variance polynomials and photon transfer."""

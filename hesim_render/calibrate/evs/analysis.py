@@ -1,0 +1,259 @@
+"""What the event counts of a sensor of fixed comparisons tell: A, B, C, D, thresholds and their mismatch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.estimate import Spread
+from hesim_render.calibrate.evs.cells import PixelCounts, PixelThresholds, pool_events
+from hesim_render.calibrate.evs.counts import StaticCapture
+from hesim_render.calibrate.evs.defects import EventDefects, bad_event_pixels, bad_in_steps, classify
+from hesim_render.calibrate.evs.dispersion import Dispersion, dispersion_in_time, static_mismatch
+from hesim_render.calibrate.evs.fitted import NO_FIT, EventFit, best_start, fit_events, with_mismatch_error
+from hesim_render.calibrate.evs.medians import Typical
+from hesim_render.calibrate.evs.model import Law
+from hesim_render.calibrate.evs.starts import multi_start
+from hesim_render.calibrate.evs.steps import Steps, read_steps
+from hesim_render.calibrate.evs.thresholds import Thresholds, fit_thresholds, why_not
+from hesim_render.calibrate.moments import Progress
+from hesim_render.core.errors import SpecError
+from hesim_render.recording.capture_set import CaptureSet
+
+#: A difference of log-likelihood that decides between the shot laws; below it the paper's stands.
+DECISIVE = 5.0
+#: One that leaves no doubt: the other law is not looked at any more.
+_BEYOND_DOUBT = 500.0
+#: ρ and λ of a start are 0: whether they are needed is tested anew.
+_SYMMETRIC = np.array([1, 1, 1, 1, 0, 0])
+_LAWS: tuple[Law, Law] = ("linear", "sqrt")
+
+
+@dataclass(frozen=True)
+class EvsCalibration:
+    """What the counts tell; `fits` are per tile position, `together` pools them all.
+
+    Attributes
+    ----------
+    known : each pixel's thresholds as far as they were measured.
+    plain : counts of all positions, without that.
+    advantage : ln L of the shot law over the other's, in units of the scatter of the counts.
+    mismatch : relative spread of the threshold of one polarity.
+    """
+
+    static: StaticCapture
+    defects: EventDefects
+    theta_v: float
+    known: PixelThresholds
+    plain: PixelCounts
+    together: EventFit
+    fits: list[EventFit]
+    advantage: float
+    dispersion: Dispersion
+    mismatch: Spread
+    thresholds: Thresholds | None
+    steps: Steps | None
+    thresholds_reason: str
+    starts: NDArray[np.float64]
+    starts_standard_error: NDArray[np.float64]
+
+    @property
+    def bad(self) -> NDArray[np.bool_]:
+        return self.defects.bad
+
+
+def analyse(
+    captures: CaptureSet, static: StaticCapture, seed: int = 0, progress: Progress | None = None
+) -> EvsCalibration:
+    """Everything the counts tell.
+
+    Raises
+    ------
+    SpecError
+        As `calibrate_evs`.
+    """
+    tell = progress or (lambda what, fraction: None)
+    theta_v = captures.spec.theta_hardware_v or 1.0
+    bad = bad_event_pixels(static)
+    good = ~bad
+    if good.mean() < 0.5:
+        raise SpecError(
+            "more than half of the event pixels are outliers; check n_trials and signal_dn", file=captures.folder
+        )
+    _check_brightness(static, good, captures)
+    tell("fitting", 0.2)
+    typical = Typical.of(static, good)
+    begun = {law: best_start(typical.cells, theta_v, law) for law in _LAWS}
+    starts = {law: parameters for law, (parameters, _, _) in begun.items()}
+    # of the laws, the one that medians are nearer to: means of counts that spread widely tell less
+    lead = (begun["sqrt"][1] - begun["linear"][1]) / min(begun["sqrt"][2], begun["linear"][2])
+    by_medians: Law = "sqrt" if lead > DECISIVE else "linear"
+    wanted = (by_medians,) if abs(lead) > _BEYOND_DOUBT else _LAWS
+    pixels = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
+    laws = {law: fit_events(pixels, theta_v, law, starts[law]) for law in wanted}
+    steps, thresholds, reason = None, None, "no contrast steps (evs_steps.npz) were captured"
+    if captures.has("evs_steps"):
+        tell("contrast steps", 0.3)
+        steps = read_steps(captures, good)
+        found, _ = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
+        more = np.zeros(good.shape, bool) if found is None else bad_in_steps(steps, found, good)
+        if more.any():
+            bad, good = bad | more, good & ~more
+            steps = read_steps(captures, good)
+    tell("fitting", 0.4)
+    alone: Spread | None = None
+    # the fit needs the thresholds, and the contrast in volts needs the fit
+    for turn in range(1 if steps is None else 3):
+        if steps is not None:
+            thresholds, reason = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
+        if thresholds is not None:
+            spread, known = thresholds.spread, thresholds.of_pixels()
+        else:
+            plain = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
+            alone = alone or static_mismatch(plain, typical)
+            spread, known = alone, PixelThresholds.unknown(good.shape, alone.value)
+        pixels = pool_events(static, good, known)
+        if turn < 2:
+            laws = {law: fit_events(pixels, theta_v, law, starts[law]) for law in wanted}
+        else:
+            law = _likelier(laws)
+            laws[law] = fit_events(pixels, theta_v, law, laws[law].whole * _SYMMETRIC)
+    law = by_medians if thresholds is None and spread.value > 0 else _likelier(laws)
+    fit, others = laws[law], [other for name, other in laws.items() if name != law]
+    advantage = _advantage(fit, others[0]) if others else abs(lead)
+    _check_fit(fit, captures)
+    best = with_mismatch_error(fit, pixels, theta_v, spread.relative_error)
+    tell("fitting positions", 0.6)
+    fits = [
+        fit_events(pool_events(static, good, known, k), theta_v, law, best.parameters, best.free)
+        for k in range(static.tile[0] * static.tile[1])
+    ]
+    if thresholds is not None and steps is not None and captures.spec.contrast_of == "signal":
+        thresholds = _with_conversion_error(thresholds, steps.signal_dn, best)
+    if thresholds is not None:
+        best, *fits = (_with_sampling_error(fit, thresholds, good) for fit in (best, *fits))
+    tell("200 starts", 0.8)
+    averaged = pool_events(static, good, PixelThresholds.unknown(good.shape, spread.value))
+    ends, errors = multi_start(averaged, best, theta_v, seed)
+    return EvsCalibration(
+        static=static,
+        defects=classify(static, bad, steps),
+        theta_v=theta_v,
+        known=known,
+        plain=averaged,
+        together=best,
+        fits=fits,
+        advantage=advantage,
+        dispersion=dispersion_in_time(pixels, best, theta_v),
+        mismatch=spread,
+        thresholds=thresholds,
+        steps=steps,
+        thresholds_reason=reason,
+        starts=ends,
+        starts_standard_error=errors,
+    )
+
+
+def _measured_thresholds(
+    captures: CaptureSet, steps: Steps, fit: EventFit, good: NDArray[np.bool_]
+) -> tuple[Thresholds | None, str]:
+    """Thresholds from the steps, or why they do not tell them."""
+    step = step_in_ln(captures, steps, fit)
+    if step is None:
+        return None, "contrast is of the signal, and the static data do not tell the A/B that turns it into voltage"
+    reason = why_not(steps)
+    return (None, reason) if reason else (fit_thresholds(steps, step, good), "")
+
+
+def _likelier(laws: dict[Law, EventFit]) -> Law:
+    """The sqrt law where it describes the counts decisively better; else the paper's."""
+    if len(laws) == 1:
+        return next(iter(laws))
+    return "sqrt" if _advantage(laws["sqrt"], laws["linear"]) > DECISIVE else "linear"
+
+
+def _advantage(one: EventFit, other: EventFit) -> float:
+    """Log-likelihood of one fit above another's, in units of the scatter of the counts."""
+    return (one.log_likelihood - other.log_likelihood) / min(max(one.design_effect, other.design_effect), 1e3)
+
+
+def _check_brightness(static: StaticCapture, good: NDArray[np.bool_], captures: CaptureSet) -> None:
+    signal = static.signal_dn[good]
+    if np.ptp(signal) <= 1e-6 * max(float(np.abs(signal).max()), 1e-12) and (
+        len(static.sessions) == 1 or signal.max() == 0
+    ):
+        raise SpecError(
+            "the static capture holds one brightness and nothing to compare it with; capture a ramp of brightness, "
+            "and the dark",
+            file=captures.folder / "evs_static.npz",
+        )
+    for _, on, off in static.sessions:
+        if max(on[good].mean(), off[good].mean()) > 0.5 * static.trials:
+            raise SpecError(
+                "more than half of the trials have an event, beyond the reach of noise alone; raise the threshold",
+                file=captures.folder / "evs_static.npz",
+            )
+
+
+def _check_fit(fit: EventFit, captures: CaptureSet) -> None:
+    """No parameters are given where they mean nothing."""
+    if fit.goodness.per_dof > NO_FIT:
+        raise SpecError(
+            f"neither shot law describes these counts (χ²/dof is {fit.goodness.per_dof:.3g} at best); check that "
+            "signal_dn is the clean signal of a scene that stands still, and that n_trials counts every tick",
+            file=captures.folder / "evs_static.npz",
+        )
+
+
+def _with_sampling_error(fit: EventFit, thresholds: Thresholds, good: NDArray[np.bool_]) -> EventFit:
+    """Adds what the mean of the measured thresholds lacks: they are relative to that of these pixels, not of all such.
+
+    A and B go with the mean of both polarities, ρ with their difference.
+    """
+    on, off = (values[good].astype(np.float64) for values in (thresholds.pixel_on, thresholds.pixel_off))
+    scale = thresholds.spread.value**2 / max((on.var() + off.var()) / 2, 1e-30)  # without the estimates' own noise
+    covariance = fit.covariance.copy()
+    both, apart = (min(scale, 1.0) * float(np.var((on + sign * off) / 2)) / on.size for sign in (1, -1))
+    change = np.where(fit.free, np.array([*fit.values[:2], 0, 0, 0, 0]), 0.0)
+    covariance += both * np.outer(change, change)
+    covariance[4, 4] += apart if fit.free[4] else 0.0
+    return replace(fit, covariance=covariance)
+
+
+def _with_conversion_error(thresholds: Thresholds, signal_dn: float, fit: EventFit) -> Thresholds:
+    """Adds what the error of r = A/B does to θ₊ and θ₋ where contrasts of the signal were turned into voltage.
+
+    S = ln((r I₀ eᶜ + 1)/(r I₀ + 1)) gives ∂S/∂ln r = r I₀ eᶜ/(r I₀ eᶜ + 1) − r I₀/(r I₀ + 1), at S = θ₊ and −θ₋.
+    """
+    a, b = fit.values[:2]
+    relative = fit.covariance[:2, :2] / np.outer([a, b], [a, b])
+    variance = relative[0, 0] + relative[1, 1] - 2 * relative[0, 1]
+    x0 = a / b * signal_dn + 1
+    step = np.array([thresholds.theta_on, -thresholds.theta_off])
+    change = np.zeros(4)
+    change[:2] = np.array([1, -1]) * (1 / x0 - 1 / (x0 * np.exp(step)))
+    return replace(thresholds, covariance=thresholds.covariance + variance * np.outer(change, change))
+
+
+def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.float64] | None:
+    """S = ln x₁/x₀ of each contrast; a contrast of the signal needs A/B, None where they are not identified."""
+    if captures.spec.contrast_of == "voltage":
+        return steps.contrast
+    if not (fit.identified("A") and fit.identified("B")):
+        return None
+    a, b = fit.values[:2]
+    return np.log((a * steps.signal_dn * np.exp(steps.contrast) + b) / (a * steps.signal_dn + b))
+
+
+def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray[np.float64]:
+    """Standard errors [4] of A, B, C, D from resampling the pixels (Poisson bootstrap); that of θ is not in them."""
+    rng = np.random.default_rng(seed + 1)
+    good, fit = ~result.bad, result.together
+    values = []
+    for _ in range(samples):
+        weight = rng.poisson(1.0, good.shape)
+        pixels = pool_events(result.static, good & (weight > 0), result.known, None, weight)
+        values.append(fit_events(pixels, result.theta_v, fit.law, fit.parameters, fit.free).values[:4])
+    return np.std(values, axis=0, ddof=1)

@@ -1,0 +1,191 @@
+"""Event counts of pixels that are alike: in brightness, in polarity and in threshold where that was measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.evs.counts import StaticCapture
+
+#: Bins even in brightness and, down to `_LEAST_SIGNAL` of the brightest, in its logarithm.
+_BINS, _LOG_BINS, _LEAST_SIGNAL = 192, 480, 1e-4
+#: Width of a bin of relative thresholds; what they vary within a bin counts as spread.
+_THRESHOLD_STEP = 0.01
+
+
+@dataclass(frozen=True)
+class PixelThresholds:
+    """What is known of each pixel's thresholds; arrays [row, col].
+
+    Attributes
+    ----------
+    on, off : expected threshold relative to the mean of all pixels.
+    on_spread, off_spread : relative standard deviation that is left about it (the mismatch where nothing is known).
+    """
+
+    on: NDArray[np.float64]
+    off: NDArray[np.float64]
+    on_spread: NDArray[np.float64]
+    off_spread: NDArray[np.float64]
+
+    @classmethod
+    def unknown(cls, shape: tuple[int, ...], mismatch: float) -> PixelThresholds:
+        one, spread = np.ones(shape), np.full(shape, mismatch)
+        return cls(one, one, spread, spread)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Sums over the pixels of a cell; arrays [cell].
+
+    Attributes
+    ----------
+    signal_dn : mean signal. polarity : +1 ON, −1 OFF.
+    relative, spread : mean of the pixels' relative thresholds, and the rms of what is left about it.
+    pixels : how many they are. events : of that polarity, of all of them. trials : of one pixel.
+    """
+
+    signal_dn: NDArray[np.float64]
+    polarity: NDArray[np.float64]
+    relative: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    events: NDArray[np.float64]
+    trials: int
+
+    @property
+    def total(self) -> NDArray[np.float64]:
+        """Trials of all pixels of a cell."""
+        return self.pixels * self.trials
+
+    def coarser(self, most: int = 150) -> Cells:
+        """At most so many cells of each polarity: neighbours in brightness together. For searches, not for results."""
+        order = np.lexsort((self.signal_dn, self.polarity))
+        pixels = self.pixels[order]
+        rank = np.concatenate(
+            [np.arange(n) * min(most / n, 1.0) for n in np.unique(self.polarity, return_counts=True)[1]]
+        )
+        _, group = np.unique(np.stack([self.polarity[order], np.floor(rank)]), axis=1, return_inverse=True)
+        total = np.bincount(group, pixels).astype(np.float64)
+
+        def mean(values: NDArray) -> NDArray[np.float64]:
+            return np.bincount(group, values[order] * pixels) / np.maximum(total, 1e-30)
+
+        relative = mean(self.relative)
+        spread = np.sqrt(np.maximum(mean(self.spread**2 + self.relative**2) - relative**2, 0.0))
+        events = np.bincount(group, self.events[order]).astype(np.float64)
+        return Cells(mean(self.signal_dn), mean(self.polarity), relative, spread, total, events, self.trials)
+
+    def with_spread(self, factor: float) -> Cells:
+        """The same with the spread of thresholds scaled."""
+        return replace(self, spread=self.spread * factor)
+
+
+@dataclass(frozen=True)
+class PixelCounts:
+    """Good pixels in flat arrays, with the cell each of their counts is a part of.
+
+    Attributes
+    ----------
+    signal_dn, position : [pixel]. weight : [pixel], how often a pixel counts, None for once.
+    counts, polarity, is_dark : [count, pixel], [count], [count]; ON and OFF of the lit scene and of the dark.
+    relative, spread : [count, pixel], of the thresholds, as in `PixelThresholds`.
+    cell : [count, pixel], number of the cell.
+    cells : what they sum up to.
+    """
+
+    signal_dn: NDArray[np.float64]
+    position: NDArray[np.intp]
+    weight: NDArray[np.float64] | None
+    counts: NDArray[np.float64]
+    polarity: NDArray[np.float64]
+    is_dark: NDArray[np.bool_]
+    relative: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    cell: NDArray[np.intp]
+    cells: Cells
+
+    def single(self, count: int) -> Cells:
+        """One of the counts with every pixel a cell of its own."""
+        one = np.ones(self.signal_dn.shape)
+        return Cells(
+            signal_dn=np.zeros_like(one) if self.is_dark[count] else self.signal_dn,
+            polarity=self.polarity[count] * one,
+            relative=self.relative[count].astype(np.float64),
+            spread=self.spread[count].astype(np.float64),
+            pixels=one,
+            events=self.counts[count],
+            trials=self.cells.trials,
+        )
+
+
+def brightness_edges(signal_dn: NDArray) -> NDArray[np.float64]:
+    """Inner edges of bins of brightness: 0.5 % of the range, 2 % of the brightness, 1 % of the pixels at most.
+
+    P at a bin's mean brightness is the mean of P to 1 in a thousand even where it changes fastest with brightness.
+    """
+    low, high = float(signal_dn.min()), float(signal_dn.max())
+    sample = signal_dn[:: max(1, signal_dn.size // 20000)]
+    even = np.linspace(low, high, _BINS + 1), np.quantile(sample, np.linspace(0, 1, _BINS // 2 + 1))
+    ratios = np.geomspace(_LEAST_SIGNAL, 1.0, _LOG_BINS + 1) * high
+    return np.unique(np.concatenate([*even, ratios[ratios > low]]))[1:-1]
+
+
+def pool_events(
+    static: StaticCapture,
+    good: NDArray[np.bool_],
+    thresholds: PixelThresholds,
+    position: int | None = None,
+    weight: NDArray | None = None,
+) -> PixelCounts:
+    """Sort the counts of good pixels into cells; the dark is a brightness of its own.
+
+    Parameters
+    ----------
+    position : number of the tile position whose pixels are taken; None for all.
+    weight : [row, col], how often a pixel counts (bootstrap).
+    """
+    edges = brightness_edges(static.signal_dn[good])
+    take = good if position is None else good & (static.position == position)
+    signal = static.signal_dn[take]
+    weights = None if weight is None else weight[take].astype(np.float64)
+    bright = np.searchsorted(edges, signal, side="right")
+    counts, polarities, is_dark, relatives, spreads, index = [], [], [], [], [], []
+    columns: list[list[NDArray]] = [[] for _ in range(6)]
+    number = 0
+    for session, (light, *both) in enumerate(static.sessions):
+        for polarity, events, relative, spread in zip(
+            (1.0, -1.0), both, (thresholds.on, thresholds.off), (thresholds.on_spread, thresholds.off_spread),
+            strict=True,
+        ):  # fmt: skip
+            x, r, left, n = light[take], relative[take], spread[take], events[take].astype(np.float64)
+            alike = np.rint(r / _THRESHOLD_STEP).astype(np.intp)
+            alike -= alike.min(initial=0)
+            key = alike if session else bright * (alike.max(initial=0) + 1) + alike
+            _, cell = np.unique(key, return_inverse=True)
+            pixels = np.bincount(cell, weights).astype(np.float64)
+            least = np.maximum(pixels, 1e-30)
+
+            def mean(values: NDArray, cell: NDArray = cell, least: NDArray = least) -> NDArray[np.float64]:
+                return np.bincount(cell, values if weights is None else values * weights) / least
+
+            centre = mean(r)
+            within = np.sqrt(mean(left * left + (r - centre[cell]) ** 2))
+            values = mean(x), np.full(pixels.size, polarity), centre, within, pixels, mean(n) * least
+            for column, value in zip(columns, values, strict=True):
+                column.append(value)
+            counts.append(n)
+            polarities.append(polarity)
+            is_dark.append(session > 0)
+            relatives.append(r.astype(np.float32))
+            spreads.append(left.astype(np.float32))
+            index.append(cell + number)
+            number += pixels.size
+    signals, signs, centres, withins, numbers, events = (np.concatenate(column) for column in columns)
+    cells = Cells(signals, signs, centres, withins, numbers, events, static.trials)
+    return PixelCounts(
+        signal, np.broadcast_to(static.position, good.shape)[take], weights, np.stack(counts), np.array(polarities),
+        np.array(is_dark), np.stack(relatives), np.stack(spreads), np.stack(index), cells,
+    )  # fmt: skip

@@ -1,0 +1,136 @@
+"""Whether counts of events are as their model supposes: one law of noise in static counts and in steps alike.
+
+Each check has a chance of `finding.ALARM` to speak of counts that are. What is significant but too small to matter is
+not told.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import norm
+
+from hesim_render.calibrate.evs.analysis import EvsCalibration
+from hesim_render.calibrate.evs.curve_levels import CurveLevels, curve_levels
+from hesim_render.calibrate.evs.model import threshold_over_noise
+from hesim_render.calibrate.finding import ALARM, Finding
+
+#: Floor (chance per trial) and loss of events from which they are told.
+_LEAST_FLOOR, _LEAST_LOSS = 1e-5, 1e-3
+#: Relative error of the width of the S-curve beside its own: the curve is taken as one normal law whose width changes
+#: in proportion to the step, which is off by 1.5 % at θ = 0.2.
+_MODEL_ERROR = 0.02
+#: Standard errors apart from which two searches end at different points.
+_APART = 0.3
+
+
+def check_events(result: EvsCalibration, contrast_of: str) -> tuple[list[Finding], CurveLevels | None]:
+    """Every check of the events, and the levels of the S-curves where they were captured."""
+    found = [_counts(result), _starts(result)]
+    levels = None
+    if result.thresholds is not None and result.steps is not None:
+        levels = curve_levels(result.steps, result.thresholds)
+        found += [_ceiling(levels), _floor(result, levels), _width(result, contrast_of)]
+    return [f for f in found if f is not None], levels
+
+
+def _counts(result: EvsCalibration) -> Finding | None:
+    """χ² of the static counts by brightness, of all positions together and of each."""
+    of_each = [one.goodness.p_value for one in result.fits]
+    p_value = min(1.0, 2 * min(result.together.goodness.p_value, len(of_each) * min(of_each)))
+    if p_value > ALARM:
+        return None
+    return Finding(
+        "event counts",
+        f"the static counts are not the model's by brightness, χ²/dof {result.together.goodness.per_dof:.3g}. A … D "
+        "are off. Look at the curves of P against brightness: events that come by themselves, noise with longer tails "
+        "than a normal law, a scene that moves, or a signal_dn that is not that of the event pixels.",
+        p_value,
+    )
+
+
+def _starts(result: EvsCalibration) -> Finding | None:
+    """Searches from other starts that end elsewhere: several fits describe the counts about as well."""
+    free = np.array(result.together.free[:4]) & (result.starts_standard_error > 0)
+    away = np.abs(result.starts - np.median(result.starts, axis=0))[:, free] / result.starts_standard_error[free]
+    apart = np.any(away > _APART, axis=1)
+    if not apart.any():
+        return None
+    return Finding(
+        "starts",
+        f"{int(apart.sum())} of {apart.size} searches from other starts end elsewhere, by up to {away.max():.2g} "
+        "standard errors: the counts do not tell A … D in one way only. Capture more trials, and brighter scenes.",
+        None,
+    )
+
+
+def _ceiling(levels: CurveLevels) -> Finding | None:
+    value, error = levels.ceiling
+    p_value = float(norm.sf((1 - value) / max(error, 1e-12)))
+    if p_value > ALARM or 1 - value < _LEAST_LOSS:
+        return None
+    return Finding(
+        "S-curve ceiling",
+        f"steps far beyond the threshold give an event in {value:.4f} ± {error:.1g} of the trials, not in all. "
+        "Thresholds and their mismatch are off. Events are lost (look at the read-out's bandwidth, and at arbitration "
+        "when all pixels step at once: step fewer of them), or trials are counted that had no step.",
+        p_value,
+    )
+
+
+def _floor(result: EvsCalibration, levels: CurveLevels) -> Finding | None:
+    """Events of steps the other way; ON beyond what leaks."""
+    fit = result.together
+    leak, leak_error = (fit.values[5], np.sqrt(max(fit.covariance[5, 5], 0.0))) if fit.free[5] else (0.0, 0.0)
+    found = []
+    for name, (value, error), own, own_error in (
+        ("ON", levels.floor_on, leak, leak_error), ("OFF", levels.floor_off, 0.0, 0.0),
+    ):  # fmt: skip
+        p_value = 4 * float(norm.sf(abs(value - own) / max(float(np.hypot(error, own_error)), 1e-12)))
+        if p_value < ALARM and abs(value - own) > _LEAST_FLOOR and value > 0:
+            found.append((name, value, p_value))
+    if not found:
+        return None
+    rates = " and ".join(f"{value:.2g} ({name})" for name, value, _ in found)
+    return Finding(
+        "S-curve floor",
+        f"steps away from the threshold still give events, in {rates} of the trials, beyond leak. A … D, which take "
+        "the rarest counts for noise, are off. Look for events that come by themselves (hot neighbours, crosstalk, "
+        "read-out noise, moving objects) or noise with longer tails than a normal law.",
+        min(p for _, _, p in found),
+    )
+
+
+def _width(result: EvsCalibration, contrast_of: str) -> Finding | None:
+    """Noise by the width of the S-curve against noise by the static counts."""
+    thresholds, steps, fit = result.thresholds, result.steps, result.together
+    # without C the static counts do not tell the noise in the light of the steps
+    if thresholds is None or steps is None or not all(fit.identified(name) for name in "ABC"):
+        return None
+    theta = thresholds.theta
+    measured, error = thresholds.noise
+    signals = np.array([steps.signal_dn])
+    if contrast_of == "signal":
+        # σ_n² = s₀²/x₀² + s₁²/x₁² at the steps that reach θ₊ and −θ₋, of which static counts at I₀ and I₁ tell 2 s²/x²
+        a, b = fit.values[:2]
+        reach = np.exp([thresholds.theta_on, -thresholds.theta_off])
+        after = np.maximum(((a * steps.signal_dn + b) * reach - b) / a, 0.0)
+        signals = np.concatenate([signals, signals, after])
+    elif thresholds.width**2 > (thresholds.spread.value * theta) ** 2:
+        measured = float(np.sqrt(thresholds.width**2 - (thresholds.spread.value * theta) ** 2))
+    u, _ = threshold_over_noise(fit.parameters, signals, result.theta_v, fit.law)
+    expected = theta * float(np.sqrt(np.mean(1 / u**2)))
+    if not 0 < 4 * error < measured:
+        return None
+    own = float(np.sqrt(fit.covariance[1, 1])) / fit.values[1]
+    spread = float(np.hypot(np.hypot(error / measured, own), _MODEL_ERROR))
+    z = float(np.log(measured / expected)) / spread
+    p_value = 2 * float(norm.sf(abs(z)))
+    if p_value > ALARM:
+        return None
+    return Finding(
+        "S-curve width",
+        f"the width of the S-curve asks for noise of {measured:.3g} (ln), the static counts for {expected:.3g}: they "
+        "are not of one normal law. A … D hold for the static counts at best, and θ/σ does not. Look for noise with "
+        "longer tails than a normal law, events that come by themselves, or steps captured at another light or bias.",
+        p_value,
+    )

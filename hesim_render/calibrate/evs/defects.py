@@ -1,0 +1,175 @@
+"""Event pixels unlike the others: found by what no threshold within their spread could give, and named by how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+from scipy.stats import binom, poisson
+
+from hesim_render.calibrate.evs.counts import StaticCapture
+from hesim_render.calibrate.evs.medians import (
+    LEAST_EVENTS,
+    by_group,
+    density,
+    like_brightness,
+    middle_and_spread,
+    spread_of_thresholds,
+)
+from hesim_render.calibrate.evs.steps import Steps
+from hesim_render.calibrate.evs.thresholds import Thresholds, totals_of
+
+#: Chance with which a good pixel's count may be called bad, and the part of the spread allowed for.
+_CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06
+#: Fewest pixels from which the spread of a difference is taken.
+_FEWEST = 200
+#: Standard errors by which counts of one pixel differ where it does not stay as it is.
+_SIGMAS = 6.0
+
+
+class Defect(IntEnum):
+    """What a pixel does; values are those of the map ``defect``."""
+
+    NONE = 0
+    STUCK = 1  # gives no event at all
+    HOT = 2  # gives events at a steady rate of its own
+    FLICKERING = 3  # gives events at a rate that comes and goes
+    OTHER = 4  # its counts are unlike those of any threshold; nothing more is known
+
+
+@dataclass(frozen=True)
+class EventDefects:
+    """Bad event pixels; maps [row, col].
+
+    Attributes
+    ----------
+    bad : all of them. kind : uint8, `Defect`.
+    on, off : events per trial of hot and flickering ones beyond what a good pixel gives, 0 elsewhere.
+    """
+
+    bad: NDArray[np.bool_]
+    kind: NDArray[np.uint8]
+    on: NDArray[np.float32]
+    off: NDArray[np.float32]
+
+    def count(self, kind: Defect) -> int:
+        return int(np.sum(self.kind == kind))
+
+
+def bad_event_pixels(static: StaticCapture) -> NDArray[np.bool_]:
+    """Pixels [row, col] whose counts no threshold within the spread of the others could give.
+
+    Pixels are compared with those of like brightness. The spread of thresholds is taken from quartiles, so that bad
+    pixels do not widen it. A pixel is bad where a threshold 6 spreads (6 % at least) away would give its count with
+    a chance below 1e-7, or where its two thresholds differ by so much.
+    """
+    known = np.isfinite(static.signal_dn)
+    bad = ~known
+    spread = spread_of_thresholds(static, known)
+    reach = max(_LEAST_REACH, _SPREADS * spread)
+    for signal, *both in static.sessions:
+        group = like_brightness(signal[known])
+        middle, _ = middle_and_spread([counts[known] for counts in both], group, static.trials, spread)
+        for u, counts in zip(middle, both, strict=True):
+            bad[known] |= _out_of_reach(counts[known], group, static.trials, u, reach)
+        bad[known] |= _apart([counts[known] for counts in both], group, static.trials, middle)
+    return bad
+
+
+def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reach: float) -> NDArray[np.bool_]:
+    high, low = ndtr(-u * max(1 - reach, 0.0)), ndtr(-u * (1 + reach))
+    # Only counts far off need the exact tail.
+    margin = 4.0
+    h, w = (trials * high)[group], (trials * low)[group]
+    found = np.zeros(counts.shape, bool)
+    over, under = counts > h + margin * np.sqrt(h), counts < w - margin * np.sqrt(w)
+    found[over] = binom.sf(counts[over] - 1, trials, high[group[over]]) < _CHANCE
+    found[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE
+    return found
+
+
+def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArray]) -> NDArray[np.bool_]:
+    """Pixels whose thresholds of ON and OFF differ from each other as those of no other do."""
+    found = np.zeros(group.shape, bool)
+    enough = np.all([counts >= LEAST_EVENTS for counts in both], axis=0)
+    rate = [(counts[enough] + 0.5) / (trials + 1) for counts in both]
+    t = [-ndtri(r) for r in rate]
+    noise = sum(r * (1 - r) / trials / np.maximum(density(x), 1e-12) ** 2 for r, x in zip(rate, t, strict=True))
+    u = (middle[0] + middle[1])[group[enough]] / 2
+    usable = u > 0.3
+    if usable.sum() < _FEWEST:
+        return found
+    difference = (t[0] - t[1] - (middle[0] - middle[1])[group[enough]])[usable] / u[usable]
+    own = np.sqrt(noise[usable]) / u[usable]
+    low, centre, high = np.quantile(difference, [0.16, 0.5, 0.84])
+    spread = np.sqrt(max(((high - low) / 2) ** 2 - float(np.median(own**2)), 0.0))
+    limit = max(_LEAST_REACH, _SPREADS * spread) + _SIGMAS * own
+    found[np.flatnonzero(enough)[usable]] = np.abs(difference - centre) > limit
+    return found
+
+
+def bad_in_steps(steps: Steps, thresholds: Thresholds, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Good pixels [row, col] whose events over all steps no threshold within the spread could give."""
+    found = np.zeros(good.shape, bool)
+    for polarity, total, mismatch in (
+        (1.0, steps.on_total, thresholds.mismatch_on), (-1.0, steps.off_total, thresholds.mismatch_off),
+    ):  # fmt: skip
+        reach = max(_LEAST_REACH, _SPREADS * mismatch)
+        # the sum of binomial counts scatters less than a Poisson one of its mean
+        most, least = totals_of(thresholds, polarity, np.array([1 - reach, 1 + reach]), steps.trials)
+        found |= good & ((poisson.sf(total - 1, most) < _CHANCE) | (poisson.cdf(total, least) < _CHANCE))
+    apart = (thresholds.pixel_on - thresholds.pixel_off).astype(np.float64)
+    noise = np.hypot(thresholds.noise_on, thresholds.noise_off).astype(np.float64)
+    low, centre, high = np.quantile(apart[good], [0.16, 0.5, 0.84])
+    spread = np.sqrt(max(((high - low) / 2) ** 2 - float(np.median(noise[good] ** 2)), 0.0))
+    return found | (good & (np.abs(apart - centre) > max(_LEAST_REACH, _SPREADS * spread) + _SIGMAS * noise))
+
+
+def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None) -> EventDefects:
+    """Name the bad pixels: stuck, hot, flickering, or nothing of that kind.
+
+    A stuck pixel gives no event in any capture. A hot or a flickering one gives more than a thousandth of the good
+    pixels of its brightness ever do; the hot one as many per trial in the dark as in the light.
+    """
+    kind = np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE))
+    on_rate, off_rate = np.zeros((2, *bad.shape), np.float32)
+    if not bad.any():
+        return EventDefects(bad, kind, on_rate, off_rate)
+    events = np.zeros(int(bad.sum()), np.int64)
+    rates, excess = [], []
+    for signal, on, off in static.sessions:
+        both = np.stack([on[bad], off[bad]]).astype(np.float64)
+        top = _usual_most(signal, on + off, bad)
+        excess.append(both.sum(axis=0) > top + _SIGMAS * np.sqrt(top + 1))
+        rates.append(both / static.trials)
+        events += (on + off)[bad]
+    over, steady = np.any(excess, axis=0), np.all(excess, axis=0)
+    if len(rates) > 1:
+        # what its light gives comes on top of a hot pixel's own events: a tenth is allowed for that
+        apart = np.abs(rates[0] - rates[1]).sum(axis=0)
+        counting = np.sqrt((rates[0] + rates[1]).sum(axis=0) / static.trials)
+        steady &= apart < _SIGMAS * counting + 0.1 * np.minimum(rates[0], rates[1]).sum(axis=0)
+    silent = events == 0
+    if steps is not None:
+        silent &= (steps.on_total[bad] + steps.off_total[bad]) == 0
+    named = np.full(events.shape, np.uint8(Defect.OTHER))
+    named[over] = np.where(steady[over], np.uint8(Defect.HOT), np.uint8(Defect.FLICKERING))
+    named[silent] = Defect.STUCK
+    kind[bad] = named
+    on_rate[bad], off_rate[bad] = np.where(over, np.mean(rates, axis=0), 0.0)
+    return EventDefects(bad, kind, on_rate, off_rate)
+
+
+def _usual_most(signal: NDArray, counts: NDArray, bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """For each bad pixel, what only a thousandth of the good pixels of its brightness exceed."""
+    good = ~bad & np.isfinite(signal)
+    group = like_brightness(signal[good])
+    most = np.array([np.quantile(part, 0.999) for part in by_group(counts[good], group)])
+    light = np.array([part.max() for part in by_group(signal[good], group)])
+    # a pixel whose brightness is not known is compared with the busiest
+    here = np.where(np.isfinite(signal[bad]), signal[bad], np.inf)
+    place = np.minimum(np.searchsorted(light, here), most.size - 1)
+    return np.where(np.isfinite(here), most[place], most.max())

@@ -1,0 +1,219 @@
+"""What an EVS calibration writes: the section of ``calibration.yaml``, its maps and what the report draws."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.evs.analysis import DECISIVE, EvsCalibration
+from hesim_render.calibrate.evs.cells import Cells, PixelThresholds, pool_events
+from hesim_render.calibrate.evs.checks import check_events
+from hesim_render.calibrate.evs.counts import StaticCapture
+from hesim_render.calibrate.evs.fitted import EventFit
+from hesim_render.calibrate.evs.model import both_probabilities
+from hesim_render.calibrate.evs.thresholds import curve
+from hesim_render.recording.capture_set import CaptureSet
+
+_FIGURE_PX = 320
+#: Most bins of a histogram of counts.
+_BINS = 64
+_UNITS = {"A": "1/(V DN)", "B": "1/V", "C": "1/DN", "D": ""}
+_MODEL = (
+    "theta/sigma_n = Theta (A I + B) / sqrt(2 (1 + 2 D y + y^2)), y = C I (linear) or C sqrt(I) (sqrt); "
+    "P = Q(theta/sigma_n), over the thresholds' mismatch"
+)
+
+
+def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | None) -> dict[str, Any]:
+    """The section ``evs``; a parameter the data do not tell is null, with its reason."""
+    fit, spread, thresholds = result.together, result.dispersion, result.thresholds
+    other = "sqrt" if fit.law == "linear" else "linear"
+    tile = result.static.tile
+    theta = not_identifiable(result.thresholds_reason)
+    findings, levels = check_events(result, captures.spec.contrast_of)
+    section: dict[str, Any] = {
+        "findings": [finding.described() for finding in findings],
+        "model": _MODEL,
+        "theta_hardware_v": captures.spec.theta_hardware_v
+        or not_identifiable("not stated in capture.yaml; 1 V is taken as its unit"),
+        "shot_law": fit.law,
+        "shot_law_log_likelihood": {
+            fit.law: fit.log_likelihood,
+            other: fit.log_likelihood - result.advantage,
+            "decisive": bool(abs(result.advantage) > DECISIVE and fit.identified("C")),
+        },
+        **_parameters(fit),
+        "positions": [
+            {"tile_position": list(divmod(k, tile[1])), **_parameters(one)} for k, one in enumerate(result.fits)
+        ],
+        **_gauge(result),
+    }
+    if thresholds is None:
+        section |= {"theta": theta, "theta_on": theta, "theta_off": theta}
+    else:
+        error = np.sqrt(np.diag(thresholds.covariance))
+        section |= {
+            "theta": estimated(thresholds.theta, thresholds.theta_error, "ln"),
+            "theta_on": estimated(thresholds.theta_on, error[0], "ln"),
+            "theta_off": estimated(thresholds.theta_off, error[1], "ln"),
+        }
+    if levels is not None:
+        section["s_curve"] = {
+            name: estimated(value, error, "events per trial") for name, (value, error) in vars(levels).items()
+        }
+    section["threshold_mismatch"] = result.mismatch.described() | {
+        "from": "static counts" if thresholds is None else "steps"
+    }
+    rho, leak = fit.values[4:]
+    error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
+    absent = "not significant (likelihood ratio at 1e-3): the model without it is kept"
+    section["asymmetry"] = estimated(rho, error[4]) if fit.free[4] else {"value": 0.0, "note": absent}
+    section["leak_per_trial"] = (
+        estimated(leak, error[5], "ON events") if fit.free[5] else {"value": 0.0, "note": absent}
+    )
+    hidden = "hidden behind the mismatch of thresholds, or too few events"
+    section["dispersion"] = {
+        name: estimated(value, error) if np.isfinite(value) else not_identifiable(hidden)
+        for name, value, error in (
+            ("temporal", spread.total, spread.total_error),
+            ("temporal_difference", spread.difference, spread.difference_error),
+        )
+    }
+    section["dispersion"]["standard_errors"] = "sandwich"
+    section["dispersion"]["design_effect"] = fit.design_effect
+    section["goodness"] = {
+        "chi2_per_dof": fit.goodness.per_dof,
+        "dof": fit.goodness.dof,
+        "p_value": fit.goodness.p_value,
+        "positions_chi2_per_dof": [one.goodness.per_dof for one in result.fits],
+        "positions_p_value": [one.goodness.p_value for one in result.fits],
+    }
+    section["signal_range_dn"] = [float(np.nanmin(result.static.signal_dn)), float(np.nanmax(result.static.signal_dn))]
+    section["trials"] = result.static.trials
+    section["bad_pixels"] = int(result.bad.sum())
+    scatter = np.ptp(result.starts, axis=0) / result.starts_standard_error
+    section["multi_start"] = {
+        "starts": len(result.starts),
+        "largest_difference_in_standard_errors": [s if ok else None for s, ok in zip(scatter, fit.free, strict=False)],
+    }
+    if bootstrap is not None:
+        section["bootstrap_standard_error"] = {
+            name: e if ok else None for name, e, ok in zip("ABCD", bootstrap, fit.free, strict=False)
+        }
+    return section
+
+
+def _parameters(fit: EventFit) -> dict[str, Any]:
+    error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
+    return {
+        name: estimated(fit.values[k], error[k], _UNITS[name])
+        if fit.identified(name)
+        else not_identifiable(fit.reasons.get(name, "not told by the data"))
+        for k, name in enumerate("ABCD")
+    }
+
+
+def _gauge(result: EvsCalibration) -> dict[str, Any]:
+    """β of each position in a fixed gauge, standard errors by the delta method."""
+    known = result.thresholds is not None
+    theta0 = result.thresholds.theta / result.theta_v if result.thresholds is not None else 1.0
+    theta0_error = result.thresholds.theta_error / result.theta_v if result.thresholds is not None else 0.0
+    betas, errors = [], []
+    for fit in result.fits:
+        a, b, c, d = fit.values[:4]
+        jacobian = np.zeros((6, 5))  # rows β0 … β5, columns A, B, C, D, β0
+        jacobian[0, 4] = 1.0
+        jacobian[1, :2] = 1 / b, -a / b**2
+        jacobian[3, [1, 2, 4]] = -c * theta0 / b**2, theta0 / b, c / b
+        jacobian[4, [1, 4]] = -theta0 / b**2, 1 / b
+        jacobian[5, 3] = 1.0
+        covariance = np.zeros((5, 5))
+        covariance[:4, :4] = fit.covariance[:4, :4]
+        covariance[4, 4] = theta0_error**2
+        error = np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0))
+        a_told, b_told, c_told, d_told = (fit.identified(name) for name in "ABCD")
+        told = [True, a_told and b_told, True, c_told and b_told, b_told, d_told]
+        values = [theta0, a / b, 1.0, c * theta0 / b, theta0 / b, d]
+        betas.append([v if ok else None for v, ok in zip(values, told, strict=True)])
+        errors.append([e if ok else None for e, ok in zip(error, told, strict=True)])
+    return {
+        "gauge": "beta2 = 1 V; beta0 = theta/Theta"
+        + ("" if known else " = 1, as theta was not measured: the response to contrast is not calibrated"),
+        "beta": betas,
+        "beta_standard_error": errors,
+    }
+
+
+def maps(result: EvsCalibration) -> dict[str, NDArray]:
+    """Map files of the section, and small arrays for the report (their names start with ``figure_``)."""
+    defects, static = result.defects, result.static
+    arrays: dict[str, NDArray] = {
+        "bad_pixels": result.bad, "defect": defects.kind, "defect_on_per_trial": defects.on,
+        "defect_off_per_trial": defects.off,
+    }  # fmt: skip
+    if result.thresholds is not None:
+        arrays["threshold_on_relative"] = result.thresholds.pixel_on
+        arrays["threshold_off_relative"] = result.thresholds.pixel_off
+    return arrays | _static_figures(result, static) | _step_figures(result)
+
+
+def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, NDArray]:
+    fit, good = result.together, ~result.bad
+    step = max(1, -(-max(static.n_on.shape) // _FIGURE_PX))
+    figures: dict[str, NDArray] = {
+        "figure_probability": ((static.n_on + static.n_off)[::step, ::step] / (2 * static.trials)).astype(np.float32)
+    }
+    figures["figure_rates"] = _rates(result.plain.cells)
+    top = float(figures["figure_rates"][:, 0].max())
+    line = np.unique(np.concatenate([np.linspace(0, top, 150), np.geomspace(1e-4 * top, top, 150)]))
+    on, off = both_probabilities(fit.parameters, line, result.theta_v, fit.law, result.mismatch.value)
+    figures["figure_rates_fit"] = np.stack([line, on, off], axis=1)
+    unknown = PixelThresholds.unknown(good.shape, result.mismatch.value)
+    figures["figure_position_rates"] = np.concatenate(
+        [
+            np.column_stack([np.full(len(rates), k), rates])
+            for k in range(len(result.fits))
+            for rates in [_rates(pool_events(static, good, unknown, k).cells)]
+        ]
+    )
+    figures["figure_position_fits"] = np.stack(
+        [
+            np.mean(both_probabilities(one.parameters, line, result.theta_v, one.law, result.mismatch.value), axis=0)
+            for one in result.fits
+        ]
+    )
+    for name, (_, on_map, off_map) in zip(("lit", "dark"), static.sessions, strict=False):
+        most = max(4, int(np.quantile(np.maximum(on_map, off_map)[good], 0.999) * 1.15))
+        # bins of whole counts, so that every bin can hold as many of them
+        wide = -(-(most + 1) // _BINS)
+        edges = np.arange(-(-(most + 1) // wide) + 1) * wide - 0.5
+        top = float(edges[-1])
+        figures[f"figure_on_off_{name}"] = np.histogram2d(off_map[good], on_map[good], bins=(edges, edges))[0]
+        figures[f"figure_on_off_{name}_top"] = np.array(top)
+    figures["figure_starts"] = result.starts
+    figures["figure_starts_error"] = result.starts_standard_error
+    return figures
+
+
+def _rates(cells: Cells) -> NDArray[np.float64]:
+    """Signal, ON and OFF events, and trials of either, of each brightness: rows [cell, 4]."""
+    on, off = cells.polarity > 0, cells.polarity < 0
+    return np.stack([cells.signal_dn[on], cells.events[on], cells.events[off], cells.total[on]], axis=1)
+
+
+def _step_figures(result: EvsCalibration) -> dict[str, NDArray]:
+    thresholds, steps = result.thresholds, result.steps
+    if thresholds is None or steps is None:
+        return {}
+    events = [counts.sum(axis=1) for counts in (steps.on, steps.off)]
+    line = np.linspace(thresholds.step.min(), thresholds.step.max(), 200)
+    return {
+        "figure_steps": np.stack([thresholds.step, *events], axis=1),
+        "figure_steps_trials": np.array(steps.trials_of_all),
+        "figure_steps_fit": np.stack(
+            [line, curve(thresholds.values, 1.0, line), curve(thresholds.values, -1.0, line)], axis=1
+        ),
+    }

@@ -1,0 +1,1 @@
+"""The HTML report of a calibration, and its drawings."""

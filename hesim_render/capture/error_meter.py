@@ -1,0 +1,80 @@
+"""How exact a render was, from its two independent halves, in units of the sensor's own noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+
+#: Values looked at of each picture, and bins of a decade of the histogram from the first bin's end on.
+_VALUES, _BINS, _FIRST, _DECADES = 1 << 15, 50, 1e-5, 10
+
+
+class ErrorMeter:
+    """Errors of the values of a run.
+
+    Half the difference of a value's two halves has the variance of the value's own error and, where rays are many, its
+    distribution. Of large pictures some values are looked at, the same in every picture.
+    """
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(_BINS * _DECADES + 2, np.int64)
+        self._square, self._values, self._pictures = 0.0, 0, 0
+        self._where: tuple[NDArray[np.int64], Any] | None = None
+
+    def add(
+        self,
+        half_a: Any,
+        half_b: Any,
+        noise: Callable[[NDArray[np.float64], NDArray[np.int64]], NDArray[np.float64]],
+    ) -> None:
+        """One picture.
+
+        Parameters
+        ----------
+        half_a, half_b : Dr.Jit Float [n], electrons; the same array where a source has no error of this kind.
+        noise : electrons [k] and places in the picture [k] → one standard deviation of the noise there, electrons.
+        """
+        import drjit as dr
+
+        types, count = jit(), dr.width(half_a)
+        if half_a is half_b or count == 0:
+            return
+        if self._where is None or self._where[0][-1] >= count or self._where[0].size < min(_VALUES, count):
+            chosen = np.random.default_rng(0).choice(count, min(_VALUES, count), replace=False)
+            place = np.sort(chosen)
+            self._where = place, types.UInt32(place.astype(np.uint32))
+        place, index = self._where
+        one, other = (np.array(dr.gather(types.Float, half, index), np.float64) for half in (half_a, half_b))
+        error = np.abs(one - other) / 2 / noise((one + other) / 2, place)
+        with np.errstate(divide="ignore"):
+            bins = np.floor(_BINS * np.log10(error / _FIRST)) + 1
+        self._counts += np.bincount(
+            np.clip(bins, 0, self._counts.size - 1).astype(np.int64), minlength=self._counts.size
+        )
+        self._square += float(np.sum(error * error))
+        self._values += error.size
+        self._pictures += 1
+
+    def as_dict(self, wanted: float | None = None) -> dict[str, float] | None:
+        """For the manifest, in units of noise; None where nothing was seen.
+
+        Parameters
+        ----------
+        wanted : error that was asked for.
+        """
+        if not self._values:
+            return None
+        lower = np.concatenate([[0.0], _FIRST * 10 ** (np.arange(self._counts.size - 1) / _BINS)])
+        cumulated = np.cumsum(self._counts)
+        found = {"rms": float(np.sqrt(self._square / self._values))}
+        for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
+            # the middle of the bin, which is 4.7 % wide
+            found[name] = float(lower[np.searchsorted(cumulated, part * cumulated[-1])] * 10 ** (0.5 / _BINS))
+        if wanted is not None:
+            found["share_above_wanted"] = float(self._counts[lower >= wanted * (1 - 1e-9)].sum() / self._values)
+        return found

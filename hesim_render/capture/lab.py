@@ -1,0 +1,253 @@
+"""A virtual calibration session: the captures a person with the sensor on a bench would make.
+
+Frames and events come from the same noise models and the same event stage as in a simulation; the light
+is that of `hesim_render.capture.bench`.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from hesim_render.capture.bench import Bench, set_up
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.core.npz import NpzWriter
+from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.core.progress import Progress
+from hesim_render.core.units import S_PER_US
+from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.specs.files import content_hash, list_names
+from hesim_render.specs.sensor import read_sensor
+
+CAPTURE_NAME = "capture.yaml"
+#: Exposure sets of the paper, µs. The longest dark set of its two sensors is taken for every sensor.
+DARK_EXPOSURES_US = (1000, 5000, 20000, 50000, 80000)
+LIT_EXPOSURES_US = (1000, 2000, 5000, 10000, 20000, 40000, 50000, 80000)
+
+#: S-curve: contrasts from −2 θ to 2 θ, the brightest of which is the target's brightest patch.
+_CONTRASTS, _REACH = 21, 2.0
+_LEAST_TRIALS = 50
+_FEWEST_FRAMES = 8
+_FRAME_WORK = 8  # a frame takes about as long as so many ticks
+
+
+def write_captures(
+    sensor: Sensor,
+    out: str | Path,
+    *,
+    frames: int = 64,
+    ticks: int = 20000,
+    seed: int = 7,
+    without: Sequence[str] = (),
+    dark_exposures_us: Sequence[int] = DARK_EXPOSURES_US,
+    lit_exposures_us: Sequence[int] = LIT_EXPOSURES_US,
+    illuminant: str = "D65",
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Hold a calibration session and write its capture set; it appears whole or not at all.
+
+    Parameters
+    ----------
+    sensor : from `load_sensor`; crop it to capture a part. Frames are streamed to disk: memory does not grow with
+        their number. Of a sensor with reference ``last_event`` only frames are captured: it makes no comparisons at
+        fixed times, so its counts have no probability per trial.
+    frames : per exposure, dark and lit.
+    ticks : comparisons counted on the static target, and as many in the dark; the S-curve takes a
+        hundredth of them, 50 at least, at each of 21 contrasts.
+    seed : of the temporal noise; every frame and tick of a session has its own number, so none repeats.
+    without : noise terms to switch off, as in `simulate`.
+    overwrite : replace a capture set that is there.
+    progress : called with (done, total, what).
+
+    Returns
+    -------
+    The folder, absolute.
+
+    Raises
+    ------
+    RangeError
+        For a number out of range, or a noise term that does not exist.
+    SpecError
+        If the illuminant is unknown or does not cover the response.
+    OutputError
+        If `out` exists or cannot be written.
+    """
+    for name, exposures in (("dark exposures", dark_exposures_us), ("lit exposures", lit_exposures_us)):
+        if len(set(exposures)) < max(2, len(exposures)) or min(exposures) <= 0:
+            raise RangeError(name, list(exposures), "two or more different times above 0, in µs")
+    if frames < _FEWEST_FRAMES:
+        raise RangeError("frames", frames, f"{_FEWEST_FRAMES} or more, to get a variance")
+    if not 1 <= ticks < 2**31:
+        raise RangeError("ticks", ticks, "1 to 2^31 - 1")
+    if not 0 <= seed < 2**64:
+        raise RangeError("seed", seed, "0 to 2^64 - 1")
+    bench = set_up(sensor, lit_exposures_us, illuminant, without)
+    session = _Session(bench, seed, progress)
+    if bench.aps is not None:
+        session.total += _FRAME_WORK * frames * (len(dark_exposures_us) + len(lit_exposures_us))
+    trials = max(_LEAST_TRIALS, ticks // 100)
+    if bench.evs is not None:
+        session.total += 2 * ticks + 2 * trials * _CONTRASTS
+    folder = OutputFolder(out, CAPTURE_NAME, overwrite)
+    try:
+        with output_errors(folder.target):
+            if bench.aps is not None:
+                session.write_frames(folder.path / "aps_dark.npz", dark_exposures_us, frames, 0.0)
+                session.write_frames(folder.path / "aps_lit.npz", lit_exposures_us, frames, 1.0)
+            if bench.evs is not None:
+                session.write_static(folder.path / "evs_static.npz", ticks)
+                session.write_steps(folder.path / "evs_steps.npz", trials)
+            _describe(bench, folder.path, illuminant, seed)
+        return folder.commit()
+    except BaseException:
+        folder.discard()
+        raise
+
+
+@dataclass
+class _Session:
+    """Numbers frames and ticks through the session, and tells how far it is."""
+
+    bench: Bench
+    seed: int
+    progress: Progress | None
+    total: float = 0.0
+    done: float = 0.0
+    frame: int = 0
+    t_us: int = 0
+
+    def _advance(self, work: float, what: str) -> None:
+        self.done += work
+        if self.progress is not None:
+            self.progress(self.done, self.total, what)
+
+    def write_frames(self, file: Path, exposures_us: Sequence[int], frames: int, light: float) -> None:
+        aps, layout = self.bench.aps, self.bench.sensor.layout
+        assert aps is not None
+        flux = jit().Float((light * self.bench.frame_flux_e_per_s).astype(np.float32).ravel())
+        valid = layout.aps_mask
+
+        def shoot() -> Iterator[NDArray[np.uint16]]:
+            for exposure_us in exposures_us:
+                electrons = flux * (exposure_us * S_PER_US)
+                for _ in range(frames):
+                    raw = aps.sample(electrons, exposure_us, self.seed, self.frame)
+                    self.frame += 1
+                    self._advance(_FRAME_WORK, file.stem)
+                    yield np.where(valid, raw, 0).astype(np.uint16)
+
+        with NpzWriter(file) as archive:
+            archive.add("exposures_us", np.array(exposures_us, dtype=np.int64))
+            archive.add_pieces("frames", (len(exposures_us), frames, *layout.shape), np.uint16, shoot())
+
+    def write_static(self, file: Path, ticks: int) -> None:
+        signal = self.bench.event_signal_dn
+        on, off = self._counts([self._electrons(signal)], ticks, "event counts, lit")
+        dark_on, dark_off = self._counts([self._electrons(0.0 * signal)], ticks, "event counts, dark")
+        arrays: dict[str, NDArray] = {
+            "signal_dn": signal, "n_on": on, "n_off": off, "n_trials": np.array(ticks),
+            "dark_n_on": dark_on, "dark_n_off": dark_off,
+        }  # fmt: skip
+        with NpzWriter(file) as archive:
+            for name, array in arrays.items():
+                archive.add(name, array)
+
+    def write_steps(self, file: Path, trials: int) -> None:
+        """Steps from one level to others and back; of each pair only the step away is counted.
+
+        The light is set filter by filter, so that every event pixel starts from the same signal.
+        """
+        evs = self.bench.evs
+        assert evs is not None
+        theta = (evs.spec.contrast_threshold_on + evs.spec.contrast_threshold_off) / 2
+        contrast = theta * np.linspace(-_REACH, _REACH, _CONTRASTS)
+        level = np.full(self.bench.event_signal_dn.shape, np.exp(-contrast[-1]) * self.bench.event_signal_dn.max())
+        before = self._electrons(level)
+        counts = [
+            self._counts([before, self._electrons(level * np.exp(step))], trials, "contrast steps") for step in contrast
+        ]
+        with NpzWriter(file) as archive:
+            archive.add("contrast", contrast)
+            archive.add("signal_dn", np.array(level.flat[0]))
+            archive.add("n_trials", np.array(trials))
+            for k, name in enumerate(("n_on", "n_off")):
+                archive.add_pieces(name, (len(counts), *level.shape), counts[0][k].dtype, (pair[k] for pair in counts))
+
+    def _electrons(self, signal_dn: NDArray[np.float64]) -> Any:
+        """Electrons of one event window, flat on the device."""
+        assert self.bench.evs is not None
+        seconds = self.bench.evs.spec.window_us * S_PER_US
+        return jit().Float((signal_dn / self.bench.event_dn_per_e_per_s * seconds).astype(np.float32).ravel())
+
+    def _counts(self, levels: Sequence[Any], trials: int, what: str) -> tuple[NDArray, NDArray]:
+        """ON and OFF events [y, x] of `trials` arrivals at the last level, the levels being shown in turn."""
+        evs = self.bench.evs
+        assert evs is not None and evs.spec.tick_us is not None
+        shape = self.bench.sensor.layout.evs_shape
+        on, off = np.zeros((2, shape[0] * shape[1]), dtype=np.min_scalar_type(trials))
+        stage, period = EvsStage(evs, self.seed), len(levels)
+        # the first sample of all is only a reference
+        for k in range(trials * period + (period == 1)):
+            self.t_us += evs.spec.tick_us
+            events = stage.step(levels[k % period], self.t_us)
+            if k % period == period - 1:
+                # a pixel has at most one event at a tick
+                pixel = events["y"].astype(np.int64) * shape[1] + events["x"]
+                on[pixel[events["polarity"] > 0]] += 1
+                off[pixel[events["polarity"] < 0]] += 1
+            if k % 64 == 0:
+                self._advance(min(64, trials * period - k), what)
+        return on.reshape(shape), off.reshape(shape)
+
+
+def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
+    """``capture.yaml``, and the sensor's file where it is not one that ships."""
+    spec, layout = bench.sensor.spec, bench.sensor.layout
+    shipped = bench.sensor.file in list_names("sensors") and content_hash(
+        read_sensor(bench.sensor.file)
+    ) == content_hash(spec)
+    if not shipped:
+        _dump(spec.model_dump(mode="json", exclude_none=True, exclude={"noise"}), folder / "sensor.yaml")
+    tile_rows, tile_cols = layout.tile_shape
+    content: dict[str, Any] = {
+        "bit_depth": 16 if bench.aps is None else bench.aps.spec.bit_depth,
+        "tile_rows": tile_rows,
+        "tile_cols": tile_cols,
+        "sensor": bench.sensor.file if shipped else "sensor.yaml",
+        "illuminant": illuminant,
+        "roi": {"x": layout.col0, "y": layout.row0, "width_px": layout.cols, "height_px": layout.rows},
+    }
+    if bench.evs is not None:
+        reference = bench.evs.spec.signal_reference
+        if bench.evs.spec.threshold_hardware_v is not None:
+            content["theta_hardware_v"] = bench.evs.spec.threshold_hardware_v
+        content["signal_reference"] = {
+            "k": reference.k_dn_per_e, "t_ref_us": reference.t_ref_us, "filter": reference.filter
+        }  # fmt: skip
+        content["contrast_of"] = "signal"
+    content["notes"] = (
+        f"a virtual session, hesim-render lab {spec.name}: {illuminant}, {bench.lux:.4g} lux on the brightest patch; "
+        f"seed {seed}"
+    )
+    _dump(content, folder / CAPTURE_NAME)
+
+
+def _dump(content: dict[str, Any], file: Path) -> None:
+    yaml: Any = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.sort_base_mapping_type_on_output = False
+    yaml.allow_unicode = True
+    yaml.width = 110
+    text = io.StringIO()
+    yaml.dump(content, text)
+    file.write_text(text.getvalue(), encoding="utf-8")

@@ -1,0 +1,243 @@
+"""The main job: render a scene, expose a sensor to it, and record what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core import backend
+from hesim_render.core.errors import ConflictError, RangeError, TooLongError
+from hesim_render.core.progress import Progress, ProgressReport, shown
+from hesim_render.core.units import US_PER_S
+from hesim_render.mosaic.schedule import require_countable
+from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.flicker import flickering
+from hesim_render.sources.render.audit.audit import STRETCHES, Audit
+from hesim_render.sources.render.audit.units import NotedFlux
+from hesim_render.sources.render.change_driven.flux import QUALITY, ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.forecast import Estimate, forecast
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
+from hesim_render.sources.scene import Scene
+
+#: Rays per pixel in the exact mode where the user names none. A static scene is rendered once for the whole run,
+#: a moving one once per slice.
+STATIC_SAMPLES = 64
+MOVING_SAMPLES = 16
+
+
+def simulate(
+    scene: Scene,
+    sensor: Sensor,
+    *,
+    duration_s: float = 0.1,
+    seed: int = 7,
+    clean: bool = False,
+    without: Sequence[str] = (),
+    quality: float | None = None,
+    samples: int | None = None,
+    exact: bool = False,
+    max_minutes: float | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Progress | Literal[False] | None = None,
+    on_estimate: Callable[[Estimate], None] | None = None,
+) -> Recording:
+    """RAW frames and events of a scene, with the electrons behind them.
+
+    Parameters
+    ----------
+    scene, sensor : from `load_scene` and `load_sensor` (crop the sensor for a region of interest).
+    duration_s : simulated time from 0, s.
+    seed : of the temporal noise and of the render's samples; the device's own maps come from the
+        sensor file's device seed.
+    clean : switch every noise term off.
+    without : noise terms to switch off by name, such as ``aps.read`` or ``evs.leak``.
+    quality : error of the render as a part of the sensor's own noise, default 0.5: each pixel gets as many
+        rays as that takes, and only what changes is rendered again. An audit states what that has missed.
+    samples : rays per pixel and slice, even, in place of `quality`; asks for the exact mode.
+    exact : render every pixel of every slice with the same number of rays, default 64 for a static scene, 16
+        for a moving one.
+    max_minutes : refuse a run whose estimate is longer; None does not.
+    out : folder to stream the recording into; None keeps it in memory.
+    overwrite : replace an existing recording in `out`.
+    progress : called with (done, total, what). None shows a bar in notebooks and nothing elsewhere; False nothing.
+    on_estimate : called with what the run will take, before it begins; not in the exact mode.
+
+    Returns
+    -------
+    Recording
+        Frames whose last row is exposed within the run, events, and their truth with standard
+        errors from two independent halves of the render. ``settings.render`` of its manifest tells what
+        was reached.
+
+    Raises
+    ------
+    RangeError
+        For a duration, seed, quality, sample count or noise term out of range.
+    ConflictError
+        If `quality` comes with `exact` or `samples`.
+    TooLongError
+        If the run would take longer than `max_minutes`.
+    SpecError
+        If scene and sensor do not fit together (a spectrum that does not cover the response).
+    OutputError
+        If `out` exists or cannot be written; nothing half-written is left.
+    """
+    duration_us = _duration_us(duration_s)
+    if not 0 <= seed < 2**64:
+        raise RangeError("seed", seed, "0 to 2^64 - 1")
+    if quality is not None and (exact or samples is not None):
+        other = "samples" if samples is not None else "exact"
+        raise ConflictError(
+            f"give --quality or --{other} (quality, {other}), not both: --quality asks for an error and gives each "
+            f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number"
+        )
+    require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
+    noise = noise_models(sensor, clean, without)
+    settings: dict[str, Any] = {"clean": clean, "without": list(without)}
+    with shown(progress, f"{scene.name} → {sensor.name}") as told:
+        seen, level = in_absolute_light(scene)
+        flux, mode = _source(seen, sensor, seed, quality, samples, exact, told)
+        settings |= mode
+        if level is not None:
+            settings["light_level"] = level.as_dict()
+        settings |= {"backend": backend.select().describe(), "camera": _camera_used(flux)}
+        rendering = _change_driven_parts(flux)
+        wanted = rendering[0].quality if rendering else None
+        plain = Capture(flux, flux.sensor, *noise, duration_us, seed)
+        if rendering:
+            expected = forecast(rendering, plain.event_pixels, plain.event_blocks, *plain.frame_exposures)
+            if on_estimate is not None:
+                on_estimate(expected)
+            if max_minutes is not None and expected.seconds > 60 * max_minutes:
+                raise TooLongError(
+                    f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
+                    "(max_minutes=None), or ask for less: a shorter --duration, a smaller --roi, or a larger error, "
+                    f"such as --quality {2 * rendering[0].quality:g}"
+                )
+            if isinstance(told, ProgressReport):
+                told.expect(expected.seconds)
+            if flux.is_static:
+                rendering[0].progress = _share_progress(expected.rays, told)
+        noted = _noted(flux, plain, seed) if rendering else None
+        capture = plain if noted is None else Capture(noted, flux.sensor, *noise, duration_us, seed)
+        with RecordingWriter(
+            out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
+            overwrite=overwrite,
+        ) as writer:  # fmt: skip
+            capture.record(writer, told)
+            render: dict[str, Any] = {
+                "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
+            }
+            if noted is not None:
+                if told is not None:
+                    told(0, 1, "audit")
+                render |= _work_done(rendering)
+                model = flux.sensor.evs if flux.sensor.spec.evs is not None else None
+                render["audit"] = Audit(noted, flux, rendering[0].quality, model, capture.event_pixels, seed).run()
+            writer.add_settings({"render": render})
+            return writer.finish()
+
+
+def _camera_used(flux: Any) -> dict[str, Any]:
+    """Where the camera stands at rest and how wide it sees, whatever of it was said by whom; plain values."""
+    view = flux.view
+    left, right, _, _ = view.region_mm
+    axis, image_mm = view.sensor.lens.axis_mm[0], view.sensor.lens.image_distance_mm
+    across = np.arctan((right - axis) / image_mm) - np.arctan((left - axis) / image_mm)
+    pose = view.camera_to_world
+    return {
+        "origin_m": pose[:3, 3].tolist(),
+        "forward": (-pose[:3, 2]).tolist(),
+        "up": pose[:3, 1].tolist(),
+        "horizontal_fov_deg": float(np.degrees(across)),
+        "near_m": float(view.near_m),
+    }
+
+
+def _source(
+    scene: Scene,
+    sensor: Sensor,
+    seed: int,
+    quality: float | None,
+    samples: int | None,
+    exact: bool,
+    progress: Progress | None,
+) -> tuple[Any, dict[str, Any]]:
+    """The renderer that was asked for, or that the scene needs, and what the manifest says of it."""
+    settings: dict[str, Any] = {}
+    window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
+    if not exact and samples is None:
+        wanted = QUALITY if quality is None else quality
+
+        def make(part: Scene, most_power: float) -> ChangeDrivenFlux:
+            return ChangeDrivenFlux(part, sensor, wanted, seed=seed, most_power=most_power)
+
+        try:
+            return flickering(scene, make, window_us), {"mode": "change-driven", "quality": wanted}
+        except NeedsExactMode as error:
+            if quality is not None:
+                raise
+            settings["exact_because"] = str(error)
+    default = MOVING_SAMPLES if scene.spec.motion else STATIC_SAMPLES
+    rays = default if samples is None else samples
+    told = _ray_progress(scene, sensor, rays, progress)
+    flux = flickering(
+        scene, lambda part, _: RenderedFlux(part, sensor, samples=rays, seed=seed, progress=told), window_us
+    )
+    return flux, settings | {"mode": "exact", "samples": rays}
+
+
+def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
+    """The change-driven renderers of a source: one for each waveform of its lights; none in the exact mode."""
+    return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
+
+
+def _noted(flux: Any, capture: Capture, seed: int) -> NotedFlux:
+    """The source, with units of an audit noted on the way."""
+    spec = flux.sensor.spec.evs
+    stretch = STRETCHES[spec.reference] if spec is not None else (0, 1, 0)
+    windows = 0 if flux.is_static else sum(int(block.wanted.sum()) for block in capture.event_blocks())
+    frames = 1 if flux.is_static else max(1, len(capture.frame_exposures[1]))
+    return NotedFlux(flux, capture.event_pixels, windows, frames, *stretch, seed)
+
+
+def _work_done(parts: list[ChangeDrivenFlux]) -> dict[str, Any]:
+    """Rays and pairs of all parts, plain values."""
+    total = {name: sum(getattr(part.counts, name) for part in parts) for name in vars(parts[0].counts)}
+    return {"quality": parts[0].quality, "renders": len(parts), **total}
+
+
+def _share_progress(total: float, progress: Progress | None) -> Callable[[int], None] | None:
+    """A static scene is one long render: tell how much of what was expected is done."""
+    if progress is None or total <= 0:
+        return None
+    return lambda rays: progress(min(rays, total), total, "rays")
+
+
+def _ray_progress(
+    scene: Scene, sensor: Sensor, samples: int, progress: Progress | None
+) -> Callable[[int], None] | None:
+    """A static scene is one long render: tell how many of its rays are done."""
+    if progress is None or scene.spec.motion:
+        return None
+    wanted = sensor.layout.aps_mask.copy()
+    wanted.ravel()[sensor.layout.evs_pixel.ravel()] = True
+    total = float(np.count_nonzero(wanted) * samples)
+    return lambda rays: progress(min(rays, total), total, "rays")
+
+
+def _duration_us(duration_s: float) -> int:
+    if not 0 < duration_s < float("inf"):
+        raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
+    duration_us = round(duration_s * US_PER_S)
+    if duration_us < 1:
+        raise RangeError("duration_s", duration_s, "at least one microsecond")
+    return duration_us

@@ -1,0 +1,191 @@
+"""A video in front of a sensor: RAW frames and events from pictures instead of a rendered scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core import backend
+from hesim_render.core.errors import RangeError, SpecError, TooLongError
+from hesim_render.core.progress import Progress, ProgressReport, in_words, shown
+from hesim_render.core.units import S_PER_US, US_PER_S
+from hesim_render.mosaic.description import Mosaic, describe
+from hesim_render.mosaic.schedule import require_countable
+from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.video import VideoFlux, VideoOptions
+from hesim_render.sources.video.flux import Source
+from hesim_render.spectral import spectrum as spectra
+
+#: Slack of a duration given in decimals of the video's length, µs.
+_SLACK_US = 1.0
+#: Processor seconds for a pixel of a picture, of an event sample and of a frame that is read out and stored; seconds
+#: for each of these besides its pixels, and in all. From `benchmarks/video.py`, for one core of an AVX-512 server.
+_PER_PIXEL_S, _PER_ITEM_S, _IN_ALL_S = np.array([8e-9, 17e-9, 60e-9]), np.array([1e-3, 1e-3, 2e-2]), 4.0
+
+
+@dataclass(frozen=True)
+class VideoEstimate:
+    """What a run will take, right to about a factor of two; decoding of hard codecs comes on top.
+
+    Parameters
+    ----------
+    seconds : in all.
+    pictures, event_samples, frames : how many of each.
+    """
+
+    seconds: float
+    pictures: int
+    event_samples: int
+    frames: int
+
+    def __str__(self) -> str:
+        return (
+            f"about {in_words(self.seconds)}, {self.pictures} pictures, {self.event_samples} event samples, "
+            f"{self.frames} frames"
+        )
+
+
+def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimate:
+    """From counts alone: nothing is read, and nothing is held in memory however long the run."""
+    aps, evs, shape = sensor.spec.aps, sensor.spec.evs, sensor.layout.shape
+    pictures = min(flux.clock.count, int(np.searchsorted(flux.clock.middle_us, duration_us)) + 1)
+    samples = 0
+    if evs is not None:
+        samples = pictures if evs.tick_us is None else duration_us // evs.tick_us
+    frames = 0 if aps is None else int(duration_us * S_PER_US * aps.frame_rate_hz)
+    count = np.array([pictures, samples, frames], dtype=np.float64)
+    rows, cols = sensor.layout.evs_shape
+    pixels = np.array([shape[0] * shape[1], rows * cols, shape[0] * shape[1]])
+    seconds = (count * pixels * _PER_PIXEL_S).sum() / (os.cpu_count() or 1) + (count * _PER_ITEM_S).sum() + _IN_ALL_S
+    return VideoEstimate(float(seconds), pictures, int(samples), frames)
+
+
+def simulate_video(
+    source: Source,
+    sensor: Sensor,
+    *,
+    duration_s: float | None = None,
+    seed: int = 7,
+    clean: bool = False,
+    without: Sequence[str] = (),
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    progress: Progress | Literal[False] | None = None,
+    max_minutes: float | None = None,
+    on_estimate: Callable[[VideoEstimate], None] | None = None,
+    **options: Any,
+) -> Recording:
+    """RAW frames and events of a video, with the electrons behind them.
+
+    Parameters
+    ----------
+    source : path of a video file, of a folder of numbered pictures or of a ``.npy`` file, or an array
+        [time, row, col] or [time, row, col, channel].
+    sensor : from `load_sensor` (crop it for a region of interest).
+    duration_s : simulated time from the video's first picture, s; default all of it.
+    seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as in `simulate`.
+    options : of `sources.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
+        tags, ``mode``, ``white_lux`` or ``white_e_per_s`` with ``white_filter``, ``fit``, ``lens_shading``, …
+
+    Returns
+    -------
+    Recording
+        As of `simulate`; the standard errors of the truth are 0. ``settings.video`` of its manifest holds the
+        input's hash and all that was done with it.
+
+    Raises
+    ------
+    SpecError
+        If the video cannot be read, is damaged or lacks colour tags or a clock.
+    RangeError
+        For a value out of range, or a duration longer than the video.
+    TooLongError
+        If the run would take longer than `max_minutes`.
+    OutputError
+        If `out` exists or cannot be written; nothing half-written is left.
+    """
+    if not 0 <= seed < 2**64:
+        raise RangeError("seed", seed, "0 to 2^64 - 1")
+    aps, evs = noise_models(sensor, clean, without)
+    flux = VideoFlux(source, sensor, VideoOptions.of(**options))
+    try:
+        name = "array" if isinstance(source, np.ndarray) else str(source)
+        duration_us = _duration_us(duration_s, flux, name)
+        require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
+        expected = _forecast(flux, sensor, duration_us)
+        if on_estimate is not None:
+            on_estimate(expected)
+        if max_minutes is not None and expected.seconds > 60 * max_minutes:
+            raise TooLongError(
+                f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
+                "(max_minutes=None), or ask for less: a shorter --duration or a smaller --roi"
+            )
+        settings = {
+            "clean": clean,
+            "without": list(without),
+            "backend": backend.select().describe(),
+        }
+        capture = Capture(flux, sensor, aps, evs, duration_us, seed)
+        with RecordingWriter(
+            out,
+            sensor,
+            seed=seed,
+            duration_us=duration_us,
+            settings=settings,
+            overwrite=overwrite,
+            mosaic=_mosaic(sensor, flux.options),
+        ) as writer:
+            with shown(progress, f"{Path(name).name} → {sensor.name}") as told:
+                if isinstance(told, ProgressReport):
+                    told.expect(expected.seconds)
+                flux.start_digest()
+                capture.record(writer, told)
+            writer.add_settings({"video": flux.describe()})
+            return writer.finish()
+    finally:
+        flux.close()
+
+
+def _duration_us(duration_s: float | None, flux: VideoFlux, name: str) -> int:
+    """Length of the run in whole µs, within the video."""
+    length_us = flux.clock.end_us
+    if duration_s is None:
+        if flux.cut_short:
+            raise SpecError(
+                f"ends after {length_us * S_PER_US:.6g} s, but it once was longer ({flux.cut_short}): copy it anew, or "
+                "give a duration that is there",
+                file=name,
+            )
+        duration_us = int(length_us + 1e-3)
+        if duration_us < 1:
+            raise SpecError(f"lasts {length_us:g} µs, less than one", file=name)
+        return duration_us
+    if not 0 < duration_s < float("inf"):
+        raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
+    duration_us = round(duration_s * US_PER_S)
+    if duration_us < 1 or duration_us > length_us + _SLACK_US:
+        raise RangeError("duration_s", duration_s, f"at most the video's {length_us * S_PER_US:.6g} s")
+    return duration_us
+
+
+def _mosaic(sensor: Sensor, options: VideoOptions) -> Mosaic:
+    """The sensor's mosaic under the video's light, with the balance and matrix of a camera that was given."""
+    mosaic = describe(sensor, spectra.illuminant(options.illuminant))
+    camera = options.camera
+    if camera is None or sorted(camera.channels) != sorted(mosaic.channels):
+        return mosaic
+    order = [camera.channels.index(name) for name in mosaic.channels]
+    neutral = 1 / np.array(camera.white_balance)[order]
+    return mosaic.model_copy(
+        update={
+            "neutral": (neutral / neutral.max()).tolist(),
+            "camera_to_srgb": np.array(camera.matrix)[:, order].tolist(),
+        }
+    )

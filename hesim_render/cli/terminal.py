@@ -1,0 +1,155 @@
+"""What commands read from and write to a terminal: texts into values, lines, a summary."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hesim_render.core.errors import RangeError
+from hesim_render.core.guard import printable
+
+if TYPE_CHECKING:
+    from hesim_render.recording.recording import Recording
+
+
+def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """``--set`` items for the scene file and for the sensor file (those that begin with ``sensor.``)."""
+    from hesim_render.specs.files import parse_override
+
+    scene: dict[str, Any] = {}
+    sensor: dict[str, Any] = {}
+    for key, value in map(parse_override, texts):
+        if key.startswith("sensor."):
+            sensor[key.removeprefix("sensor.")] = value
+        else:
+            scene[key] = value
+    return scene, sensor
+
+
+def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
+    """Width, height and optional first column and row of ``512x384`` or ``512x384+100+200``."""
+    match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})(?:\+([0-9]{1,9})\+([0-9]{1,9}))?", text)
+    if match is None:
+        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384")
+    width, height, x, y = (None if part is None else int(part) for part in match.groups())
+    assert width is not None and height is not None
+    return width, height, x, y
+
+
+def parse_exposures(text: str) -> list[int]:
+    """Exposures in µs of ``1,5,20``, in ms."""
+    try:
+        return [round(1000 * float(part)) for part in text.split(",")]
+    except (ValueError, OverflowError):
+        raise RangeError("exposures", text, "times in ms, such as 1,5,20") from None
+
+
+def say(text: str) -> None:
+    """A line on stdout. Where nobody reads any more, the run goes on: its result is not the text."""
+    import typer
+
+    try:
+        typer.echo(text)
+    except BrokenPipeError:
+        silence_stdout()
+
+
+def silence_stdout() -> None:
+    """From now on stdout goes nowhere, also what is still to be flushed when Python ends."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def complain(*lines: str) -> None:
+    """Lines on stderr, each with the program's name, if there is anyone to read them."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        for line in lines:
+            sys.stderr.write(f"hesim-render: {printable(' '.join(line.split()))}\n")
+        sys.stderr.flush()
+
+
+def summary(recording: Recording) -> str:
+    """What a recording holds and where, in a few lines."""
+    manifest = recording.manifest
+    counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
+    video = manifest["settings"].get("video")
+    scene = Path(video["source"]).name if video else (manifest.get("scene") or {}).get("name", "no scene file")
+    lines = [
+        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}"
+    ]
+    if any(any(row) for row in recording.mosaic.tile_aps):
+        size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
+        none = " (no frame's last row is fully exposed in this time)" if counts["frames"] == 0 else ""
+        lines.append(f"  RAW frames: {counts['frames']} of {size}, {bits}{none}")
+    if grid["width"]:
+        lines.append(
+            f"  events: {counts['events']} ({counts['events_on']} ON, {counts['events_off']} OFF) "
+            f"on {grid['width']}x{grid['height']} px"
+        )
+    if counts.get("events_dropped"):
+        lines.append(f"  {counts['events_dropped']} more events were lost in the sensor's read-out")
+    lines += _reached(manifest["settings"].get("render"))
+    if recording.path is not None:
+        pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
+        lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
+    return "\n".join(map(printable, lines))
+
+
+def _reached(render: dict[str, Any] | None) -> list[str]:
+    """What a render of a wanted quality has come to."""
+    if render is None:
+        return []
+    wanted = f", asked for {render['quality']:g}" if "quality" in render else ""
+    lines = []
+    for name, error in render["error_noise"].items():
+        if error is not None:
+            lines.append(
+                f"  render, {name}: stated error {_short(error['rms'])} of the sensor's noise (rms{wanted}); "
+                f"95 % of values below {_short(error['p95'])}, 99 % below {_short(error['p99'])}"
+            )
+    audit = render.get("audit", {})
+    for name in ("events", "frames"):
+        part = audit.get(name)
+        if part is None:
+            continue
+        line = (
+            f"  audit, {name}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
+            f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of the noise, "
+            f"with 99 % confidence at most {_percent(part['off_at_most'])}"
+        )
+        if part.get("true_events"):
+            line += (
+                f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
+                f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"
+            )
+        lines.append(line)
+    return lines + _verdict(audit)
+
+
+def _verdict(audit: dict[str, Any]) -> list[str]:
+    """The line that says so if a run is not what it should be, or not shown to be."""
+    if not is_short_of_wish(audit):
+        if audit.get("verdict") == "not shown":
+            return ["  audit: too little was looked at again to confirm this run's quality; nothing speaks against it"]
+        return []
+    return [f"  NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]
+
+
+def is_short_of_wish(audit: dict[str, Any] | None) -> bool:
+    """Whether an audit has found that a run is not what was asked for."""
+    return audit is not None and audit.get("verdict") == "not met"
+
+
+def _short(value: float) -> str:
+    return f"{value:.2g}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

@@ -1,0 +1,286 @@
+"""Which Dr.Jit backend runs here: a GPU where one works, else LLVM on the CPU.
+
+LLVM 15 and 16 abort the whole process on CPUs with AVX-512, so no library is ever loaded into
+this process before a child process has compiled and run a kernel with it. Candidates, in order:
+
+1. ``DRJIT_LIBLLVM_PATH``, if set;
+2. the system's ``libLLVM``, version 17 or newer, newest first;
+3. the library inside the optional ``llvm`` extra (the ``tadashi`` wheel carries LLVM 17).
+
+Dr.Jit loads its LLVM the moment it is imported, so `hesim_render` prepares the choice when it is
+imported itself (`prepare`). The verdict on a library is cached by path, size and modification time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import ctypes.util
+import functools
+import importlib
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hesim_render.core.errors import BackendError
+
+OLDEST_LLVM = 17
+BACKEND_VARIABLE = "HESIM_RENDER_BACKEND"  # "llvm" or "cuda" forces one
+INSTALL_HINT = (
+    "install LLVM >= 17, either with the system's package manager (Debian 12+, Ubuntu 24.04+: "
+    "'sudo apt install libllvm19') or without root: pip install 'hesim_render[llvm]'"
+)
+
+#: What this process itself wrote into DRJIT_LIBLLVM_PATH: no wish of the user's.
+_chosen_here = ""
+
+_SYSTEM_FOLDERS = (
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/usr/lib/llvm-*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+)
+
+# Runs in a child process: argv = backend, library, preloads... Compiles a kernel with vector
+# minimum and maximum, the very instructions that LLVM 15 and 16 fail to select on AVX-512.
+_PROBE = """
+import ctypes, os, sys
+backend, library, *preload = sys.argv[1:]
+if backend == "llvm":
+    for name in preload:
+        ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+    handle = ctypes.CDLL(library)
+    try:
+        version = (ctypes.c_uint * 3)()
+        handle.LLVMGetVersion(*[ctypes.byref(version, 4 * k) for k in range(3)])
+    except AttributeError:
+        sys.exit("older than LLVM 16 (no LLVMGetVersion)")
+    print(".".join(map(str, version)), flush=True)
+    if version[0] < %d:
+        sys.exit(f"LLVM {version[0]} is older than %d")
+    os.environ["DRJIT_LIBLLVM_PATH"] = library
+    import drjit.llvm as types
+else:
+    import drjit.cuda as types
+    print("GPU", flush=True)
+import drjit as dr
+x = dr.arange(types.Float, 4096)
+y = dr.minimum(dr.maximum(x, 17), 99) + dr.clip(dr.round(x * 0.5), 0, 1023)
+z = dr.sum(dr.minimum(types.UInt32(y), 500))
+assert z[0] == 1882201, z
+print("ok")
+""" % (OLDEST_LLVM, OLDEST_LLVM)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One library (or the GPU) and what the probe said of it."""
+
+    backend: str  # "llvm" or "cuda"
+    source: str  # how it was found
+    path: str
+    preload: tuple[str, ...] = ()
+    version: str = ""
+    works: bool = False
+    reason: str = ""
+
+    def describe(self) -> str:
+        label = "CUDA" if self.backend == "cuda" else f"LLVM {self.version or '?'}"
+        return f"{label} ({self.source}: {self.path})" if self.path else f"{label} ({self.source})"
+
+
+def _major(path: Path) -> int:
+    """Major version in a libLLVM file name, 0 where it has none."""
+    match = re.search(r"libLLVM[-.](?:so\.)?(\d+)", path.name)
+    return int(match.group(1)) if match else 0
+
+
+def _system_libraries() -> list[Path]:
+    folders: list[Path] = []
+    for pattern in _SYSTEM_FOLDERS:
+        root = Path("/")
+        folders += sorted(root.glob(pattern.lstrip("/")))
+    found: dict[str, Path] = {}
+    for folder in folders:
+        for path in list(folder.glob("libLLVM[-.]*so*")) + list(folder.glob("libLLVM*.dylib")):
+            if _major(path) >= OLDEST_LLVM:
+                found.setdefault(os.path.realpath(path), path)
+    return sorted(found.values(), key=_major, reverse=True)
+
+
+def _extra_library() -> tuple[str, tuple[str, ...]] | None:
+    """libLLVM inside the ``llvm`` extra, and the two libraries it needs loaded first."""
+    spec = importlib.util.find_spec("tadashi")
+    if spec is None or not spec.submodule_search_locations:
+        return None
+    folder = Path(next(iter(spec.submodule_search_locations))).parent / "tadashi.libs"
+    library = sorted(folder.glob("libLLVM-*.so*"))
+    if not library:
+        return None
+    preload = [str(p) for stem in ("libffi", "libtinfo") for p in sorted(folder.glob(f"{stem}-*.so*"))]
+    return str(library[-1]), tuple(preload)
+
+
+def candidates() -> list[Candidate]:
+    """Everything that could run Dr.Jit here, best first; nothing has been loaded yet."""
+    forced = os.environ.get(BACKEND_VARIABLE, "").lower()
+    if forced not in ("", "llvm", "cuda"):
+        raise BackendError(f"{BACKEND_VARIABLE} is {forced!r}; expected 'llvm' or 'cuda'")
+    found: list[Candidate] = []
+    if forced != "llvm" and ctypes.util.find_library("cuda"):
+        found.append(Candidate("cuda", "GPU", ""))
+    if forced != "cuda":
+        given = os.environ.get("DRJIT_LIBLLVM_PATH")
+        extra = _extra_library()
+        if given and given != _chosen_here:
+            preload = extra[1] if extra and given == extra[0] else ()  # inherited from a parent that chose it
+            found.append(Candidate("llvm", "DRJIT_LIBLLVM_PATH", given, preload))
+        found += [Candidate("llvm", "system", str(path)) for path in _system_libraries()]
+        if extra:
+            found.append(Candidate("llvm", "'llvm' extra", extra[0], extra[1]))
+    return found
+
+
+def _cache_file() -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(root) / "hesim_render" / "backend.json"
+
+
+def _cache_key(candidate: Candidate) -> str | None:
+    """What a verdict depends on; None where it cannot be told, so that it is not remembered."""
+    try:
+        if candidate.backend == "cuda":
+            devices = ",".join(sorted(str(path) for path in Path("/dev").glob("nvidia*")))
+            identity = Path("/proc/driver/nvidia/version").read_text() + devices
+        else:
+            stat = os.stat(candidate.path)
+            identity = f"{candidate.path}|{stat.st_size}|{stat.st_mtime_ns}"
+    except OSError:
+        return None
+    drjit = importlib.util.find_spec("drjit")
+    return "|".join((candidate.backend, identity, str(drjit.origin if drjit else ""), sys.version))
+
+
+def probe(candidate: Candidate) -> Candidate:
+    """Run a kernel with `candidate` in a child process and say how it went."""
+    if candidate.path and not os.path.exists(candidate.path):
+        return Candidate(**{**candidate.__dict__, "reason": "no such file"})
+    command = [sys.executable, "-c", _PROBE, candidate.backend, candidate.path, *candidate.preload]
+    environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Candidate(**{**candidate.__dict__, "reason": f"probe did not finish: {error}"})
+    lines = child.stdout.split()
+    version = lines[0] if lines else ""
+    works = child.returncode == 0 and lines[-1:] == ["ok"]
+    reason = ""
+    if not works:
+        last = (child.stderr.strip().splitlines() or [""])[-1]
+        died = f"killed by signal {-child.returncode}" if child.returncode < 0 else ""
+        reason = "; ".join(part for part in (died, last) if part) or f"exit status {child.returncode}"
+    return Candidate(**{**candidate.__dict__, "version": version, "works": works, "reason": reason})
+
+
+def _probe_cached(candidate: Candidate) -> Candidate:
+    """As `probe`, remembering libraries that worked (a failure is always tried again)."""
+    key = _cache_key(candidate)
+    file = _cache_file()
+    try:
+        cache = json.loads(file.read_text())
+    except (OSError, ValueError):
+        cache = {}
+    if key is not None and key in cache:
+        return Candidate(**{**candidate.__dict__, "version": cache[key], "works": True})
+    result = probe(candidate)
+    if result.works and key is not None:
+        cache[key] = result.version
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            temporary = file.with_suffix(f".{os.getpid()}.tmp")
+            temporary.write_text(json.dumps(cache))
+            os.replace(temporary, file)
+        except OSError:
+            pass  # an unwritable cache costs a second per start, nothing else
+    return result
+
+
+def _loaded_llvm() -> list[str]:
+    """LLVM libraries in this process (Linux)."""
+    try:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+    except OSError:
+        return []
+    return sorted({line.split(maxsplit=5)[5] for line in lines if "libLLVM" in line})
+
+
+def _adopt(chosen: Candidate) -> Candidate:
+    """Dr.Jit takes its LLVM when it is imported: if that happened before, see that it took a good one."""
+    if chosen.backend == "cuda" or "drjit" not in sys.modules:
+        return chosen
+    loaded = _loaded_llvm()
+    if any(os.path.realpath(path) == os.path.realpath(chosen.path) for path in loaded):
+        return chosen
+    early = [_probe_cached(Candidate("llvm", "taken by Dr.Jit", path)) for path in loaded]
+    if early and all(candidate.works for candidate in early):
+        return early[0]
+    took = f"took {early[0].describe()}, which does not work ({early[0].reason})" if early else "found no LLVM"
+    raise BackendError(
+        f"Dr.Jit was imported before hesim_render and {took}: import hesim_render first, "
+        f"or set DRJIT_LIBLLVM_PATH={chosen.path}"
+    )
+
+
+@functools.cache
+def select() -> Candidate:
+    """First candidate that works; its library is set up for Dr.Jit in this process.
+
+    Raises
+    ------
+    BackendError
+        If none works; the message lists what was tried and what to install. Also if Dr.Jit was
+        imported earlier and took a library that does not work.
+    """
+    global _chosen_here
+    tried: list[str] = []
+    for candidate in candidates():
+        result = _probe_cached(candidate)
+        if not result.works:
+            tried.append(f"{result.describe()}: {result.reason}")
+            continue
+        result = _adopt(result)
+        if result.backend == "llvm":
+            for name in result.preload:
+                ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+            _chosen_here = result.path
+            os.environ["DRJIT_LIBLLVM_PATH"] = result.path
+        return result
+    detail = f" (tried {'; '.join(tried)})" if tried else ""
+    raise BackendError(f"no Dr.Jit backend works on this machine{detail}: {INSTALL_HINT}")
+
+
+def prepare() -> None:
+    """Select silently, before anything imports Dr.Jit; what is wrong is told where it is first needed."""
+    if "drjit" not in sys.modules:
+        with contextlib.suppress(BackendError):
+            select()
+
+
+def variant() -> str:
+    """Mitsuba variant that belongs to the selected backend."""
+    return f"{select().backend}_ad_spectral"
+
+
+@functools.cache
+def jit() -> Any:
+    """Module with the Dr.Jit array types of the selected backend (``drjit.llvm.ad`` or ``drjit.cuda.ad``)."""
+    return importlib.import_module(f"drjit.{select().backend}.ad")

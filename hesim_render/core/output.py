@@ -1,0 +1,250 @@
+"""Output folders and files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import glob
+import hashlib
+import os
+import re
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+from hesim_render.core.errors import HesimError, OutputError
+
+#: Temporary files and folders of this process that have neither been committed nor discarded, and their targets.
+_unfinished: dict[Path, Path] = {}
+#: Longest part of a target's name that a temporary name repeats: names have 255 bytes at most.
+_LONGEST_NAME = 100
+_CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
+_RENAME_EXCHANGE = 2  # of renameat2(2)
+
+
+@atexit.register
+def discard_unfinished() -> None:
+    """Remove everything temporary that is still being written, and put back what it was to replace.
+
+    An interrupt can arrive between any two instructions, also before the `try` that would have
+    discarded the folder; whoever ends on one calls this last.
+    """
+    for path, target in list(_unfinished.items()):
+        _put_back(path.with_suffix(".old"), target)
+        _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+    _unfinished.pop(path, None)
+
+
+def _prefix(target: Path) -> str:
+    """What names of temporary files and folders for a target begin with; the number of the process follows."""
+    name = target.name
+    if len(os.fsencode(name)) > _LONGEST_NAME:
+        name = f"{name[: _LONGEST_NAME // 4]}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
+    return f".{name}.{socket.gethostname()[:64]}-"
+
+
+def _tidy_up(target: Path) -> None:
+    """Put right what killed runs of this machine have left for a target: restore the old, remove the unfinished."""
+    prefix = _prefix(target)
+    for suffix in (".old", ".partial"):  # first what can be put back
+        for leftover in target.parent.glob(f"{glob.escape(prefix)}*{suffix}"):
+            owner = leftover.name.removeprefix(prefix).removesuffix(suffix)
+            if owner.isdigit() and leftover not in _unfinished and not _is_alive_elsewhere(int(owner)):
+                _put_back(leftover, target) if suffix == ".old" else _remove(leftover)
+
+
+def _put_back(old: Path, target: Path) -> None:
+    """What was moved away to be replaced: back in its place where that is empty, else gone."""
+    if not old.exists():
+        return
+    if target.exists():
+        _remove(old)
+        return
+    with contextlib.suppress(OSError):
+        os.rename(old, target)
+
+
+def _exchange(path: Path, target: Path) -> bool:
+    """Let two paths change places in one step; False where the system cannot."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):
+        return False
+    here = -100  # AT_FDCWD
+    return rename(here, os.fsencode(path), here, os.fsencode(target), _RENAME_EXCHANGE) == 0
+
+
+def check_target(target: str | Path, marker: str, overwrite: bool = False) -> Path:
+    """Whether a folder may be written at `target`; returns its absolute path.
+
+    Parameters
+    ----------
+    marker : file that tells a folder of ours, which `overwrite` may replace; no other folder is touched.
+
+    Raises
+    ------
+    OutputError
+        If something is there that must not be replaced, or the place cannot hold a folder.
+    """
+    with output_errors(Path(target)):
+        path = Path(target).expanduser().resolve()
+        _check_name(path, target)
+        _tidy_up(path)
+        if not path.exists():
+            return path
+        if not path.is_dir():
+            raise OutputError(f"{target}: is a file; give the name of a new folder")
+        if not any(path.iterdir()):
+            return path
+        if not (path / marker).is_file():
+            raise OutputError(f"{target}: exists and holds other things; give the name of a new folder")
+        if not overwrite:
+            raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
+    return path
+
+
+def check_place(target: str | Path) -> Path:
+    """Whether there can be a file at `target`; returns its absolute path, in which a last link is not followed.
+
+    Raises
+    ------
+    OutputError
+        If there is a folder, or the place cannot hold a file.
+    """
+    with output_errors(Path(target)):
+        path = Path(target).expanduser().absolute()
+        _check_name(path, target)
+        _tidy_up(path)
+        if path.is_dir():
+            raise OutputError(f"{target}: is a folder; give the name of a file")
+    return path
+
+
+def _check_name(path: Path, target: str | Path) -> None:
+    """Whether the name is short enough, and its folder can be made and written to."""
+    if len(os.fsencode(path.name)) > _most_bytes(path.parent):
+        raise OutputError(f"{str(target)[:60]}…: the name is too long")
+    for parent in path.parents:
+        if parent.exists():
+            if not parent.is_dir():
+                raise OutputError(f"{target}: cannot be written ({parent} is not a folder)")
+            if not os.access(parent, os.W_OK | os.X_OK):
+                raise OutputError(f"{target}: cannot be written (no permission to write in {parent})")
+            break
+
+
+def _most_bytes(folder: Path) -> int:
+    """Bytes that a name in a folder may have."""
+    try:
+        return os.pathconf(next(parent for parent in (folder, *folder.parents) if parent.is_dir()), "PC_NAME_MAX")
+    except (OSError, ValueError):
+        return 255
+
+
+@contextlib.contextmanager
+def output_errors(target: Path) -> Iterator[None]:
+    """Turns failures of writing (also those of HDF5, which come as several kinds) into `OutputError`."""
+    try:
+        yield
+    except HesimError:
+        raise
+    except (OSError, RuntimeError) as error:
+        raise OutputError(f"{target}: cannot be written ({_reason(error)})") from None
+
+
+def _reason(error: Exception) -> str:
+    reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
+    # NumPy says of a write that was cut short only how many items it had
+    return "no space left, or a limit on the size of files" if _CUT_SHORT.fullmatch(reason) else reason
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """The path of a temporary file that takes the target's place when all went well, and is removed when not.
+
+    What is at the target is replaced in one step; a link there is replaced, not followed.
+    """
+    with output_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _tidy_up(target)
+        path = target.with_name(f"{_prefix(target)}{os.getpid()}.partial")
+        _unfinished[path] = target
+        try:
+            yield path
+            os.replace(path, target)
+            _unfinished.pop(path, None)
+        except BaseException:
+            _remove(path)
+            raise
+
+
+class OutputFolder:
+    """A folder being written under a temporary name beside its target.
+
+    `commit` gives it its name; `discard` removes it. Leftovers of killed runs of this machine are
+    removed on the way in.
+
+    Raises
+    ------
+    OutputError
+        As `check_target`, and if the temporary folder cannot be made.
+    """
+
+    def __init__(self, target: str | Path, marker: str, overwrite: bool = False) -> None:
+        self.target = check_target(target, marker, overwrite)
+        self._marker, self._overwrite = marker, overwrite
+        self.path = self.target.with_name(f"{_prefix(self.target)}{os.getpid()}.partial")
+        with output_errors(self.target):
+            self.target.parent.mkdir(parents=True, exist_ok=True)
+            _remove(self.path)  # of an earlier try of this process
+            _unfinished[self.path] = self.target
+            self.path.mkdir()
+
+    def commit(self) -> Path:
+        """Give the finished folder its name; what was there before is removed afterwards.
+
+        At every instant the name stands for the old folder or the new one. Where the file system cannot exchange two
+        folders there is one at which it stands for neither; then the old one is put back, if need be by the next run.
+        """
+        check_target(self.target, self._marker, self._overwrite)
+        with output_errors(self.target):
+            if not self.target.exists():
+                os.rename(self.path, self.target)
+            elif not _exchange(self.path, self.target):
+                self._move_in()
+            _remove(self.path)  # the old one, after an exchange
+        return self.target
+
+    def _move_in(self) -> None:
+        old = self.path.with_suffix(".old")
+        try:
+            os.rename(self.target, old)
+            os.rename(self.path, self.target)
+        finally:
+            _put_back(old, self.target)
+
+    def discard(self) -> None:
+        _remove(self.path)
+
+
+def _is_alive_elsewhere(pid: int) -> bool:
+    """Whether another process of this number runs."""
+    if pid == os.getpid():
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True

@@ -1,0 +1,150 @@
+"""When each row is exposed and when each event comparison is made, in µs from the start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import RangeError
+from hesim_render.core.units import US_PER_S
+from hesim_render.specs.sensor import ApsSpec, EvsSpec
+
+#: Longest run with events, µs: their times are stored in 32 bit. Without events, and most frames and comparisons.
+_MOST_EVENT_US, _MOST_US = 2**32 - 1, 10**12
+_MOST_FRAMES, _MOST_TICKS = 2_000_000, 20_000_000
+
+
+def require_countable(aps: ApsSpec | None, evs: EvsSpec | None, duration_us: int) -> None:
+    """Refuse a run that is too long to be listed, before anything of it is.
+
+    Raises
+    ------
+    RangeError
+        With the longest duration that would do.
+    """
+    limits = {"a run": _MOST_US}
+    if evs is not None:
+        limits["a recording of events"] = _MOST_EVENT_US
+        if evs.tick_us is not None:
+            limits[f"{_MOST_TICKS} comparisons, one every {evs.tick_us} µs"] = _MOST_TICKS * evs.tick_us
+    if aps is not None:
+        limits[f"{_MOST_FRAMES} frames at {aps.frame_rate_hz:g} Hz"] = int(_MOST_FRAMES * US_PER_S / aps.frame_rate_hz)
+    what, most_us = min(limits.items(), key=lambda item: item[1])
+    if duration_us > most_us:
+        raise RangeError("duration_s", duration_us / US_PER_S, f"at most {most_us / US_PER_S:.10g}: so long is {what}")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One frame: row r integrates over [start_us + r·line_time_us, … + exposure_us].
+
+    Parameters
+    ----------
+    index : frame number, 0 first.
+    start_us : begin of row 0's exposure.
+    rows : rows that are read out.
+    line_time_us : delay from row to row; 0 for a global shutter.
+    """
+
+    index: int
+    start_us: int
+    exposure_us: int
+    rows: int
+    line_time_us: float
+
+    @property
+    def t_us(self) -> int:
+        """Time stamp: the end of row 0's exposure."""
+        return self.start_us + self.exposure_us
+
+    @property
+    def end_us(self) -> float:
+        """End of the last row's exposure."""
+        return self.start_us + (self.rows - 1) * self.line_time_us + self.exposure_us
+
+    def row_begin_us(self, row: NDArray) -> NDArray[np.float64]:
+        return self.start_us + row * self.line_time_us
+
+
+def exposures(spec: ApsSpec, rows: int, duration_us: int) -> list[Exposure]:
+    """All frames whose last row is fully exposed within the run.
+
+    Frame k begins at k / frame_rate_hz. A region of fewer rows is read out as a window: its first
+    row starts the frame.
+    """
+    line_time_us = spec.line_time_us if spec.shutter == "rolling" else 0.0
+    found: list[Exposure] = []
+    while True:
+        start_us = round(len(found) * US_PER_S / spec.frame_rate_hz)
+        exposure = Exposure(len(found), start_us, spec.exposure_us, rows, line_time_us)
+        if exposure.end_us > duration_us:
+            return found
+        found.append(exposure)
+
+
+#: Intervals between windows in a block: what is filled in lies between two windows of one.
+BLOCK_INTERVALS = 16
+#: Sample times of sensors without a tick of their own are found cell by cell of this length, µs; cells begin at its
+#: multiples, which are sample times themselves.
+CELL_US = 1000
+
+
+@dataclass(frozen=True)
+class Block:
+    """Successive windows in which event pixels are sampled.
+
+    Blocks are cut at times of their own, whatever is asked for: so what a run gives at a time does not depend on when
+    it begins or ends. The last window of a block is the first of the next.
+
+    Parameters
+    ----------
+    begin_us, end_us : [w], in order of time.
+    wanted : [w], windows that the run asks for; the others are needed to fill in between.
+    """
+
+    begin_us: NDArray[np.float64]
+    end_us: NDArray[np.float64]
+    wanted: NDArray[np.bool_]
+
+
+def tick_blocks(spec: EvsSpec, begin_us: float, end_us: float) -> Iterator[Block]:
+    """Windows of the fixed comparisons after one time and up to another: window k ends at k·tick_us."""
+    assert spec.tick_us is not None
+    first, last = int(begin_us // spec.tick_us) + 1, int(end_us // spec.tick_us)
+    for number in range((first - 1) // BLOCK_INTERVALS, -(-last // BLOCK_INTERVALS)):
+        ticks = np.arange(BLOCK_INTERVALS * number, BLOCK_INTERVALS * (number + 1) + 1)
+        wanted = (ticks >= first) & (ticks <= last)
+        wanted[0] = False  # it is the last one of the block before
+        ends = ticks.astype(np.float64) * spec.tick_us
+        yield Block(ends - spec.window_us, ends, wanted)
+
+
+def instant_blocks(
+    instants_us: Callable[[float, float], NDArray[np.int64]], window_us: int, begin_us: float, end_us: float
+) -> Iterator[Block]:
+    """Windows that end at the instants of a source, after one time and up to another.
+
+    Of every `BLOCK_INTERVALS` cells, the instants are cut into blocks of as many intervals.
+
+    Parameters
+    ----------
+    instants_us : see `SampledFlux.instants_us`.
+    """
+    length = BLOCK_INTERVALS * CELL_US
+    for number in range(int(begin_us // length), -(-int(np.ceil(end_us)) // length)):
+        instants = instants_us(number * length, (number + 1) * length)
+        for first in range(0, instants.size - 1, BLOCK_INTERVALS):
+            ends = instants[first : first + BLOCK_INTERVALS + 1].astype(np.float64)
+            wanted = (ends > begin_us) & (ends <= end_us)
+            wanted[0] = False
+            if wanted.any():
+                yield Block(ends - window_us, ends, wanted)
+
+
+def ticks_us(spec: EvsSpec, duration_us: int) -> NDArray[np.int64]:
+    """Times of the fixed comparisons: k·tick_us, k = 1, 2, …; each ends a window of window_us."""
+    assert spec.tick_us is not None
+    return np.arange(spec.tick_us, duration_us + 1, spec.tick_us, dtype=np.int64)

@@ -1,0 +1,1 @@
+"""Frame pixels: formulas and sampler, fixed patterns."""

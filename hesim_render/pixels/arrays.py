@@ -1,0 +1,60 @@
+"""Parameters that are one number, or one value per pixel, on the device; and what pixels remember, off it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.backend import jit
+
+
+def to_device(value: Any) -> Any:
+    """A number as an opaque Dr.Jit Float (a new one compiles nothing), an array as a flat Float."""
+    import drjit as dr
+
+    types = jit()
+    if np.ndim(value):
+        return types.Float(np.ascontiguousarray(value, dtype=np.float32).ravel())
+    return dr.opaque(types.Float, float(value))
+
+
+def take(value: Any, index: Any) -> Any:
+    """Entries `index` of a device array; a number stays a number."""
+    import drjit as dr
+
+    return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
+
+
+def saved(part: Any) -> dict[str, Any]:
+    """What an object remembers between two calls, as plain values and NumPy arrays: the attributes in its `STATE`."""
+    return {name: _off_device(getattr(part, name)) for name in part.STATE}
+
+
+def restore(part: Any, state: dict[str, Any]) -> None:
+    """Put back what `saved` told, into an object made alike."""
+    for name in part.STATE:
+        own = getattr(part, name)
+        if hasattr(own, "STATE"):
+            restore(own, state[name])
+        else:
+            setattr(part, name, _on_device(state[name]))
+
+
+def _off_device(value: Any) -> Any:
+    import drjit as dr
+
+    if hasattr(value, "STATE"):
+        return saved(value)
+    if isinstance(value, tuple):
+        return tuple(_off_device(entry) for entry in value)
+    return (type(value), np.array(value)) if dr.is_array_v(value) else value
+
+
+def _on_device(value: Any) -> Any:
+    if isinstance(value, tuple):
+        if len(value) == 2 and isinstance(value[1], np.ndarray):
+            kind, entries = value
+            return kind(entries)
+        return tuple(_on_device(entry) for entry in value)
+    return value

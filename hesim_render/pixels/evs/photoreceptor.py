@@ -1,0 +1,124 @@
+"""The photoreceptor's bandwidth: ln x through two equal poles, stepped exactly.
+
+With u = ln x of the light and a the rate of both poles, z' = a(u − z) and y' = a(z − y); y is what the
+comparator sees. For u on a straight line from u₀ to u₁ in a time h, with E = exp(−ah) and p = (1 − E)/(ah)::
+
+    z₁ = u₁ + E (z₀ − u₀) − p (u₁ − u₀)
+    y₁ = u₁ + E (y₀ − u₀ + ah (z₀ − u₀)) − (2p − E)(u₁ − u₀)
+
+which is exact whatever h is. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A
+photoreceptor is a second-order system whose corner rises with the photocurrent (Graça et al. 2021,
+"Unraveling the paradox of intensity-dependent DVS pixel noise") until its bias current limits it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from hesim_render.core.backend import jit
+from hesim_render.core.units import US_PER_S
+from hesim_render.pixels.evs.model import EvsNoise
+
+#: Nodes per period of the highest corner frequency: between them y is taken as a straight line.
+NODES_PER_CORNER_PERIOD = 32
+
+#: 1 − E is a difference of near equals below this a·h; a series of five terms is good to 2e-8 there.
+_SERIES_BELOW = 0.1
+
+
+def _rate(corner_hz: Any) -> Any:
+    """a in 1/µs of both poles of a corner frequency."""
+    return corner_hz * (math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / US_PER_S)
+
+
+class Photoreceptor:
+    """State of each pixel's low-pass, and a time grid of its own.
+
+    A corner that follows the light is held from one node of the grid to the next, at its value half-way as
+    a straight line through this node and the last foretells it; steps within that stretch add up exactly.
+    So nothing depends on how often the filter is asked.
+
+    Parameters
+    ----------
+    noise : with `photoreceptor` given.
+    """
+
+    STATE = ("_t_us", "_node", "_input", "_state", "_rate", "_node_rate")
+
+    def __init__(self, noise: EvsNoise) -> None:
+        spec = noise.photoreceptor
+        assert spec is not None
+        self._noise, self._spec = noise, spec
+        self._period_us = US_PER_S / (NODES_PER_CORNER_PERIOD * spec.cutoff_hz)
+        self._t_us = 0.0
+        self._node = 0  # the last node at or before the present
+        self._input: Any = None  # u
+        self._state: tuple[Any, Any] = (None, None)  # z, y
+        self._rate: Any = None  # a in 1/µs up to the next node: a number, or one per pixel
+        self._node_rate: Any = None  # a at the last node
+
+    def _rate_at(self, log: Any) -> Any:
+        return _rate(self._noise.corner_hz(log) if self._spec.follows_light else self._spec.cutoff_hz)
+
+    def _node_at(self, t_us: float) -> int:
+        return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding
+
+    def start(self, log: Any, t_us: int) -> Any:
+        """Begin settled at the light of the first sample; returns y."""
+        self._t_us, self._node = float(t_us), self._node_at(t_us)
+        self._input, self._state = log, (log, log)
+        self._rate = self._node_rate = self._rate_at(log)
+        return log
+
+    def nodes_us(self, end_us: float) -> list[float]:
+        """Times of the nodes after the present and before `end_us`."""
+        last = math.ceil(end_us / self._period_us - 1e-6) - 1
+        return [node * self._period_us for node in range(self._node + 1, last + 1)]
+
+    def to(self, log: Any, t_us: float) -> Any:
+        """y at `t_us`, ln x having gone on a straight line to `log`; no node lies in between."""
+        import drjit as dr
+
+        types = jit()
+        elapsed_us = t_us - self._t_us
+        if self._spec.follows_light:
+            h = self._rate * dr.opaque(types.Float, elapsed_us)
+            decay = dr.exp(-h)
+            series = dr.fma(h, dr.fma(h, dr.fma(h, dr.fma(h, 1 / 120, -1 / 24), 1 / 6), -0.5), 1.0)
+            lag = dr.select(h < _SERIES_BELOW, series, (1.0 - decay) / h)
+        else:
+            exact = self._rate * elapsed_us
+            h, decay, lag = (
+                dr.opaque(types.Float, value) for value in (exact, math.exp(-exact), -math.expm1(-exact) / exact)
+            )
+        z, y = self._state
+        change, z_off = log - self._input, z - self._input
+        self._state = (
+            log + (decay * z_off - lag * change),
+            log + (decay * dr.fma(h, z_off, y - self._input) - (2.0 * lag - decay) * change),
+        )
+        self._input, self._t_us = log, t_us
+        dr.eval(self._input, self._state)
+        node = self._node_at(t_us)
+        if self._spec.min_cutoff_hz is not None and node > self._node:
+            before, now = self._node_rate, self._rate_at(log)
+            lowest = dr.maximum(0.5 * now, _rate(self._spec.min_cutoff_hz))
+            highest = dr.minimum(2.0 * now, _rate(self._spec.cutoff_hz))
+            self._node_rate, self._rate = now, dr.clip(dr.fma(0.5, now - before, now), lowest, highest)
+            dr.eval(self._rate, self._node_rate)
+        self._node = node
+        return self._state[1]
+
+    def follow(self, log: Any, t_us: int) -> Any:
+        """y at the next sample, over all nodes in between; the first call begins settled."""
+        import drjit as dr
+
+        if self._input is None:
+            return self.start(log, t_us)
+        if self._spec.follows_light:
+            before, begin_us = self._input, self._t_us
+            for node_us in self.nodes_us(t_us):
+                part = dr.opaque(jit().Float, (node_us - begin_us) / (t_us - begin_us))
+                self.to(dr.fma(log - before, part, before), node_us)
+        return self.to(log, float(t_us))

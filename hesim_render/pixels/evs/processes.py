@@ -1,0 +1,140 @@
+"""Processes in time of asynchronous event pixels: band-limited noise and leak events.
+
+Both are functions of the seed, the pixel and the time the first sample was taken; nothing depends on
+how often they are asked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.rng import Stream, philox, stream_key
+from hesim_render.core.units import US_PER_S
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.normal import normal_pair
+
+#: Nodes of the noise per period of the photoreceptor's cut-off frequency.
+NODES_PER_CUTOFF_PERIOD = 16
+
+
+class BandNoise:
+    """Unit noise of each pixel, band-limited at the cut-off: exact at nodes, linear in between.
+
+    White noise through two equal poles, −3 dB at the cut-off together. With a = 2π f_c/√(√2 − 1) its
+    correlation is (1 + a|τ|)·exp(−a|τ|), and its slope is finite, so that it crosses a level at a finite
+    rate (Rice 1945): zero upwards a/2π times a second. Behind a single pole that rate has no limit, and
+    event rates would follow the spacing of the nodes.
+
+    The state (u, u'/a) steps from node to node with its exact transition matrix. Between nodes the
+    interpolated variance averages (2 + ρ)/3, ρ the correlation of neighbours; the amplitude makes up
+    for it.
+    """
+
+    STATE = ("_node", "_value", "_state")
+
+    def __init__(self, noise: EvsNoise, seed: int) -> None:
+        cutoff_hz = noise.spec.photoreceptor_cutoff_hz
+        assert cutoff_hz is not None
+        self._key, self._seed = noise.device_key, seed
+        self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz)
+        h = math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / NODES_PER_CUTOFF_PERIOD  # a·period
+        self._transition = math.exp(-h) * np.array([[1.0 + h, h], [-h, 1.0 - h]])
+        self._amplitude = math.sqrt(3.0 / (2.0 + (1.0 + h) * math.exp(-h)))
+        # in the stationary state u and u'/a are independent, each of variance 1
+        fresh = np.eye(2) - self._transition @ self._transition.T
+        self._fresh = self._amplitude * np.linalg.cholesky(fresh)
+        self._node = 0  # the last node at or before the present
+        self._value: Any = None  # u at that node
+        self._state: tuple[Any, Any] = (None, None)  # u and u'/a at the next one
+
+    def _deviates(self, node: int) -> tuple[Any, Any]:
+        word = philox(self._seed, Stream.EVS, self._key, node & ((1 << 48) - 1)).next_uint32x4()
+        return normal_pair(word[0], word[1])
+
+    def _advance(self) -> None:
+        """The state one node further on."""
+        import drjit as dr
+
+        self._value, speed = self._state
+        z = self._deviates(self._node + 1)
+        self._state = tuple(
+            float(f[0]) * self._value + float(f[1]) * speed + float(g[0]) * z[0] + float(g[1]) * z[1]
+            for f, g in zip(self._transition, self._fresh, strict=True)
+        )
+        dr.schedule(self._state)
+
+    def start(self, t_us: int) -> Any:
+        """Begin in the stationary state; the noise at `t_us`."""
+        import drjit as dr
+
+        self._node = math.floor(t_us / self._period_us)
+        self._state = tuple(self._amplitude * z for z in self._deviates(self._node))
+        self._advance()
+        dr.eval(self._value)
+        return self.at(t_us)
+
+    def nodes_us(self, end_us: float) -> list[float]:
+        """Times of the nodes after the present and before `end_us`."""
+        last = math.ceil(end_us / self._period_us) - 1
+        return [node * self._period_us for node in range(self._node + 1, last + 1)]
+
+    def at(self, t_us: float) -> Any:
+        """The noise at `t_us`, which lies at most one node ahead of the present."""
+        import drjit as dr
+
+        part = t_us / self._period_us - self._node
+        if part > 1.0 - 1e-9:  # the next node is reached, but for rounding
+            self._node += 1
+            self._advance()
+            part = max(t_us / self._period_us - self._node, 0.0)
+        return dr.fma(self._state[0] - self._value, dr.opaque(jit().Float, part), self._value)
+
+
+class LeakProcess:
+    """Leak events: each pixel waits exponentially distributed times."""
+
+    STATE = ("_due_us", "_count")
+
+    def __init__(self, noise: EvsNoise, seed: int) -> None:
+        self._key = noise.device_key
+        self._stream_key = stream_key(seed, Stream.EVS_LEAK)
+        self._mean_us = US_PER_S / noise.leak_rate_hz
+        self._due_us: Any = None  # Float64
+        self._count: Any = None  # events so far
+
+    def _wait_us(self, key: Any, count: Any) -> Any:
+        import drjit as dr
+
+        types = jit()
+        word = types.Philox4x32(dr.opaque(types.UInt64, self._stream_key), key, count).next_uint32x4()[0]
+        return types.Float64(-dr.log(dr.fma(types.Float(word), 2.0**-32, 2.0**-33))) * self._mean_us
+
+    def start(self, t_us: int) -> None:
+        import drjit as dr
+
+        self._count = dr.zeros(jit().UInt32, dr.width(self._key))
+        self._due_us = self._wait_us(self._key, self._count) + float(t_us)
+        dr.eval(self._due_us)
+
+    def until(self, t_us: float) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint32]]]:
+        """Times and pixels of the events up to `t_us`; each round has the next one of each pixel that is due."""
+        import drjit as dr
+
+        types = jit()
+        pixel: Any = dr.compress(self._due_us <= float(t_us))
+        while dr.width(pixel):
+            due_us = dr.gather(types.Float64, self._due_us, pixel)
+            count = dr.gather(types.UInt32, self._count, pixel) + 1
+            following = due_us + self._wait_us(dr.gather(types.UInt32, self._key, pixel), count)
+            dr.eval(due_us, count, following)
+            dr.scatter(self._due_us, following, pixel)
+            dr.scatter(self._count, count, pixel)
+            yield np.array(due_us), np.array(pixel)
+            again: Any = dr.compress(following <= float(t_us))
+            pixel = dr.gather(types.UInt32, pixel, again)

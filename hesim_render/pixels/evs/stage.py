@@ -1,0 +1,292 @@
+"""The event stage: one step per sample, each pixel's memory between them, events out.
+
+`EvsStage` is fed the noise-free electrons of each event pixel's window. In ``previous_sample`` mode the
+sensor's own tick decides when; in ``last_event`` mode the source may be sampled at any times.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.core.rng import Stream, philox
+from hesim_render.core.units import S_PER_US
+from hesim_render.pixels.arrays import restore, saved, take
+from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.photoreceptor import Photoreceptor
+from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
+from hesim_render.pixels.evs.readout import EventReadout
+from hesim_render.pixels.evs.refractory import Refractory
+from hesim_render.pixels.normal import normal_pair
+
+
+class _Mode(Protocol):
+    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]: ...
+
+
+def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
+    """Structured array of events at flat pixel indices of an event grid `cols` wide."""
+    events = np.empty(len(pixel), EVENT_DTYPE)
+    events["t_us"], events["polarity"] = t_us, polarity
+    events["y"], events["x"] = np.divmod(pixel.astype(np.uint32), np.uint32(cols))
+    return events
+
+
+class EvsStage:
+    """Turns a sequence of samples into events.
+
+    Parameters
+    ----------
+    noise : the sensor's noise model (`Sensor.evs`, perhaps `without` some terms).
+    seed : the events are a pure function of it, the device seed, the sample times and the electrons.
+
+    Notes
+    -----
+    ``previous_sample``: each sample is compared with the one before; at most one event per pixel and
+    tick, at the sample's time. With ``noise_mode: per_instant`` the noise n_t is drawn once per sample and
+    differenced, so successive differences correlate by −½; with ``independent`` N(0, σ_n²) is drawn per
+    difference. A leak event is an ON event that comes with probability 1 − exp(−rate·Δt), where the
+    comparison itself gave none.
+
+    ``last_event``: the level of the last event is kept. ln x is linear in time between samples; a
+    change of several thresholds gives several events, each at its own crossing, rounded up to whole µs. The
+    noise is stationary and band-limited at the photoreceptor's cut-off (`BandNoise`), on time nodes of
+    the sensor's own; its time-averaged variance is s²/x² at the current signal; `noise_mode` has no
+    meaning. Leak events come as a Poisson process
+    and leave the reference alone. Nothing there depends on how often `step` is called.
+
+    Where the sensor has a photoreceptor, ln x (without its noise) first passes its low-pass, ln x being
+    linear in time between samples in both modes. With a refractory period (``last_event``), see `Refractory`; with
+    a read-out limit, see `EventReadout`.
+    """
+
+    STATE = ("_mode", "_t_us", "_readout")
+
+    def __init__(self, noise: EvsNoise, seed: int) -> None:
+        self.noise = noise
+        mode = _PreviousSample if noise.spec.reference == "previous_sample" else _LastEvent
+        self._mode: _Mode = mode(noise, int(seed))
+        self._t_us: int | None = None
+        self._readout: EventReadout | None = None
+        if noise.readout_max_events_per_s is not None:
+            rows = noise.layout.evs_shape[0]
+            self._readout = EventReadout(noise.readout_max_events_per_s, noise.readout_buffer_events, rows)
+
+    def state(self) -> dict[str, Any]:
+        """What the pixels remember, plain values and NumPy arrays: a run goes on from there as if it never stopped."""
+        return saved(self)
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go on from a `state` of a stage of the same sensor, region, terms and seed."""
+        restore(self, state)
+
+    @property
+    def t_us(self) -> int | None:
+        """Time of the last sample; None before the first."""
+        return self._t_us
+
+    @property
+    def dropped(self) -> int:
+        """Events lost in the read-out so far."""
+        return self._readout.dropped if self._readout is not None else 0
+
+    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+        """Take one sample.
+
+        Parameters
+        ----------
+        electrons : Dr.Jit Float [event pixels], row-major on the event grid: noise-free electrons of the
+            window of ``window_us`` that ends at `t_us`.
+        t_us : time of the sample, later than the one before.
+
+        Returns
+        -------
+        Events since the sample before, `EVENT_DTYPE`, sorted by time and then row-major. The first sample
+        sets the reference and gives none.
+
+        Raises
+        ------
+        RangeError
+            If `t_us` does not increase or the array has another size.
+        """
+        import drjit as dr
+
+        rows, cols = self.noise.layout.evs_shape
+        if dr.width(electrons) != rows * cols:
+            raise RangeError("number of event pixels", dr.width(electrons), f"{rows}×{cols}")
+        if self._t_us is not None and t_us <= self._t_us:
+            raise RangeError("t_us", t_us, f"a time after the last sample, {self._t_us}")
+        self._t_us = int(t_us)
+        events = self._mode.step(electrons, self._t_us)
+        return events if self._readout is None else self._readout.take(events)
+
+
+class _PreviousSample:
+    """Compares successive samples."""
+
+    STATE = ("_t_us", "_level", "_variance", "_photoreceptor")
+
+    def __init__(self, noise: EvsNoise, seed: int) -> None:
+        self._noise, self._seed = noise, seed
+        self._cols = noise.layout.evs_shape[1]
+        self._independent = noise.spec.noise_mode == "independent"
+        self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
+        self._t_us = 0
+        self._level: Any = None  # ln x, with the noise of its instant where that is shared
+        self._variance: Any = None  # s²/x² of the last sample, where noise is independent
+
+    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+        import drjit as dr
+
+        types = jit()
+        level, variance = self._noise.log_level(electrons)
+        if self._photoreceptor:
+            level = self._photoreceptor.follow(level, t_us)
+        word = philox(self._seed, Stream.EVS, self._noise.device_key, t_us).next_uint32x4()
+        deviate = normal_pair(word[0], word[1])[0]
+        if not self._independent:
+            level = dr.fma(dr.sqrt(variance), deviate, level)
+        if self._level is None:
+            self._keep(level, variance, t_us)
+            return no_events()
+        change = level - self._level
+        if self._independent:
+            change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
+        theta_on, theta_off = self._noise.device_thresholds
+        on, off = change > theta_on, change < -theta_off
+        if self._noise.leak_rate_hz > 0:
+            probability = -math.expm1(-self._noise.leak_rate_hz * (t_us - self._t_us) * S_PER_US)
+            on |= ~off & (word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1)))
+        polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
+        dr.schedule(polarity)
+        self._keep(level, variance, t_us)
+        found = polarity.numpy()
+        pixel = np.flatnonzero(found != 0)  # in row-major order
+        return _events(t_us, pixel, found[pixel], self._cols)
+
+    def _keep(self, level: Any, variance: Any, t_us: int) -> None:
+        import drjit as dr
+
+        self._t_us, self._level = t_us, level
+        if self._independent:
+            self._variance = variance
+            dr.schedule(variance)
+        dr.eval(self._level)
+
+
+class _LastEvent:
+    """Keeps the level of each pixel's last event."""
+
+    STATE: tuple[str, ...] = (
+        *("_t_us", "_log", "_spread", "_level", "_reference"),
+        *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
+    )
+
+    def __init__(self, noise: EvsNoise, seed: int) -> None:
+        self._noise = noise
+        self._cols = noise.layout.evs_shape[1]
+        self._t_us = 0
+        self._log: Any = None  # ln x of the last sample
+        self._spread: Any = None  # s/x of the last sample
+        self._level: Any = None  # ln x with its noise, at the end of the last segment
+        self._reference: Any = None  # level of the last event
+        self._band_noise = None if noise.is_noiseless else BandNoise(noise, seed)
+        self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
+        self._refractory: Refractory | None = None
+        if noise.refractory_period_us is not None:
+            self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
+        self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
+
+    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+        import drjit as dr
+
+        parts: list[NDArray[np.void]] = []
+        log, variance = self._noise.log_level(electrons)
+        spread = dr.sqrt(variance)
+        dr.eval(log, spread)
+        if self._log is None:
+            start = self._photoreceptor.start(log, t_us) if self._photoreceptor else log
+            self._level = start + (spread * self._band_noise.start(t_us) if self._band_noise else 0.0)
+            self._reference = dr.copy(self._level)
+            dr.eval(self._level, self._reference)
+            if self._leak:
+                self._leak.start(t_us)
+        else:
+            begin_us = float(self._t_us)
+            for end_us in self._nodes_us(t_us):
+                part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
+                level = dr.fma(log - self._log, part, self._log)
+                if self._photoreceptor:
+                    level = self._photoreceptor.to(level, end_us)
+                if self._band_noise:
+                    level = dr.fma(
+                        dr.fma(spread - self._spread, part, self._spread), self._band_noise.at(end_us), level
+                    )
+                parts.append(self._crossings(level, begin_us, end_us))
+                begin_us = end_us
+            if self._leak and not self._refractory:
+                for due_us, pixel in self._leak.until(t_us):
+                    parts.append(_events(self._stamp(due_us), pixel, 1, self._cols))
+        self._t_us, self._log, self._spread = t_us, log, spread
+        events = np.concatenate(parts) if parts else no_events()
+        # stable: a pixel's own events stay in their order where they share a microsecond
+        return events[np.lexsort((events["x"], events["y"], events["t_us"]))]
+
+    def _nodes_us(self, t_us: int) -> list[float]:
+        """Ends of the segments up to the sample at `t_us`, in each of which the level goes on a straight line."""
+        grids = [grid.nodes_us(t_us) for grid in (self._band_noise, self._photoreceptor) if grid]
+        return [*sorted(set().union(*grids)), float(t_us)]
+
+    def _stamp(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Whole µs after the last sample: the end of the one an event falls in, so that steps do not overlap."""
+        return np.maximum(np.ceil(t_us), self._t_us + 1)
+
+    def _crossings(self, level: Any, begin_us: float, end_us: float) -> NDArray[np.void]:
+        """Events of one segment in which the level goes on a straight line to `level`, unsorted."""
+        import drjit as dr
+
+        if self._refractory:
+            return self._crossings_with_dead_time(self._refractory, level, begin_us, end_us)
+        types = jit()
+        theta_on, theta_off = self._noise.device_thresholds
+        distance = level - self._reference
+        theta = dr.select(distance > 0, theta_on, theta_off)
+        crossed = dr.mulsign(dr.floor(dr.abs(distance) / theta), distance)  # thresholds, with the direction
+        reference = dr.fma(crossed, theta, self._reference)
+        dr.eval(level, reference, crossed)
+        before = self._reference, self._level
+        self._reference, self._level = reference, level
+        found = np.flatnonzero(crossed.numpy())
+        if len(found) == 0:
+            return no_events()
+        pixel = types.UInt32(found.astype(np.uint32))
+        gathered = [dr.gather(types.Float, value, pixel) for value in (crossed, *before, level)]
+        gathered.append(dr.select(gathered[0] > 0, take(theta_on, pixel), -take(theta_off, pixel)))
+        dr.eval(gathered)
+        count, *values = (np.array(value).astype(np.float64) for value in gathered)
+        repeats = np.abs(count).astype(np.int64)
+        number = np.arange(1, repeats.sum() + 1) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+        reference_0, level_0, level_1, theta_signed = (np.repeat(value, repeats) for value in values)
+        travel = level_1 - level_0
+        # a crossing that rounding kept from the segment before is due at once
+        part = (reference_0 + number * theta_signed - level_0) / np.where(travel == 0, np.inf, travel)
+        t_us = begin_us + np.clip(part, 0.0, 1.0) * (end_us - begin_us)
+        return _events(self._stamp(t_us), np.repeat(found, repeats), np.sign(theta_signed), self._cols)
+
+    def _crossings_with_dead_time(
+        self, refractory: Refractory, level: Any, begin_us: float, end_us: float
+    ) -> NDArray[np.void]:
+        """The same where pixels rest after each event, a leak event too; both kinds come out together."""
+        due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
+        due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
+        self._reference, t_us, pixel, polarity = refractory.crossings(
+            self._reference, (self._level, level), self._noise.device_thresholds, begin_us, end_us, (due_us, due_pixel)
+        )
+        self._level = level
+        return _events(self._stamp(t_us), pixel, polarity, self._cols)

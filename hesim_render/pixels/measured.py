@@ -1,0 +1,126 @@
+"""Measured maps of the calibration a sensor file points at, cut to the region that is read out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.specs.calibration import as_written, read_calibration, read_maps
+from hesim_render.specs.geometry import Region
+
+#: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
+_EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "bad_pixels": ("b", 1.0)}
+_THRESHOLD = ("fiu", 1e3)  # relative to the mean
+
+
+def require_region(layout: Layout) -> None:
+    """Check that the calibration's maps cover the region read out.
+
+    Raises
+    ------
+    SpecError
+        Where they do not; the message names the region they are of.
+    """
+    if layout.spec.noise is not None:
+        _offset(layout, read_calibration(layout.spec.noise.path))
+
+
+def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
+    """``n_row`` [row, 1], ``n_blc`` and ``n_dp`` [row, col] over the region: DN, DN and DN/s; None if not measured."""
+    found = _read(layout, "aps", ("n_row", "n_blc", "n_dp"))
+    if found is None:
+        return None
+    maps, (row, col) = found
+    rows = slice(row, row + layout.rows)
+    cut = {name: maps[name][rows, col : col + layout.cols] for name in ("n_blc", "n_dp")}
+    return {name: values.astype(np.float32) for name, values in (cut | {"n_row": maps["n_row"][rows, None]}).items()}
+
+
+def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[np.float32] | None:
+    """Threshold of each event pixel relative to the mean, [y, x] over the region; None if not measured.
+
+    Each pixel's measured value carries the noise of its estimate; deviations are scaled to `spread`, the
+    mismatch with that noise taken out.
+
+    Parameters
+    ----------
+    polarity : ``on`` or ``off``.
+    spread : relative standard deviation over pixels.
+    """
+    name = f"threshold_{polarity}_relative"
+    found = _read(layout, "evs", (name, "bad_pixels"))
+    if found is None or name not in found[0]:
+        return None
+    maps, (row, col) = found
+    values = maps[name].astype(np.float64)
+    good = values[~maps["bad_pixels"]]
+    scaled = 1 + (values - good.mean()) * (spread / max(float(good.std()), 1e-12))
+    grid = layout.spec.evs_grid
+    assert grid is not None
+    tile_rows, tile_cols = layout.tile_shape
+    y, x = row // tile_rows * grid.rows_per_tile, col // tile_cols * grid.cols_per_tile
+    height, width = layout.evs_shape
+    return scaled[y : y + height, x : x + width].astype(np.float32)
+
+
+def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[dict[str, NDArray], tuple[int, int]] | None:
+    """Maps of a section, whole, and where the region read out begins in them (row, col of the mosaic)."""
+    noise = layout.spec.noise
+    if noise is None:
+        return None
+    data = read_calibration(noise.path)
+    if section not in data:
+        return None
+    offset = _offset(layout, data)
+    maps = read_maps(noise.path, section, data, names)
+    height, width = _region(layout, data)[2:]
+    grid = layout.spec.evs_grid
+    if section == "evs" and grid is not None:
+        tile_rows, tile_cols = layout.tile_shape
+        height, width = height // tile_rows * grid.rows_per_tile, width // tile_cols * grid.cols_per_tile
+    for name in names:
+        if name not in maps and not name.startswith("threshold_"):  # thresholds are known only where steps were shown
+            raise SpecError(f"its map file of {section!r} holds no {name!r}", file=noise.path)
+    for name, values in maps.items():
+        wanted = (height,) if values.ndim == 1 else (height, width)
+        if values.shape != wanted:
+            raise SpecError(
+                f"map {name} is of size {values.shape}, the region captured of {wanted}; state roi in capture.yaml "
+                "where only a part of the sensor was captured",
+                file=noise.path,
+            )
+        kind, largest = _EXPECTED.get(name, _THRESHOLD)
+        if values.dtype.kind not in kind:
+            raise SpecError(f"map {name} holds {values.dtype.name}", file=noise.path)
+        if not np.all(np.abs(values) <= largest):
+            raise SpecError(f"map {name} holds values that are not finite, or beyond {largest:g}", file=noise.path)
+    return maps, offset
+
+
+def _region(layout: Layout, data: dict[str, Any]) -> tuple[int, int, int, int]:
+    """Row, column, rows and columns that were captured."""
+    roi = data["capture"].get("roi")
+    if roi is None:
+        return 0, 0, layout.spec.geometry.rows, layout.spec.geometry.cols
+    assert layout.spec.noise is not None
+    with as_written(layout.spec.noise.path):
+        region = Region.model_validate(roi)
+    return region.y, region.x, region.height_px, region.width_px
+
+
+def _offset(layout: Layout, data: dict[str, Any]) -> tuple[int, int]:
+    assert layout.spec.noise is not None
+    row, col, rows, cols = _region(layout, data)
+    inside = row <= layout.row0 and layout.row0 + layout.rows <= row + rows
+    inside &= col <= layout.col0 and layout.col0 + layout.cols <= col + cols
+    if not inside:
+        region = f"{cols}x{rows}+{col}+{row}"
+        raise SpecError(
+            f"was measured on {region} of the sensor; read out that region or a part of it (--roi {region})",
+            file=layout.spec.noise.path,
+        )
+    return layout.row0 - row, layout.col0 - col

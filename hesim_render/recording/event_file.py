@@ -1,0 +1,304 @@
+"""Events in HDF5, in the layout of the DSEC data set (Gehrig et al. 2021), Blosc LZ4.
+
+``events/t`` uint32 µs after ``t_offset``, ``events/x``, ``events/y`` uint16, ``events/p`` uint8 (1 ON,
+0 OFF); ``ms_to_idx[k]`` is the index of the first event at or after k ms, ``t_offset`` int64 µs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import reading, require_memory
+from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+
+_CHUNK = 1 << 16
+_COLUMNS = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
+_LONGEST_US = 2**32 - 1
+_LATEST_US = 2**53  # 285 years
+_LARGEST_CHUNK_BYTES = 1 << 26
+_BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event and its columns as they are read
+#: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
+_FILTERS = {1, 2, 3, 32000, 32001}
+
+
+class _Disk:
+    """The file under HDF5, which crashes where it cannot close: it never hears that the disk is full, `check` tells.
+
+    What cannot be written is dropped; the file is of no use then and about to be removed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w+b", buffering=0)
+        self._error: OSError | None = None
+        self.read, self.seek, self.tell, self.close = (
+            getattr(self._file, name) for name in ("read", "seek", "tell", "close")
+        )
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        place, done = self._file.tell(), 0
+        try:
+            while done < len(view):
+                done += self._file.write(view[done:])
+        except OSError as error:
+            self._error = self._error or error
+            self._file.seek(place + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        found = self._file.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)  # what was dropped
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return size
+
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
+    def check(self) -> None:
+        """Raise what was kept from HDF5."""
+        if self._error is not None:
+            raise self._error
+
+
+class EventFileWriter:
+    """Appends events, in order of time, with memory for one chunk only.
+
+    Parameters
+    ----------
+    shape : rows and columns of the event grid.
+    begin_us, end_us : time range of the recording; `begin_us` becomes ``t_offset``.
+
+    Raises
+    ------
+    SpecError
+        If the range does not fit the format's 32 bits (71 minutes).
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, int], begin_us: int, end_us: int) -> None:
+        if end_us - begin_us > _LONGEST_US:
+            raise SpecError(f"a recording of events holds at most {_LONGEST_US} µs, not {end_us - begin_us}")
+        self._begin_us, self._duration_us = begin_us, end_us - begin_us
+        self._pending: list[NDArray] = []
+        self._pending_count = 0
+        self._written = 0
+        self._last_us = begin_us
+        self._first_of_ms = np.zeros(1, dtype=np.uint64)
+        self._disk = _Disk(path)
+        self._file = h5py.File(self._disk, "w")
+        compression = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
+        for name, kind in _COLUMNS.items():
+            self._file.create_dataset(
+                f"events/{name}", shape=(0,), maxshape=(None,), chunks=(_CHUNK,), dtype=kind, compression=compression
+            )
+        self._file["t_offset"] = np.int64(begin_us)
+        self._file.attrs.update({"height": shape[0], "width": shape[1], "time_unit": "µs", "begin_us": begin_us})
+        self._file.attrs["end_us"] = end_us
+
+    def append(self, events: NDArray) -> None:
+        """Add events; times must not go back."""
+        if events.size == 0:
+            return
+        times = events["t_us"]
+        if times[0] < self._last_us or np.any(times[1:] < times[:-1]):
+            raise ValueError("events must come in order of time")
+        self._last_us = int(times[-1])
+        self._pending.append(events)
+        self._pending_count += events.size
+        if self._pending_count >= _CHUNK:
+            with self._told():
+                self._flush()
+
+    def _flush(self) -> None:
+        if not self._pending:
+            return
+        block = np.concatenate(self._pending)
+        self._pending, self._pending_count = [], 0
+        relative = block["t_us"] - self._begin_us
+        columns = {"t": relative, "x": block["x"], "y": block["y"], "p": block["polarity"] > 0}
+        for name, kind in _COLUMNS.items():
+            dataset = self._file[f"events/{name}"]
+            dataset.resize((self._written + block.size,))
+            dataset[self._written :] = columns[name].astype(kind)
+        # milliseconds that begin after the last one settled and not after this block's last event
+        new_ms = np.arange(self._first_of_ms.size, relative[-1] // 1000 + 1)
+        index = self._written + np.searchsorted(relative, new_ms * 1000, side="left")
+        self._first_of_ms = np.concatenate([self._first_of_ms, index.astype(np.uint64)])
+        self._written += block.size
+
+    def close(self) -> None:
+        """Write what is pending and the millisecond index."""
+        with self._told():
+            self._flush()
+            missing = self._duration_us // 1000 + 2 - self._first_of_ms.size
+            rest = np.full(max(0, missing), self._written, dtype=np.uint64)
+            self._file["ms_to_idx"] = np.concatenate([self._first_of_ms, rest])
+            self._file.close()
+            self._disk.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """What the disk said comes before what HDF5 makes of it."""
+        try:
+            yield
+        except (OSError, RuntimeError):
+            self._disk.check()
+            raise
+        self._disk.check()
+
+    def abandon(self) -> None:
+        """Close without finishing; the file is about to be removed."""
+        self._file.close()
+        self._disk.close()
+
+
+def read_events(
+    path: Path,
+    begin_us: int | None = None,
+    end_us: int | None = None,
+    *,
+    shape: tuple[int, int] | None = None,
+    count: int | None = None,
+) -> NDArray:
+    """Events with begin_us <= t_us < end_us (default: all), read from disk in that part only.
+
+    Parameters
+    ----------
+    shape : rows and columns of the event grid, in which coordinates must lie.
+    count : how many events the file must hold.
+
+    Returns
+    -------
+    `EVENT_DTYPE`, in order of time.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, leads to other files, or its parts do not fit each other.
+    """
+    with reading(path, "as events"), h5py.File(path, "r") as file:
+        columns = {name: _column(file, f"events/{name}", path, kind) for name, kind in _COLUMNS.items()}
+        sizes = {name: column.shape[0] for name, column in columns.items()}
+        total = sizes["t"]
+        if len(set(sizes.values())) > 1:
+            told = ", ".join(f"{name} {size}" for name, size in sizes.items())
+            raise SpecError(f"the columns of events are of different lengths ({told})", file=path)
+        if count is not None and count != total:
+            raise SpecError(f"holds {total} events; the recording has {count}", file=path)
+        offset = _offset(file, path)
+        first, last = _range(_index(file, total, path), offset, total, begin_us, end_us)
+        require_memory((last - first) * _BYTES_IN_ALL, f"{last - first} events", path)
+        if last <= first:
+            return no_events()
+        events = np.empty(last - first, dtype=EVENT_DTYPE)
+        events["t_us"] = columns["t"][first:last]
+        _check_index(columns["t"], first, last, offset, begin_us, end_us, path)
+        for name in ("x", "y"):
+            values = columns[name][first:last]
+            if shape is not None and values.max() >= shape[name == "x"]:
+                raise SpecError(f"events/{name} holds {values.max()}, outside the event grid", file=path)
+            events[name] = values
+        polarity = columns["p"][first:last]
+        if polarity.max() > 1:
+            raise SpecError(f"events/p holds {polarity.max()}; expected 0 and 1", file=path)
+        events["polarity"] = polarity.astype(np.int8) * 2 - 1
+    if np.any(events["t_us"][1:] < events["t_us"][:-1]):
+        raise SpecError("events/t goes back in time", file=path)
+    events["t_us"] += offset
+    low = 0 if begin_us is None else int(np.searchsorted(events["t_us"], begin_us, side="left"))
+    high = events.size if end_us is None else int(np.searchsorted(events["t_us"], end_us, side="left"))
+    return events[low:high]
+
+
+def _dataset(file: Any, name: str, path: Path) -> Any:
+    """A data set that lies in this file itself."""
+    parts = name.split("/")
+    for k in range(len(parts)):
+        part = "/".join(parts[: k + 1])
+        if not isinstance(file.get(part, getlink=True), h5py.HardLink):
+            raise SpecError(f"{part} is a link to elsewhere", file=path)
+    found = file[name]
+    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "ui":
+        raise SpecError(f"{name} is no data set of whole numbers", file=path)
+    layout = found.id.get_create_plist()
+    if found.is_virtual or layout.get_external_count():
+        raise SpecError(f"{name} has its values in another file", file=path)
+    for k in range(layout.get_nfilters()):
+        if (used := layout.get_filter(k)[0]) not in _FILTERS:
+            raise SpecError(f"{name} is packed by filter {used}; expected one of {sorted(_FILTERS)}", file=path)
+    return found
+
+
+def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
+    """A one-dimensional data set, all of it in the file: none of it is filled in where nothing was stored."""
+    found = _dataset(file, name, path)
+    if found.dtype.kind != "u" or found.dtype.itemsize > np.dtype(kind).itemsize:
+        raise SpecError(f"{name} holds {found.dtype.name}; expected {np.dtype(kind).name}", file=path)
+    if found.ndim != 1:
+        raise SpecError(f"{name} has shape {found.shape}; expected one dimension", file=path)
+    size, item = found.shape[0], found.dtype.itemsize
+    if found.chunks is None:
+        stored = found.id.get_storage_size() >= size * item
+    else:
+        require_memory(found.chunks[0] * item, f"a chunk of {name}", path, _LARGEST_CHUNK_BYTES)
+        stored = found.id.get_num_chunks() >= -(-size // found.chunks[0])
+    if not stored:
+        raise SpecError(f"{name} holds fewer values than the {size} it says", file=path)
+    return found
+
+
+def _offset(file: Any, path: Path) -> int:
+    found = _dataset(file, "t_offset", path)
+    offset = int(found[()]) if found.shape == () else -1
+    if not 0 <= offset <= _LATEST_US:
+        raise SpecError(f"t_offset must be one whole number of µs from 0 to {_LATEST_US}", file=path)
+    return offset
+
+
+def _index(file: Any, total: int, path: Path) -> NDArray[np.int64]:
+    """``ms_to_idx``, from 0 to the number of events and never going back."""
+    found = _column(file, "ms_to_idx", path)
+    if not 0 < found.shape[0] <= _LONGEST_US // 1000 + 3:
+        raise SpecError(f"ms_to_idx holds {found.shape[0]} values; expected one for each ms", file=path)
+    index = found[:]
+    if np.any(index[1:] < index[:-1]) or index[-1] > total:
+        raise SpecError(f"ms_to_idx must run from 0 to the number of events, {total}, without going back", file=path)
+    return index.astype(np.int64)
+
+
+def _range(
+    index: NDArray[np.int64], offset: int, count: int, begin_us: int | None, end_us: int | None
+) -> tuple[int, int]:
+    """Indices that hold the wanted times, by whole milliseconds."""
+    last_ms = index.size - 1
+    first, last = 0, count
+    if begin_us is not None:
+        first = int(index[min(max(0, (begin_us - offset) // 1000), last_ms)])
+    if end_us is not None and (end_us - offset) // 1000 + 1 <= last_ms:
+        last = int(index[max(0, (end_us - offset) // 1000 + 1)])
+    return first, last
+
+
+def _check_index(
+    times: Any, first: int, last: int, offset: int, begin_us: int | None, end_us: int | None, path: Path
+) -> None:
+    """The events just outside the range that the index gave must be outside the time that is wanted."""
+    early = begin_us is not None and first > 0 and int(times[first - 1]) + offset >= begin_us
+    late = end_us is not None and last < times.shape[0] and int(times[last]) + offset < end_us
+    if early or late:
+        raise SpecError("ms_to_idx does not fit the times of the events", file=path)

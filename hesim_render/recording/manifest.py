@@ -1,0 +1,167 @@
+"""``recording.json``: which specs, seed, versions and units made a recording; written, read and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ValidationError
+
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import inside, read_text, reading
+from hesim_render.mosaic import description as mosaic
+from hesim_render.recording.manifest_spec import RecordingSpec
+from hesim_render.specs.files import content_hash, validate
+from hesim_render.specs.light import mixed_light
+from hesim_render.specs.sensor import SensorSpec
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
+
+MANIFEST_NAME = "recording.json"
+SCHEMA_VERSION = 1
+
+UNITS = {
+    "raw": "DN",
+    "electrons_mean": "e-, noise-free signal of the frame's exposure",
+    "electrons_stderr": "e-, standard error of electrons_mean (Monte-Carlo render)",
+    "flux_mean_e_per_s": "e-/s, mean noise-free flux of an event pixel over the recording",
+    "flux_stderr_e_per_s": "e-/s, standard error of flux_mean_e_per_s",
+    "t_us": "µs from the start; the end of an integration window (of row 0 for a frame)",
+    "exposure_start_us": "µs, begin of row 0's exposure",
+    "exposure_us": "µs",
+    "line_time_us": "µs from one row's exposure to the next; 0 for a global shutter",
+    "x": "column of the event grid, 0 at the left",
+    "y": "row of the event grid, 0 at the top",
+    "polarity": "+1 ON, -1 OFF (events.h5: p 1 and 0)",
+}
+
+MASKS = {
+    "truth/valid.npy": "bool [row, col]: True where the pixel gives a frame value; elsewhere raw is 0 and the "
+    "truth of frames is NaN",
+}
+
+
+def build(
+    sensor: Sensor,
+    *,
+    scene: BaseModel | None,
+    seed: int,
+    duration_us: int,
+    settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The manifest of a recording about to be made; frames and counts are added as it grows."""
+    layout, spec = sensor.layout, sensor.spec
+    light = mixed_light(getattr(scene, "lights", ()))
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "software": software_versions(),
+        "seed": seed,
+        "settings": dict(settings),
+        "time": {"begin_us": 0, "end_us": duration_us},
+        "roi": {"x": layout.col0, "y": layout.row0, "width_px": layout.cols, "height_px": layout.rows},
+        "event_grid": {"width": layout.evs_shape[1], "height": layout.evs_shape[0]},
+        "mosaic": mosaic.describe(sensor, light).model_dump(mode="json"),
+        "lens": {
+            "f_number": sensor.lens.f_number,
+            "focal_length_mm": sensor.lens.focal_length_mm,
+            "magnification": sensor.lens.magnification,
+            "axis_mm": list(sensor.lens.axis_mm),
+        },
+        "sensor": {"name": spec.name, "file": sensor.file, "sha256": content_hash(spec), "spec": _dump(spec)},
+        "scene": None
+        if scene is None
+        else {
+            "name": getattr(scene, "name", ""),
+            "sha256": content_hash(scene),
+            "files_sha256": _file_hashes(scene),
+            "spec": _dump(scene),
+        },
+        "counts": {"frames": 0, "events": 0, "events_on": 0, "events_off": 0, "events_dropped": 0},
+        "frames": [],
+        "units": UNITS,
+        "masks": MASKS,
+    }
+
+
+def _dump(spec: BaseModel) -> dict[str, Any]:
+    return spec.model_dump(mode="json", exclude_none=True)
+
+
+def _file_hashes(scene: BaseModel) -> dict[str, str]:
+    """SHA-256 of each geometry file a scene names (a Mitsuba XML file's own includes are not followed)."""
+    folder = getattr(scene, "folder", Path())
+    mitsuba = getattr(scene, "mitsuba", None)
+    names = [mitsuba.file if mitsuba is not None else None, *(item.mesh for item in getattr(scene, "objects", []))]
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if name is not None}
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of everything whose change may change the bits of a recording."""
+    found = {"python": platform.python_version()}
+    for name in ("hesim_render", "mitsuba", "drjit", "numpy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+def to_text(value: Any, indent: str = "") -> str:
+    """JSON, indented, with lists of plain values on one line."""
+    deeper = indent + "  "
+    if isinstance(value, Mapping) and value:
+        items = [f"{json.dumps(str(k), ensure_ascii=False)}: {to_text(v, deeper)}" for k, v in value.items()]
+    elif isinstance(value, list | tuple) and any(isinstance(item, Mapping | list | tuple) for item in value):
+        items = [to_text(item, deeper) for item in value]
+    else:
+        return json.dumps(value, ensure_ascii=False)
+    begin, end = "{}" if isinstance(value, Mapping) else "[]"
+    body = ",".join(f"\n{deeper}{item}" for item in items)
+    return f"{begin}{body}\n{indent}{end}"
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """The manifest of a recording folder, as `RecordingSpec` has checked it.
+
+    Raises
+    ------
+    SpecError
+        If it is not a recording, or one of another schema; with the key that is wrong.
+    """
+    file = folder / MANIFEST_NAME
+    if not file.is_file():
+        raise SpecError(f"is not a recording (no {MANIFEST_NAME} in it)", file=folder)
+    text = read_text(inside(folder, MANIFEST_NAME))
+    with reading(file):
+        manifest = json.loads(text)
+    found = manifest.get("schema_version") if isinstance(manifest, dict) else None
+    if found != SCHEMA_VERSION or isinstance(found, bool):
+        raise SpecError(f"schema_version is {found!r}; this version reads {SCHEMA_VERSION}", file=file)
+    return validate(RecordingSpec, manifest, file, {}).model_dump(mode="json", exclude_unset=True)
+
+
+def sensor_spec(manifest: Mapping[str, Any], folder: Path | None = None) -> SensorSpec:
+    """The sensor of a recording, without the place of its calibration.
+
+    Parameters
+    ----------
+    folder : of the recording, for the error.
+
+    Raises
+    ------
+    SpecError
+        If the manifest holds none that this version knows.
+    """
+    try:
+        return SensorSpec.model_validate(manifest["sensor"]["spec"])
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key = ".".join(["sensor", "spec", *map(str, problem["loc"])])
+        place = None if folder is None else folder / MANIFEST_NAME
+        raise SpecError(problem["msg"].removeprefix("Value error, "), file=place, key=key) from None

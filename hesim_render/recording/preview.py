@@ -1,0 +1,221 @@
+"""Pictures of a recording: the RAW mosaic, a simple colour view, events over a frame.
+
+They are for people. The colour view averages each channel over its neighbourhood, balances white,
+applies one matrix and the sRGB curve; it is no demosaicing to measure with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from hesim_render.mosaic.description import Mosaic
+from hesim_render.spectral.colorimetry import encode_srgb
+
+Picture = NDArray[np.uint8]  # [row, col, 3], sRGB
+
+ON_COLOUR = np.array([255, 150, 20], dtype=np.float32)
+OFF_COLOUR = np.array([30, 160, 255], dtype=np.float32)
+_BACKGROUND, _INK, _FAINT = (24, 24, 27), (235, 235, 235), (150, 150, 155)
+_PANEL_PX, _WIDEST_PX = 640, 832  # small frames are magnified to about the first, none is wider than the second
+#: Linear tint of each DNG colour code, red to white.
+_TINT = np.array(
+    [[1, 0.08, 0.06], [0.1, 0.9, 0.12], [0.1, 0.2, 1], [0.1, 0.9, 1], [1, 0.2, 1], [1, 0.9, 0.1], [0.9, 0.9, 0.9]],
+    dtype=np.float32,
+)
+
+
+def colour_picture(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 1024) -> Picture:
+    """A colour view of one frame from its valid pixels, at full size or binned by whole tiles.
+
+    Parameters
+    ----------
+    raw : [row, col] DN.
+    max_width : wider frames are binned until they fit.
+    """
+    tile_cols = mosaic.tile_shape[1]
+    if raw.shape[1] <= max_width:
+        channels = _smoothed(raw, mosaic)
+    else:
+        channels = _binned(raw, mosaic, -(-raw.shape[1] // (tile_cols * max_width)))
+    return encode_srgb(_developed(channels, mosaic))
+
+
+def thumbnail(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 256) -> Picture:
+    """A small colour view, binned by whole tiles."""
+    tiles = max(1, -(-raw.shape[1] // (mosaic.tile_shape[1] * max_width)))
+    return encode_srgb(_developed(_binned(raw, mosaic, tiles), mosaic))
+
+
+def _binned(raw: NDArray[np.uint16], mosaic: Mosaic, tiles: int) -> NDArray[np.float32]:
+    """Mean DN above black of each channel over blocks of tiles, [row, col, channel]."""
+    tile = mosaic.tile_channel
+    block_rows, block_cols = tile.shape[0] * tiles, tile.shape[1] * tiles
+    rows, cols = raw.shape[0] // block_rows, raw.shape[1] // block_cols
+    if rows == 0 or cols == 0:
+        return _smoothed(raw, mosaic)
+    blocks = raw[: rows * block_rows, : cols * block_cols].reshape(rows, block_rows, cols, block_cols)
+    pixels = blocks.transpose(0, 2, 1, 3).reshape(rows, cols, block_rows * block_cols)
+    channel = np.tile(tile, (tiles, tiles)).ravel()
+    means = [pixels[..., channel == number].mean(axis=-1, dtype=np.float32) for number in range(len(mosaic.channels))]
+    return np.stack(means, axis=-1) - np.float32(mosaic.black_level_dn)
+
+
+def _smoothed(raw: NDArray[np.uint16], mosaic: Mosaic) -> NDArray[np.float32]:
+    """DN above black of each channel at every pixel: Gaussian-weighted mean of its valid neighbours."""
+    from scipy.ndimage import gaussian_filter
+
+    channel = mosaic.tiled(mosaic.tile_channel, raw.shape)
+    signal = raw.astype(np.float32) - np.float32(mosaic.black_level_dn)
+    sigma = 0.35 * max(mosaic.tile_shape)
+    if sigma < 0.5:
+        return signal[..., None]
+    planes = []
+    for number in range(len(mosaic.channels)):
+        mask = (channel == number).astype(np.float32)
+        weight = gaussian_filter(mask, sigma, mode="nearest", truncate=3.5)
+        planes.append(gaussian_filter(signal * mask, sigma, mode="nearest", truncate=3.5) / weight)
+    return np.stack(planes, axis=-1)
+
+
+def _developed(channels: NDArray[np.float32], mosaic: Mosaic) -> NDArray[np.float32]:
+    """Linear sRGB, exposed so that the brightest half percent reaches white; dark frames stay dark."""
+    span = float(mosaic.white_level_dn - mosaic.black_level_dn)
+    # saturated channels are held at one level, or highlights would turn magenta
+    balanced = np.minimum(channels / np.array(mosaic.neutral, dtype=np.float32), span)
+    linear = balanced @ np.array(mosaic.camera_to_srgb, dtype=np.float32).T
+    white = max(float(np.percentile(linear.max(axis=-1)[::2, ::2], 99.5)), 0.02 * span)
+    return linear * (0.95 / white)
+
+
+def mosaic_picture(raw: NDArray[np.uint16], mosaic: Mosaic, scale: int = 1) -> Picture:
+    """The RAW mosaic itself, each pixel in the tint of its filter, magnified `scale` times.
+
+    Pixels that give only events are dark; from scale 6 on they carry a dot in their filter's tint.
+    """
+    span = float(mosaic.white_level_dn - mosaic.black_level_dn)
+    signal = np.clip(raw.astype(np.float32) - np.float32(mosaic.black_level_dn), 0, span)
+    valid = mosaic.tiled(mosaic.tile_channel >= 0, raw.shape)
+    white = max(float(np.percentile(signal[valid], 99.5)), 0.02 * span) if valid.any() else span
+    tint = _TINT[mosaic.tiled(mosaic.tile_code, raw.shape)]
+    if mosaic.is_mono:
+        tint = np.ones_like(tint)
+    picture = encode_srgb(tint * np.where(valid, signal / white, 0.012)[..., None])
+    picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)
+    if scale >= 6:
+        dot = np.zeros((scale, scale), dtype=bool)
+        dot[scale // 3 : -(scale // 3), scale // 3 : -(scale // 3)] = True
+        where = ~valid.repeat(scale, axis=0).repeat(scale, axis=1) & np.tile(dot, raw.shape)
+        picture[where] = encode_srgb(0.35 * tint).repeat(scale, axis=0).repeat(scale, axis=1)[where]
+    return picture
+
+
+def events_picture(background: Picture, events: NDArray, event_shape: tuple[int, int]) -> Picture:
+    """Events over a dimmed grey frame: ON orange, OFF blue, stronger where there are more.
+
+    Parameters
+    ----------
+    background : the frame, any size.
+    events : structured array of the window to show.
+    event_shape : rows and columns of the event grid.
+    """
+    size = background.shape[:2]
+    grey = background.astype(np.float32) @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+    canvas = np.repeat((18 + 0.3 * grey)[..., None], 3, axis=2)
+    rows, cols = event_shape
+    if rows == 0 or cols == 0:
+        return canvas.astype(np.uint8)
+    # a grid finer than the picture is summed over the picture's pixels, so that no event gets lost
+    height, width = min(rows, size[0]), min(cols, size[1])
+    cell = events["y"].astype(np.int64) * height // rows * width + events["x"].astype(np.int64) * width // cols
+    on = np.bincount(cell[events["polarity"] > 0], minlength=height * width).reshape(height, width)
+    off = np.bincount(cell[events["polarity"] < 0], minlength=height * width).reshape(height, width)
+    total = on + off
+    share = (on / np.maximum(total, 1)).astype(np.float32)[..., None]
+    colour = share * ON_COLOUR + (1 - share) * OFF_COLOUR
+    opacity = (1 - np.exp(-2.0 * total)).astype(np.float32)[..., None]
+    y, x = np.arange(size[0]) * height // size[0], np.arange(size[1]) * width // size[1]
+    opacity, colour = opacity[y][:, x], colour[y][:, x]
+    return (canvas * (1 - opacity) + colour * opacity).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of a sheet and the line under it."""
+
+    picture: Picture
+    caption: str
+
+
+def panel_width(cols: int, tile_cols: int) -> tuple[int, int]:
+    """Width of the panels of a sheet for frames of `cols` columns, and the share of tiles shown (1 in n²)."""
+    step = -(-cols // _WIDEST_PX)
+    if step > 1:
+        return cols // (tile_cols * step) * tile_cols, step
+    return cols * max(1, round(_PANEL_PX / cols)), 1
+
+
+def every_tile(raw: NDArray[np.uint16], mosaic: Mosaic, step: int) -> NDArray[np.uint16]:
+    """One tile of each `step` × `step`, so that a large mosaic still looks like one."""
+    kept = [
+        (np.arange(size // (period * step))[:, None] * period * step + np.arange(period)).ravel()
+        for size, period in zip(raw.shape, mosaic.tile_shape, strict=True)
+    ]
+    return raw[np.ix_(*kept)]
+
+
+def fitted(picture: Picture, width_px: int) -> Picture:
+    """A picture at `width_px`: whole-number magnification where that fits, else an area average."""
+    rows, cols = picture.shape[:2]
+    if width_px % cols == 0:
+        scale = width_px // cols
+        return picture.repeat(scale, axis=0).repeat(scale, axis=1)
+    size = (width_px, max(1, round(rows * width_px / cols)))
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+
+
+def busiest_window(picture: Picture, fraction: float) -> tuple[float, float]:
+    """Relative (row, col) of the top left of the window of this relative size with the most contrast."""
+    grey = picture.astype(np.float32).mean(axis=2)
+    steps = np.linspace(0.0, 1.0 - fraction, 9)
+    height, width = max(2, int(grey.shape[0] * fraction)), max(2, int(grey.shape[1] * fraction))
+    corners = [(row, col) for row in steps for col in steps]
+    spread = [
+        grey[int(r * grey.shape[0]) :, int(c * grey.shape[1]) :][:height, :width].std() - 4 * abs(r + c - 1 + fraction)
+        for r, c in corners
+    ]
+    return corners[int(np.argmax(spread))]
+
+
+def contact_sheet(panels: Sequence[Panel], title: str, width_px: int, columns: int = 2) -> Image.Image:
+    """Panels of one width side by side with captions, under a title."""
+    gap, line = 14, 24
+    pictures = [fitted(panel.picture, width_px) for panel in panels]
+    columns = min(columns, len(pictures))
+    rows = [list(range(k, min(k + columns, len(pictures)))) for k in range(0, len(pictures), columns)]
+    heights = [max(pictures[k].shape[0] for k in row) + line for row in rows]
+    size = (gap + columns * (width_px + gap), 2 * gap + line + sum(heights) + gap * (len(rows) - 1))
+    sheet = Image.new("RGB", size, _BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((gap, gap - 2), title, fill=_INK, font=ImageFont.load_default(size=16))
+    top = gap + line
+    for row, height in zip(rows, heights, strict=True):
+        for place, k in enumerate(row):
+            left = gap + place * (width_px + gap)
+            sheet.paste(Image.fromarray(pictures[k]), (left, top))
+            below = top + pictures[k].shape[0] + 4
+            draw.text((left, below), panels[k].caption, fill=_FAINT, font=ImageFont.load_default(size=13))
+        top += height + gap
+    return sheet
+
+
+def save_animation(path: str, pictures: Sequence[Picture], frame_ms: int = 80) -> None:
+    """An endless animated GIF."""
+    images = [Image.fromarray(picture).quantize(96) for picture in pictures]
+    images[0].save(
+        path, format="GIF", save_all=True, append_images=images[1:], duration=frame_ms, loop=0, optimize=False
+    )

@@ -1,0 +1,163 @@
+"""The previews of a recording: a contact sheet, a 2×2 DNG of a quad mosaic, an animation if it moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from hesim_render.core.guard import printable
+from hesim_render.core.output import replacing
+from hesim_render.pixels.evs.events import no_events
+from hesim_render.recording import dng, preview
+from hesim_render.recording.preview import Panel, Picture
+
+if TYPE_CHECKING:
+    from hesim_render.recording.recording import Frame, Recording
+
+#: Events of a moving scene are shown over a window of this length, µs.
+WINDOW_US = 10_000
+_ANIMATION_STEPS = 30
+_ANIMATION_WIDTH_PX = 640
+_ZOOM = 8
+
+
+def write_previews(recording: Recording, folder: Path) -> list[Path]:
+    """Write ``preview.png`` and, where they apply, ``preview.dng`` and ``preview.gif``; returns their paths.
+
+    Each takes the place of an earlier one in one step; a link of its name is replaced, not followed.
+    """
+    written = [folder / "preview.png"]
+    with replacing(written[0]) as temporary:
+        contact_sheet(recording).save(temporary, format="PNG")
+    if len(recording.frames):
+        frame = _middle(recording)
+        smaller = dng.binned(frame.raw, recording.mosaic)
+        if smaller is not None:
+            raw, mosaic = smaller
+            written.append(folder / "preview.dng")
+            with replacing(written[-1]) as temporary:
+                dng.write_dng(
+                    temporary, raw, mosaic, exposure_us=frame.exposure_us, description=frame.times,
+                    thumbnail=preview.thumbnail(raw, mosaic),
+                )  # fmt: skip
+    pictures = animation(recording) if moves(recording) else []
+    if len(pictures) > 1:
+        written.append(folder / "preview.gif")
+        with replacing(written[-1]) as temporary:
+            preview.save_animation(str(temporary), pictures)
+    return written
+
+
+def moves(recording: Recording) -> bool:
+    """Whether the scene of a recording has motion; a video counts as such."""
+    if "video" in recording.manifest["settings"]:
+        return True
+    scene = recording.manifest.get("scene") or {}
+    return bool(scene.get("spec", {}).get("motion"))
+
+
+def _middle(recording: Recording) -> Frame:
+    return recording.frames[len(recording.frames) // 2]
+
+
+def contact_sheet(recording: Recording) -> Image.Image:
+    """Colour view, events over it, the RAW mosaic whole and magnified, with captions."""
+    panels: list[Panel] = []
+    mosaic = recording.mosaic
+    begin_us, end_us = recording.manifest["time"]["begin_us"], recording.manifest["time"]["end_us"]
+    middle_us = (begin_us + end_us) // 2
+    if len(recording.frames):
+        frame = _middle(recording)
+        colour = preview.colour_picture(frame.raw, mosaic)
+        middle_us = frame.exposure_start_us + frame.exposure_us // 2
+        label = "Grey view" if len(mosaic.channels) == 1 else "Colour view"
+        panels.append(Panel(colour, f"{label} of frame {frame.index}, {_ms(frame.exposure_us)} exposure"))
+    else:
+        colour = _black(recording)
+    if min(recording.event_shape) > 0:
+        # a scene that stands still gives only noise: show all of it
+        window_us = WINDOW_US if moves(recording) else end_us - begin_us
+        first = max(begin_us, min(middle_us - window_us // 2, end_us - window_us))
+        last = min(first + window_us, end_us)
+        events = recording.event_slice(first, last + 1)
+        picture = preview.events_picture(colour, events, recording.event_shape)
+        panels.append(Panel(picture, f"{_count(events.size, 'event')} in {_ms(last - first)}: ON orange, OFF blue"))
+    roi = recording.manifest["roi"]
+    width_px, step = preview.panel_width(roi["width_px"], mosaic.tile_shape[1])
+    if len(recording.frames):
+        panels += _mosaic_panels(frame, recording, colour, width_px, step)
+    if not panels:
+        panels.append(Panel(colour, "no frames and no event pixels"))
+    counts = recording.manifest["counts"]
+    scene = (recording.manifest.get("scene") or {}).get("name", "")
+    title = "  ·  ".join(
+        part
+        for part in (
+            scene, mosaic.sensor, f"{_size(recording)} px", _ms(recording.duration_us),
+            _count(counts["frames"], "frame"), _count(counts["events"], "event"), f"seed {recording.manifest['seed']}",
+        )
+        if part
+    )  # fmt: skip
+    return preview.contact_sheet(panels, printable(title), width_px)
+
+
+def _mosaic_panels(frame: Frame, recording: Recording, colour: Picture, width_px: int, step: int) -> list[Panel]:
+    """The RAW mosaic in its filters' tints, and its busiest part magnified."""
+    mosaic = recording.mosaic
+    rows, cols = frame.raw.shape
+    tile_rows, tile_cols = mosaic.tile_shape
+    width = min(cols, max(1, width_px // _ZOOM // tile_cols) * tile_cols)
+    height = min(rows, max(1, width * rows // cols // tile_rows) * tile_rows)
+    row, col = preview.busiest_window(colour, width / cols) if cols > width else (0.0, 0.0)
+    top = min(int(row * rows), rows - height) // tile_rows * tile_rows
+    left = min(int(col * cols), cols - width) // tile_cols * tile_cols
+    part = preview.mosaic_picture(frame.raw[top : top + height, left : left + width], mosaic, _ZOOM)
+    note = "" if frame.valid.all() else "; dots: event pixels"
+    zoomed = Panel(part, f"RAW at row {top}, column {left}, magnified {_ZOOM} times{note}")
+    if mosaic.is_mono:
+        return [zoomed]
+    whole = preview.mosaic_picture(preview.every_tile(frame.raw, mosaic, step), mosaic)
+    shown = "" if step == 1 else f"; 1 of {step}x{step} tiles shown"
+    return [Panel(whole, f"RAW mosaic in the tints of its filters{shown}"), zoomed]
+
+
+def animation(recording: Recording) -> list[Picture]:
+    """Events over the latest frame, step by step through the recording."""
+    if min(recording.event_shape) == 0:
+        frames = [preview.colour_picture(f.raw, recording.mosaic, _ANIMATION_WIDTH_PX) for f in recording.frames]
+        return frames[:_ANIMATION_STEPS]
+    begin_us, end_us = recording.manifest["time"]["begin_us"], recording.manifest["time"]["end_us"]
+    edges = np.linspace(begin_us, end_us + 1, _ANIMATION_STEPS + 1).astype(int)
+    shown_at = [entry["t_us"] for entry in recording.manifest["frames"]]
+    pictures: list[Picture] = []
+    background, shown = _black(recording), -1
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        latest = max(0, int(np.searchsorted(shown_at, last, side="right")) - 1)
+        if shown_at and latest != shown:
+            raw = recording.frames[latest].raw
+            background, shown = preview.colour_picture(raw, recording.mosaic, _ANIMATION_WIDTH_PX), latest
+        events = recording.event_slice(int(first), int(last)) if last > first else no_events()
+        pictures.append(preview.events_picture(background, events, recording.event_shape))
+    return pictures
+
+
+def _black(recording: Recording) -> Picture:
+    roi = recording.manifest["roi"]
+    shrink = max(1, -(-roi["width_px"] // 1024))
+    return np.zeros((roi["height_px"] // shrink, roi["width_px"] // shrink, 3), dtype=np.uint8)
+
+
+def _size(recording: Recording) -> str:
+    roi = recording.manifest["roi"]
+    return f"{roi['width_px']}x{roi['height_px']}"
+
+
+def _ms(microseconds: int) -> str:
+    return f"{microseconds / 1000:g} ms"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

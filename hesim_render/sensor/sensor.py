@@ -1,0 +1,156 @@
+"""A sensor ready to use: its file, the region read out, its lens, and both noise models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps.model import ApsNoise
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.measured import require_region
+from hesim_render.sensor import lens as optics
+from hesim_render.sensor.lens import Lens
+from hesim_render.specs.sensor import SensorSpec, read_sensor
+from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
+
+
+@dataclass(frozen=True, repr=False)
+class Sensor:
+    """One sensor file over one read-out region.
+
+    Parameters
+    ----------
+    layout : region, tile and event grid; `layout.spec` is the file.
+    lens : the lens in use (a scene may replace f-number, focal length and focus).
+    """
+
+    layout: Layout
+    lens: Lens
+    file: str = field(default="", compare=False)
+
+    @classmethod
+    def from_spec(cls, spec: SensorSpec, file: str = "") -> Sensor:
+        return cls(Layout.full(spec), Lens.of(spec), file)
+
+    def __repr__(self) -> str:
+        layout, geometry, lens = self.layout, self.spec.geometry, self.lens
+        parts = [f"{layout.cols}x{layout.rows}+{layout.col0}+{layout.row0} of {geometry.cols}x{geometry.rows} px"]
+        if self.spec.evs is not None:
+            parts.append(f"events on {layout.evs_shape[1]}x{layout.evs_shape[0]} px")
+        if self.spec.aps is None:
+            parts.append("no frames")
+        parts.append(f"f/{lens.f_number:g}, {lens.focal_length_mm:g} mm")
+        return f"<Sensor {self.name!r}: {'; '.join(parts)}>"
+
+    @property
+    def spec(self) -> SensorSpec:
+        return self.layout.spec
+
+    @property
+    def name(self) -> str:
+        return self.spec.name
+
+    @property
+    def rows(self) -> int:
+        return self.layout.rows
+
+    @property
+    def cols(self) -> int:
+        return self.layout.cols
+
+    def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> Sensor:
+        """The same sensor with a smaller read-out region (columns first, as in 512x384).
+
+        The region is centred unless `x`, `y` (its first column and row) are given, and always
+        starts at a whole tile. Device maps and random numbers follow the full sensor's pixels.
+
+        Raises
+        ------
+        RangeError
+            If the region does not fit or is not made of whole tiles.
+        """
+        return replace(self, layout=self.layout.crop(width_px, height_px, x, y))
+
+    def with_lens(self, **changes: float | None) -> Sensor:
+        """With another `f_number`, `focal_length_mm` or `focus_distance_m` (see `Lens.of`)."""
+        return replace(self, lens=Lens.of(self.spec, **changes))
+
+    @cached_property
+    def responses(self) -> dict[str, Spectrum]:
+        """P_c·C_f of Eq. 1 per filter, on the optical axis: e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹."""
+        return {name: optics.response(self.spec, name, self.lens) for name in self.spec.filters}
+
+    def spectral_response(self, wavelength_nm: ArrayLike) -> dict[str, NDArray[np.float64]]:
+        """The P_c(λ)·C_f(λ) of Eq. 1 at `wavelength_nm`, per filter.
+
+        Returns
+        -------
+        {filter: array like wavelength_nm}, in e⁻/s per W m⁻² sr⁻¹ nm⁻¹: A_pix·FF·G·τ·C_f·η·λ/(hc),
+        on the optical axis, with G = π/(1 + 4N²(1 + |m|)²).
+        """
+        return {name: response.at(wavelength_nm) for name, response in self.responses.items()}
+
+    @cached_property
+    def relative_illumination(self) -> NDArray[np.float32]:
+        """V(x) at every pixel, [row, col]."""
+        return optics.relative_illumination(self.layout, self.lens)
+
+    @cached_property
+    def aps(self) -> ApsNoise:
+        """The frame pixels' noise model.
+
+        Raises
+        ------
+        SpecError
+            If the sensor has none, or its measured maps do not cover the region read out.
+        """
+        if self.spec.aps is None:
+            raise SpecError(f"sensor {self.name!r} has no frame pixels")
+        require_region(self.layout)
+        return ApsNoise(self.spec.aps, self.layout, self.spec.device_seed)
+
+    @cached_property
+    def evs(self) -> EvsNoise:
+        """The event pixels' noise model.
+
+        Raises
+        ------
+        SpecError
+            If the sensor has none, or its measured maps do not cover the region read out.
+        """
+        if self.spec.evs is None:
+            raise SpecError(f"sensor {self.name!r} has no event pixels")
+        require_region(self.layout)
+        return EvsNoise(self.spec.evs, self.layout, self.spec.device_seed, self._signal_scale)
+
+    @property
+    def _signal_scale(self) -> NDArray[np.float64]:
+        """Per event position: response of the signal reference's filter over the position's own."""
+        assert self.spec.evs is not None
+        reference = self.spec.evs.signal_reference.filter
+        positions = self.spec.positions("evs")
+        if reference == "own":
+            return np.ones(len(positions))
+        flat = constant(1.0)
+        total = {name: integrate_product(response, flat) for name, response in self.responses.items()}
+        own = [self.spec.pixels[self.spec.tile_rows[i][j]].filter for i, j in positions]
+        return np.array([total[reference] / total[name] for name in own])
+
+
+def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Sensor:
+    """A sensor by shipped name (``hesim-render list sensors``) or path of a YAML file.
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of what is wrong.
+    """
+    return Sensor.from_spec(read_sensor(name_or_path, overrides), str(name_or_path))

@@ -1,0 +1,1 @@
+"""Who can say how many photo-electrons per second each pixel gets."""

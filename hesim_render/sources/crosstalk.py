@@ -1,0 +1,125 @@
+"""Crosstalk: part of a pixel's electrons is collected by its four neighbours, whatever their roles.
+
+Charge that is set free under one pixel diffuses to the next before either is read. With c the part that leaves,
+Φ' = (1 − c)·Φ + c/4·(Φ above + Φ below + Φ left + Φ right): the kernel is symmetric, so that no electron is
+lost. At the border of the region a pixel keeps the share of the neighbour it lacks. What a pixel receives
+falls into its own exposure, also with a rolling shutter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.mosaic.schedule import Block
+from hesim_render.sources.protocol import FluxSource, Sample, SampledFlux
+
+
+def mixed(image: NDArray, part: float) -> NDArray:
+    """Φ' of an image [row, col] of electrons or their rate."""
+    if part == 0:
+        return image
+    padded = np.pad(image, 1, mode="edge")
+    around = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+    return (1.0 - part) * image + part / 4 * around
+
+
+def with_crosstalk(flux: FluxSource, shape: tuple[int, int], part: float) -> FluxSource:
+    """The source as the pixels of a region [row, col] see it; itself where no part leaves a pixel."""
+    if part <= 0:
+        return flux
+    return (
+        SampledCrosstalkFlux(flux, shape, part) if isinstance(flux, SampledFlux) else CrosstalkFlux(flux, shape, part)
+    )
+
+
+class CrosstalkFlux:
+    """A source of flux behind crosstalk; implements `FluxSource`.
+
+    It asks the source for the neighbours of the listed pixels too, each over the listed pixel's interval: where
+    intervals differ from row to row a pixel is asked for up to three times.
+
+    Parameters
+    ----------
+    flux : the source.
+    shape : rows and columns of the read-out region.
+    part : c, 0 to 1.
+    """
+
+    def __init__(self, flux: FluxSource, shape: tuple[int, int], part: float) -> None:
+        self._flux, self._shape, self._part = flux, shape, part
+        self.is_static = flux.is_static
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        return self._flux.slice_edges_us(begin_us, end_us)
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        return self._flux.sample_times_us(begin_us, end_us)
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """See `FluxSource.mean_flux`; both halves are mixed alike."""
+
+        types = jit()
+        own = np.asarray(pixel, dtype=np.int64).ravel()
+        sites = self._sites(own)
+        begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
+        if begin.ndim == end.ndim == 0:
+            asked, place = np.unique(sites, return_inverse=True)
+        else:
+            interval = np.broadcast_to(begin + 1j * end, own.shape)
+            intervals, number = np.unique(interval, return_inverse=True)
+            asked, place = np.unique(sites * intervals.size + number, return_inverse=True)
+            asked, number = np.divmod(asked, intervals.size)
+            begin, end = intervals.real[number], intervals.imag[number]
+        halves = self._flux.mean_flux(asked.astype(np.uint32), begin, end)
+        return self._mix(halves, [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)])
+
+    def _sites(self, own: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Each pixel and its four neighbours, itself where it lacks one, [5, n]."""
+        rows, cols = self._shape
+        row, col = np.divmod(own, cols)
+        return np.stack(
+            [
+                own,
+                own - cols * (row > 0),
+                own + cols * (row < rows - 1),
+                own - (col > 0),
+                own + (col < cols - 1),
+            ]
+        )
+
+    def _mix(self, halves: tuple[Any, Any], index: list[Any]) -> tuple[Any, Any]:
+        import drjit as dr
+
+        types = jit()
+        result = []
+        for half in halves:
+            centre, *around = (dr.gather(types.Float, half, where) for where in index)
+            result.append(
+                (1.0 - self._part) * centre + self._part / 4 * (around[0] + around[1] + around[2] + around[3])
+            )
+        dr.eval(result)
+        return result[0], result[1]
+
+
+class SampledCrosstalkFlux(CrosstalkFlux):
+    """The same of a source that is asked for many windows at once; implements `SampledFlux`."""
+
+    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
+        """See `SampledFlux.instants_us`."""
+        assert isinstance(self._flux, SampledFlux)
+        return self._flux.instants_us(begin_us, end_us)
+
+    def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
+        """See `SampledFlux.flux_of_blocks`."""
+        types = jit()
+        sites = self._sites(np.asarray(pixel, dtype=np.int64).ravel())
+        asked, place = np.unique(sites, return_inverse=True)
+        index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
+        assert isinstance(self._flux, SampledFlux)
+        for sample in self._flux.flux_of_blocks(asked.astype(np.uint32), blocks):
+            yield Sample(*self._mix((sample.half_a, sample.half_b), index))

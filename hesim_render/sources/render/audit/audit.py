@@ -1,0 +1,336 @@
+"""What a run is worth, measured: random pixels over stretches of time are rendered again, with other random numbers.
+
+The audit decides nothing about the picture. Its units are stretches of windows of one pixel (`units`): as many in
+each stretch of time, of pixels that are drawn independently of each other; of a sensor with a tick one window of a
+stretch is judged, so that nothing is counted twice that belongs together. They are rendered with random numbers of
+their own and so many rays that their error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for
+the whole run, at whatever number of units the audit stops (`confidence`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.sources.protocol import AuditableFlux
+from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
+from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
+from hesim_render.sources.render.audit.units import NotedFlux, Units
+
+#: Confidence of each stated bound.
+CONFIDENCE = 0.99
+#: What a run should have: share of values off by more than the tolerance, of signal events missed, of events too many.
+MOST_OFF, MOST_MISSED, MOST_EXTRA = 0.02, 0.02, 0.01
+#: Deviation that counts, in wanted errors.
+TOLERANCE = 3.0
+#: Windows of a unit before those that are judged, these, and after them: an event may come one window early or late.
+STRETCHES = {"previous_sample": (2, 1, 1), "last_event": (1, 8, 1)}
+#: Events that are counted of a unit at most.
+_MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
+#: Part of the units of pixels that nothing can come near which is rendered again; they count for more.
+_STILL_PART = 0.25
+#: Wanted error of the reference over the sensor's noise, as a part of the run's quality.
+_REFERENCE = 0.5
+#: Units that are looked at before it is asked whether they are enough: at first, and later on.
+_LEAST_BATCH, _MOST_BATCH = 256, 16384
+#: Rays of an audit at most: a part of the run's own, or so many if that is more.
+_PART, _RAYS = 0.25, 30_000_000
+
+
+class _Tally:
+    """What units were seen to have, arrays [unit] in the random order in which they are looked at.
+
+    Parameters
+    ----------
+    units : so many.
+
+    Attributes
+    ----------
+    off : share of values off by more than the tolerance, times the number of units that this one stands for.
+    expected : the same of what the error which the run states puts there by itself.
+    events : what `compare` counted; `by_error`, what it counts of the reference with the stated error on top.
+    eventful : first so many of which all that have events in the run were looked at; `looked_at`, all.
+    """
+
+    def __init__(self, units: int) -> None:
+        self.off, self.expected, self.by_error = (np.zeros(units) for _ in range(3))
+        self.events = Counted(*(np.zeros(units) for _ in range(5)))
+        self.has_event = np.zeros(units, np.bool_)
+        self.eventful = self.looked_at = 0
+        self._deviations: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
+
+    def note(self, place: NDArray[np.int64], deviation: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
+        """Deviations of some units, [window, unit], absolute, in units of noise, and how many each stands for."""
+        each = np.broadcast_to(place, deviation.shape), deviation, np.broadcast_to(weight, deviation.shape)
+        self._deviations.append(tuple(values.ravel() for values in each))  # type: ignore[arg-type]
+
+    def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Deviations and weights of all that were looked at, the least first."""
+        place, deviation, weight = (np.concatenate(values) for values in zip(*self._deviations, strict=True))
+        among = np.flatnonzero(place < self.looked_at)
+        order = among[np.argsort(deviation[among])]
+        return deviation[order], weight[order]
+
+    def rate(self, values: NDArray[np.float64]) -> float:
+        """Mean over units, of something that only events have."""
+        rare = values[: self.eventful][self.has_event[: self.eventful]].sum() / max(1, self.eventful)
+        other = values[: self.looked_at][~self.has_event[: self.looked_at]].sum() / max(1, self.looked_at)
+        return float(rare + other)
+
+
+class Audit:
+    """One run, audited.
+
+    Parameters
+    ----------
+    noted : what it gave.
+    source : rendered it, and renders units again.
+    quality : that was asked for.
+    noise : of the event pixels, None where there are none.
+    event_pixel : mosaic indices in the order of the event grid.
+    seed : of the choices.
+    """
+
+    def __init__(
+        self,
+        noted: NotedFlux,
+        source: AuditableFlux,
+        quality: float,
+        noise: EvsNoise | None,
+        event_pixel: NDArray[np.uint32],
+        seed: int,
+    ) -> None:
+        self._noted, self._source, self._quality, self._noise = noted, source, quality, noise
+        self._event_pixel = event_pixel
+        self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 2]))
+
+    def run(self) -> dict[str, Any]:
+        """Bounds, estimates and deviations, and whether they are what they should be; plain values."""
+        own = self._source.rays_traced
+        room = max(_PART * own, _RAYS)
+        found: dict[str, Any] = {"confidence": CONFIDENCE, "tolerance_noise": TOLERANCE * self._quality}
+        kinds = [name for name in ("events", "frames") if getattr(self._noted, name)]
+        for name in kinds:
+            found[name] = self._one(getattr(self._noted, name), name == "events", room / len(kinds))
+        found["rays"] = self._source.rays_traced - own
+        return found | self._verdict([found[name] for name in kinds])
+
+    def _one(self, noted: list[Units], events: bool, room: float) -> dict[str, Any]:
+        """Of the event pixels, or of frames.
+
+        Units have one random order. In some first part of it, all are looked at that have an event in the run; they are
+        few, tell how many events there are, and only they can have one too many. In a first part of that, the others
+        are looked at as well: something may be off or missed in any of them.
+        """
+        begin, batches = self._source.rays_traced, self._batches(noted)
+        tally, result, seen = _Tally(sum(units.pixel.size for units in noted)), dict[str, Any](), 0
+        if events:
+            for batch in batches:
+                seen += 1
+                self._look_at(batch, tally, "eventful")
+                spent = self._source.rays_traced - begin
+                if spent > room / 2 or (
+                    self._event_bounds(tally)["extra_at_most"] <= MOST_EXTRA / 2 and spent > room / 8
+                ):
+                    break
+        for number, batch in enumerate(batches):
+            if events and number >= seen:
+                self._look_at(batch, tally, "eventful")
+            self._look_at(batch, tally, "calm" if events else "frames")
+            result = self._bounds(tally, events)
+            enough = result["off_at_most"] <= MOST_OFF and (
+                not result.get("true_events")
+                or (result["missed_at_most"] <= MOST_MISSED and result["extra_at_most"] <= MOST_EXTRA)
+            )
+            if enough or self._source.rays_traced - begin > room:
+                break
+        return result
+
+    def _batches(self, noted: list[Units]) -> list[list[tuple[NDArray[np.int64], Units]]]:
+        """All units in a random order, more and more at a time, those of equal shape together, with their places."""
+        which = np.concatenate([np.full(units.pixel.size, number) for number, units in enumerate(noted)])
+        inside = np.concatenate([np.arange(units.pixel.size) for units in noted])
+        order, found, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
+        while first < order.size:
+            chosen = order[first : first + size]
+            by_shape: dict[bytes, list[tuple[NDArray[np.int64], Units]]] = {}
+            for one in np.unique(which[chosen]):
+                here = np.flatnonzero(which[chosen] == one)
+                units = noted[one].at(inside[chosen[here]])
+                by_shape.setdefault(units.core.tobytes(), []).append((first + here, units))
+            found.append(
+                [(np.concatenate([place for place, _ in parts]), Units.joined([units for _, units in parts]))
+                 for parts in by_shape.values()]
+            )  # fmt: skip
+            first, size = first + chosen.size, min(size + size // 2, _MOST_BATCH)
+        return found
+
+    def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: _Tally, which: str) -> None:
+        """Render some units again and count what is found: those with events, the others, or all of frames."""
+        for place, units in batch:
+            if which == "frames":
+                some, still = np.arange(place.size), np.zeros(place.size, np.bool_)
+            else:
+                has_event = self._has_event(units)
+                tally.has_event[place] = has_event
+                some = np.flatnonzero(has_event if which == "eventful" else ~has_event)
+                still = self._source.still_pixels(units.pixel[some])
+                taken = ~still | (self._rng.random(some.size) < _STILL_PART)
+                some, still = some[taken], still[taken]
+            if some.size:
+                self._count(units.at(some), place[some], still, which, tally)
+        count = sum(place.size for place, _ in batch)
+        if which == "eventful":
+            tally.eventful += count
+        else:
+            tally.looked_at += count
+
+    def _count(
+        self, units: Units, place: NDArray[np.int64], still: NDArray[np.bool_], which: str, tally: _Tally
+    ) -> None:
+        events, core, tolerance = which != "frames", units.core, TOLERANCE * self._quality
+        reference = self._reference(units, still, which)
+        unit = self._source.noise_unit(units.pixel, reference, events)[core]
+        deviation, weight = np.abs(units.flux - reference)[core] / unit, np.where(still, 1 / _STILL_PART, 1.0)
+        tally.off[place] = weight * np.mean(deviation > tolerance, axis=0)
+        tally.expected[place] = weight * np.mean(np.abs(units.difference[core]) > tolerance * unit, axis=0)
+        tally.note(place, deviation, weight)
+        if events:
+            moving = np.flatnonzero(~still)
+            part, other = units.at(moving), reference[:, moving]
+            found = self._compare(part, part.flux, other)
+            for total, values in zip(vars(tally.events).values(), vars(found).values(), strict=True):
+                total[place[moving]] = values
+            # what an error like the stated one does to the reference
+            by_error = self._compare(part, other + part.difference, other)
+            tally.by_error[place[moving]] = by_error.missed + by_error.extra + by_error.flips
+
+    def _reference(self, units: Units, still: NDArray[np.bool_], which: str) -> NDArray[np.float64]:
+        """Flux of units by other random numbers, [window, unit]; what is not needed is as the run has it."""
+        needed = np.zeros(units.flux.shape, np.bool_)
+        core = np.flatnonzero(units.core)
+        needed[core] = True
+        if which == "calm" and core[0] > 0:
+            # where the run has no event near by, only missed ones are asked for
+            needed[core[0] - 1] |= ~still
+        elif which == "eventful":
+            needed[:] |= ~still
+        reference = units.flux.copy()
+        place = np.nonzero(needed)[1]
+        reference[needed] = self._source.reference_flux(
+            units.pixel[place],
+            *(units.begin_us[needed], units.end_us[needed]),
+            _REFERENCE * self._quality,
+            events=which != "frames",
+        )
+        return reference
+
+    def _has_event(self, units: Units) -> NDArray[np.bool_]:
+        """Units in which the run itself may have an event, [unit]."""
+        assert self._noise is not None
+        signal = self._log(units.pixel, units.flux)
+        on, off = self._thresholds(units.pixel)
+        if self._noise.spec.reference == "previous_sample":
+            change = np.diff(signal, axis=0)
+            return np.asarray(((change > on) | (change < -off)).any(axis=0))
+        # the level that its events start from is not known: with less than half a threshold there is none
+        return np.asarray(np.ptp(signal, axis=0) > 0.5 * np.minimum(on, off))
+
+    def _log(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64]) -> NDArray[np.float64]:
+        """ln x of event pixels, [window, unit]."""
+        assert self._noise is not None
+        return self._noise.log_signal(flux, self._place(pixel))
+
+    def _thresholds(self, pixel: NDArray[np.uint32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        assert self._noise is not None
+        shape = self._noise.layout.evs_shape
+        maps = self._noise.threshold_on_map, self._noise.threshold_off_map
+        on, off = (np.broadcast_to(theta, shape).ravel()[self._place(pixel)].astype(np.float64) for theta in maps)
+        return on, off
+
+    def _place(self, pixel: NDArray[np.uint32]) -> NDArray[np.int64]:
+        """On the event grid."""
+        order = np.argsort(self._event_pixel)
+        return order[np.searchsorted(self._event_pixel, pixel, sorter=order)]
+
+    def _compare(self, units: Units, flux: NDArray[np.float64], reference: NDArray[np.float64]) -> Counted:
+        """Events of a flux of some units against those of the reference, all [window, unit]."""
+        assert self._noise is not None
+        run = self._log(units.pixel, flux)
+        error = self._log(units.pixel, flux + units.error) - run
+        arguments = run, self._log(units.pixel, reference), error, self._thresholds(units.pixel), units.core
+        if self._noise.spec.reference == "previous_sample":
+            return compare_ticks(*arguments)
+        return compare_crossings(*arguments, _MOST_EVENTS["last_event"])
+
+    def _bounds(self, tally: _Tally, events: bool) -> dict[str, Any]:
+        off, most = tally.off[: tally.looked_at], 1 / _STILL_PART if events else 1.0
+        deviation, weight = tally.deviations()
+        cumulated = np.cumsum(weight)
+        parts = {name: deviation[np.searchsorted(cumulated, p * cumulated[-1])] for name, p in _PARTS.items()}
+        found: dict[str, Any] = {
+            "units": int(off.size),
+            "off": float(off.mean()),
+            "off_at_most": min(1.0, most * upper_bound(off / most, CONFIDENCE)),
+            "off_wanted_at_most": MOST_OFF,
+            "deviation_noise": {
+                "rms": float(np.sqrt(np.sum(weight * deviation**2) / weight.sum())),
+                **{name: float(value) for name, value in parts.items()},
+                "largest": float(deviation[-1]),
+            },
+            "off_by_stated_error_alone": float(tally.expected[: tally.looked_at].mean()),
+        }
+        return found | self._event_bounds(tally) if events else found
+
+    def _event_bounds(self, tally: _Tally) -> dict[str, Any]:
+        """Of missed and extra events. Units in which nothing can move have neither."""
+        assert self._noise is not None
+        most, counted = float(_MOST_EVENTS[self._noise.spec.reference]), tally.events
+        each = 1 - (1 - CONFIDENCE) / 2
+        eventful = np.flatnonzero(tally.has_event[: tally.eventful])
+        known = np.zeros(tally.eventful)
+        known[eventful] = np.minimum(counted.true[eventful], most)
+        at_least = lower_bound(known / most, each)
+        missed = upper_bound(np.minimum(counted.missed[: tally.looked_at], most) / most, each)
+        part, whole = (np.minimum(values[eventful], most) for values in (counted.extra, counted.found))
+        seen = bool(counted.true.any())
+        true = tally.rate(counted.true) if seen else np.inf
+        found = tally.rate(counted.found) or np.inf
+        return {
+            "true_events": float(counted.true.sum()),
+            "missed": tally.rate(counted.missed) / true,
+            "missed_at_most": min(1.0, missed / at_least) if at_least > 0 else 1.0,
+            "missed_wanted_at_most": MOST_MISSED,
+            "extra": tally.rate(counted.extra) / found,
+            "extra_at_most": ratio_upper_bound(part, whole, most, CONFIDENCE),
+            "extra_wanted_at_most": MOST_EXTRA,
+            "flips": tally.rate(counted.flips) / true,
+            "flips_by_stated_error": tally.rate(tally.by_error) / true,
+        }
+
+    def _verdict(self, parts: list[dict[str, Any]]) -> dict[str, Any]:
+        """Whether the run is what it should be: shown with confidence, shown not to be, or neither."""
+        shares = [(part[name], part[f"{name}_at_most"], part[f"{name}_wanted_at_most"])
+                  for part in parts for name in ("off", "missed", "extra")
+                  if name in part and (name == "off" or part["true_events"])]  # fmt: skip
+        needed = self._quality
+        for part in parts:
+            needed = min(needed, self._quality * TOLERANCE * self._quality / max(part["deviation_noise"]["p99"], 1e-12))
+        failed = any(share > most for share, _, most in shares)
+        shown = all(bound <= most for _, bound, most in shares)
+        return {
+            "verdict": "not met" if failed else "met" if shown else "not shown",
+            "quality_needed": _rounded_down(min(needed, 0.7 * self._quality)) if failed else None,
+        }
+
+
+_PARTS = {"median": 0.5, "p95": 0.95, "p99": 0.99}
+
+
+def _rounded_down(value: float) -> float:
+    """To two digits."""
+    step = 10 ** (np.floor(np.log10(value)) - 1)
+    return float(np.floor(value / step + 1e-9) * step)

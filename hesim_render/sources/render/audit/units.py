@@ -1,0 +1,183 @@
+"""What a source gives to a few random pixels, noted while it is passed on: the units of the audit."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.mosaic.schedule import Block
+from hesim_render.sources.protocol import Sample, SampledFlux
+
+#: Units noted in a run, about.
+_UNITS = 200_000
+_BY_WINDOW = ("begin_us", "end_us", "flux", "difference", "error")
+
+
+@dataclass(frozen=True)
+class Units:
+    """Stretches of successive windows of some pixels, arrays [window, unit].
+
+    Parameters
+    ----------
+    pixel : [unit], mosaic indices.
+    begin_us, end_us : each unit's own windows.
+    core : [window], those that are judged; the others lie before and after them.
+    flux : as it was given, e⁻/s.
+    difference : half the difference of both halves, e⁻/s: it varies as the flux's own error does.
+    error : standard error that the source expects, e⁻/s; 0 where it tells none.
+    """
+
+    pixel: NDArray[np.uint32]
+    begin_us: NDArray[np.float64]
+    end_us: NDArray[np.float64]
+    core: NDArray[np.bool_]
+    flux: NDArray[np.float64]
+    difference: NDArray[np.float64]
+    error: NDArray[np.float64]
+
+    def at(self, place: NDArray) -> Units:
+        """Some of the units."""
+        values = {name: getattr(self, name)[:, place] for name in _BY_WINDOW}
+        return Units(pixel=self.pixel[place], core=self.core, **values)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Units]) -> Units:
+        """Units of the same shape."""
+        values = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in _BY_WINDOW}
+        return cls(pixel=np.concatenate([part.pixel for part in parts]), core=parts[0].core, **values)
+
+
+@dataclass
+class _Open:
+    """Units that are being noted: places in the list, how many windows until they are full, and what was given so far.
+
+    `skipped` is how many windows of a unit lie before the first one of the run.
+    """
+
+    place: NDArray[np.int64]
+    skipped: int
+    windows: list[tuple[float, float]] = field(default_factory=list)
+    halves: list[NDArray[np.float64]] = field(default_factory=list)
+    error: list[NDArray[np.float64]] = field(default_factory=list)
+
+
+class NotedFlux:
+    """Another source; implements `SampledFlux`.
+
+    Units are drawn evenly over the pixels of each stretch or frame, independently of each other and of all values.
+
+    Parameters
+    ----------
+    source : the other one.
+    event_pixel : [n], mosaic indices of the event pixels.
+    samples, frames : windows that event pixels will be asked for, and calls for frames, about.
+    before, core, after : windows of a unit: so many before those that are judged, those, and after them.
+    seed : of the choice.
+
+    Attributes
+    ----------
+    events, frames : what was noted; units of frames have one window.
+    """
+
+    def __init__(
+        self,
+        source: SampledFlux,
+        event_pixel: NDArray[np.uint32],
+        samples: int,
+        frames: int,
+        before: int,
+        core: int,
+        after: int,
+        seed: int,
+    ) -> None:
+        self.source, self._event_pixel = source, event_pixel
+        self._before, self._core, self._after = before, core, after
+        self.is_static, self.sensor = source.is_static, getattr(source, "sensor", None)
+        self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 1]))
+        self._of_events = -(-_UNITS // max(1, -(-samples // core)))
+        self._of_frames = -(-_UNITS // max(1, frames))
+        self.events: list[Units] = []
+        self.frames: list[Units] = []
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        return self.source.slice_edges_us(begin_us, end_us)
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        return self.source.sample_times_us(begin_us, end_us)
+
+    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
+        return self.source.instants_us(begin_us, end_us)
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """See `FluxSource.mean_flux`."""
+        halves = self.source.mean_flux(pixel, begin_us, end_us)
+        count = len(pixel)
+        if count:
+            place = self._rng.integers(0, count, self._of_frames)
+            begin, end = (np.broadcast_to(np.asarray(t, np.float64), (count,))[place][None] for t in (begin_us, end_us))
+            flux, difference = _mean_and_difference(halves, place)
+            self.frames.append(
+                Units(
+                    np.asarray(pixel)[place],
+                    *(begin, end, np.ones(1, np.bool_)),
+                    *(flux[None], difference[None], 0 * flux[None]),
+                )
+            )
+        return halves
+
+    def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
+        """See `SampledFlux.flux_of_blocks`."""
+        among = np.flatnonzero(np.isin(pixel, self._event_pixel))
+        times: deque[tuple[float, float]] = deque()
+
+        def told(blocks: Iterable[Block]) -> Iterator[Block]:
+            for block in blocks:
+                begin, end = block.begin_us[block.wanted], block.end_us[block.wanted]
+                times.extend(zip(begin.tolist(), end.tolist(), strict=True))
+                yield block
+
+        units: deque[_Open] = deque()
+        if among.size:
+            # of the first windows, which have fewer before them
+            units.extend(self._open(among, skipped) for skipped in range(self._before, 0, -self._core))
+        for number, sample in enumerate(self.source.flux_of_blocks(pixel, told(blocks))):
+            window = times.popleft()
+            if among.size and (number + self._before) % self._core == 0:
+                units.append(self._open(among, 0))
+            for one in units:
+                one.windows.append(window)
+                one.halves.append(_mean_and_difference((sample.half_a, sample.half_b), one.place))
+                nothing = np.zeros(one.place.size)
+                one.error.append(nothing if sample.error is None else sample.error[one.place].astype(np.float64))
+            while units and len(units[0].halves) + units[0].skipped == self._before + self._core + self._after:
+                self._close(pixel, units.popleft())
+            yield sample
+        for one in units:
+            self._close(pixel, one)
+
+    def _open(self, among: NDArray[np.int64], skipped: int) -> _Open:
+        return _Open(self._rng.choice(among, self._of_events), skipped)
+
+    def _close(self, pixel: NDArray[np.uint32], one: _Open) -> None:
+        number = np.arange(len(one.halves)) + one.skipped
+        core = (number >= self._before) & (number < self._before + self._core)
+        if core.any():
+            begin, end = (np.repeat(t[:, None], one.place.size, axis=1) for t in np.array(one.windows).T)
+            flux, difference = np.array(one.halves).swapaxes(0, 1)
+            self.events.append(Units(pixel[one.place], begin, end, core, flux, difference, np.array(one.error)))
+
+
+def _mean_and_difference(halves: tuple[Any, Any], place: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Mean and half the difference of both halves at some places, [2, k]."""
+    import drjit as dr
+
+    types = jit()
+    index = types.UInt32(place.astype(np.uint32))
+    one, other = (np.array(dr.gather(types.Float, half, index), np.float64) for half in halves)
+    return np.stack([one + other, one - other]) / 2

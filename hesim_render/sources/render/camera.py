@@ -1,0 +1,306 @@
+"""Where the camera stands, and one ray per sample of each mosaic pixel.
+
+Camera space: x to the right of the image, y up, looking along −z, the origin at the centre of the
+entrance pupil. The optical axis meets the chip at the *full* sensor's centre, or where the lens in use says
+(`Lens.axis_mm`); places on the chip are counted from that centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import atan2, degrees, radians, tan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import SpecError
+from hesim_render.core.units import MM_PER_M
+from hesim_render.sensor.lens import pixel_centres_mm
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
+from hesim_render.sources.render.scene.trajectory import rotation_about
+from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector
+
+_FWHM_PER_SIGMA = 2.3548200450309493  # 2 √(2 ln 2)
+#: From this camera's axes to Mitsuba's (x to the left, looking along +z), and back.
+MITSUBA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class View:
+    """A placed camera.
+
+    Parameters
+    ----------
+    camera_to_world : 4×4 rigid, at rest (before any motion of the camera).
+    sensor : with the lens in use.
+    of_region : whether it was placed by the read-out region, so that another region sees another picture.
+    near_m : nothing before this depth is seen, m.
+    """
+
+    camera_to_world: NDArray[np.float64]
+    sensor: Sensor
+    of_region: bool = False
+    near_m: float = 0.0
+
+    @property
+    def followed_mm(self) -> tuple[float, float, float, float]:
+        """Part of the chip in which motion is followed, as `region_mm`: the same for all crops of one picture."""
+        if self.of_region:
+            return self.region_mm
+        geometry = self.sensor.spec.geometry
+        half_x, half_y = (count * geometry.pitch_um * 1e-3 / 2 for count in (geometry.cols, geometry.rows))
+        return -half_x, half_x, -half_y, half_y
+
+    @property
+    def region_mm(self) -> tuple[float, float, float, float]:
+        """Read-out region on the chip from its centre: left, right, top, bottom (y downwards), mm."""
+        x, y = pixel_centres_mm(self.sensor.layout)
+        half = self.sensor.spec.geometry.pitch_um * 1e-3 / 2
+        return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
+
+    def project(self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64] | None = None) -> NDArray:
+        """Column and row (pixels, fractional, of this region) of world points [..., 3]; [..., 2].
+
+        Points beside or behind the pupil are taken at a small positive depth.
+        """
+        matrix = self.camera_to_world if camera_to_world is None else camera_to_world
+        local = (points - matrix[..., None, :3, 3]) @ matrix[..., :3, :3]
+        depth = np.maximum(-local[..., 2], 1e-3 + 0.02 * np.linalg.norm(local, axis=-1))
+        scale = self.sensor.lens.image_distance_mm / depth / (self.sensor.spec.geometry.pitch_um * 1e-3)
+        left, _, top, _ = self.region_mm
+        axis_x, axis_y = self.sensor.lens.axis_mm
+        pitch = self.sensor.spec.geometry.pitch_um * 1e-3
+        x, y = (axis_x - left) / pitch, (axis_y - top) / pitch
+        return np.stack([local[..., 0] * scale + x, -local[..., 1] * scale + y], axis=-1)
+
+    def project_on_sensor(
+        self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Column and row (pixels, fractional, of the full sensor) of world points [k, n, 3] through k poses.
+
+        Returns
+        -------
+        places : [k, n, 2]; points beside or behind the pupil are taken at a small positive depth.
+        px_per_m : [k, n], pixels for a metre across the axis there.
+        """
+        left, _, top, _ = self.region_mm
+        geometry = self.sensor.spec.geometry
+        pitch = geometry.pitch_um * 1e-3
+        own = self.project(points, camera_to_world)
+        local = (points - camera_to_world[..., None, :3, 3]) @ camera_to_world[..., :3, :3]
+        depth = np.maximum(-local[..., 2], 1e-3 + 0.02 * np.linalg.norm(local, axis=-1))
+        first = np.array([left / pitch + geometry.cols / 2, top / pitch + geometry.rows / 2])
+        return own + first, self.sensor.lens.image_distance_mm / depth / pitch
+
+    def unproject(self, depth_m: NDArray[np.float64], camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """World points of a 5×5 grid over the picture, at each depth along the axis; [25 · depths, 3]."""
+        left, right, top, bottom = self.region_mm
+        x, y = np.meshgrid(np.linspace(left, right, 5), np.linspace(top, bottom, 5))
+        image_mm, (axis_x, axis_y) = self.sensor.lens.image_distance_mm, self.sensor.lens.axis_mm
+        tangent = np.stack(
+            [(x.ravel() - axis_x) / image_mm, -(y.ravel() - axis_y) / image_mm, -np.ones(x.size)], axis=-1
+        )
+        local = (depth_m[:, None, None] * tangent).reshape(-1, 3)
+        return local @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+
+
+def look_at(origin: Vector, target: Vector, up: Vector) -> NDArray[np.float64]:
+    """Camera-to-world matrix of a camera at `origin` that looks at `target`, `up` upwards in the image.
+
+    Raises
+    ------
+    SpecError
+        If `up` is parallel to the line of sight.
+    """
+    backward = np.subtract(origin, target).astype(np.float64)
+    backward /= np.linalg.norm(backward)
+    right = np.cross(np.asarray(up, dtype=np.float64), backward)
+    if np.linalg.norm(right) < 1e-9:
+        raise SpecError("'up' is parallel to the line of sight", key="camera.up")
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = right, np.cross(backward, right), backward
+    matrix[:3, 3] = origin
+    return matrix
+
+
+def _region_size_mm(sensor: Sensor) -> tuple[float, float]:
+    pitch = sensor.spec.geometry.pitch_um * 1e-3
+    return sensor.cols * pitch, sensor.rows * pitch
+
+
+def _with_image_distance(sensor: Sensor, camera: CameraSpec, image_mm: float, object_mm: float | None) -> Sensor:
+    """The sensor with the focal length that puts its image at `image_mm` when focused at `object_mm`."""
+    fixed = sensor.spec.lens.magnification
+    focus_mm = camera.focus_distance_m * MM_PER_M if camera.focus_distance_m else object_mm
+    if fixed != "focus":
+        focal = image_mm / (1 + abs(float(fixed)))
+    elif focus_mm is None:
+        focal = image_mm
+    else:
+        focal = image_mm * focus_mm / (image_mm + focus_mm)  # 1/f = 1/v + 1/d
+    focus_m = None if focus_mm is None else focus_mm / MM_PER_M
+    return sensor.with_lens(f_number=camera.f_number, focal_length_mm=focal, focus_distance_m=focus_m)
+
+
+def _turned_to_region(view: View, towards: tuple[float, float] = (0.0, 0.0)) -> View:
+    """The camera turned so that the middle of its region, not the optical axis, looks along its −z.
+
+    A field of view is stated for the region; a region far off the axis would look past the scene.
+
+    Parameters
+    ----------
+    towards : where the middle looks instead: tangents to the right and downwards.
+    """
+    left, right, top, bottom = view.region_mm
+    image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
+    looks = np.array([(left + right) / 2 - axis_x, axis_y - (top + bottom) / 2, -image_mm])
+    wanted = np.array([towards[0], -towards[1], -1.0])
+    looks, wanted = looks / np.linalg.norm(looks), wanted / np.linalg.norm(wanted)
+    axis = np.cross(looks, wanted)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-12:
+        return view
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_about(axis, degrees(atan2(sine, float(looks @ wanted))))
+    return replace(view, camera_to_world=view.camera_to_world @ turn)
+
+
+def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View:
+    """Back off along +z until the target's image takes `fit_margin` of the region, both ways inside.
+
+    The magnification m this needs fixes the distance: d = f (1 + 1/m) for a thin lens focused on the
+    target, else d = v/m with the image distance v that the file or the field of view sets. Where the
+    region is off the optical axis the camera moves sideways, so that the target still fills it.
+    """
+    assert scene.target is not None
+    width_mm, height_mm = _region_size_mm(sensor)
+    target = scene.target
+    needed = camera.fit_margin * min(width_mm / (target.width_m * MM_PER_M), height_mm / (target.height_m * MM_PER_M))
+    if camera.horizontal_fov_deg is not None:
+        image_mm = width_mm / 2 / tan(radians(camera.horizontal_fov_deg) / 2)
+        sensor = _with_image_distance(sensor, camera, image_mm, image_mm / needed)
+    else:
+        focal = camera.focal_length_mm or sensor.spec.lens.focal_length_mm
+        focus_m = camera.focus_distance_m or focal * (1 + 1 / needed) / MM_PER_M
+        sensor = sensor.with_lens(f_number=camera.f_number, focal_length_mm=focal, focus_distance_m=focus_m)
+        image_mm = sensor.lens.image_distance_mm
+    distance_m = image_mm / needed / MM_PER_M
+    view = View(np.eye(4), sensor, of_region=True)
+    left, right, top, bottom = view.region_mm
+    view.camera_to_world[:3, 3] = [
+        -(left + right) / 2 / image_mm * distance_m,
+        (top + bottom) / 2 / image_mm * distance_m,
+        distance_m,
+    ]
+    return view
+
+
+def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera | None = None) -> View:
+    """The camera of a scene: its pose at rest and the sensor with focal length, f-number and focus resolved.
+
+    With a `camera` section: `fit` as in `CameraSpec`, else the stated origin and target; focus
+    defaults to the distance between them. `horizontal_fov_deg` spans the read-out region's width as
+    if it were centred on the axis, and the camera is turned so that the region's middle looks at the
+    target; with a focal length a region off the axis sees its part of the full sensor's picture.
+    Without a `camera` section, the Mitsuba scene's first sensor: its whole picture (the film's crop window, where it
+    has one) just fits into the region, focused at infinity. A principal point off the picture's middle becomes one off
+    the chip's, about which the lens's fall-off of light lies too.
+
+    Parameters
+    ----------
+    mitsuba_sensor : of the Mitsuba scene; needed only without a `camera` section.
+
+    Raises
+    ------
+    SpecError
+        If the camera cannot be placed as asked.
+    """
+    camera = scene.camera
+    if camera is None:
+        return _from_mitsuba(scene, sensor, mitsuba_sensor)
+    if camera.fit == "target":
+        return _fit_to_target(scene, camera, sensor)
+    matrix = look_at(camera.origin_m, camera.target_m, camera.up)
+    away_m = float(np.linalg.norm(np.subtract(camera.origin_m, camera.target_m)))
+    if camera.horizontal_fov_deg is not None:
+        image_mm = _region_size_mm(sensor)[0] / 2 / tan(radians(camera.horizontal_fov_deg) / 2)
+        placed = View(matrix, _with_image_distance(sensor, camera, image_mm, away_m * MM_PER_M), of_region=True)
+        return _turned_to_region(placed)
+    focus_m = camera.focus_distance_m or away_m
+    return View(
+        matrix,
+        sensor.with_lens(f_number=camera.f_number, focal_length_mm=camera.focal_length_mm, focus_distance_m=focus_m),
+    )
+
+
+def _from_mitsuba(scene: SceneSpec, sensor: Sensor, camera: MitsubaCamera | None) -> View:
+    if camera is None:
+        raise SpecError(f"scene {scene.name!r}: the Mitsuba scene has no sensor; add a 'camera' section", key="camera")
+    left, right, top, bottom = camera.picture
+    width_mm, height_mm = _region_size_mm(sensor)
+    image_mm = min(width_mm / (right - left), height_mm / (bottom - top))
+    matrix = camera.to_world @ MITSUBA_AXES
+    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)  # a scale in to_world says nothing about the view
+    used = _with_image_distance(sensor, CameraSpec(), image_mm, None)
+    # the middle of the picture, not the axis, is in the middle of the region
+    middle = (left + right) / 2, (top + bottom) / 2
+    lens = replace(used.lens, axis_mm=(-middle[0] * image_mm, -middle[1] * image_mm))
+    return _turned_to_region(View(matrix, replace(used, lens=lens), True, camera.near_m), middle)
+
+
+class RayFactory:
+    """Primary rays of mosaic pixels on the device: box aperture, Gaussian PSF, pinhole at the entrance pupil.
+
+    Rows and columns are those of the full sensor, so that a crop's rays are the full sensor's to the bit.
+    """
+
+    def __init__(self, view: View) -> None:
+        import drjit as dr
+
+        types = jit()
+        geometry, lens = view.sensor.spec.geometry, view.sensor.lens
+        pitch_mm = geometry.pitch_um * 1e-3
+        # opaque, so that another lens or sensor compiles nothing
+        self._middle = [
+            dr.opaque(types.Float, (count - 1) / 2 + axis / pitch_mm)
+            for count, axis in zip((geometry.cols, geometry.rows), lens.axis_mm, strict=True)
+        ]
+        #: Tangent of the chief ray's angle from one pixel to the next.
+        self._step = dr.opaque(types.Float, float(pitch_mm / lens.image_distance_mm))
+        psf_um = view.sensor.spec.lens.psf_fwhm_um
+        self.has_psf = psf_um > 0
+        self._sigma_px = dr.opaque(types.Float, float(psf_um / _FWHM_PER_SIGMA / geometry.pitch_um))
+        self._rotation = [[dr.opaque(types.Float, float(v)) for v in row] for row in view.camera_to_world[:3, :3]]
+        self._origin = [dr.opaque(types.Float, float(v)) for v in view.camera_to_world[:3, 3]]
+        self._near = dr.opaque(types.Float, view.near_m) if view.near_m > 0 else None
+
+    def rays(self, row: Any, col: Any, aperture: Any, blur: Any | None) -> tuple[Any, Any]:
+        """Origin and unit direction in world space, the camera at rest.
+
+        Parameters
+        ----------
+        row, col : Dr.Jit Float, position on the full sensor.
+        aperture : pair of Float in [0, 1), place inside the pixel.
+        blur : pair of Float in [0, 1) for the PSF, or None.
+        """
+        import drjit as dr
+
+        types = jit()
+        offset_x, offset_y = aperture[0] - 0.5, aperture[1] - 0.5
+        if blur is not None:  # Box-Muller
+            radius = self._sigma_px * dr.sqrt(-2 * dr.log(1 - blur[0]))
+            sine, cosine = dr.sincos(2 * dr.pi * blur[1])
+            offset_x, offset_y = offset_x + radius * cosine, offset_y + radius * sine
+        # half-integers from the middle of the chip are exact in float32
+        x = (col - self._middle[0] + offset_x) * self._step
+        y = (row - self._middle[1] + offset_y) * self._step
+        local = dr.normalize(types.Array3f(x, -y, -1.0))
+        direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
+        origin = types.Array3f(*self._origin)
+        if self._near is not None:  # where a ray passes that depth
+            origin = dr.fma(direction, self._near / -local.z, origin)
+        return origin, direction

@@ -1,0 +1,94 @@
+"""What a run will take, from a few patches of the picture looked at beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.mosaic.schedule import Block, Exposure
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+
+#: Patches of so many pixels by side, and blocks spread over the run, in which rays are counted.
+_PATCHES, _SIDE, _BLOCKS = 6, 12, 3
+#: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
+#: of the stages, bytes.
+_BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a run will take, right to about a factor of two.
+
+    Parameters
+    ----------
+    seconds : of rendering.
+    peak_bytes : of memory.
+    rays : in all.
+    """
+
+    seconds: float
+    peak_bytes: float
+    rays: float
+
+    def __str__(self) -> str:
+        if self.seconds < 90:
+            duration = f"{max(1, round(self.seconds))} s"
+        elif self.seconds < 5400:
+            duration = f"{self.seconds / 60:.0f} min"
+        else:
+            duration = f"{self.seconds / 3600:.1f} h"
+        return f"about {duration}, {self.peak_bytes / 1e9:.1f} GB, {self.rays / 1e6:.0f} million rays"
+
+
+def forecast(
+    sources: Sequence[ChangeDrivenFlux],
+    event_pixel: NDArray[np.uint32],
+    blocks: Callable[[], Iterator[Block]],
+    frame_pixel: NDArray[np.uint32],
+    exposures: Sequence[Exposure],
+) -> Estimate:
+    """Time and memory of a run.
+
+    Parameters
+    ----------
+    sources : of one scene, each is asked for all of it.
+    event_pixel, blocks : what they will be asked for, and `frame_pixel`, `exposures` for frames.
+    """
+    is_static = sources[0].is_static
+    rng = np.random.default_rng(sources[0].seed)
+    rays = rate = 0.0
+    windows = 0
+    for source in sources:
+        if event_pixel.size and not is_static:
+            every = list(blocks())
+            windows = max(block.wanted.size for block in every)
+            chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, _BLOCKS).astype(int))]
+            patch = _patches(event_pixel, source, rng)
+            each = [source.foretell(patch, block.begin_us, block.end_us, "events") for block in chosen]
+            rays += float(np.mean(each)) * event_pixel.size * len(every)
+        pixel = np.union1d(frame_pixel if exposures else frame_pixel[:0], event_pixel if is_static else event_pixel[:0])
+        if pixel.size:
+            patch = _patches(pixel, source, rng)
+            begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))
+            each_frame = source.foretell(patch, np.array([begin]), np.array([end]), "any")
+            rays += each_frame * pixel.size * (1 if is_static else len(exposures))
+        rate = max(rate, source.rays_per_second())
+    held = _WINDOW_BYTES * windows * event_pixel.size * len(sources)
+    return Estimate(
+        seconds=rays / max(rate, 1.0),
+        peak_bytes=_BASE_BYTES + held + _EVENT_BYTES * event_pixel.size + _FRAME_BYTES * frame_pixel.size,
+        rays=rays,
+    )
+
+
+def _patches(pixel: NDArray[np.uint32], source: ChangeDrivenFlux, rng: np.random.Generator) -> NDArray[np.uint32]:
+    """Listed pixels in some small squares: neighbours are looked at together, as in the run."""
+    row, col = np.divmod(pixel.astype(np.int64), source.sensor.cols)
+    side = _SIDE * max(1.0, np.sqrt(source.sensor.rows * source.sensor.cols / pixel.size))
+    found = np.zeros(pixel.size, np.bool_)
+    for centre in rng.choice(pixel.size, _PATCHES):
+        found |= (np.abs(row - row[centre]) <= side / 2) & (np.abs(col - col[centre]) <= side / 2)
+    return pixel[found]

@@ -1,0 +1,121 @@
+"""What a block of windows is rendered of, and what is filled in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.sources.render.change_driven.error_target import NoiseUnit
+from hesim_render.sources.render.change_driven.neighbours import Sites
+from hesim_render.sources.render.change_driven.pilot import Pilot, allocate
+from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
+
+
+def changes(flux: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Windows next to which a pilot changes, [window, site].
+
+    A window is marked where the flux has left the last marked one by more than `least`; so is the one before it, where
+    most of that happened in one step. The first and the last window have no marks for being so.
+
+    Parameters
+    ----------
+    flux : of a pilot, [window, site].
+    least : change that counts, in the same unit, [window, site].
+    """
+    marked = np.zeros(flux.shape, np.bool_)
+    level = flux[0].copy()
+    for window in range(1, flux.shape[0]):
+        now = flux[window]
+        bound = np.minimum(least[window - 1], least[window])
+        changed = np.abs(now - level) > bound
+        marked[window] |= changed
+        marked[window - 1] |= changed & (np.abs(now - flux[window - 1]) > np.float32(0.5) * bound)
+        np.copyto(level, now, where=changed)
+    return marked
+
+
+def longer(marked: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """Marks, [window, site], and so many windows before and after each."""
+    found = marked.copy()
+    for shift in range(1, by + 1):
+        found[shift:] |= marked[:-shift]
+        found[:-shift] |= marked[shift:]
+    return found
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the listed pixels of a block are rendered, arrays [window, pixel].
+
+    Parameters
+    ----------
+    rendered : which pairs are; the first and the last window always, the rest is filled in on straight lines.
+    rays : of each rendered pair, a power of two.
+    lit : which estimate it takes, see `MattIntegrator`.
+    error : its expected standard error, e⁻/s.
+    """
+
+    rendered: NDArray[np.bool_]
+    rays: NDArray[np.int16]
+    lit: NDArray[np.bool_]
+    error: NDArray[np.float32]
+
+
+def plan(
+    pilot: Pilot, sites: Sites, unit: NoiseUnit, quality: float, gain: Gain, tuning: Tuning, is_knot: bool
+) -> Plan:
+    """From what the pilot shows of a block, or of one window.
+
+    Parameters
+    ----------
+    unit : what the noise of each site is worth, at its flux.
+    quality : wanted error in these units.
+    gain : of stratified rays.
+    is_knot : whether the first and the last window may be ends of blocks.
+    """
+    count, last = pilot.windows, pilot.windows - 1
+    shape = count, sites.listed.size
+    units = np.stack([unit(pilot.flux_of(window)) for window in range(count)])
+    out = Plan(
+        np.ones(shape, np.bool_), np.zeros(shape, np.int16), np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
+    )
+    if last > 1:
+        flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
+        marked = changes(flux, least)
+        great = changes(flux, np.float32(tuning.great) * least)
+        huge = longer(changes(flux, np.float32(tuning.huge) * least), tuning.huge_windows)
+        for window in range(1, last):
+            near = sites.most(great[window], 1) | sites.most(huge[window], 2)
+            out.rendered[window] = marked[window][sites.listed] | near
+        if pilot.closer:
+            # what comes and goes within a window or two has no straight lines
+            looked_at = np.zeros(flux.shape, np.bool_)
+            for window, closer in enumerate(pilot.closer):
+                looked_at[window, closer.place] = True
+            out.rendered[1:last] |= longer(looked_at, 1)[1:last, sites.listed]
+    for window in range(count):
+        at_end = is_knot and window in (0, last)
+        part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
+        out.rays[window], out.lit[window], out.error[window] = part
+    return out
+
+
+def fill_in(values: NDArray[np.float32], known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> None:
+    """Put what is not known on straight lines between what is, in place.
+
+    Parameters
+    ----------
+    values, known : [window, pixel]; the first and the last window are known.
+    centre_us : [window], increasing.
+    """
+    number = np.arange(known.shape[0], dtype=np.int16)[:, None]
+    before = np.maximum.accumulate(np.where(known, number, np.int16(-1)), axis=0)
+    after = np.minimum.accumulate(np.where(known, number, np.int16(known.shape[0]))[::-1], axis=0)[::-1]
+    for window in range(1, known.shape[0] - 1):
+        place = np.flatnonzero(~known[window])
+        low, high = before[window, place], after[window, place]
+        part = ((centre_us[window] - centre_us[low]) / (centre_us[high] - centre_us[low])).astype(np.float32)
+        begin = values[low, place]
+        values[window, place] = begin + part * (values[high, place] - begin)

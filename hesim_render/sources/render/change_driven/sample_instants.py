@@ -1,0 +1,125 @@
+"""When an asynchronous sensor is sampled: instants close enough together to follow all motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.units import S_PER_US
+from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
+from hesim_render.sources.render.camera import View
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, fastest_turn_rad_per_s, places
+from hesim_render.sources.render.transport.moving_scene import Group
+
+#: Motion between two instants, pixels. ln x is taken as straight between them: the threshold crossings of an edge of
+#: contrast 4 are then off by less than 2 % of the time of a tenth of a pixel.
+STEP_PX = 0.05
+#: Instants are no closer together, µs, but at keyframes.
+LEAST_US = 10
+#: Cells for which distances are taken together, and the part of a distance that is relied on: between the rays that
+#: measure how far the scene is, something may be nearer.
+_CELLS, _SURE = BLOCK_INTERVALS, 0.5
+#: Objects nearer to the camera than this part of their own distance from its axis's foot count as being there.
+_NEAREST = 0.05
+
+
+class MotionClock:
+    """Instants of a scene; a pure function of time, whatever interval or region is asked for.
+
+    In every cell the speed in the image is bounded from the tracks' own speeds and the least distances: instants are
+    even parts of a cell in which nothing moves by more than `STEP_PX`, and keyframes.
+
+    Parameters
+    ----------
+    view : the camera at rest; `camera` its track, if it moves.
+    groups : what moves.
+    distance_m : least distance from the camera, along its axis, of what rests and is seen at a time, m.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        camera: Trajectory | None,
+        groups: list[Group],
+        distance_m: Callable[[float], float],
+    ) -> None:
+        self._view, self._camera, self._groups, self._distance_m = view, camera, groups, distance_m
+        self._tracks = [group.trajectory for group in groups] + ([camera] if camera else [])
+        geometry, lens = view.sensor.spec.geometry, view.sensor.lens
+        pitch_mm = geometry.pitch_um * 1e-3
+        self._px_per_rad = lens.image_distance_mm / pitch_mm
+        left, right, top, bottom = view.followed_mm
+        axis_x, axis_y = lens.axis_mm
+        reach = max(axis_x - left, right - axis_x), max(axis_y - top, bottom - axis_y)
+        corner = np.array(reach) / lens.image_distance_mm
+        #: 1/cos of the angle at which the farthest corner is seen.
+        self._stretch = float(np.sqrt(1 + corner @ corner))
+        self._speed_of = lru_cache(maxsize=1024)(self._per_metre)
+
+    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
+        """Whole µs from `begin_us` to `end_us`, with both; multiples of `CELL_US` are among them."""
+        cells = range(int(begin_us // CELL_US), -(-int(np.ceil(end_us)) // CELL_US))
+        ends = np.rint([begin_us, end_us]).astype(np.int64)
+        keyframes = (_keyframes(track, begin_us, end_us) for track in self._tracks)
+        found = np.unique(np.concatenate([ends, *(self._cell(k) for k in cells), *keyframes]))
+        return found[(found >= ends[0]) & (found <= ends[1])]
+
+    def _cell(self, number: int) -> NDArray[np.int64]:
+        begin, end = number * CELL_US, (number + 1) * CELL_US
+        pieces = ceil(self._motion_px(begin, end) / STEP_PX - 1e-9)
+        pieces = max(1, min(pieces, CELL_US // LEAST_US))
+        return np.rint(np.linspace(begin, end, pieces + 1)).astype(np.int64)
+
+    def _motion_px(self, begin_us: float, end_us: float) -> float:
+        """Farthest that anything can move in the image within a cell."""
+        turn, shift = 0.0, 0.0
+        if self._camera is not None:
+            turn = fastest_turn_rad_per_s(self._camera, begin_us, end_us)
+            shift = fastest_m_per_s(self._view.camera_to_world[None, :3, 3], self._camera, begin_us, end_us)
+        resting, nearest = self._speed_of(int(begin_us // (CELL_US * _CELLS)))
+        fastest = turn * self._stretch**2 + shift * resting
+        for group, per_metre in zip(self._groups, nearest, strict=True):
+            own = fastest_m_per_s(group.corners, group.trajectory, begin_us, end_us)
+            fastest = max(fastest, turn * self._stretch**2 + (shift + own) * per_metre)
+        return fastest * self._px_per_rad * S_PER_US * (end_us - begin_us)
+
+    def _per_metre(self, number: int) -> tuple[float, list[float]]:
+        """Radians in the image for a metre of motion of what rests, and of each group, at most, within some cells."""
+        begin, end = number * _CELLS * CELL_US, (number + 1) * _CELLS * CELL_US
+        resting = 0.0
+        if self._camera is not None:
+            resting = self._stretch / (_SURE * min(self._distance_m(t) for t in (begin, 0.5 * (begin + end), end)))
+        return resting, [self._stretch / self._depth_m(group, begin, end) for group in self._groups]
+
+    def _depth_m(self, group: Group, begin_us: float, end_us: float) -> float:
+        """Least depth of a group before the camera within an interval, or a small part of its distance."""
+        times = np.array([begin_us, 0.5 * (begin_us + end_us), end_us])
+        poses = np.broadcast_to(self._view.camera_to_world, (3, 4, 4))
+        moved = 0.0
+        if self._camera is not None:
+            poses = self._camera.matrix(times) @ poses
+            seconds = S_PER_US * 0.25 * (end_us - begin_us)
+            moved = seconds * fastest_m_per_s(self._view.camera_to_world[None, :3, 3], self._camera, begin_us, end_us)
+        least = np.inf
+        for points, margin in places(group.corners, group.trajectory, begin_us, end_us):
+            for pose in poses:
+                away = points - pose[:3, 3]
+                depth = -(away @ pose[:3, 2]) - margin - moved
+                floor = _NEAREST * np.linalg.norm(away, axis=-1)
+                least = min(least, float(np.maximum(depth, floor).min()))
+        return max(least, 1e-6)
+
+
+def _keyframes(track: Trajectory, begin_us: float, end_us: float) -> NDArray[np.int64]:
+    """Keyframes of a track within an interval, and one µs after each: something may jump there."""
+    knots = track.knots_us
+    if track.repeat:
+        first, last = (np.floor((t - knots[0]) / track.period_us) for t in (begin_us, end_us))
+        knots = (knots[:-1] + track.period_us * np.arange(first, last + 2)[:, None]).ravel()
+    whole = np.rint(knots[(knots >= begin_us - 1) & (knots <= end_us)]).astype(np.int64)
+    return np.concatenate([whole, whole + 1])

@@ -1,0 +1,121 @@
+"""Windows of time, on the host and on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.tables import table
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows
+
+#: Intervals for which boxes of moving objects are found, in one call.
+_MOST_BINS = 64
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of time.
+
+    Parameters
+    ----------
+    begin_us, end_us : [w], µs.
+    """
+
+    begin_us: NDArray[np.float64]
+    end_us: NDArray[np.float64]
+
+    @property
+    def size(self) -> int:
+        return self.begin_us.size
+
+    @property
+    def span_us(self) -> tuple[float, float]:
+        """Begin of the first and end of the last."""
+        return float(self.begin_us.min()), float(self.end_us.max())
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Windows on the device.
+
+    Parameters
+    ----------
+    length_us : Float, of each window.
+    times, boxes : see `Moment`; `bins`, UInt32, of each window.
+    tracks, groups : so many.
+    """
+
+    length_us: Any
+    times: Any
+    boxes: Any
+    bins: Any
+    tracks: int
+    groups: int
+
+    def at(self, window: Any, share: Any) -> Moment:
+        """A share of each lane's window."""
+        import drjit as dr
+
+        instant = share * dr.gather(type(self.length_us), self.length_us, window)
+        where = dr.gather(type(self.bins), self.bins, window)
+        return Moment(instant, self.times, self.tracks, window, self.boxes, self.groups, where)
+
+    @classmethod
+    def of(
+        cls,
+        windows: Windows,
+        span_us: tuple[float, float] | None,
+        tracks: Sequence[Trajectory],
+        groups: int,
+        boxes_of: Callable[[tuple[tuple[float, float], ...]], NDArray[np.float64]],
+    ) -> Moments:
+        """Put windows on the device.
+
+        Parameters
+        ----------
+        span_us : interval in which boxes hold; None for that of each window, or of a few that lie near each other.
+        tracks : of all that moves, those of groups first.
+        groups : so many.
+        boxes_of : intervals, µs → boxes in which each group stays, [interval, group, 2, 3], m.
+        """
+        import drjit as dr
+
+        types = jit()
+        # wrapped on the host in double precision: float32 µs would lose their fractions within seconds
+        times = [
+            track.local_us(windows.begin_us) if track.repeat else windows.begin_us - track.knots_us[0]
+            for track in tracks
+        ]
+        bins, spans = _bins(windows) if span_us is None else (np.zeros(windows.size, np.uint32), (span_us,))
+        boxes = boxes_of(spans)
+        # never one entry, which would be a constant in the kernel; rows of boxes are fetched by fours
+        lengths, local, sides = (
+            table(types.Float, np.append(values.astype(np.float32).ravel(), np.zeros(8, np.float32)))
+            for values in (
+                windows.end_us - windows.begin_us,
+                np.stack(times, axis=1) if times else np.empty(0),
+                box_rows(boxes) if groups else np.empty(0),
+            )
+        )
+        numbers = types.UInt32(np.append(bins, bins[-1:]))
+        moments = cls(lengths, local, sides, numbers, len(tracks), groups)
+        dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)
+        return moments
+
+
+def _bins(windows: Windows) -> tuple[NDArray[np.uint32], tuple[tuple[float, float], ...]]:
+    """Windows that lie near each other in time, together: a number for each window, an interval for each number."""
+    order = np.argsort(windows.begin_us, kind="stable")
+    number = np.empty(windows.size, np.uint32)
+    number[order] = np.arange(windows.size) * min(windows.size, _MOST_BINS) // windows.size
+    count = int(number.max()) + 1
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, number, windows.begin_us)
+    np.maximum.at(high, number, windows.end_us)
+    return number, tuple(zip(low.tolist(), high.tolist(), strict=True))

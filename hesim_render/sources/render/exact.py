@@ -1,0 +1,170 @@
+"""The renderer as a source of flux: Φ of any mosaic pixels over any time slice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
+from hesim_render.sources.render.timeline import Timeline
+from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
+from hesim_render.sources.scene import Scene
+from hesim_render.spectral.spectrum import Spectrum
+
+#: Largest motion of an object within a slice, pixels.
+MAX_MOTION_PX = 0.5
+
+
+def used_responses(sensor: Sensor) -> dict[str, Spectrum]:
+    """Responses of the filters that occur in the tile."""
+    spec = sensor.spec
+    used = {spec.pixels[letter].filter for letter in "".join(spec.tile_rows)}
+    return {name: response for name, response in sensor.responses.items() if name in used}
+
+
+def require_finite(half_a: Any, half_b: Any, scene: Scene, layout: Layout, pixel: NDArray[np.uint32]) -> None:
+    """Refuse flux that is not a number or infinite.
+
+    Parameters
+    ----------
+    half_a, half_b : Dr.Jit Float [n], of the mosaic indices `pixel` of the region `layout`.
+
+    Raises
+    ------
+    SpecError
+        With scene file and the first such pixel.
+    """
+    import drjit as dr
+
+    if np.isfinite(dr.sum(half_a)[0]) and np.isfinite(dr.sum(half_b)[0]):
+        return  # one number for the host, not one for each pixel
+    both = np.array(half_a) + np.array(half_b)
+    wrong = np.flatnonzero(~np.isfinite(both))
+    if wrong.size:
+        row, col = divmod(int(pixel[wrong[0]]), layout.cols)
+        raise SpecError(
+            f"scene {scene.name!r} has a radiance that is not finite ({both[wrong[0]]}), seen by {wrong.size} of "
+            f"{both.size} pixels, the first in row {row}, column {col} of the region: check its emitters and materials",
+            file=scene.spec.file,
+        )
+
+
+class RenderedFlux:
+    """Φ = V(x) · ∫ L(x, t, λ) R(λ) dλ in e⁻/s, by path tracing; implements `FluxSource`.
+
+    R = A_pix·FF·G·τ_lens·C_f·η·λ/(hc) with G = π/(1 + 4N²(1 + |m|)²) is the pixel's own response; L is
+    averaged over the pixel's whole pitch (a box) after the lens PSF, and over the time interval where
+    the camera moves. Objects stand still within a slice (`slice_edges_us`), at the pose of its middle.
+
+    The lens is a pinhole at the entrance pupil: everything is in focus. Random numbers are a pure
+    function of (seed, pixel on the full sensor, sample): neither chunking, order, crop nor time enters.
+
+    Parameters
+    ----------
+    scene, sensor : what and through what; a scene may replace focal length, f-number and focus.
+    samples : rays per pixel and call, even; one half of them makes `half_a`, the other `half_b`.
+        Powers of two stratify best.
+    seed : of the run.
+    max_motion_px : how far an object may move within a slice.
+    progress : called with the number of rays traced so far, after each block.
+    block_rays : most rays that are traced at a time.
+
+    Attributes
+    ----------
+    sensor : with the lens in use.
+    view : the placed camera.
+    is_static : True where nothing moves.
+
+    Raises
+    ------
+    SpecError
+        If the scene cannot be loaded or does not cover a filter's response; later, if its radiance is not finite.
+    RangeError
+        If `samples` is odd or below 2, or `max_motion_px` is not above 0.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        samples: int = 16,
+        seed: int = 0,
+        *,
+        max_motion_px: float = MAX_MOTION_PX,
+        progress: Callable[[int], None] | None = None,
+        block_rays: int = BLOCK_RAYS,
+    ) -> None:
+        if not max_motion_px > 0:
+            raise RangeError("max_motion_px", max_motion_px, "a distance above 0")
+        self.scene, self.samples, self.seed = scene, samples, seed
+        self._tracer = PixelTracer(scene, sensor, samples, seed, used_responses(sensor), progress, block_rays)
+        self.view = self._tracer.view
+        self.sensor = self.view.sensor
+        built = self._tracer.built
+        corners = {name: np.concatenate([s.corners for s in built.groups[name]]) for name in built.trajectories}
+        self._timeline = Timeline(
+            self.view, self._tracer.camera, built.trajectories, corners, built.corners, max_motion_px
+        )
+        self.is_static = not built.trajectories and self._tracer.camera is None
+        types = jit()
+        self._wavelengths = WavelengthSampler(self.sensor.responses)
+        self._filter = types.UInt32(self.sensor.layout.filter_index.ravel().astype(np.uint32))
+        illumination = self.sensor.relative_illumination.ravel() * np.float32(self._tracer.radiance_scale)
+        self._illumination = types.Float(illumination)
+
+    @property
+    def rays_per_pixel(self) -> int:
+        """Rays that one call traces for each listed pixel (for progress bars)."""
+        return 0 if self._tracer.built.is_dark else self.samples
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside the interval at which moving objects take their next pose, µs."""
+        return self._timeline.edges_us(begin_us, end_us)
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside the interval that follow all motion, the camera's too, µs."""
+        return self._timeline.sample_times_us(begin_us, end_us)
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """Mean Φ of each listed pixel over its own interval; see `FluxSource.mean_flux`.
+
+        Returns
+        -------
+        half_a, half_b : Dr.Jit Float [n], e⁻/s.
+
+        Raises
+        ------
+        RangeError
+            If a pixel lies outside the region or an interval ends before it begins.
+        """
+        import drjit as dr
+
+        pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+        if pixels.size == 0 or self._tracer.built.is_dark:
+            zeros = dr.zeros(jit().Float, pixels.size)
+            return zeros, dr.zeros(jit().Float, pixels.size)
+        self._tracer.pose(self._timeline.pose_time_us(float(np.min(begin_us)), float(np.max(end_us))))
+        ((half_a, half_b),) = self._tracer.trace(pixels, begin_us, end_us, self._choose, self._weigh)
+        require_finite(half_a, half_b, self.scene, self.sensor.layout, pixels)
+        return half_a, half_b
+
+    def _choose(self, pixel: Any, u: Any) -> list[Any]:
+        import drjit as dr
+
+        return self._wavelengths.sample(dr.gather(jit().UInt32, self._filter, pixel), u)
+
+    def _weigh(self, pixel: Any, radiance: Any) -> list[Any]:
+        """Wavelengths are distributed as R, so Φ = V · ∫R dλ · mean of L."""
+        import drjit as dr
+
+        types = jit()
+        total = self._wavelengths.total(dr.gather(types.UInt32, self._filter, pixel))
+        # not dr.mean, which has the number of lanes in the kernel: each new one would compile
+        return [dr.sum(radiance) / len(radiance) * total * dr.gather(types.Float, self._illumination, pixel)]

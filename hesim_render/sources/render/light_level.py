@@ -1,0 +1,213 @@
+"""Mitsuba scenes in absolute light: the factor to their radiance that makes a level on a plane what was asked for.
+
+The irradiance of all light together, what surfaces throw back included, is measured by paths from a point of the plane:
+with light sampled there and directions of a Lambertian surface, weighted against each other (Veach and Guibas 1995,
+"Optimally combining sampling techniques for Monte Carlo rendering"), and the scene's own integrator beyond.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from math import ceil, log2, pi
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import SpecError
+from hesim_render.core.rng import Stream, stream_key
+from hesim_render.sources.render.sampling.sampler import sampler_class
+from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
+from hesim_render.sources.render.scene.builder import BuiltScene, build
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport.paths import power_heuristic
+from hesim_render.sources.scene import Scene
+from hesim_render.specs.scene import MitsubaSpec, SceneSpec
+from hesim_render.spectral.spectrum import LUMINOUS_EFFICACY_LM_PER_W, RENDERABLE_NM, Spectrum, constant, photopic
+
+#: Standard error that is aimed at, relative; and the largest one with which a level is still taken.
+WISH, MOST_ERROR = 1e-3, 1e-2
+#: Independent estimates, whose scatter is the error; and rays of each: for a look, and at most.
+_ESTIMATES, _LOOK, _MOST = 64, 1 << 10, 1 << 17
+#: Rays at a time.
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class LightLevel:
+    """What was asked for, and how it was reached.
+
+    Parameters
+    ----------
+    level : on the plane, at t = 0; `unit`, lx or W m⁻².
+    plane_point_m, plane_normal : of the plane.
+    measured : level with a factor of 1.
+    error : standard error of that, relative.
+    radiance_scale : factor to the scene's radiance.
+    rays : with which it was measured.
+    """
+
+    level: float
+    unit: str
+    plane_point_m: tuple[float, float, float]
+    plane_normal: tuple[float, float, float]
+    measured: float
+    error: float
+    radiance_scale: float
+    rays: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def in_absolute_light(scene: Scene) -> tuple[Scene, LightLevel | None]:
+    """A scene whose light has a factor in place of a level, and how that was found; the scene itself if it had none.
+
+    Of the light all emitters that are lit count, at their time means, and everything stands where it does at t = 0.
+    The numbers are a pure function of the scene.
+
+    Raises
+    ------
+    SpecError
+        If the scene cannot be loaded, no light reaches the plane, or the level is uncertain by more than `MOST_ERROR`.
+    """
+    source = scene.spec.mitsuba
+    if source is None or not source.has_level:
+        return scene, None
+    found = _measured(scene.spec, source)
+    scaled = source.model_copy(
+        update={"radiance_scale": found.radiance_scale, "illuminance_lux": None, "irradiance_w_m2": None,
+                "plane_point_m": None, "plane_normal": None}
+    )  # fmt: skip
+    return Scene(scene.spec.model_copy(update={"mitsuba": scaled})), found
+
+
+def _measured(spec: SceneSpec, source: MitsubaSpec) -> LightLevel:
+    assert source.plane_point_m is not None and source.plane_normal is not None
+    if source.illuminance_lux is not None:
+        level, unit, key = source.illuminance_lux, "lx", "mitsuba.illuminance_lux"
+        response = photopic().scaled(LUMINOUS_EFFICACY_LM_PER_W)
+    else:
+        assert source.irradiance_w_m2 is not None
+        level, unit, key = source.irradiance_w_m2, "W m^-2", "mitsuba.irradiance_w_m2"
+        response = constant(1.0, *RENDERABLE_NM)
+    built = build(mitsuba(), spec)
+    built.pose(0.0)
+    meter = _Meter(built, spec, key, response, source.plane_point_m, source.plane_normal)
+    look = meter.estimates(_LOOK, Stream.LIGHT_LEVEL_PILOT)
+    # how many rays there are is decided by rays that are not among them
+    scatter = float(_error(look))
+    rays = min(_MOST, max(_LOOK, 1 << ceil(log2(max(1.0, _LOOK * (scatter / WISH) ** 2)))))
+    values = meter.estimates(rays, Stream.LIGHT_LEVEL)
+    built.rest()
+    mean, error = float(values.mean()), float(_error(values))
+    if not mean > 0:
+        raise SpecError("no light of the scene reaches the plane from the front (see plane_point_m, plane_normal)",
+                        file=spec.file, key=key)  # fmt: skip
+    if error > MOST_ERROR:
+        raise SpecError(
+            f"the light on the plane can be measured to {100 * error:.2g} % only (glass, or a lamp in a niche?); take "
+            "another point, or give radiance_scale",
+            file=spec.file,
+            key=key,
+        )
+    normal = tuple((np.array(source.plane_normal) / np.linalg.norm(source.plane_normal)).tolist())
+    return LightLevel(level, unit, source.plane_point_m, normal, mean, error, level / mean, rays * _ESTIMATES)
+
+
+def _error(values: np.ndarray) -> float:
+    """Relative standard error of the mean of independent estimates; 1 of nothing."""
+    mean = values.mean()
+    return float(values.std(ddof=1) / np.sqrt(values.size) / mean) if mean > 0 else 1.0
+
+
+class _Meter:
+    """Measures light on a plane.
+
+    Parameters
+    ----------
+    built : the scene, posed.
+    spec, key : where it stands, for errors.
+    response : to the spectral irradiance.
+    point, normal : of the plane, normal not of length 1.
+    """
+
+    def __init__(
+        self,
+        built: BuiltScene,
+        spec: SceneSpec,
+        key: str,
+        response: Spectrum,
+        point: tuple[float, float, float],
+        normal: tuple[float, float, float],
+    ) -> None:
+        mi = built.mi
+        self._mi, self._scene = mi, built.scene
+        if any(shape.is_medium_transition() for shape in built.scene.shapes()):
+            raise SpecError("a level cannot be measured among media; give radiance_scale", file=spec.file, key=key)
+        self._beyond = _beyond_one(mi, built, spec, key)
+        self._wavelengths = WavelengthSampler({"level": response})
+        self._point = mi.Point3f(*point)
+        self._normal = mi.Normal3f(*(np.array(normal) / np.linalg.norm(normal)).tolist())
+        self._sampler = sampler_class(mi.variant())()
+
+    def estimates(self, rays: int, stream: Stream) -> np.ndarray:
+        """Independent estimates of the level, of so many rays each, a power of two."""
+        import drjit as dr
+
+        types = jit()
+        key = dr.opaque(types.UInt64, stream_key(0, stream))
+        at_once = max(1, _BLOCK // rays)
+        found = []
+        for first in range(0, _ESTIMATES, at_once):
+            lane = dr.arange(types.UInt32, min(at_once, _ESTIMATES - first) * rays)
+            number = lane // rays
+            estimate = number + dr.opaque(types.UInt32, first)
+            self._sampler.setup(key, estimate, types.UInt32(0), lane - number * rays, rays)
+            found.append(np.array(dr.block_sum(self._level(), rays), np.float64) / rays)
+            self._sampler.rest()
+        return np.concatenate(found)
+
+    def _level(self) -> Any:
+        """Of one ray a lane."""
+        import drjit as dr
+
+        mi, scene, sampler = self._mi, self._scene, self._sampler
+        index = mi.UInt32(0)
+        bands = mi.UnpolarizedSpectrum(*self._wavelengths.sample(index, sampler.next_1d()))
+        here = mi.Interaction3f(0.0, 0.0, bands, self._point, self._normal)
+
+        seen, weight = scene.sample_emitter_direction(here, sampler.next_2d(), True, True)
+        cosine = dr.maximum(dr.dot(self._normal, seen.d), 0.0)
+        share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, cosine / pi))
+        total = dr.select((seen.pdf > 0) & (cosine > 0), weight * cosine * share, 0.0)
+
+        local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        ray = here.spawn_ray(mi.Frame3f(self._normal).to_world(local))
+        ray.wavelengths = bands
+        si = scene.ray_intersect(ray)
+        light = si.emitter(scene)
+        shines = light != None  # noqa: E711  (a Dr.Jit comparison)
+        own = dr.select(shines, light.eval(si, shines), 0.0)
+        density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
+        total += pi * own * power_heuristic(local.z / pi, density)
+        if self._beyond is not None:
+            radiance, _, _ = self._beyond.sample(scene, sampler, mi.RayDifferential3f(ray))
+            total += pi * (radiance - own)
+        return dr.sum(total) / len(total) * self._wavelengths.total(index)
+
+
+def _beyond_one(mi: Any, built: BuiltScene, spec: SceneSpec, key: str) -> Any:
+    """The scene's integrator as it goes on from a surface: its paths one segment shorter; None where they end there."""
+    plugin = built.integrator_plugin
+    if plugin is None:
+        raise SpecError(
+            "the integrator was made before, so that its path length is not known; give it as a dictionary",
+            file=spec.file,
+            key=key,
+        )
+    depth = plugin.get("max_depth", -1)
+    if plugin["type"] == "direct" or 0 <= depth <= 2:
+        return None
+    return mi.load_dict({**plugin, "max_depth": depth - 1 if depth > 0 else -1, "hide_emitters": False})

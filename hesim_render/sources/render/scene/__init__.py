@@ -1,0 +1,1 @@
+"""From a scene file or a Mitsuba scene to objects that can be moved."""

@@ -1,0 +1,286 @@
+"""From a scene file to a Mitsuba scene whose objects can be moved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene import lights
+from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
+from hesim_render.sources.render.scene.mitsuba_scene import load_mitsuba, path_tracer
+from hesim_render.sources.render.scene.mitsuba_version import (
+    Movable,
+    as_spec_error,
+    box_corners,
+    make_mesh,
+    spectrum_dict,
+    transform,
+)
+from hesim_render.sources.render.scene.paint import Paint
+from hesim_render.sources.render.scene.targets import build_target
+from hesim_render.sources.render.scene.trajectory import Trajectory, rotation_about
+from hesim_render.specs.scene import ObjectSpec, SceneSpec
+from hesim_render.spectral.spectrum import Spectrum, require_coverage
+
+#: Shapes that have no inside: they are seen from both sides.
+_OPEN_SHAPES = ("rectangle", "mesh")
+
+
+@dataclass
+class BuiltScene:
+    """A loaded Mitsuba scene.
+
+    Parameters
+    ----------
+    mi : the mitsuba module it was built with (its variant must stay current while the scene is used).
+    scene : mitsuba.Scene.
+    integrator : a path tracer of the scene's depth.
+    parameters : mitsuba.traverse(scene).
+    groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
+    trajectories : of the groups that really move.
+    is_dark : True where nothing emits.
+    paints : of all shapes but lamps, where all are matt and the light is direct; else None.
+    exact_because : why the scene needs the exact mode; None where it does not.
+    camera : the Mitsuba scene's own, where it is used.
+    integrator_plugin : what a Mitsuba scene's integrator was made of; None where it was made before.
+    """
+
+    mi: Any
+    scene: Any
+    integrator: Any
+    parameters: Any
+    groups: dict[str, list[Movable]]
+    trajectories: dict[str, Trajectory]
+    is_dark: bool
+    paints: list[Paint] | None
+    exact_because: str | None = None
+    camera: MitsubaCamera | None = None
+    integrator_plugin: dict[str, Any] | None = None
+
+    def pose(self, t_us: float) -> None:
+        """Put every moving object at its pose of `t_us`."""
+        for name, trajectory in self.trajectories.items():
+            matrix = trajectory.matrix(t_us)
+            for shape in self.groups[name]:
+                shape.set_pose(matrix)
+        if self.trajectories:
+            self.parameters.update()
+
+    def rest(self) -> None:
+        """Put every moving object back where the file places it."""
+        for name in self.trajectories:
+            for shape in self.groups[name]:
+                shape.set_pose(np.eye(4))
+        if self.trajectories:
+            self.parameters.update()
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """Corners of the box around all shapes as they stand, [8, 3]; the origin where there are none."""
+        box = self.scene.bbox()
+        if not self.scene.shapes():
+            return np.zeros((8, 3))
+        return box_corners(np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel())
+
+    def mitsuba_sensor(self) -> MitsubaCamera | None:
+        """The camera of the scene's own first sensor, if it has one and the scene file has none."""
+        return self.camera
+
+
+def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = None) -> BuiltScene:
+    """Load a scene for rendering.
+
+    Parameters
+    ----------
+    mi : the mitsuba module with the wanted variant set.
+    responses : spectra that light and reflectance must cover (≥ 99.9 % of each), by name.
+
+    Raises
+    ------
+    SpecError
+        If Mitsuba refuses the scene, a plugin of it is not rendered, a spectrum does not cover a response, or a track
+        moves nothing.
+    """
+    if responses:
+        check_coverage(spec, responses)
+    because, camera, plugin = None, None, None
+    if spec.mitsuba is not None:
+        loaded = load_mitsuba(mi, spec, spec.mitsuba)
+        scene, integrator, because, camera = loaded.scene, loaded.integrator, loaded.exact_because, loaded.camera
+        plugin = loaded.integrator_plugin
+        groups: dict[str, list[str]] = {}
+        paints = None
+    else:
+        content, groups, paints = _describe(mi, spec)
+        with as_spec_error(spec.file):
+            scene = mi.load_dict({"type": "scene", **content}, optimize=False)
+        integrator = path_tracer(mi, spec.max_depth or 2)
+    parameters = mi.traverse(scene)
+    trajectories = {track.object: Trajectory(track) for track in spec.motion if track.object != "camera"}
+    movable: dict[str, list[Movable]] = {}
+    shapes = {shape.id(): shape for shape in scene.shapes()}
+    for name in trajectories:
+        prefixes = groups.get(name, [name])
+        for prefix in prefixes:
+            if prefix not in shapes:
+                known = ", ".join(sorted(shapes))
+                raise SpecError(f"motion: no shape {name!r} in the Mitsuba scene; there are {known}", file=spec.file)
+            if f"{prefix}.vertex_positions" not in parameters and f"{prefix}.to_world" not in parameters:
+                kind = shapes[prefix].class_name()
+                raise SpecError(
+                    f"motion: shape {name!r} is a {kind}, which cannot move; use a mesh (PLY, OBJ)", file=spec.file
+                )
+        movable[name] = [Movable(parameters, prefix, shapes[prefix]) for prefix in prefixes]
+    return BuiltScene(
+        mi=mi,
+        scene=scene,
+        integrator=integrator,
+        parameters=parameters,
+        groups=movable,
+        trajectories={name: trajectory for name, trajectory in trajectories.items() if trajectory.moves},
+        is_dark=len(scene.emitters()) == 0,
+        paints=paints if (spec.max_depth or 2) == 2 else None,
+        exact_because=because,
+        camera=camera,
+        integrator_plugin=plugin,
+    )
+
+
+def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
+    """Mitsuba's dictionary of a scene file, which shape ids belong to each movable name, and the shapes' paint."""
+    content: dict[str, Any] = {}
+    groups: dict[str, list[str]] = {}
+    paints: list[Paint] = []
+    if spec.target is not None:
+        groups["target"] = []
+        for number, piece in enumerate(build_target(spec.target)):
+            name = f"target_{number}"
+            bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
+            content[name] = make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf)
+            groups["target"].append(name)
+            paints.append(Paint(name, (piece.reflectance,)))
+    for number, item in enumerate(spec.objects):
+        name = f"object_{number}"
+        content[name] = _object(mi, item, name, spec.folder)
+        groups[item.name] = [name]
+        paints.append(_paint(item, name))
+    try:
+        content.update(lights.emitters(mi, spec.lights))
+    except SpecError as error:
+        raise SpecError(str(error), file=spec.file) from None
+    return content, groups, paints
+
+
+def _paint(item: ObjectSpec, name: str) -> Paint:
+    """What `_object` paints an object with."""
+    colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
+    u, v = item.pattern_count
+    return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
+
+
+def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
+    placement = np.eye(4)
+    placement[:3, :3] = rotation_about(item.rotation_axis, item.rotation_deg)
+    placement[:3, 3] = item.position_m
+    half = np.array(item.size_m) / 2
+    texture = spectrum_dict(item.reflectance.load())
+    if item.pattern is not None:
+        scale = np.diag([item.pattern_count[0] / 2, item.pattern_count[1] / 2, 1.0, 1.0])
+        texture = {
+            "type": "checkerboard",
+            "color0": texture,
+            "color1": spectrum_dict(item.pattern.load()),
+            "to_uv": transform(mi, scale),
+        }
+    bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
+    if item.shape in _OPEN_SHAPES:
+        bsdf = {"type": "twosided", "material": bsdf}
+    if item.shape == "sphere":
+        to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))
+        return {"type": "sphere", "to_world": to_world, "bsdf": bsdf}
+    if item.shape == "mesh":
+        return _mesh_file(mi, item, placement, bsdf, folder)
+    corners, faces, uv = _box_mesh() if item.shape == "box" else _rectangle_mesh()
+    vertices = (corners * half) @ placement[:3, :3].T + placement[:3, 3]
+    return make_mesh(mi, name, vertices, faces, bsdf, uv)
+
+
+def _mesh_file(mi: Any, item: ObjectSpec, placement: NDArray[np.float64], bsdf: dict[str, Any], folder: Path) -> Any:
+    """A mesh file, scaled so that its bounding box becomes `size_m` and centred on the object's place."""
+    path = folder / str(item.mesh)
+    if not path.is_file():
+        raise SpecError(f"no such mesh file: {path}", key=f"objects.{item.name}.mesh")
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in ("obj", "ply"):
+        raise SpecError(f"a mesh must be an OBJ or PLY file, not {path.name}", key=f"objects.{item.name}.mesh")
+    with as_spec_error(path, f"objects.{item.name}.mesh"):
+        box = mi.load_dict({"type": kind, "filename": str(path)}).bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    extent = high - low
+    factors = np.divide(item.size_m, extent, out=np.ones(3), where=extent > 0)
+    fit = np.diag([*factors, 1.0])
+    fit[:3, 3] = -factors * (low + high) / 2
+    return {"type": kind, "filename": str(path), "to_world": transform(mi, placement @ fit), "bsdf": bsdf}
+
+
+def _rectangle_mesh() -> tuple[NDArray, NDArray, NDArray]:
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float64)
+    return corners, np.array([[0, 1, 2], [0, 2, 3]]), (corners[:, :2] + 1) / 2
+
+
+def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
+    """Six faces, normals outwards, each with its own u, v from 0 to 1."""
+    vertices: list[NDArray] = []
+    faces: list[NDArray] = []
+    uv: list[NDArray] = []
+    flat, triangles, flat_uv = _rectangle_mesh()
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            # cyclic axes keep the face right-handed; mirroring u on the far side turns its normal round
+            face = np.empty((4, 3))
+            face[:, (axis + 1) % 3], face[:, (axis + 2) % 3], face[:, axis] = flat[:, 0] * sign, flat[:, 1], sign
+            faces.append(triangles + 4 * len(vertices))
+            vertices.append(face)
+            uv.append(flat_uv)
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv)
+
+
+def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
+    """Key and spectrum of a scene file's light and reflectances; none in darkness or for a Mitsuba scene.
+
+    A Mitsuba scene is taken as it is: its RGB colours become spectra over the whole visible range.
+    """
+    if spec.mitsuba is not None or not any(light.is_lit for light in spec.lights):
+        return
+    for number, light in enumerate(spec.lights):
+        if light.is_lit:
+            yield f"{lights.key_of(spec.lights, number)}.illuminant", light.illuminant.load()
+    if spec.target is not None:
+        for piece in build_target(spec.target):
+            yield f"target ({piece.name})", piece.reflectance
+    for item in spec.objects:
+        for key, source in (("reflectance", item.reflectance), ("pattern", item.pattern)):
+            if source is not None:
+                yield f"objects.{item.name}.{key}", source.load()
+
+
+def check_coverage(spec: SceneSpec, responses: Mapping[str, Spectrum]) -> None:
+    """Refuse a scene whose light or a reflectance covers less than 99.9 % of a response.
+
+    Raises
+    ------
+    SpecError
+        With scene file and key.
+    """
+    for key, spectrum in named_spectra(spec):
+        for name, response in responses.items():
+            try:
+                require_coverage(spectrum, response, "this spectrum", f"filter {name!r}")
+            except SpecError as error:
+                raise SpecError(str(error), file=spec.file, key=key) from None

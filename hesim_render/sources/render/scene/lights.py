@@ -1,0 +1,185 @@
+"""Absolute emitters: a light's level on a named plane becomes radiance, intensity or irradiance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform
+from hesim_render.specs.light import LightSpec, irradiance
+from hesim_render.spectral.spectrum import Spectrum, summed
+
+#: Dimmest light, relative to facing the plane squarely, that can still set a level on it.
+_GRAZING = 1e-6
+
+
+def form_factor_integral(
+    corners: NDArray[np.float64], point: NDArray[np.float64], normal: NDArray[np.float64]
+) -> float:
+    """∫ cos θ dω over a polygon as seen from `point` on a plane with unit `normal`, in sr: E = L × this.
+
+    Lambert's formula, ½ Σ γ_i (Γ_i · n) with γ_i the angle that edge i subtends and Γ_i the unit
+    normal of the plane through `point` and that edge; the part below the plane's horizon is cut off.
+
+    Parameters
+    ----------
+    corners : polygon's corners in order, [n, 3].
+    """
+    rays = _clip_to_horizon(corners - point, normal)
+    if len(rays) < 3:
+        return 0.0
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    following = np.roll(rays, -1, axis=0)
+    cross = np.cross(rays, following)
+    sine = np.linalg.norm(cross, axis=1)
+    angle = np.arctan2(sine, np.sum(rays * following, axis=1))
+    weight = np.divide(angle, sine, out=np.zeros_like(angle), where=sine > 0)
+    return abs(float(0.5 * np.sum(weight * (cross @ normal))))
+
+
+def _clip_to_horizon(rays: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of a polygon on the side of the plane through the origin that `normal` points to."""
+    height = rays @ normal
+    kept: list[NDArray[np.float64]] = []
+    for i in range(len(rays)):
+        j = (i + 1) % len(rays)
+        if height[i] >= 0:
+            kept.append(rays[i])
+        if (height[i] >= 0) != (height[j] >= 0):
+            kept.append(rays[i] + (rays[j] - rays[i]) * (height[i] / (height[i] - height[j])))
+    return np.array(kept)
+
+
+def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
+    """Placement [4, 4] of an area light: columns are half its width, half its height, its unit normal, its centre.
+
+    The normal points at the plane point; the width runs horizontally (along x where the light
+    shines straight up or down).
+    """
+    assert light.position_m is not None and light.size_m is not None
+    centre = np.array(light.position_m, dtype=np.float64)
+    normal = _unit(np.array(light.plane_point_m) - centre, light)
+    width = np.cross([0.0, 1.0, 0.0], normal)
+    width = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(width) < 1e-9 else width / np.linalg.norm(width)
+    height = np.cross(normal, width)
+    frame = np.eye(4)
+    frame[:3, 0], frame[:3, 1] = width * light.size_m[0] / 2, height * light.size_m[1] / 2
+    frame[:3, 2], frame[:3, 3] = normal, centre
+    return frame
+
+
+def emitters(mi: Any, given: Sequence[LightSpec]) -> dict[str, Any]:
+    """Entries of the Mitsuba scene for its lights, at their time means.
+
+    ``uniform``: L = E/π from everywhere, as of a plane under an even sky, visible behind the scene; several
+    are one sky of their sum. ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``:
+    a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black where it is switched off.
+
+    Raises
+    ------
+    SpecError
+        If a light cannot reach its plane from the front.
+    """
+    entries: dict[str, Any] = {}
+    skies: list[Spectrum] = []
+    for number, light in enumerate(given):
+        name = name_of(given, number)
+        level = irradiance(light)
+        if light.type == "area":
+            entries[name] = _area(mi, light, level, key_of(given, number))
+        elif level is None:
+            continue
+        elif light.type == "uniform":
+            skies.append(level.scaled(1 / pi))
+        else:
+            entries[name] = _beam(light, level, key_of(given, number))
+    if skies:
+        # Sampling directions by the BSDF alone has no variance under an even sky, sampling the sky has: its
+        # weight is 0. Where no other light takes the share that Mitsuba insists on, a black point light does.
+        radiance = skies[0] if len(skies) == 1 else summed(*skies)
+        if not any(entry["type"] != "rectangle" or "emitter" in entry for entry in entries.values()):
+            black = {"type": "uniform", "value": 0.0}
+            entries["light_unlit"] = {"type": "point", "position": [0, 0, 0], "intensity": black}
+        entries["light_sky"] = {"type": "constant", "radiance": spectrum_dict(radiance), "sampling_weight": 0.0}
+    return entries
+
+
+def name_of(given: Sequence[LightSpec], number: int) -> str:
+    """Name of a light's entry in the Mitsuba scene."""
+    return "light" if len(given) == 1 else f"light_{number}"
+
+
+def key_of(given: Sequence[LightSpec], number: int) -> str:
+    """Where a light stands in the scene file."""
+    return "light" if len(given) == 1 else f"light.{number}"
+
+
+def geometry_on_plane(light: LightSpec, key: str) -> float:
+    """What a light of unit strength gives its plane at its point, unshadowed: irradiance is strength times this.
+
+    ``area``: radiance, ∫ cos θ dω in sr. ``point``: intensity, cos θ/d² in sr/m². ``directional``: irradiance across
+    the beam, cos θ.
+
+    Raises
+    ------
+    SpecError
+        If the light cannot reach its plane from the front.
+    """
+    plane, normal = _plane(light, key)
+    if light.type == "directional":
+        return _facing(float(-beam_direction(light, key) @ normal), key)
+    if light.type == "point":
+        away = np.array(light.position_m, dtype=np.float64) - plane
+        return _facing(float(_unit(away, light, f"{key}.position_m") @ normal), key) / float(away @ away)
+    frame = area_light_frame(light)
+    corners = frame[:3, 3] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ frame[:3, :2].T
+    return _facing(form_factor_integral(corners, plane, normal), key)
+
+
+def beam_direction(light: LightSpec, key: str = "light") -> NDArray[np.float64]:
+    """Unit vector [3] in which a directional light travels."""
+    return _unit(np.array(light.direction, dtype=np.float64), light, f"{key}.direction")
+
+
+def _beam(light: LightSpec, level: Spectrum, key: str) -> dict[str, Any]:
+    """A directional or a point light."""
+    strength = spectrum_dict(level.scaled(1 / geometry_on_plane(light, key)))
+    if light.type == "directional":
+        return {"type": "directional", "direction": beam_direction(light, key).tolist(), "irradiance": strength}
+    return {"type": "point", "position": list(light.position_m or ()), "intensity": strength}
+
+
+def _area(mi: Any, light: LightSpec, level: Spectrum | None, key: str) -> dict[str, Any]:
+    frame, geometry = area_light_frame(light), geometry_on_plane(light, key)
+    rectangle: dict[str, Any] = {
+        "type": "rectangle",
+        "to_world": transform(mi, frame),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
+    }
+    if level is not None:
+        rectangle["emitter"] = {"type": "area", "radiance": spectrum_dict(level.scaled(1 / geometry))}
+    return rectangle
+
+
+def _plane(light: LightSpec, key: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Point and unit normal of the plane on which the level holds."""
+    normal = _unit(np.array(light.plane_normal, dtype=np.float64), light, f"{key}.plane_normal")
+    return np.array(light.plane_point_m, dtype=np.float64), normal
+
+
+def _facing(cosine: float, key: str) -> float:
+    if cosine < _GRAZING:
+        raise SpecError("the light does not reach its plane from the front (see plane_point_m, plane_normal)", key=key)
+    return cosine
+
+
+def _unit(vector: NDArray[np.float64], light: LightSpec, key: str = "light") -> NDArray[np.float64]:
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        raise SpecError(f"a light of type '{light.type}' is given a direction of length zero", key=key)
+    return vector / length

@@ -1,0 +1,74 @@
+"""The camera of a Mitsuba scene: what of it says where it stands and what it sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import radians, tan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.sources.render.scene.mitsuba_version import box_corners
+from hesim_render.sources.render.scene.plugins import Used
+
+
+@dataclass(frozen=True)
+class MitsubaCamera:
+    """A perspective sensor of Mitsuba's.
+
+    Parameters
+    ----------
+    to_world : 4×4, from Mitsuba's axes: x to the left of the picture, y up, looking along +z.
+    picture : tangents of the angles from the optical axis at which the picture ends: left, right, top, bottom; to the
+        right and downwards. Of a film with a crop window the picture is that window.
+    near_m : nothing before this depth is seen.
+    """
+
+    to_world: NDArray[np.float64]
+    picture: tuple[float, float, float, float]
+    near_m: float
+
+    @classmethod
+    def of(cls, mi: Any, scene: Any, used: Used) -> MitsubaCamera:
+        """The first sensor of a loaded scene.
+
+        Parameters
+        ----------
+        used : that sensor, from `check_camera`.
+
+        Raises
+        ------
+        SpecError
+            If it asks for an exposure, or does not see as far as there are shapes.
+        """
+        sensor = scene.sensors()[0]
+        told = mi.traverse(sensor)
+        if sensor.shutter_open_time() > 0:
+            raise used.refused("its shutter_open and shutter_close are an exposure, which the sensor file gives; "
+                               "remove them")  # fmt: skip
+        to_world = np.array(told["to_world"].matrix, dtype=np.float64).reshape(4, 4, -1)[:, :, 0]
+        far, depth = float(told["far_clip"]), _farthest(scene, to_world)
+        if depth > far:
+            raise used.refused(
+                f"its far_clip is {far:g}, and there are shapes up to {depth:g} away, which would be seen here; "
+                "give a far_clip beyond them, or remove them"
+            )
+        film = (told[f"film.{key}"] for key in ("size", "crop_size", "crop_offset"))
+        size, crop, first = (np.ravel(value).astype(float) for value in film)
+        half_x = tan(radians(float(np.ravel(told["x_fov"])[0])) / 2)
+        half = np.array([half_x, half_x * size[1] / size[0]])
+        shift = np.array([float(np.ravel(told[f"principal_point_offset_{axis}"])[0]) for axis in "xy"])
+        low, high = ((2 * (edge / size + shift) - 1) * half for edge in (first, first + crop))
+        picture = float(low[0]), float(high[0]), float(low[1]), float(high[1])
+        return cls(to_world, picture, float(told["near_clip"]))
+
+
+def _farthest(scene: Any, to_world: NDArray[np.float64]) -> float:
+    """Largest depth along the axis of anything in a scene; minus infinity where there is nothing."""
+    if not scene.shapes():
+        return -np.inf
+    box = scene.bbox()
+    corners = box_corners(*(np.array(corner, dtype=np.float64).ravel() for corner in (box.min, box.max)))
+    axis = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
+    return float(((corners - to_world[:3, 3]) @ axis).max())

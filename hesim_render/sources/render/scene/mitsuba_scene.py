@@ -1,0 +1,152 @@
+"""Scenes of Mitsuba's own: an XML file, a built-in, or a dictionary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.files import require_short_number
+from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, load_scene, switch_off, transform
+from hesim_render.sources.render.scene.plugins import (
+    Used,
+    check_camera,
+    exact_reason,
+    integrator_plugin,
+    require_known,
+    set_depth,
+    used_plugins,
+)
+from hesim_render.specs.scene import MitsubaSpec, SceneSpec
+
+#: Path length for a scene without an integrator of its own.
+_DEFAULT_DEPTH = 8
+#: Segments from which on Russian roulette ends some paths. Mitsuba's default is 5; but a vector of lanes takes as long
+#: as its longest path, so that roulette saves little, and what it adds to the noise is a lot.
+_ROULETTE = {"rr_depth": 16}
+
+
+@dataclass(frozen=True)
+class MitsubaScene:
+    """What was loaded.
+
+    Parameters
+    ----------
+    scene : mitsuba.Scene.
+    integrator : its own, or a path tracer where it has none.
+    integrator_plugin : what that was made of; None where it was made before.
+    exact_because : why it needs the exact mode; None where it does not.
+    camera : its first sensor, where there is one and the scene file has no camera.
+    """
+
+    scene: Any
+    integrator: Any
+    integrator_plugin: dict[str, Any] | None
+    exact_because: str | None
+    camera: MitsubaCamera | None
+
+
+def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
+    """A scene of Mitsuba's own, with the emitters that are wanted.
+
+    Raises
+    ------
+    SpecError
+        If Mitsuba refuses it, a plugin of it is not rendered, or a name is not one of an emitter.
+    """
+    where: tuple[Path | None, str | None] = (spec.file, "mitsuba.inline")
+    if source.file is not None:
+        path = spec.folder / source.file
+        if not path.is_file():
+            raise SpecError(f"no such Mitsuba scene file: {path}", file=spec.file, key="mitsuba.file")
+        where = (path, None)
+
+    root: Path | None = None  # a dictionary that a program gave is its own
+    if not spec.allow_outside and spec.file is not None:
+        root = spec.folder
+    elif not spec.allow_outside and source.file is not None:
+        root = path.parent
+
+    def load(review: Callable[[Any], None]) -> Any:
+        with as_spec_error(*where):
+            if source.file is not None:
+                return load_scene(mi, path, review, root)
+            own = mi.cornell_box() if source.builtin else _plugin_dict(mi, source.inline or {}, spec.file)
+            return load_scene(mi, {"type": "scene", **own}, review, root)
+
+    moving = [track.object for track in spec.motion]
+    reason: str | None = None
+    camera: Used | None = None
+    plugin: dict[str, Any] | None = None
+
+    def check(state: Any) -> None:
+        nonlocal reason, camera, plugin
+        if state.nodes[0].type != mi.ObjectType.Scene:
+            raise SpecError("the Mitsuba file describes no scene", file=source.file or spec.file, key="mitsuba")
+        found = used_plugins(mi, state, spec.file)
+        reason = exact_reason(found, moving)
+        camera = check_camera(found) if spec.camera is None else None
+        if spec.max_depth is not None:
+            set_depth(found, spec.max_depth)
+        plugin = integrator_plugin(found, {"type": "path", "max_depth": spec.max_depth or _DEFAULT_DEPTH, **_ROULETTE})
+
+    def check_and_switch_off(state: Any) -> None:
+        check(state)
+        try:
+            switch_off(state, source.may_shine, [*(source.lit or ()), *source.unlit, *source.waveforms])
+        except SpecError as error:
+            raise SpecError(str(error), file=spec.file, key="mitsuba") from None
+
+    scene = load(check)
+    meant_dark = bool(spec.lights)  # of type 'none', or the scene file would have been refused
+    if meant_dark and scene.emitters():
+        raise SpecError("type 'none' is darkness, but the Mitsuba scene has emitters", file=spec.file, key="light")
+    if not meant_dark and not scene.emitters():
+        raise SpecError(
+            "the Mitsuba scene has no emitter, so there is nothing to see; if it is meant to be dark, write "
+            "'light: {type: none}' beside it",
+            file=spec.file,
+            key="mitsuba",
+        )
+    if source.lit is not None or source.unlit or source.waveforms:
+        scene = load(check_and_switch_off)
+    integrator = scene.integrator() or mi.load_dict(plugin)
+    seen = None if camera is None else MitsubaCamera.of(mi, scene, camera)
+    return MitsubaScene(scene, integrator, plugin, reason, seen)
+
+
+def path_tracer(mi: Any, depth: int) -> Any:
+    """Mitsuba's, for paths of so many segments."""
+    return mi.load_dict({"type": "path", "max_depth": depth, **_ROULETTE})
+
+
+def _plugin_dict(
+    mi: Any, node: Mapping[str, Any], file: Path | None = None, key: str = "mitsuba.inline"
+) -> dict[str, Any]:
+    """A dictionary as YAML writes it: 4×4 lists become transforms, lists of numbers in spectra become text.
+
+    Parameters
+    ----------
+    file, key : where it stands.
+    """
+    content: dict[str, Any] = {}
+    for name, value in node.items():
+        require_short_number(str(name), file)
+        if name == "type":
+            require_known(value, file, key)
+        if isinstance(value, Mapping):
+            content[name] = _plugin_dict(mi, value, file, f"{key}.{name}")
+        elif isinstance(value, list) and np.shape(value) == (4, 4):
+            content[name] = transform(mi, value)
+        elif isinstance(value, list) and name in ("wavelengths", "values"):
+            content[name] = ",".join(f"{float(v):.9g}" for v in value)
+        elif isinstance(value, mi.Bitmap):
+            content[name] = mi.Bitmap(value)  # a texture takes what is in it away: the next one would be black
+        else:
+            content[name] = value
+    return content

@@ -1,0 +1,274 @@
+"""Everything that depends on Mitsuba's version or its global state, in one place.
+
+Mitsuba 3.10 renames mesh parameters and brings animated transforms: what it touches is here and
+in `builder`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core import backend
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.files import check_xml, require_state_inside
+from hesim_render.spectral.spectrum import Spectrum
+
+_LEAST_THREADS = 2
+#: Largest departure of a wavelength from an even grid, relative, that counts as rounding.
+_EVEN = 1e-9
+#: Values below are none in 32 bit; Mitsuba's reader of numbers refuses them.
+_NOTHING = 1e-37
+
+
+def mitsuba() -> Any:
+    """The mitsuba module, its variant set to the selected backend's, its log kept to errors.
+
+    Raises
+    ------
+    BackendError
+        If no backend works here.
+    """
+    wanted = backend.variant()
+    import mitsuba as mi
+
+    if mi.variant() != wanted:
+        mi.set_variant(wanted)
+    mi.set_log_level(mi.LogLevel.Error)
+    resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs know it as an object
+    if str(resolver[0]) != str(_home(mi)):
+        resolver.prepend(str(_home(mi)))
+    _have_threads()
+    return mi
+
+
+def _home(mi: Any) -> Path:
+    """Folder of Mitsuba's own plugins and data.
+
+    It comes first wherever files are looked for: Mitsuba takes ``plugins/TYPE.so`` from the first folder that has it,
+    by default the working folder, so that files beside a scene, or where a program is started, would run as its code.
+    """
+    return Path(mi.__file__).resolve().parent
+
+
+def _have_threads() -> None:
+    """Let there be two threads at least: on a machine of one core Mitsuba would wait for ever.
+
+    It reads and writes EXR files in tasks of its pool, one of which waits for others.
+    """
+    import drjit as dr
+
+    if dr.thread_count() < _LEAST_THREADS:
+        dr.set_thread_count(_LEAST_THREADS)
+
+
+@contextmanager
+def using_variant(name: str | None) -> Iterator[Any]:
+    """The mitsuba module in another variant for a while (``scalar_spectral``); None keeps the backend's.
+
+    Raises
+    ------
+    SpecError
+        If this build of Mitsuba lacks the variant.
+    """
+    mi = mitsuba()
+    if name is None or name == mi.variant():
+        yield mi
+        return
+    if name not in mi.variants() or "spectral" not in name:
+        spectral = ", ".join(v for v in mi.variants() if "spectral" in v)
+        raise SpecError(f"no spectral Mitsuba variant {name!r}; this build has {spectral}")
+    before = mi.variant()
+    mi.set_variant(name)
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield mi
+    finally:
+        mi.set_variant(before)
+
+
+@contextmanager
+def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[None]:
+    """Turn an exception of Mitsuba's loader into a `SpecError` of one line."""
+    try:
+        yield
+    except (RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, SpecError):
+            raise
+        text = re.sub(r"\[[\w.]+:\d+\]\s*", "", str(error))
+        lines = [line.strip(" :") for line in text.splitlines() if line.strip()]
+        raise SpecError(f"Mitsuba cannot read this scene: {' '.join(lines)[:400]}", file=file, key=key) from None
+
+
+def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], None], root: Path | None = None) -> Any:
+    """A scene from an XML file or a dictionary, nothing merged.
+
+    Parameters
+    ----------
+    review : called with the `ParserState` of what was read, before anything is made of it; it may change that.
+    root : folder in which all files that it names must lie; None lets them lie anywhere.
+    """
+    parser = mi.parser
+    config = parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    resolver = mi.file_resolver()  # type: ignore[operator]  # its stubs have it as a plain object
+    inner = mi.FileResolver(resolver)
+    if isinstance(source, Path):
+        inner.prepend(str(source.resolve().parent))
+    inner.prepend(str(_home(mi)))
+    mi.set_file_resolver(inner)
+    try:
+        if isinstance(source, Path):
+            check_xml(source, root, lambda name: str(inner.resolve(name)))
+        state = (
+            parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
+        )
+        if root is not None:
+            find = mi.file_resolver().resolve
+            file = source if isinstance(source, Path) else None
+            require_state_inside(mi, state, root, lambda name: str(find(name)), file)
+        parser.transform_all(config, state)
+        mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> of the file has put its own folder first
+        review(state)
+        return parser.instantiate(config, state)
+    finally:
+        mi.set_file_resolver(resolver)
+
+
+def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:
+    """Take the unwanted emitters out of a parsed scene; a shape that loses its own stays.
+
+    Parameters
+    ----------
+    shines : whether the emitter of a name is wanted. Its name is the id of its shape, or its own.
+    names : that must be emitters of the scene.
+
+    Raises
+    ------
+    SpecError
+        If a name is not one of an emitter.
+    """
+    import mitsuba as mi
+
+    nodes, known = state.nodes, set()
+    for node in nodes:
+        properties = node.props
+        for key in list(properties.keys()):
+            if properties.type(key) != mi.Properties.Type.ResolvedReference:
+                continue
+            child = nodes[properties[key].index()]
+            if child.type != mi.ObjectType.Emitter:
+                continue
+            both = [node.props.id(), child.props.id()] if node.type == mi.ObjectType.Shape else [child.props.id()]
+            # its own name counts where it is asked for: in a dictionary each shape may call its light 'emitter'
+            name = next((name for name in both if name in names), both[0])
+            known.add(name)
+            if not shines(name):
+                del properties[key]
+    for name in names:
+        if name not in known:
+            there = ", ".join(sorted(repr(k) for k in known if k)) or "none with a name"
+            raise SpecError(f"no emitter {name!r} in the Mitsuba scene; there are {there}")
+
+
+def spectrum_dict(spectrum: Spectrum) -> dict[str, Any]:
+    """A spectrum as an explicit Mitsuba plugin, absolute: Mitsuba neither normalises nor reshapes it.
+
+    (A bare number as radiance would mean a spectrum shaped like D65, and ``d65`` is normalised.) On an evenly
+    spaced grid, ``regular``: the same values without the search that makes ``irregular`` 15-30 % of a render.
+    """
+    spectrum = Spectrum(spectrum.wavelength_nm, np.where(np.abs(spectrum.values) < _NOTHING, 0.0, spectrum.values))
+    if not np.any(spectrum.values):
+        return {"type": "uniform", "value": 0.0}  # an all-zero table is refused
+    low, high = spectrum.support_nm
+    even = np.linspace(low, high, spectrum.wavelength_nm.size)
+    if np.abs(spectrum.wavelength_nm - even).max() <= _EVEN * high:
+        return {
+            "type": "regular",
+            "wavelength_min": low,
+            "wavelength_max": high,
+            "values": ",".join(f"{value:.9g}" for value in spectrum.values),
+        }
+    return {
+        "type": "irregular",
+        "wavelengths": ",".join(f"{value:.9g}" for value in spectrum.wavelength_nm),
+        "values": ",".join(f"{value:.9g}" for value in spectrum.values),
+    }
+
+
+def make_mesh(
+    mi: Any,
+    name: str,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.uint32],
+    bsdf: dict[str, Any],
+    texcoords: NDArray[np.float64] | None = None,
+) -> Any:
+    """A flat-shaded mesh from arrays: vertices [n, 3] in metres, faces [m, 3], texture coordinates [n, 2]."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_texcoords=texcoords is not None, props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
+    parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
+    if texcoords is not None:
+        parameters["vertex_texcoords"] = np.ascontiguousarray(texcoords, dtype=np.float32).ravel()
+    parameters.update()
+    return mesh
+
+
+def transform(mi: Any, matrix: NDArray[np.float64] | Sequence[Sequence[float]]) -> Any:
+    """A 4×4 matrix as Mitsuba's scalar transform."""
+    return mi.ScalarTransform4f(np.asarray(matrix, dtype=np.float64))
+
+
+class Movable:
+    """One shape of a loaded scene whose pose can be set: initial geometry, moved by a rigid pose."""
+
+    def __init__(self, parameters: Any, prefix: str, shape: Any) -> None:
+        self._parameters = parameters
+        self.prefix = prefix
+        self._to_world: NDArray[np.float64] | None = None
+        self.is_mesh = f"{prefix}.vertex_positions" in parameters
+        if self.is_mesh:
+            self._vertices = np.array(parameters[f"{prefix}.vertex_positions"], dtype=np.float64).reshape(-1, 3)
+            normals = f"{prefix}.vertex_normals"
+            has_normals = normals in parameters and len(parameters[normals]) == self._vertices.size
+            self._normals = np.array(parameters[normals], dtype=np.float64).reshape(-1, 3) if has_normals else None
+            self.corners = box_corners(self._vertices.min(axis=0), self._vertices.max(axis=0))
+        else:
+            matrix = np.array(parameters[f"{prefix}.to_world"].matrix, dtype=np.float64)
+            self._to_world = matrix.reshape(matrix.shape[0], matrix.shape[1], -1)[:, :, 0]
+            if shape.class_name() == "Instance":
+                box = shape.bbox()
+                self.corners = box_corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())
+            else:
+                unit = box_corners(-np.ones(3), np.ones(3))  # Mitsuba's analytic shapes fit into [-1, 1]³
+                self.corners = unit @ self._to_world[:3, :3].T + self._to_world[:3, 3]
+
+    def set_pose(self, pose: NDArray[np.float64]) -> None:
+        """Put the shape at `pose` (4×4 rigid) times its initial placement; takes effect at ``parameters.update()``."""
+        rotation, shift = pose[:3, :3], pose[:3, 3]
+        if self._to_world is not None:
+            import mitsuba as mi
+
+            # a transform whose entries are arrays, not literals: setting it does not recompile anything
+            self._parameters[f"{self.prefix}.to_world"] = mi.AffineTransform4f((pose @ self._to_world).tolist())
+            return
+        positions = self._vertices @ rotation.T + shift
+        self._parameters[f"{self.prefix}.vertex_positions"] = positions.astype(np.float32).ravel()
+        if self._normals is not None:
+            turned = self._normals @ rotation.T
+            self._parameters[f"{self.prefix}.vertex_normals"] = turned.astype(np.float32).ravel()
+
+
+def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The 8 corners of an axis-parallel box, [8, 3]."""
+    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, 8).T
+    return low + corners * (high - low)

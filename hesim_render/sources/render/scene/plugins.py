@@ -1,0 +1,345 @@
+"""What is done with each plugin that a scene of Mitsuba's own may name.
+
+Every one is taken as Mitsuba takes it, or leads to the exact mode with a reason, or is refused by name, place and what
+to write instead. A few are the business of the sensor file: what they say is not asked for. Nothing that is not in
+these tables is loaded, so that a scene file cannot name a library to run either.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hesim_render.core.errors import SpecError
+
+#: Rendered in both modes as Mitsuba renders them, by the kind of plugin.
+HONOURED: dict[str, tuple[str, ...]] = {
+    "Integrator": ("path",),
+    "Sensor": ("perspective",),
+    "Emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot", "sunsky"),
+    "Shape": (
+        *("cube", "cylinder", "disk", "obj", "ply", "rectangle", "serialized", "sphere"),
+        *("bsplinecurve", "ellipsoids", "ellipsoidsmesh", "linearcurve", "merge", "sdfgrid"),
+    ),
+    "BSDF": (
+        *("blendbsdf", "bumpmap", "conductor", "dielectric", "diffuse", "hair", "mask", "measured", "normalmap"),
+        *("null", "plastic", "pplastic", "principled", "principledthin", "roughconductor", "roughdielectric"),
+        *("roughplastic", "thindielectric", "twosided"),
+    ),
+    "Texture": (
+        *("bitmap", "blackbody", "checkerboard", "d65", "irregular", "mesh_attribute", "rawconstant", "regular"),
+        *("srgb", "uniform", "volume"),
+    ),
+    "Volume": ("constvolume", "gridvolume"),
+}
+
+#: Rendered in the exact mode alone, and why.
+EXACT: dict[str, dict[str, str]] = {
+    "Integrator": {
+        "volpath": "it follows light through media, not only between surfaces",
+        "volpathmis": "it follows light through media, not only between surfaces",
+        "direct": "it samples direct light in a way of its own",
+    },
+    "Shape": {
+        "instance": "it is a copy that has no surface of its own",
+        "shapegroup": "its copies have no surface of their own",
+    },
+    "Medium": {name: "light is followed through it" for name in ("heterogeneous", "homogeneous")},
+    "PhaseFunction": {
+        name: "it belongs to a medium" for name in ("blendphase", "hg", "isotropic", "rayleigh", "sggx", "tabphase")
+    },
+}
+
+#: The sensor file says this: pixels are boxes that integrate, with noise of their own.
+OF_THE_SENSOR_FILE: dict[str, tuple[str, ...]] = {
+    "Film": ("hdrfilm",),
+    "Sampler": ("independent", "ldsampler", "multijitter", "orthogonal", "stratified"),
+    "ReconstructionFilter": ("box", "catmullrom", "gaussian", "lanczos", "mitchell", "tent"),
+}
+
+_UNPOLARISED = "light is rendered without its polarisation, of which this would keep a part; remove it"
+_BESIDE = "it adds other quantities to a picture; put the integrator that is inside it in its place"
+_DERIVATIVES = "it is made for derivatives; use 'path'"
+_CAMERA = "use a 'perspective' sensor, or add a 'camera' section to the scene file"
+
+#: Refused, and what to do.
+REFUSED: dict[str, dict[str, str]] = {
+    "Integrator": {
+        "aov": _BESIDE,
+        "moment": _BESIDE,
+        "stokes": _BESIDE,
+        "depth": "it gives distances, not light; use 'path'",
+        "ptracer": "it throws light at a film of its own, and pixels are asked one by one here; use 'path'",
+        "prb": _DERIVATIVES,
+        "prb_basic": _DERIVATIVES,
+        "prb_projective": _DERIVATIVES,
+        "direct_projective": "it is made for derivatives; use 'direct'",
+        "prbvolpath": "it is made for derivatives; use 'volpath'",
+        "volprim_rf_basic": "it shows a radiance field that has no units; use 'path' with emitters and materials",
+    },
+    "Sensor": {
+        "thinlens": f"its depth of field is not rendered: all is in focus here; {_CAMERA}",
+        "orthographic": f"a lens sees in perspective; {_CAMERA}",
+        "irradiancemeter": f"it has no picture; {_CAMERA}",
+        "radiancemeter": f"it has no picture; {_CAMERA}",
+        "distant": f"it has no picture; {_CAMERA}",
+        "batch": f"it is several cameras at once; {_CAMERA}",
+        "flat_sensor": f"it has no picture; {_CAMERA}",
+    },
+    "Film": {"specfilm": "its channels are responses, which the sensor file gives; use 'hdrfilm'"},
+    "Emitter": {
+        "directionalarea": "no path from the camera can find its light; use 'directional', 'spot' or 'projector'",
+        "timed_sunsky": "its sun moves by a clock of its own; use 'sunsky' with the time of day that is meant",
+    },
+    "Shape": {"blender": "it is read from the memory of a running Blender; export the mesh as PLY"},
+    "BSDF": {name: _UNPOLARISED for name in ("circular", "measured_polarized", "polarizer", "retarder")},
+}
+
+#: Class names of objects that were made before they were put into a dictionary. (All written in Python share one.)
+_MADE: dict[str, tuple[str, str]] = {
+    "AOVIntegrator": ("Integrator", "aov"),
+    "BatchSensor": ("Sensor", "batch"),
+    "BlenderMesh": ("Shape", "blender"),
+    "CircularPolarizer": ("BSDF", "circular"),
+    "DepthIntegrator": ("Integrator", "depth"),
+    "DirectIntegrator": ("Integrator", "direct"),
+    "DirectionalArea": ("Emitter", "directionalarea"),
+    "Instance": ("Shape", "instance"),
+    "LinearPolarizer": ("BSDF", "polarizer"),
+    "LinearRetarder": ("BSDF", "retarder"),
+    "MeasuredPolarized": ("BSDF", "measured_polarized"),
+    "MomentIntegrator": ("Integrator", "moment"),
+    "ParticleTracerIntegrator": ("Integrator", "ptracer"),
+    "PathIntegrator": ("Integrator", "path"),
+    "PerspectiveCamera": ("Sensor", "perspective"),
+    "ShapeGroupPlugin": ("Shape", "shapegroup"),
+    "SpecFilm": ("Film", "specfilm"),
+    "StokesIntegrator": ("Integrator", "stokes"),
+    "ThinLensCamera": ("Sensor", "thinlens"),
+    "TimedSunskyEmitter": ("Emitter", "timed_sunsky"),
+    "VolpathMisIntegratorImpl": ("Integrator", "volpathmis"),
+    "VolumetricPathIntegrator": ("Integrator", "volpath"),
+}
+
+#: Kind of each plugin.
+_KINDS = {
+    name: kind
+    for table in (HONOURED, EXACT, OF_THE_SENSOR_FILE, REFUSED)
+    for kind, names in table.items()
+    for name in names
+}
+#: What a dictionary may name beside plugins.
+_BESIDE_PLUGINS = ("scene", "ref", "rgb", "spectrum")
+_THROUGH_MEDIA = ("volpath", "volpathmis")
+#: With these the path length may be set from outside.
+_HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
+#: What belongs to a camera: looked at where that camera is used.
+OF_A_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
+_PLACE = re.compile(r"(?P<file>.+) \(line (?P<line>\d+), col \d+\)")
+_KEY = re.compile(r'dictionary node "(?P<key>.*)"')
+
+
+@dataclass(frozen=True)
+class Used:
+    """One plugin of a parsed scene.
+
+    Parameters
+    ----------
+    kind, name : of the plugin.
+    own_id : its id, empty where it has none.
+    place : arguments of a `SpecError` that say where it stands.
+    node : of Mitsuba's parser; None where the object was made before.
+    owners : nodes that it belongs to.
+    """
+
+    kind: str
+    name: str
+    own_id: str
+    place: Mapping[str, Any]
+    node: Any
+    owners: tuple[Any, ...]
+
+    def refused(self, why: str) -> SpecError:
+        """That this plugin is not rendered."""
+        return SpecError(f"{self}: {why}", **self.place)
+
+    def __str__(self) -> str:
+        return f"{self.kind if self.kind == 'BSDF' else self.kind.lower()} '{self.name}'"
+
+
+def require_known(name: Any, file: Path | None, key: str) -> None:
+    """Refuse a type in a dictionary that is no plugin of Mitsuba's: to look what it is Mitsuba would load it.
+
+    Raises
+    ------
+    SpecError
+        With its place.
+    """
+    if not isinstance(name, str) or (name not in _KINDS and name not in _BESIDE_PLUGINS):
+        raise SpecError(f"type {name!r} is no plugin of Mitsuba's that is known here", file=file, key=key)
+
+
+def used_plugins(mi: Any, state: Any, file: Path | None) -> list[Used]:
+    """All plugins of a parsed scene, in order; `file` is the scene file, for a dictionary within it."""
+    nodes, types = list(state.nodes), mi.Properties.Type
+    owners: list[list[Any]] = [[] for _ in nodes]
+    for node in nodes:
+        for key in node.props:
+            if node.props.type(key) == types.ResolvedReference:
+                owners[node.props[key].index()].append(node)
+    found: list[Used] = []
+    for node, above in zip(nodes, owners, strict=True):
+        place, name = _place(mi, state, node, file), node.props.plugin_name()
+        # of what is written in Python a parsed dictionary does not tell the kind
+        kind = _KINDS.get(name, "Plugin") if node.type.name == "Unknown" else node.type.name
+        if kind != "Scene":
+            found.append(Used(kind, name, node.props.id(), place, node, tuple(above)))
+        for key in node.props:
+            if node.props.type(key) == types.Object:
+                inside = {**place, "key": ".".join(filter(None, (place.get("key"), key)))}
+                found.extend(_made(mi, node.props[key], inside, node))
+    return found
+
+
+def _place(mi: Any, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
+    """Arguments of a `SpecError` for where a node stands."""
+    told, own = mi.parser.file_location(state, node), node.props.id()
+    if match := _PLACE.fullmatch(told):
+        return {"file": match["file"], "line": int(match["line"]), "key": own or None}
+    match = _KEY.fullmatch(told)
+    inside = "" if match is None or match["key"] == "root" else f".{match['key']}"
+    return {"file": file, "key": f"mitsuba.inline{inside}"}
+
+
+def _made(mi: Any, value: Any, place: Mapping[str, Any], owner: Any) -> Iterator[Used]:
+    """An object that was made before, and what is in it."""
+    if not isinstance(value, mi.Object):
+        return
+    for item in mi.traverse(value).hierarchy:
+        name = item.class_name()
+        kinds = (mi.Integrator, mi.Sensor, mi.Shape, mi.Medium)
+        kind = next((kind.__name__ for kind in kinds if isinstance(item, kind)), "")
+        if name in _MADE:
+            kind, name = _MADE[name]
+        elif kind == "Medium":
+            name = name.removesuffix("Medium").lower()
+        if kind:
+            yield Used(kind, name, item.id(), place, None, (owner,))
+
+
+def exact_reason(found: Iterable[Used], moving: Iterable[str]) -> str | None:
+    """Why a scene needs the exact mode, None where it does not.
+
+    Parameters
+    ----------
+    found : from `used_plugins`.
+    moving : ids of shapes that move.
+
+    Raises
+    ------
+    SpecError
+        If a plugin is not rendered.
+    """
+    plugins, moved = list(found), set(moving)
+    reason = None
+    for used in plugins:
+        if used.kind in OF_A_CAMERA:
+            continue
+        if (why := _why_refused(used)) is not None:
+            raise used.refused(why)
+        if used.node is None and used.kind == "Shape" and used.own_id in moved:
+            raise used.refused("it moves, and was made before, so that it would keep its pose; give it as a dictionary")
+        exact = EXACT.get(used.kind, {}).get(used.name) or _exact_where_it_moves(used, moved)
+        if exact and reason is None:
+            reason = f"{used}: {exact}"
+    _check_media(plugins, moved)
+    return reason
+
+
+def _why_refused(used: Used) -> str | None:
+    why = REFUSED.get(used.kind, {}).get(used.name)
+    if why is not None or used.name in EXACT.get(used.kind, {}):
+        return why
+    if used.node is None and used.kind not in ("Integrator", "Sensor"):
+        return None  # of a class of Mitsuba's own that is nowhere refused
+    known = HONOURED.get(used.kind, ()) + OF_THE_SENSOR_FILE.get(used.kind, ())
+    return None if used.name in known else f"it is not known here; use one of {', '.join(sorted(known))}"
+
+
+def _exact_where_it_moves(used: Used, moved: set[str]) -> str | None:
+    if used.kind == "Texture" and used.name == "volume" and moved:
+        return "it stays where it is while shapes move through it"
+    if used.name == "sdfgrid" and used.own_id in moved:
+        return "it moves, and its surface is found by steps"
+    return None
+
+
+def _check_media(plugins: Iterable[Used], moved: set[str]) -> None:
+    """Refuse media that the integrator would not see, or that would stay behind."""
+    integrator = next((used.name for used in plugins if used.kind == "Integrator"), None)
+    for used in plugins:
+        shapes = [owner for owner in used.owners if owner.type.name == "Shape"]
+        if used.kind != "Medium" or (used.node is not None and not shapes):
+            continue
+        if integrator not in _THROUGH_MEDIA:
+            own = f"integrator '{integrator}'" if integrator else "'path', which is used where there is no integrator,"
+            raise used.refused(f"{own} does not see media; use 'volpath' or 'volpathmis', or remove the medium")
+        if used.name == "heterogeneous" and any(shape.props.id() in moved for shape in shapes):
+            raise used.refused("the shape around it moves, and its volume would not; use a 'homogeneous' medium")
+
+
+def set_depth(found: Iterable[Used], depth: int) -> bool:
+    """Give a parsed scene's integrator a path length; False where it has none.
+
+    Raises
+    ------
+    SpecError
+        If the integrator has no path length.
+    """
+    for used in found:
+        if used.kind != "Integrator":
+            continue
+        if used.node is None:
+            raise used.refused("it was made before, so that max_depth cannot be set; give it as a dictionary")
+        if used.name in _HAVE_DEPTH:
+            used.node.props["max_depth"] = depth
+        elif depth != 2:  # 'direct' is that
+            raise used.refused(f"it has no path length, and the scene file asks for max_depth {depth}; use 'path'")
+        return True
+    return False
+
+
+def integrator_plugin(found: Iterable[Used], otherwise: dict[str, Any]) -> dict[str, Any] | None:
+    """A parsed scene's integrator as a dictionary, or another where it has none; None where it was made before."""
+    for used in found:
+        if used.kind == "Integrator":
+            return None if used.node is None else {"type": used.name, **dict(used.node.props.items())}
+    return otherwise
+
+
+def check_camera(found: Iterable[Used]) -> Used | None:
+    """The first sensor of a parsed scene, if it has any.
+
+    Raises
+    ------
+    SpecError
+        If it asks for what is not rendered: with the plugin, its place, and what to do.
+    """
+    plugins = list(found)
+    first = next((used for used in plugins if used.kind == "Sensor"), None)
+    if first is None:
+        return None
+    for used in plugins:
+        own = used.place is first.place if first.node is None else any(owner is first.node for owner in used.owners)
+        if used is not first and not own:
+            continue
+        if (why := _why_refused(used)) is not None:
+            raise used.refused(why)
+        if used.kind == "Medium":
+            raise used.refused("the camera stands in it, which is not rendered; put the camera outside")
+        if used.kind == "Texture":
+            raise used.refused("it is the camera's 'srf', and the responses are the sensor file's; remove it")
+    return first

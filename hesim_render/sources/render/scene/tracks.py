@@ -1,0 +1,159 @@
+"""Keyframed rigid poses on the device: of any track of several, per lane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.tables import table
+
+if TYPE_CHECKING:
+    from hesim_render.sources.render.scene.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class DevicePose:
+    """Rigid poses, one a lane: x → R x + shift; `columns` are those of R."""
+
+    columns: tuple[Any, Any, Any]
+    shift: Any
+
+    @classmethod
+    def about(cls, w: Any, v: Any, pivot: Any, shift: Any) -> DevicePose:
+        """x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
+        import drjit as dr
+
+        x, y, z = v
+        vector = type(v)
+        rest = cls(
+            (
+                vector(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+                vector(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+                vector(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+            ),
+            dr.zeros(vector),
+        )
+        return cls(rest.columns, shift + pivot - rest.turn_to_world(pivot))
+
+    @classmethod
+    def none(cls, vector: Any) -> DevicePose:
+        """Of what stays where it is."""
+        import drjit as dr
+
+        return cls((vector(1, 0, 0), vector(0, 1, 0), vector(0, 0, 1)), dr.zeros(vector))
+
+    def where(self, condition: Any, other: DevicePose) -> DevicePose:
+        """This pose in lanes where a condition holds, another one in the rest."""
+        import drjit as dr
+
+        columns = (dr.select(condition, a, b) for a, b in zip(self.columns, other.columns, strict=True))
+        return DevicePose(tuple(columns), dr.select(condition, self.shift, other.shift))
+
+    def turn_to_world(self, direction: Any) -> Any:
+        import drjit as dr
+
+        (x, y, z), (first, second, third) = direction, self.columns
+        return dr.fma(first, x, dr.fma(second, y, third * z))
+
+    def to_world(self, point: Any) -> Any:
+        import drjit as dr
+
+        (x, y, z), (first, second, third) = point, self.columns
+        return dr.fma(first, x, dr.fma(second, y, dr.fma(third, z, self.shift)))
+
+    def turn_to_rest(self, direction: Any) -> Any:
+        import drjit as dr
+
+        vector = type(self.shift)
+        return vector(*(dr.dot(column, vector(direction)) for column in self.columns))
+
+    def to_rest(self, point: Any) -> Any:
+        return self.turn_to_rest(type(self.shift)(point) - self.shift)
+
+
+class Tracks:
+    """Tracks of several objects in tables, so that one kernel serves any number of them.
+
+    Parameters
+    ----------
+    trajectories : one or more.
+    """
+
+    def __init__(self, trajectories: Sequence[Trajectory]) -> None:
+        import drjit as dr
+
+        types = jit()
+        rows: list[NDArray[np.float64]] = []
+        times: list[NDArray[np.float64]] = []
+        heads: list[list[float]] = []
+        for track in trajectories:
+            knots = track.knots_us - track.knots_us[0]
+            heads.append(
+                [
+                    sum(t.size for t in times),
+                    sum(len(row) for row in rows),
+                    knots.size,
+                    knots[-1],
+                    track.repeat,
+                    *track.pivot_m,
+                ]
+            )
+            # one row a segment, fetched as four packets of four: gathers of single numbers cost more than the poses
+            columns = [
+                *(knots[:-1, None], 1 / np.diff(knots)[:, None], track.arc_rad[:, None] / 2, track.arc_axis),
+                *(track.start_rotation, track.translation_m[:-1], np.diff(track.translation_m, axis=0)),
+            ]
+            rows.append(np.hstack(columns))
+            times.append(knots)
+        self._heads, self._rows, self._times = (
+            table(types.Float, np.concatenate(values).astype(np.float32)) for values in (heads, rows, times)
+        )
+        #: Steps in which the segment of a time is found; a power of two, so that tracks alike in length share a kernel.
+        self._most = 1 << max(0, max(map(len, rows)) - 1).bit_length()
+        dr.make_opaque(self._heads, self._rows, self._times)
+
+    def pose(self, number: Any, local_us: Any) -> DevicePose:
+        """Pose of every lane at its own time.
+
+        Parameters
+        ----------
+        number : of its track, an integer or UInt32.
+        local_us : Float, time since that track's first keyframe, see `Trajectory.pose_at`.
+        """
+        import drjit as dr
+
+        types = jit()
+        number = types.UInt32(number)
+        first_time, first_row, knots, period = dr.gather(types.Array4f, self._heads, 2 * number)
+        repeat, *pivot = dr.gather(types.Array4f, self._heads, 2 * number + 1)
+        wrapped = local_us - period * dr.floor(local_us / period)
+        local_us = dr.select((repeat > 0) & (local_us >= period), wrapped, local_us)
+        local_us = dr.clip(local_us, 0, period)
+        last = types.UInt32(knots) - 2  # of the segments
+        base = types.UInt32(first_time)
+        segment = dr.binary_search(
+            0,
+            self._most - 1,
+            lambda i: (
+                (types.UInt32(i) < last)
+                & (dr.gather(types.Float, self._times, base + dr.minimum(types.UInt32(i) + 1, last)) <= local_us)
+            ),
+        )
+        place = 4 * (types.UInt32(first_row) + dr.minimum(types.UInt32(segment), last))
+        row = [x for k in range(4) for x in dr.gather(types.Array4f, self._rows, place + k)]
+        share = (local_us - row[0]) * row[1]
+        sine, cosine = dr.sincos(share * row[2])
+        vector = types.Array3f
+        turn_v = vector(*row[3:6]) * sine
+        base_w, base_v = row[6], vector(*row[7:10])
+        return DevicePose.about(
+            w=cosine * base_w - dr.dot(turn_v, base_v),
+            v=cosine * base_v + base_w * turn_v + dr.cross(turn_v, base_v),
+            pivot=vector(*pivot),
+            shift=dr.fma(vector(*row[13:16]), share, vector(*row[10:13])),
+        )

@@ -1,0 +1,213 @@
+"""Keyframed rigid poses: where an object or the camera is at any time."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from math import degrees, radians
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
+from hesim_render.specs.scene import KeyframeSpec, TrackSpec
+
+Quaternion = NDArray[np.float64]  # w, x, y, z
+_EPSILON = 1e-12
+
+
+def _axis_angle(axis: NDArray[np.float64], angle_rad: NDArray[np.float64]) -> Quaternion:
+    """Quaternions [..., 4] of rotations about unit axes [..., 3]."""
+    half = np.asarray(angle_rad, dtype=np.float64)[..., None] / 2
+    return np.concatenate([np.cos(half), np.sin(half) * axis], axis=-1)
+
+
+def _multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """p · q: rotate by q, then by p."""
+    w = p[..., :1] * q[..., :1] - np.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)
+    v = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
+    return np.concatenate([w, v], axis=-1)
+
+
+def rotation_matrix(q: Quaternion) -> NDArray[np.float64]:
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_about(axis: ArrayLike, angle_deg: float) -> NDArray[np.float64]:
+    """Matrix [3, 3] of a right-handed turn by `angle_deg` about `axis` (any length but zero)."""
+    direction = np.asarray(axis, dtype=np.float64)
+    return rotation_matrix(_axis_angle(direction / np.linalg.norm(direction), np.array(radians(angle_deg))))
+
+
+def _unit(axis: ArrayLike) -> NDArray[np.float64]:
+    vector = np.asarray(axis, dtype=np.float64)
+    return vector / np.linalg.norm(vector)
+
+
+def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], float]:
+    """Axis and angle (rad, any number of turns) of the rotation that leads from one keyframe to the next."""
+    if start.rotation_deg == 0:
+        return _unit(end.rotation_axis), radians(end.rotation_deg)
+    if end.rotation_deg == 0:
+        return _unit(start.rotation_axis), -radians(start.rotation_deg)
+    a, b = _unit(start.rotation_axis), _unit(end.rotation_axis)
+    if abs(abs(a @ b) - 1) < 1e-9:
+        return a, radians(end.rotation_deg * np.sign(a @ b) - start.rotation_deg)
+    first = _axis_angle(a, np.array(radians(start.rotation_deg)))
+    second = _axis_angle(b, np.array(radians(end.rotation_deg)))
+    step = _multiply(second, first * np.array([1, -1, -1, -1]))
+    step = -step if step[0] < 0 else step  # the shorter of the two arcs
+    sine = float(np.linalg.norm(step[1:]))
+    if sine < _EPSILON:
+        return a, 0.0
+    return step[1:] / sine, 2 * float(np.arctan2(sine, step[0]))
+
+
+class Piece(NamedTuple):
+    """Part of the segment between two keyframes.
+
+    Parameters
+    ----------
+    segment : its number.
+    first, last : shares of it, 0 to 1.
+    length_us : of the part.
+    """
+
+    segment: int
+    first: float
+    last: float
+    length_us: float
+
+
+class Trajectory:
+    """A track evaluated: pose(t) = translate(T(t)) · pivot + R(t) · (x − pivot).
+
+    Between keyframes T is linear and R turns at constant angular speed: about the shared axis, any
+    number of turns, where both keyframes name the same axis (a rotation of 0 shares every axis);
+    along the shortest arc otherwise. Outside the keyframes the pose is held, or the track repeats
+    with the period from its first to its last keyframe.
+
+    Parameters
+    ----------
+    track : keyframes as written in the scene file, angles in degrees, lengths in metres.
+    """
+
+    def __init__(self, track: TrackSpec) -> None:
+        frames = track.keyframes
+        self.repeat = track.repeat
+        self.pivot_m = np.array(track.pivot_m, dtype=np.float64)
+        self.knots_us = np.array([frame.t_us for frame in frames], dtype=np.float64)
+        self.translation_m = np.array([frame.translation_m for frame in frames], dtype=np.float64)
+        arcs = [_arc(start, end) for start, end in zip(frames[:-1], frames[1:], strict=True)]
+        self.arc_axis = np.array([axis for axis, _ in arcs])
+        self.arc_rad = np.array([angle for _, angle in arcs])
+        self.start_rotation = np.array(
+            [_axis_angle(_unit(f.rotation_axis), np.array(radians(f.rotation_deg))) for f in frames[:-1]]
+        )
+
+    @property
+    def period_us(self) -> float:
+        """From the first keyframe to the last."""
+        return float(self.knots_us[-1] - self.knots_us[0])
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose changes at all."""
+        return bool(np.any(np.ptp(self.translation_m, axis=0) > 0) or np.any(np.abs(self.arc_rad) > 0))
+
+    def local_us(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Time since the first keyframe, wrapped where the track repeats, else held to its ends."""
+        local = np.asarray(t_us, dtype=np.float64) - self.knots_us[0]
+        return np.mod(local, self.period_us) if self.repeat else np.clip(local, 0.0, self.period_us)
+
+    def matrix(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Pose at one or many times: 4×4 rigid matrices, shape [..., 4, 4] for times of shape [...]."""
+        local = self.local_us(t_us)
+        knots = self.knots_us - self.knots_us[0]
+        segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
+        return self.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
+
+    def throughout(self, times_us: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
+        """Segment that holds a stretch of time without `ends_us` inside, and its poses at times of it, [k, 4, 4].
+
+        At the stretch's end the pose is that before a track that repeats jumps.
+        """
+        middle = 0.5 * (times_us[0] + times_us[-1])
+        knots, local = self.knots_us - self.knots_us[0], float(self.local_us(middle))
+        segment = int(np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2))
+        if not self.repeat:  # held before and after
+            local = middle - self.knots_us[0]
+        share = (local + times_us - middle - knots[segment]) / (knots[segment + 1] - knots[segment])
+        return segment, self.within(np.full(share.size, segment), np.clip(share, 0.0, 1.0))
+
+    def within(self, segment: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Pose in the segments between two keyframes at a share of each, 0 to 1 with both ends; [..., 4, 4]."""
+        turn = _axis_angle(self.arc_axis[segment], share * self.arc_rad[segment])
+        rotation = rotation_matrix(_multiply(turn, self.start_rotation[segment]))
+        start = self.translation_m[segment]
+        translation = start + share[..., None] * (self.translation_m[segment + 1] - start)
+        pose = np.zeros((*share.shape, 4, 4))
+        pose[..., :3, :3] = rotation
+        pose[..., :3, 3] = translation + self.pivot_m - rotation @ self.pivot_m
+        pose[..., 3, 3] = 1.0
+        return pose
+
+    def pieces(self, begin_us: float, end_us: float) -> list[Piece]:
+        """What an interval has of the segments between keyframes, in order of time; no pose is left out.
+
+        A track that repeats jumps at its last keyframe, which is therefore the end of one piece and the begin of the
+        next. Of an interval of a period or more each segment comes once.
+        """
+        knots = self.knots_us - self.knots_us[0]
+        period = float(knots[-1])
+        if not self.repeat:
+            spans = [tuple(np.clip([begin_us, end_us], *self.knots_us[[0, -1]]) - self.knots_us[0])]
+        elif end_us - begin_us >= period:
+            spans = [(0.0, period)]
+        else:
+            first = float(self.local_us(begin_us))
+            last = first + end_us - begin_us
+            spans = [(first, last)] if last <= period else [(first, period), (0.0, last - period)]
+        found = []
+        for low, high in spans:
+            for segment in range(knots.size - 1):
+                a, b = max(low, knots[segment]), min(high, knots[segment + 1])
+                if a <= b:
+                    length = knots[segment + 1] - knots[segment]
+                    found.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
+        return found
+
+    def ends_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside an interval at which a segment between two keyframes begins or ends, µs, in order."""
+        knots, first = self.knots_us, np.zeros(1)
+        if self.repeat:
+            first = np.arange(
+                np.floor((begin_us - knots[0]) / self.period_us), np.ceil((end_us - knots[0]) / self.period_us)
+            )
+        times = np.unique((knots + self.period_us * first[:, None]).ravel())
+        return times[(times > begin_us) & (times < end_us)]
+
+    def pose_at(self, local_us: Any) -> DevicePose:
+        """Pose of every lane at its own time.
+
+        Parameters
+        ----------
+        local_us : Dr.Jit Float, time since the first keyframe as from `local_us`; it may run past the
+            end of the track by less than a period.
+        """
+        return self._on_device.pose(0, local_us)
+
+    @cached_property
+    def _on_device(self) -> Tracks:
+        return Tracks([self])
+
+    def __repr__(self) -> str:
+        turns = degrees(float(np.sum(np.abs(self.arc_rad))))
+        return f"Trajectory({self.knots_us.size} keyframes, {self.period_us:g} µs, {turns:g}° in all)"

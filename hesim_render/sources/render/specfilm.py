@@ -1,0 +1,161 @@
+"""A second, independent estimate of the flux: Mitsuba's own camera, film and sampler."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import atan, degrees
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.flicker import light_parts
+from hesim_render.sources.render.camera import MITSUBA_AXES, View, place_camera
+from hesim_render.sources.render.exact import used_responses
+from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform, using_variant
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.scene import Scene
+
+
+@dataclass(frozen=True)
+class ReferenceFlux:
+    """Flux of every pixel as if all had the same filter.
+
+    Parameters
+    ----------
+    flux : per filter, [row, col], e⁻/s.
+    stderr : standard error of each, from the scatter of independent renders, [row, col].
+    sensor : with the lens in use.
+    """
+
+    flux: dict[str, NDArray[np.float64]]
+    stderr: dict[str, NDArray[np.float64]]
+    sensor: Sensor
+
+    def mosaic(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Flux and standard error of each pixel through its own filter, [row, col]."""
+        index = self.sensor.layout.filter_index
+        names = self.sensor.layout.filters
+        blank = np.zeros(self.sensor.layout.shape)
+        flux = np.stack([self.flux.get(name, blank) for name in names])
+        stderr = np.stack([self.stderr.get(name, blank) for name in names])
+        choose = index[None].astype(np.intp)
+        return np.take_along_axis(flux, choose, axis=0)[0], np.take_along_axis(stderr, choose, axis=0)[0]
+
+
+def perspective_dict(mi: Any, view: View, camera_to_world: NDArray[np.float64], film: dict[str, Any]) -> dict[str, Any]:
+    """Mitsuba's perspective sensor over exactly the read-out region."""
+    left, right, top, bottom = view.region_mm
+    width, height = right - left, bottom - top
+    image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
+    return {
+        "type": "perspective",
+        "fov": degrees(2 * atan(width / 2 / image_mm)),
+        "fov_axis": "x",
+        # Mitsuba counts the offset of the film's centre from the axis, in units of its size
+        "principal_point_offset_x": ((left + right) / 2 - axis_x) / width,
+        "principal_point_offset_y": ((top + bottom) / 2 - axis_y) / height,
+        "near_clip": max(1e-4, view.near_m),
+        "far_clip": 1e5,
+        "to_world": transform(mi, camera_to_world @ MITSUBA_AXES),
+        "sampler": {"type": "independent"},
+        "film": film,
+    }
+
+
+def camera_at(scene: Scene, view: View, t_us: float) -> NDArray[np.float64]:
+    """Camera-to-world matrix of a (moving) camera at one time."""
+    for track in scene.spec.motion:
+        if track.object == "camera":
+            return Trajectory(track).matrix(t_us) @ view.camera_to_world
+    return view.camera_to_world
+
+
+def reference_flux(
+    scene: Scene,
+    sensor: Sensor,
+    samples: int,
+    t_us: float = 0.0,
+    variant: str | None = None,
+    *,
+    repeats: int = 8,
+    seed: int = 0,
+) -> ReferenceFlux:
+    """Flux at one instant through `mitsuba.render` and a ``specfilm`` whose channels are the pixel responses.
+
+    Shares with `RenderedFlux` the scene's geometry and the lens, but neither rays, wavelengths,
+    random numbers nor film; it also runs in scalar variants. Relative illumination applies.
+
+    Parameters
+    ----------
+    samples : rays per pixel and repeat.
+    t_us : objects, camera and lights are frozen at this time.
+    variant : a spectral Mitsuba variant, such as ``scalar_spectral``; default the backend's.
+    repeats : independent renders, 2 or more; their scatter gives the standard error.
+
+    Raises
+    ------
+    SpecError
+        If the scene is not valid, the variant is missing, or the lens blurs (there is no PSF here).
+    RangeError
+        If `samples` is below 1 or `repeats` below 2.
+    """
+    if samples < 1:
+        raise RangeError("samples", samples, "1 or more")
+    if repeats < 2:
+        raise RangeError("repeats", repeats, "2 or more")
+    if sensor.spec.lens.psf_fwhm_um > 0:
+        raise SpecError("the reference estimator renders no lens PSF; set it to 0", key="lens.psf_fwhm_um")
+    scene, _ = in_absolute_light(scene)
+    parts = [(1.0 if w is None else float(w.mean(t_us, t_us)), part) for w, part in light_parts(scene)]
+    view: View | None = None
+    renders = np.zeros(1)
+    with using_variant(variant) as mi:
+        for power, part in parts:
+            view, own = _renders(mi, part, sensor, samples, t_us, repeats, seed)
+            renders = renders + power * own
+    assert view is not None
+    scale = scene.spec.mitsuba.radiance_scale if scene.spec.mitsuba is not None else 1.0
+    renders = renders * (view.sensor.relative_illumination * scale)[None, :, :, None]
+    mean = renders.mean(axis=0)
+    stderr = renders.std(axis=0, ddof=1) / np.sqrt(repeats)
+    names = list(used_responses(view.sensor))
+    return ReferenceFlux(
+        {name: mean[:, :, k] for k, name in enumerate(names)},
+        {name: stderr[:, :, k] for k, name in enumerate(names)},
+        view.sensor,
+    )
+
+
+def _renders(
+    mi: Any, scene: Scene, sensor: Sensor, samples: int, t_us: float, repeats: int, seed: int
+) -> tuple[View, NDArray[np.float64]]:
+    """The placed camera and [repeat, row, col, filter] before relative illumination, lights at their mean."""
+    built = build(mi, scene.spec, used_responses(sensor))
+    view = place_camera(scene.spec, sensor, built.mitsuba_sensor())
+    responses = used_responses(view.sensor)
+    if built.is_dark:
+        return view, np.zeros((repeats, *view.sensor.layout.shape, len(responses)))
+    built.pose(t_us)
+    film = {
+        "type": "specfilm",
+        "width": view.sensor.cols,
+        "height": view.sensor.rows,
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+        # channels come back in the order of their names
+        **{f"channel_{number:03d}": spectrum_dict(response) for number, response in enumerate(responses.values())},
+    }
+    camera = mi.load_dict(perspective_dict(mi, view, camera_at(scene, view, t_us), film))
+    renders = [
+        np.array(
+            mi.render(built.scene, sensor=camera, integrator=built.integrator, spp=samples, seed=seed + k),
+            dtype=np.float64,
+        )
+        for k in range(repeats)
+    ]
+    return view, np.stack(renders)

@@ -1,0 +1,192 @@
+"""When the scene moves on: time slices short enough that no moving object goes far within one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.sources.render.camera import View
+from hesim_render.sources.render.scene.trajectory import Trajectory
+
+#: Steps in which the path of an object's corners is measured between two keyframes, at least.
+_LEAST_STEPS = 16
+#: Largest turn of one such step.
+_STEP_RAD = np.radians(5.0)
+#: Longest step in which the camera's motion is measured, µs.
+_CAMERA_STEP_US = 2000.0
+
+
+class Timeline:
+    """Slices of an animated scene; a pure function of time, whatever interval is asked for.
+
+    Between two keyframes of any object, time is cut evenly into slices within which no corner of
+    a moving object's bounding box moves more than `max_motion_px` in the image.
+
+    Parameters
+    ----------
+    view : the camera at rest; `camera` its track, if it moves.
+    trajectories : of the moving objects.
+    corners : bounding-box corners of each, at rest, [k, 3] in metres.
+    scene_corners : corners of the whole scene's box at rest, [8, 3]; what a moving camera sees go by.
+    max_motion_px : motion allowed within a slice, pixels.
+    min_slice_us : no slice is shorter.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        camera: Trajectory | None,
+        trajectories: Mapping[str, Trajectory],
+        corners: Mapping[str, NDArray[np.float64]],
+        scene_corners: NDArray[np.float64],
+        max_motion_px: float = 0.5,
+        min_slice_us: float = 10.0,
+    ) -> None:
+        self._view, self._camera = view, camera
+        self._trajectories, self._corners = dict(trajectories), dict(corners)
+        self._scene_corners = scene_corners
+        self._max_motion_px, self._min_slice_us = max_motion_px, min_slice_us
+        self._edges_between = lru_cache(maxsize=4096)(self._measure)
+
+    def _knots(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """All keyframe times from the last at or before `begin_us` to the first at or after `end_us`."""
+        knots: list[NDArray[np.float64]] = []
+        for trajectory in self._trajectories.values():
+            own = trajectory.knots_us
+            if trajectory.repeat:
+                period = trajectory.period_us
+                first = np.floor((begin_us - own[0]) / period) - 1
+                last = np.floor((end_us - own[0]) / period) + 1
+                own = (own[None, :-1] + period * np.arange(first, last + 1)[:, None]).ravel()
+            knots.append(own)
+        every = np.unique(np.concatenate(knots))
+        low = every[every <= begin_us]
+        high = every[every >= end_us]
+        inner = every[(every > begin_us) & (every < end_us)]
+        return np.concatenate([low[-1:], inner, high[:1]])
+
+    def _measure(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Slice edges strictly between two neighbouring keyframes."""
+        path_px = 0.0
+        for name, trajectory in self._trajectories.items():
+            turn = float(np.max(np.abs(trajectory.arc_rad)))
+            steps = _LEAST_STEPS + int(np.ceil(turn / _STEP_RAD))
+            times = np.linspace(begin_us, end_us, steps + 1)
+            # the wrap of a repeating track falls on the knot itself: stay on this side of it
+            times[-1] -= 1e-6 * (end_us - begin_us)
+            poses = trajectory.matrix(times)
+            points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+            camera = np.broadcast_to(self._view.camera_to_world, poses.shape)
+            if self._camera is not None:
+                camera = self._camera.matrix(times) @ camera
+            # both places through the same camera: its own motion is rendered ray by ray
+            first = self._view.project(points[:-1], camera[:-1])
+            second = self._view.project(points[1:], camera[:-1])
+            step_px = np.linalg.norm(second - first, axis=-1).max(axis=-1)
+            path_px = max(path_px, float(step_px.max()) * steps)
+        pieces = int(np.ceil(path_px / self._max_motion_px - 1e-9))
+        pieces = max(1, min(pieces, int((end_us - begin_us) / self._min_slice_us)))
+        return np.linspace(begin_us, end_us, pieces + 1)[1:-1]
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside an interval between which the image moves by `max_motion_px` or less.
+
+        Objects and the camera both count: the slice edges, and between them evenly as many times as
+        the camera's own motion asks for.
+        """
+        bounds = np.concatenate([[begin_us], self.edges_us(begin_us, end_us), [end_us]])
+        if self._camera is None:
+            return bounds[1:-1]
+        pieces = [np.linspace(a, b, self._camera_pieces(a, b) + 1)[:-1] for a, b in pairwise(bounds)]
+        return np.concatenate(pieces)[1:]
+
+    def _camera_pieces(self, begin_us: float, end_us: float) -> int:
+        """How many parts of an interval keep the camera's own image motion below the limit."""
+        pieces = int(np.ceil(self.camera_motion_px(begin_us, end_us) / self._max_motion_px - 1e-9))
+        return max(1, min(pieces, int((end_us - begin_us) / self._min_slice_us)))
+
+    def camera_motion_px(self, begin_us: float, end_us: float) -> float:
+        """Farthest that anything at rest may move in the image during an interval, pixels.
+
+        Measured at the nearest and the farthest corner of the scene's box, at the pace of the fastest part.
+        """
+        if self._camera is None:
+            return 0.0
+        times = np.linspace(begin_us, end_us, max(_LEAST_STEPS, int((end_us - begin_us) / _CAMERA_STEP_US)) + 1)
+        poses = self._camera.matrix(times) @ self._view.camera_to_world
+        fastest_px = 0.0
+        for now, then in zip(poses[:-1], poses[1:], strict=True):
+            depth = (now[:3, 3] - self._scene_corners) @ now[:3, 2]
+            farthest = max(float(depth.max()), 1e-3)
+            nearest = max(float(depth.min()), 0.05 * farthest)
+            seen = self._view.unproject(np.array([nearest, farthest]), now)
+            moved = self._view.project(seen, then) - self._view.project(seen, now)
+            fastest_px = max(fastest_px, float(np.linalg.norm(moved, axis=-1).max()))
+        return fastest_px * (times.size - 1)
+
+    def object_motion_px(self, name: str, begin_us: float, end_us: float) -> float:
+        """Length of the longest way a corner of one moving object goes in the image during an interval, pixels."""
+        trajectory = self._trajectories[name]
+        times = np.linspace(begin_us, end_us, _LEAST_STEPS + 1)
+        poses = trajectory.matrix(times)
+        points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        camera = self._view.camera_to_world
+        if self._camera is not None:
+            camera = self._camera.matrix(np.array(0.5 * (begin_us + end_us))) @ camera
+        places = self._view.project(points, np.broadcast_to(camera, poses.shape))
+        return float(np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=0).max())
+
+    def outlines_px(self, name: str, begin_us: float, end_us: float, parts: int = 6) -> list[NDArray[np.float64]]:
+        """Where a moving object's box is seen during an interval: points whose convex hulls hold it, in some parts.
+
+        Returns
+        -------
+        For each part of the interval, column and row of all corners at its begin, middle and end, [k, 2] pixels.
+        """
+        times = np.linspace(begin_us, end_us, 2 * parts + 1)
+        poses = self._trajectories[name].matrix(times)
+        points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        camera = np.broadcast_to(self._view.camera_to_world, poses.shape)
+        if self._camera is not None:
+            camera = self._camera.matrix(times) @ camera
+        places = self._view.project(points, camera)
+        return [places[2 * k : 2 * k + 3].reshape(-1, 2) for k in range(parts)]
+
+    def extent_px(self, name: str, t_us: float) -> float:
+        """Least extent of one moving object's box in the image, of its two, pixels."""
+        pose = self._trajectories[name].matrix(t_us)
+        camera = (
+            self._view.camera_to_world
+            if self._camera is None
+            else self._camera.matrix(t_us) @ self._view.camera_to_world
+        )
+        places = self._view.project(self._corners[name] @ pose[:3, :3].T + pose[:3, 3], camera)
+        return float(np.ptp(places, axis=0).min())
+
+    def edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """All slice edges strictly inside an interval, increasing."""
+        if not self._trajectories:
+            return np.empty(0)
+        knots = self._knots(begin_us, end_us)
+        between = [self._edges_between(float(a), float(b)) for a, b in zip(knots[:-1], knots[1:], strict=True)]
+        every = np.unique(np.concatenate([knots, *between]))
+        return every[(every > begin_us) & (every < end_us)]
+
+    def pose_time_us(self, begin_us: float, end_us: float) -> float:
+        """Middle of the slice that holds an interval: when objects stand where they are drawn."""
+        middle = (begin_us + end_us) / 2
+        if not self._trajectories:
+            return middle
+        knots = self._knots(middle, middle)
+        if knots[0] > middle or knots[-1] < middle:  # before the first or after the last keyframe: held
+            return middle
+        if knots[0] == knots[-1]:
+            return float(knots[0])
+        edges = np.concatenate([knots, self._edges_between(float(knots[0]), float(knots[-1]))])
+        edges.sort()
+        right = int(np.clip(np.searchsorted(edges, middle, side="right"), 1, edges.size - 1))
+        return float(edges[right - 1] + edges[right]) / 2

@@ -1,0 +1,241 @@
+"""Paths from mosaic pixels into the scene, in blocks that bound memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.core.rng import Stream, stream_key
+from hesim_render.core.tables import spread_out
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.camera import RayFactory, place_camera
+from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.render.sampling.sampler import sampler_class
+from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.scene import Scene
+from hesim_render.spectral.spectrum import Spectrum
+
+#: So many rays are traced at a time, for bounded memory.
+BLOCK_RAYS = 1 << 20
+
+#: (mosaic index, u in [0, 1)) → the four wavelengths of a ray, nm.
+Wavelengths = Callable[[Any, Any], list[Any]]
+#: (mosaic index, radiance at those four) → the quantities to average.
+Values = Callable[[Any, Any], list[Any]]
+
+
+class Tracer:
+    """A scene, a placed camera and the pixels of its sensor; what the tracers of both modes have in common.
+
+    Parameters
+    ----------
+    scene, sensor : what and through what.
+    responses : spectra that the scene must cover.
+    progress : called with the number of rays traced so far, after each block.
+    block_rays : most rays that are traced at a time.
+
+    Attributes
+    ----------
+    built, view : the scene in Mitsuba, the placed camera.
+    sensor : with the lens in use.
+    camera : its trajectory, or None where it rests.
+    radiance_scale : factor from the scene's own radiance to W m⁻² sr⁻¹ nm⁻¹.
+    rays_done : so far.
+
+    Raises
+    ------
+    SpecError
+        If the scene cannot be loaded or does not cover a response.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        responses: Mapping[str, Spectrum],
+        progress: Callable[[int], None] | None,
+        block_rays: int,
+    ) -> None:
+        import drjit as dr
+
+        mi, types = mitsuba(), jit()
+        self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
+        scene, _ = in_absolute_light(scene)
+        self.built = build(mi, scene.spec, responses)
+        self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
+        self.sensor = self.view.sensor
+        tracks = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
+        self.camera = next((trajectory for trajectory in tracks if trajectory.moves), None)
+        mitsuba_scene = scene.spec.mitsuba
+        self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
+        self._rays = RayFactory(self.view)
+        self._sampler = sampler_class(mi.variant())()
+        self._full_cols = dr.opaque(types.UInt32, self.sensor.spec.geometry.cols)
+
+    def _row_and_col(self, index: Any) -> tuple[Any, Any]:
+        """Of a pixel's number on the full sensor; that is what its random numbers follow, too."""
+        row = index // self._full_cols
+        return row, index - row * self._full_cols
+
+    def _report(self, rays: int) -> None:
+        self.rays_done += rays
+        if self.progress is not None:
+            self.progress(self.rays_done)
+
+
+class PixelTracer(Tracer):
+    """Averages over each pixel's rays, every pixel with as many, objects at rest.
+
+    Parameters
+    ----------
+    scene, sensor, responses, progress, block_rays : see `Tracer`.
+    samples : rays per pixel, even; a half of them for each of two independent estimates.
+    seed : of the run.
+
+    Raises
+    ------
+    SpecError
+        If the scene cannot be loaded or does not cover a response.
+    RangeError
+        If `samples` is odd, below 2 or larger than a block.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        samples: int,
+        seed: int,
+        responses: Mapping[str, Spectrum],
+        progress: Callable[[int], None] | None = None,
+        block_rays: int = BLOCK_RAYS,
+    ) -> None:
+        import drjit as dr
+
+        if samples < 2 or samples % 2:
+            raise RangeError("samples", samples, "an even number of rays per pixel, 2 or more")
+        if samples > block_rays:
+            raise RangeError("samples", samples, f"at most {block_rays} rays per pixel")
+        super().__init__(scene, sensor, responses, progress, block_rays)
+        self.samples = samples
+        self._full_index = self.sensor.layout.full_index.ravel()
+        self._posed_us: float | None = None
+        self._key = dr.opaque(jit().UInt64, stream_key(seed, Stream.RENDER))
+
+    @property
+    def pixel_count(self) -> int:
+        return self.view.sensor.rows * self.view.sensor.cols
+
+    def pose(self, t_us: float) -> None:
+        """Put moving objects at their place of `t_us`."""
+        if self.built.trajectories and t_us != self._posed_us:
+            self.built.pose(t_us)
+            self._posed_us = t_us
+
+    def trace(
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: ArrayLike,
+        end_us: ArrayLike,
+        wavelengths: Wavelengths,
+        values: Values,
+    ) -> list[tuple[Any, Any]]:
+        """Averages over the rays of each listed pixel, the camera moving through the pixel's own interval.
+
+        Returns
+        -------
+        For each of `values`: half_a, half_b, Dr.Jit Float [n] each.
+
+        Raises
+        ------
+        RangeError
+            If a pixel lies outside the region or an interval ends before it begins.
+        """
+        import drjit as dr
+
+        mitsuba()  # the variant may have been changed by other code
+        begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
+        if pixel.size and int(pixel.max()) >= self.pixel_count:
+            raise RangeError("pixel", int(pixel.max()), f"0 to {self.pixel_count - 1}, inside the region")
+        if not np.all(end >= begin):
+            raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
+        times = None
+        if self.camera is not None:
+            # wrapped on the host in double precision, pixel by pixel: no rounding depends on the others
+            local = self.camera.local_us(begin) if self.camera.repeat else begin - self.camera.knots_us[0]
+            times = [np.broadcast_to(v, pixel.shape).astype(np.float32) for v in (local, end - begin)]
+        parts: list[list[tuple[Any, Any]]] = []
+        room = self._block_rays // self.samples
+        for first in range(0, pixel.size, room):
+            part = slice(first, first + room)
+            spread = None if times is None else [values[part] for values in times]
+            parts.append(self._block(pixel[part], spread, wavelengths, values))
+            self._report(pixel[part].size * self.samples)
+        if len(parts) == 1:
+            return parts[0]
+        channels = range(len(parts[0]))
+        return [(dr.concat([p[k][0] for p in parts]), dr.concat([p[k][1] for p in parts])) for k in channels]
+
+    def _block(
+        self,
+        pixels: NDArray[np.uint32],
+        times: list[NDArray[np.float32]] | None,
+        wavelengths: Wavelengths,
+        values: Values,
+    ) -> list[tuple[Any, Any]]:
+        """Both halves of a few pixels."""
+        import drjit as dr
+
+        types = jit()
+        count, per_half = pixels.size, self.samples // 2
+
+        ray = dr.arange(types.UInt32, count * self.samples)
+        lane = ray // self.samples
+        place = ray - lane * self.samples
+        half = dr.select(place >= per_half, types.UInt32(1), types.UInt32(0))
+        pixel = spread_out(types.UInt32, pixels, lane)
+        index = spread_out(types.UInt32, self._full_index[pixels], lane)
+        spread = None if times is None else [spread_out(types.Float, table, lane) for table in times]
+        quantities = self._rays_of(pixel, index, half, place - half * per_half, spread, wavelengths, values)
+        sums = [dr.block_sum(quantity, per_half) * (1 / per_half) for quantity in quantities]
+        dr.eval(*sums)
+        self._sampler.rest()
+        first = dr.arange(types.UInt32, count) * 2
+        halves = [(dr.gather(types.Float, s, first), dr.gather(types.Float, s, first + 1)) for s in sums]
+        dr.eval(halves)
+        return halves
+
+    def _rays_of(
+        self,
+        pixel: Any,
+        index: Any,
+        half: Any,
+        sample: Any,
+        spread: list[Any] | None,
+        wavelengths: Wavelengths,
+        values: Values,
+    ) -> list[Any]:
+        """The wanted quantities of one ray per lane."""
+        mi, types = self.built.mi, jit()
+        row, col = self._row_and_col(index)
+        sampler = self._sampler
+        sampler.setup(self._key, index, half, sample, self.samples // 2)
+        aperture, moment = sampler.next_3d()
+        blur = sampler.next_2d() if self._rays.has_psf else None
+        choice = sampler.next_1d()
+        origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
+        if spread is not None:
+            assert self.camera is not None
+            pose = self.camera.pose_at(spread[0] + moment * spread[1])
+            origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
+        bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice))
+        primary = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
+        radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary)
+        return values(pixel, radiance)

@@ -1,0 +1,198 @@
+"""Many moving objects of simple form: met one after another in a loop over tables.
+
+The kernel is the same however many there are. Objects are what `closed_form` knows: balls, boxes, rectangles. Each is
+tried in its own frame, at the ray's own time, where the ray meets the box that holds it meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.tables import table
+from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
+from hesim_render.sources.render.transport.closed_form import SimpleForm, to_ball, to_face
+from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
+
+#: Entries of a row of the tables of balls and of faces.
+_BALL, _FACE = 8, 16
+
+
+class Fleet:
+    """Groups in closed form.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    forms : of each group.
+    numbers : of each group among all of the scene's; `tracks` of all of these.
+    """
+
+    def __init__(self, mi: Any, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks) -> None:
+        import drjit as dr
+
+        self._mi, self._tracks = mi, tracks
+        heads: list[list[float]] = []
+        balls: list[Any] = []
+        faces: list[Any] = []
+        for form, number in zip(forms, numbers, strict=True):
+            heads.append([number, len(balls), len(balls) + len(form.balls), 0])
+            heads.append([len(faces), len(faces) + len(form.faces), 0, 0])
+            for ball, shape in form.balls:
+                balls.append([*ball.middle, ball.square, _number(mi, shape), 0, 0, 0])
+            for face, shape in form.faces:
+                codes = [3 * first + second for first, second, _ in face.order]
+                faces.append([*face.to_uvh.ravel(), _number(mi, shape), face.triangle, *codes])
+        self._heads = mi.UInt32(np.array(heads, np.uint32).ravel())
+        self._balls = table(mi.Float, np.array([*balls, [0.0] * _BALL], np.float32))
+        self._faces = table(mi.Float, np.array([*faces, [0.0] * _FACE], np.float32))
+        self._count = mi.UInt32(len(forms))
+        dr.make_opaque(self._heads, self._balls, self._faces, self._count)
+
+    def nearest(self, ray: Any, moment: Moment, length: Any, active: Any) -> tuple[Any, ...]:
+        """The first surface before a distance.
+
+        Parameters
+        ----------
+        ray : Ray3f, world space.
+        length : how far along the ray it counts, m.
+
+        Returns
+        -------
+        hit : `PreliminaryIntersection3f` in the frame of the group met, its t infinite where there is none.
+        group : UInt32, number of that among all of the scene's.
+        met : Bool, whether the ray came through the box of any.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        inverse = inverse_of(ray.d)
+
+        def visit(k: Any, t: Any, place: Any, which: Any, ball: Any, group: Any, met: Any) -> tuple[Any, ...]:
+            number, first_ball, last_ball, _ = dr.gather(mi.Array4u, self._heads, 2 * k)
+            near = active & meets_box(ray, inverse, length, moment.box(number))
+            met |= near
+
+            def look(t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
+                local = self._at_rest(ray, number, moment)
+                first_face, last_face, _, _ = dr.gather(mi.Array4u, self._heads, 2 * k + 1)
+
+                def try_ball(j: Any, t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
+                    x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
+                    own = to_ball(local, mi.Point3f(x, y, z), square)
+                    closer = near & (own >= 0) & (own < t)
+                    t, which, ball = dr.select(closer, own, t), dr.select(closer, j, which), ball | closer
+                    return j + 1, t, place, which, ball, dr.select(closer, number, group)
+
+                def try_face(j: Any, t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
+                    own, spot, inside = to_face(local, self._rows(j))
+                    closer = near & inside & (own >= 0) & (own < t)
+                    t, which, place = (
+                        dr.select(closer, own, t),
+                        dr.select(closer, j, which),
+                        dr.select(closer, spot, place),
+                    )
+                    return j + 1, t, place, which, ball & ~closer, dr.select(closer, number, group)
+
+                state = first_ball, t, place, which, ball, group
+                _, *found = dr.while_loop(state, lambda j, *_: j < last_ball, try_ball, label="balls")
+                state = first_face, *found
+                return tuple(dr.while_loop(state, lambda j, *_: j < last_face, try_face, label="faces")[1:])
+
+            found = dr.if_stmt((t, place, which, ball, group), near, look, lambda *state: state, label="moving group")
+            return k + 1, *found, met
+
+        nothing = mi.UInt32(0), mi.Float(length), mi.Point2f(0.0), mi.UInt32(0), mi.Bool(False), mi.UInt32(0)
+        state = (*nothing, mi.Bool(False))
+        _, t, place, which, ball, group, met = dr.while_loop(
+            state, lambda k, *_: k < self._count, visit, label="moving groups"
+        )
+        return self._hit(t, t < length, place, which, ball), group, met
+
+    def blocks(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+        """Whether anything lies on a ray before its `maxt`; and whether it came through the box of any."""
+        import drjit as dr
+
+        mi = self._mi
+        inverse = inverse_of(ray.d)
+
+        def visit(k: Any, blocked: Any, met: Any) -> tuple[Any, ...]:
+            number, first_ball, last_ball, _ = dr.gather(mi.Array4u, self._heads, 2 * k)
+            near = active & meets_box(ray, inverse, ray.maxt, moment.box(number))
+            met |= near
+
+            def look(blocked: Any) -> tuple[Any]:
+                local = self._at_rest(ray, number, moment)
+                first_face, last_face, _, _ = dr.gather(mi.Array4u, self._heads, 2 * k + 1)
+
+                def try_ball(j: Any, blocked: Any) -> tuple[Any, Any]:
+                    x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
+                    t = to_ball(local, mi.Point3f(x, y, z), square)
+                    return j + 1, blocked | (near & (t >= 0) & (t < ray.maxt))
+
+                def try_face(j: Any, blocked: Any) -> tuple[Any, Any]:
+                    t, _, inside = to_face(local, self._rows(j))
+                    return j + 1, blocked | (near & inside & (t >= 0) & (t < ray.maxt))
+
+                state = first_ball, blocked
+                _, blocked = dr.while_loop(state, lambda j, _: j < last_ball, try_ball, label="balls")
+                state = first_face, blocked
+                return (dr.while_loop(state, lambda j, _: j < last_face, try_face, label="faces")[1],)
+
+            (blocked,) = dr.if_stmt((blocked,), near & ~blocked, look, lambda blocked: (blocked,), label="moving group")
+            return k + 1, blocked, met
+
+        state = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
+        _, blocked, met = dr.while_loop(state, lambda k, *_: k < self._count, visit, label="moving groups")
+        return blocked, met
+
+    def pose(self, group: Any, moment: Moment) -> DevicePose:
+        """Of the group of each lane's number."""
+        return self._tracks.pose(group, moment.local_us(group))
+
+    def _at_rest(self, ray: Any, group: Any, moment: Moment) -> Any:
+        pose = self.pose(group, moment)
+        local = type(ray)(ray)
+        local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+        return local
+
+    def _rows(self, face: Any) -> list[tuple[Any, Any]]:
+        import drjit as dr
+
+        mi = self._mi
+        found = [dr.gather(mi.Vector4f, self._faces, 4 * face + k) for k in range(3)]
+        return [(mi.Vector3f(row.x, row.y, row.z), row.w) for row in found]
+
+    def _hit(self, t: Any, found: Any, place: Any, which: Any, ball: Any) -> Any:
+        """What Mitsuba takes for the description of a surface."""
+        import drjit as dr
+
+        mi = self._mi
+        hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(t))
+        hit.valid, hit.t = found, dr.select(found, t, dr.inf)
+        face = found & ~ball
+        number, triangle, one, other = dr.gather(mi.Vector4f, self._faces, 4 * which + 3, face)
+        own = dr.gather(mi.Float, self._balls, _BALL * which + 4, found & ball)
+        shape = mi.UInt32(dr.select(ball, own, number))
+        hit.shape = dr.reinterpret_array(mi.ShapePtr, dr.select(found, shape, 0))
+        # the corner at (0, 0) or (1, 1), and those beside it along u and v, of the triangle that is met
+        u, v = place
+        second = u + v > 1
+        code = mi.UInt32(dr.select(second, other, one))
+        first = code // 3
+        along = code - 3 * first
+        weights = dr.select(second, u + v - 1, 1 - u - v), dr.select(second, 1 - v, u), dr.select(second, 1 - u, v)
+        barycentric = [dr.select(first == k, weights[0], dr.select(along == k, weights[1], weights[2])) for k in (1, 2)]
+        hit.prim_uv = mi.Point2f(*barycentric)
+        hit.prim_index = mi.UInt32(triangle) + dr.select(second, mi.UInt32(1), mi.UInt32(0))
+        return hit
+
+
+def _number(mi: Any, shape: Any) -> int:
+    """By which Dr.Jit knows a shape."""
+    import drjit as dr
+
+    number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+    return int(number[0])

@@ -1,0 +1,138 @@
+"""Where moving objects are at most: boxes and outlines that hold for every instant of an interval, not for samples.
+
+Between two keyframes an object's translation is linear and it turns at a constant speed, so that each of its points
+goes along a straight line plus an arc of a circle. A chord is off its arc by ρ (1 − cos δ/2) at most, ρ the radius and
+δ the angle; what holds a point at some instants therefore holds it in between when it is widened by that much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from math import ceil, cos, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.units import S_PER_US
+from hesim_render.sources.render.scene.trajectory import Piece, Trajectory
+
+#: Largest turn between two instants at which an object's place is taken, and most of these in a piece.
+_STEP_RAD, _MOST_STEPS = np.radians(5.0), 1024
+
+
+def places(
+    corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float
+) -> list[tuple[NDArray[np.float64], float]]:
+    """Where the corners of an object are at successive instants of an interval, piece by piece.
+
+    Parameters
+    ----------
+    corners : of a box around the object at rest, [n, 3], m.
+
+    Returns
+    -------
+    For each piece of the track between keyframes, the corners at its ends and some instants between, [k, n, 3], and how
+    far any point may be from the straight line between two of these, m.
+    """
+    found, radius = [], float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    for piece in trajectory.pieces(begin_us, end_us):
+        share, margin = _instants(trajectory, piece, radius)
+        poses = trajectory.within(np.full(share.size, piece.segment), share)
+        found.append((corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], margin))
+    return found
+
+
+def places_seen(
+    corners: NDArray[np.float64], trajectory: Trajectory, camera: Trajectory, begin_us: float, end_us: float
+) -> list[tuple[NDArray[np.float64], float]]:
+    """As `places`, where a camera that moves as well would see them if it rested: in its own frame of time 0.
+
+    A point at q from the pivot of a camera that turns by ω_c has an acceleration of at most ω_c²|q| + 2 ω_c|q̇| + |q̈| in
+    the camera's frame. A path of acceleration a is off its chord by at most a h²/8, h the time between its ends.
+
+    Parameters
+    ----------
+    camera : its track, a motion of its pose at rest.
+    """
+    radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    inner = np.union1d(trajectory.ends_us(begin_us, end_us), camera.ends_us(begin_us, end_us))
+    cuts, found = np.concatenate([[begin_us], inner, [end_us]]), []
+    for low, high in pairwise(cuts):
+        speed, turn = _speed_and_turn(trajectory, low, high)
+        own_speed, own_turn = _speed_and_turn(camera, low, high)
+        steps = min(_MOST_STEPS, max(1, ceil((turn + own_turn) * (high - low) * S_PER_US / _STEP_RAD)))
+        times = np.linspace(low, high, steps + 1)
+        (_, poses), (_, views) = trajectory.throughout(times), camera.throughout(times)
+        points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+        step_s = (high - low) * S_PER_US / steps
+        fastest = speed + turn * radius + own_speed
+        pivots = views[:, :3, :3] @ camera.pivot_m + views[:, :3, 3]
+        far = float(np.linalg.norm(points - pivots[:, None], axis=2).max()) + fastest * step_s / 2
+        acceleration = own_turn * own_turn * far + 2 * own_turn * fastest + turn * turn * radius
+        found.append(((points - views[:, None, :3, 3]) @ views[:, :3, :3], acceleration * step_s * step_s / 8))
+    return found
+
+
+def stays_in(
+    corners: NDArray[np.float64], trajectory: Trajectory, spans_us: Sequence[tuple[float, float]]
+) -> NDArray[np.float64]:
+    """Axis-parallel boxes [k, 2, 3], m, in which an object stays during each of k intervals; see `places`."""
+    radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    segments: list[NDArray[np.int64]] = []
+    shares: list[NDArray[np.float64]] = []
+    margins: list[NDArray[np.float64]] = []
+    starts: list[int] = []
+    for begin, end in spans_us:
+        starts.append(len(segments))
+        for piece in trajectory.pieces(begin, end):
+            share, margin = _instants(trajectory, piece, radius)
+            segments.append(np.full(share.size, piece.segment))
+            shares.append(share)
+            margins.append(np.full(share.size, margin))
+    poses = trajectory.within(np.concatenate(segments), np.concatenate(shares))
+    points = corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+    wider = np.concatenate(margins)[:, None]
+    first = np.cumsum([0, *(share.size for share in shares)])[starts]
+    low = np.minimum.reduceat(points.min(axis=1) - wider, first, axis=0)
+    high = np.maximum.reduceat(points.max(axis=1) + wider, first, axis=0)
+    return np.stack([low, high], axis=1)
+
+
+def _instants(trajectory: Trajectory, piece: Piece, radius_m: float) -> tuple[NDArray[np.float64], float]:
+    """Shares of a piece at which an object is taken, and how far it may be from straight lines between them, m."""
+    turn = abs(float(trajectory.arc_rad[piece.segment])) * (piece.last - piece.first)
+    steps = min(_MOST_STEPS, max(1, ceil(turn / _STEP_RAD)))
+    return np.linspace(piece.first, piece.last, steps + 1), radius_m * (1 - cos(min(turn / steps / 2, pi)))
+
+
+def _speed_and_turn(trajectory: Trajectory, begin_us: float, end_us: float) -> tuple[float, float]:
+    """Speed of the pivot, m/s, and angular speed, rad/s, in a stretch of time in one segment; 0 where it is held."""
+    local = 0.5 * (begin_us + end_us) - trajectory.knots_us[0]
+    if not trajectory.repeat and not 0 <= local <= trajectory.period_us:
+        return 0.0, 0.0
+    segment, _ = trajectory.throughout(np.array([begin_us, end_us]))
+    seconds = S_PER_US * float(np.diff(trajectory.knots_us)[segment])
+    way = float(np.linalg.norm(np.diff(trajectory.translation_m, axis=0)[segment]))
+    return way / seconds, abs(float(trajectory.arc_rad[segment])) / seconds
+
+
+def fastest_m_per_s(corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float) -> float:
+    """Highest speed of any point of an object within an interval, m/s: |v| + ωρ of the fastest piece of its track."""
+    radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    fastest = 0.0
+    for segment in {piece.segment for piece in trajectory.pieces(begin_us, end_us) if piece.length_us > 0}:
+        seconds = S_PER_US * float(np.diff(trajectory.knots_us)[segment])
+        way = float(np.linalg.norm(np.diff(trajectory.translation_m, axis=0)[segment]))
+        fastest = max(fastest, (way + abs(float(trajectory.arc_rad[segment])) * radius) / seconds)
+    return fastest
+
+
+def fastest_turn_rad_per_s(trajectory: Trajectory, begin_us: float, end_us: float) -> float:
+    """Highest angular speed within an interval."""
+    turns = [0.0]
+    for segment in {piece.segment for piece in trajectory.pieces(begin_us, end_us) if piece.length_us > 0}:
+        turns.append(
+            abs(float(trajectory.arc_rad[segment])) / (S_PER_US * float(np.diff(trajectory.knots_us)[segment]))
+        )
+    return max(turns)

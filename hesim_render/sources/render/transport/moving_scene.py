@@ -1,0 +1,299 @@
+"""A scene in which every ray has a time of its own: what moves rests in a scene of its own, and rays go to it.
+
+Mitsuba has no animated transforms, and setting a pose costs a rebuild. Here a ray is turned into each moving object's
+own frame at the ray's own time, met with the object at rest, and the nearest hit of all frames counts. Any number of
+instants is then one kernel, motion within an exposure is exact, and nothing is rebuilt or recompiled.
+
+Objects are asked only about rays that meet the box which holds them all the while (`Moment.boxes`): poses are not even
+computed for the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.builder import BuiltScene
+from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.transport.closed_form import Part
+from hesim_render.sources.render.transport.many_objects import Fleet
+from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
+
+#: Objects in closed form that are tried one by one; more are tried in a loop, whose kernel serves any number.
+_FEW = 3
+
+
+class NeedsExactMode(SpecError):
+    """A scene that paths between resting and rigidly moving surfaces do not describe."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Shapes that move together.
+
+    Parameters
+    ----------
+    name : of the object.
+    part : they themselves, at rest.
+    trajectory : how they move.
+    corners : bounding-box corners at rest, [n, 3], m.
+    """
+
+    name: str
+    part: Part
+    trajectory: Trajectory
+    corners: NDArray[np.float64]
+
+
+class Surface:
+    """Where rays have met a scene.
+
+    A moving object is met, and its surface evaluated, where it rests: textures and attributes of meshes are looked up
+    by the place on the mesh as it was loaded. What leaves the surface is turned to where the object is.
+
+    Parameters
+    ----------
+    rest : `SurfaceInteraction3f` in the frame in which the met shapes rest.
+    pose : of those shapes, per lane; None where nothing moves.
+    met : Dr.Jit Bool, whether the ray came through the box of a moving object.
+    """
+
+    def __init__(self, mi: Any, rest: Any, pose: DevicePose | None, met: Any) -> None:
+        self.rest, self._pose, self.met = rest, pose, met
+        point, normal = rest.p, rest.n
+        if pose is not None:
+            point, normal = mi.Point3f(pose.to_world(point)), mi.Normal3f(pose.turn_to_world(normal))
+        #: The same point as `Interaction3f` in world space.
+        self.world = mi.Interaction3f(rest.t, rest.time, rest.wavelengths, point, normal)
+
+    @property
+    def shading_normal(self) -> Any:
+        """In world space."""
+        n = self.rest.sh_frame.n
+        return n if self._pose is None else self._pose.turn_to_world(n)
+
+    def to_local(self, direction: Any) -> Any:
+        """From world space into the shading frame."""
+        turned = direction if self._pose is None else self._pose.turn_to_rest(direction)
+        return self.rest.to_local(turned)
+
+    def to_world(self, direction: Any) -> Any:
+        """From the shading frame into world space."""
+        turned = self.rest.to_world(direction)
+        return turned if self._pose is None else type(turned)(self._pose.turn_to_world(turned))
+
+
+class MovingScene:
+    """The parts of a built scene: what rests, with all light, and each group that moves.
+
+    Parameters
+    ----------
+    built : from `build`, its moving shapes anywhere.
+
+    Raises
+    ------
+    NeedsExactMode
+        If a moving shape emits light, a plugin of the scene asks for that mode, the scene's integrator is not Mitsuba's
+        path tracer, or it hides lights.
+    """
+
+    def __init__(self, built: BuiltScene) -> None:
+        mi = built.mi
+        if built.exact_because is not None:
+            raise NeedsExactMode(built.exact_because)
+        if not path_traced(built):
+            name = built.integrator.class_name()
+            raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
+        if built.integrator.hide_emitters:
+            raise NeedsExactMode("the integrator hides lights that are seen directly")
+        self.mi = mi
+        moving = {
+            shape: group
+            for group, trajectory in built.trajectories.items()
+            for shape in (part.prefix for part in built.groups[group])
+        }
+        built.rest()
+        parts: dict[str, dict[str, Any]] = {name: {} for name in built.trajectories}
+        resting: dict[str, Any] = {}
+        #: All shapes by the ids that they were loaded with; Mitsuba gives them others in the scenes made here.
+        self.shapes = {shape.id(): shape for shape in built.scene.shapes()}
+        for number, shape in enumerate(built.scene.shapes()):
+            group = moving.get(shape.id())
+            if group is None:
+                resting[f"shape_{number}"] = shape
+                continue
+            if shape.is_emitter():
+                raise NeedsExactMode(f"{group!r} moves and emits light")
+            parts[group][f"shape_{number}"] = shape
+        emitters = built.scene.emitters()
+        spare_even_skies(mi, emitters)
+        for number, emitter in enumerate(emitters):
+            if emitter.get_shape() is None:
+                resting[f"emitter_{number}"] = emitter
+        self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
+        lights = self.static.emitters()
+        #: Light that a ray meets: from everywhere beyond the scene, and corners of boxes around all other [n, 2, 3], m.
+        self.has_sky = any(light.is_environment() for light in lights)
+        boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
+        self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
+        self._resting = Part(mi, self.static, apart=False)
+        self.groups = [
+            Group(
+                name,
+                Part(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False), apart=True),
+                built.trajectories[name],
+                np.concatenate([part.corners for part in built.groups[name]]),
+            )
+            for name, shapes in parts.items()
+        ]
+        self._sort_groups()
+
+    def _sort_groups(self) -> None:
+        """Which groups are tried one by one, and which in a loop."""
+        simple = [number for number, group in enumerate(self.groups) if group.part.form is not None]
+        together = simple if len(simple) > _FEW else []
+        self._single = [number for number in range(len(self.groups)) if number not in together]
+        self._fleet = None
+        if self.groups:
+            self._tracks = Tracks([group.trajectory for group in self.groups])
+        if together:
+            forms = [form for k in together if (form := self.groups[k].part.form) is not None]
+            self._fleet = Fleet(self.mi, forms, together, self._tracks)
+
+    def intersect(self, ray: Any, moment: Moment, coherent: Any, active: Any, flags: Any = None) -> Surface:
+        """The nearest surface of all parts.
+
+        Parameters
+        ----------
+        ray : Ray3f in world space.
+        moment : when.
+        coherent : whether neighbouring lanes' rays are alike.
+        flags : `RayFlags` of what to know of the surface; default all.
+        """
+        import drjit as dr
+
+        mi = self.mi
+        flags = mi.RayFlags.All if flags is None else flags
+        hit, face = self._resting.nearest(ray, coherent, active)
+        rest = self._resting.surface(hit, face, ray, flags, active)
+        if not self.groups:
+            return Surface(mi, rest, None, mi.Bool(False))
+        pose = DevicePose.none(mi.Vector3f)
+
+        def take(closer: Any, found: Any, own: DevicePose, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            rest, *columns, shift = state
+            columns = [dr.select(closer, a, b) for a, b in zip(own.columns, columns, strict=True)]
+            return dr.select(closer, found, rest), *columns, dr.select(closer, own.shift, shift)
+
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            local.maxt = dr.minimum(local.maxt, state[0].t)
+            hit, face = group.part.nearest(local, coherent, near)
+            closer = near & hit.is_valid()
+            return take(closer, group.part.surface(hit, face, local, flags, closer), own, state)
+
+        resting = rest.t
+        state: tuple[Any, ...] = rest, *pose.columns, pose.shift
+        state, met = self._visit_groups(ray, moment, active, resting, state, visit)
+        if self._fleet is not None:
+            fleet = self._fleet
+            hit, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
+            met |= near
+
+            def describe(*state: Any) -> tuple[Any, ...]:
+                own = fleet.pose(number, moment)
+                found = hit.compute_surface_interaction(_at_rest(ray, own), flags, hit.is_valid())
+                return take(hit.is_valid(), found, own, state)
+
+            state = dr.if_stmt(state, hit.is_valid(), describe, lambda *state: state, label="moving surface")
+        rest, *columns, shift = state
+        return Surface(mi, rest, DevicePose(tuple(columns), shift), met)
+
+    def distance(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+        """To the nearest surface of all parts, m, infinite where there is none; and whether it met a group's box."""
+        import drjit as dr
+
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            local.maxt = dr.minimum(local.maxt, state[0])
+            hit, _ = group.part.nearest(local, False, near)
+            return (dr.select(near & hit.is_valid(), hit.t, state[0]),)
+
+        resting = self._resting.nearest(ray, False, active)[0].t
+        (nearest,), met = self._visit_groups(ray, moment, active, resting, (resting,), visit)
+        if self._fleet is not None:
+            hit, _, near = self._fleet.nearest(ray, moment, dr.minimum(ray.maxt, nearest), active)
+            nearest, met = dr.select(hit.is_valid(), hit.t, nearest), met | near
+        return nearest, met
+
+    def resting_distance(self, ray: Any) -> Any:
+        """To the nearest surface of what rests, m; infinite where there is none."""
+        return self._resting.nearest(ray, True, self.mi.Bool(True))[0].t
+
+    def occluded(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+        """Whether anything lies on a ray before its `maxt`; and whether it met a group's box."""
+
+        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return (state[0] | group.part.blocks(local, near & ~state[0]),)
+
+        blocked = self._resting.blocks(ray, active)
+        # what rests blocks the ray whatever moves
+        free = active & ~blocked
+        (blocked,), met = self._visit_groups(ray, moment, free, ray.maxt, (blocked,), visit)
+        if self._fleet is not None:
+            others, near = self._fleet.blocks(ray, moment, free)
+            blocked, met = blocked | others, met | near
+        return blocked, met
+
+    def _visit_groups(
+        self, ray: Any, moment: Moment, active: Any, length: Any, state: tuple[Any, ...], visit: Callable[..., Any]
+    ) -> tuple[tuple[Any, ...], Any]:
+        """Let each group of those tried one by one, whose box the first `length` metres of a ray meet, change a state.
+
+        Returns
+        -------
+        state, met : the latter Dr.Jit Bool, whether any box was met.
+        """
+        import drjit as dr
+
+        met = self.mi.Bool(False)
+        inverse = inverse_of(ray.d)
+        for number in self._single:
+            near = active & meets_box(ray, inverse, length, moment.box(number))
+            met |= near
+
+            def turn_to(*state: Any, number: int = number, near: Any = near) -> Any:
+                pose = self._tracks.pose(number, moment.local_us(number))
+                return visit(self.groups[number], pose, _at_rest(ray, pose), near, state)
+
+            state = dr.if_stmt(state, near, turn_to, lambda *state: state, label="moving group")
+        return state, met
+
+
+def _at_rest(ray: Any, pose: DevicePose) -> Any:
+    """A ray in the frame of what has a pose."""
+    local = type(ray)(ray)
+    local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
+    return local
+
+
+def spare_even_skies(mi: Any, emitters: Sequence[Any]) -> None:
+    """Ask no surface for the light of a sky that is the same everywhere, where there is other light.
+
+    The surface's own directions find it, and rays towards it take from those to the lamps.
+    """
+    even = [emitter for emitter in emitters if emitter.class_name() == "ConstantBackgroundEmitter"]
+    if any(emitter.sampling_weight() > 0 for emitter in emitters if emitter not in even):
+        for emitter in even:
+            parameters = mi.traverse(emitter)
+            parameters["sampling_weight"] = 0.0
+            parameters.update()
+
+
+def path_traced(built: BuiltScene) -> bool:
+    """Whether the scene is rendered by Mitsuba's path tracer, whose paths run between surfaces only."""
+    return built.integrator.class_name() == "PathIntegrator"

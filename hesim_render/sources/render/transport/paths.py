@@ -1,0 +1,225 @@
+"""A path tracer whose rays have times of their own, and which knows whether a path has come near what moves.
+
+The estimator is the common one (Veach 1997): light sampled at every vertex, combined with the
+surface's own sampling by the power heuristic; Russian roulette where a path has gone on for long. It is
+written here because Mitsuba's own follows a path through one scene at one time. What it has besides: matt
+surfaces send some paths to the images of lamps in flat mirrors (`LampImages`), and an even sky is not sampled
+(`spare_even_skies`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
+from hesim_render.sources.render.transport.mirrored_lamps import Cones, LampImages
+from hesim_render.sources.render.transport.moving_scene import MovingScene, Surface
+from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
+
+#: Chance of going on, at most, where Russian roulette is played.
+_ROULETTE_MOST = 0.95
+#: Lights that have boxes of their own to tell whether a ray may meet them; more share one.
+_MOST_LAMPS = 8
+
+
+class PathIntegrator:
+    """Radiance along rays through a `MovingScene`, and what a pixel makes of it.
+
+    Parameters
+    ----------
+    scene : what is traced.
+    max_depth : longest path in segments, 2 is direct light; below 0 there is no limit.
+    roulette_depth : segments from which on Russian roulette is played; below 0, never.
+    wavelengths : which of them a ray carries, by the filter of its pixel.
+    """
+
+    def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler) -> None:
+        import drjit as dr
+
+        self._scene, self._wavelengths = scene, wavelengths
+        self._max_depth, self._roulette_depth = (
+            depth if depth >= 0 else 1 << 30 for depth in (max_depth, roulette_depth)
+        )
+        lamps = scene.lamp_boxes
+        if len(lamps) > _MOST_LAMPS:
+            lamps = np.stack([lamps[:, 0].min(axis=0), lamps[:, 1].max(axis=0)])[None]
+        mi = scene.mi
+        self._lamps = [(mi.Vector3f(row[:3]), mi.Vector3f(row[4:7])) for row in box_rows(lamps)]
+        dr.make_opaque(self._lamps)
+        self._images = LampImages.of(scene.mi, scene.static)
+
+    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any]:
+        """One ray a lane; see `MattIntegrator.flux`, of whose estimates there is only one here."""
+        import drjit as dr
+
+        ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(*self._wavelengths.sample(filter_index, sampler.next_1d()))
+        radiance, met = self.sample(sampler, ray, moment)
+        # not dr.mean, which has the number of lanes in the kernel: each new one would compile
+        flux = dr.sum(radiance) / len(radiance) * self._wavelengths.total(filter_index)
+        return flux, flux, flux, met
+
+    def sample(self, sampler: Any, ray: Any, moment: Moment) -> tuple[Any, Any]:
+        """One path a lane.
+
+        Parameters
+        ----------
+        sampler : `next_vertex`, see `CounterSampler`.
+        ray : Ray3f with wavelengths, world space.
+        moment : when.
+
+        Returns
+        -------
+        radiance : Spectrum, W m⁻² sr⁻¹ nm⁻¹.
+        met : Bool, whether any segment came through the box of a moving object.
+        """
+        import drjit as dr
+
+        mi, scene = self._scene.mi, self._scene
+        context = mi.BSDFContext()
+        depth, met = mi.UInt32(0), mi.Bool(False)
+        throughput, radiance = mi.Spectrum(1.0), mi.Spectrum(0.0)
+        stretch = mi.Float(1.0)  # of solid angle by refraction
+        before = dr.zeros(mi.Interaction3f)
+        before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
+        ray, active = mi.Ray3f(ray), mi.Bool(True)
+        most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
+
+        def shine(si: Any, active: Any, before: Any, pdf: Any, delta: Any) -> Any:
+            """Light that what a ray runs into gives itself."""
+            light = si.emitter(scene.static, active)
+            shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
+            seen = mi.DirectionSample3f(scene.static, si, before)
+            light_pdf = scene.static.pdf_emitter_direction(before, seen, shines & ~delta)
+            share = dr.select(delta, 1.0, power_heuristic(pdf, light_pdf))
+            return dr.select(shines, light.eval(si, shines) * share, 0.0)
+
+        def step(*state: Any) -> tuple[Any, ...]:
+            """One vertex from which the path may go on; its last segment is left for after the loop."""
+            sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, _ = state
+            surface = scene.intersect(ray, moment, depth == 0, active)
+            si = surface.rest
+            met |= surface.met
+            radiance = dr.fma(throughput, shine(si, active, before, before_pdf, before_delta), radiance)
+
+            goes_on = active & si.is_valid()
+            bsdf = si.bsdf()
+            place, lobe, light, luck = sampler.next_vertex()
+
+            # light sampled from here
+            asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
+            asks &= seen.pdf != 0
+            shadow = surface.world.spawn_ray_to(seen.p)
+            infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
+            # a sky has no distance; Mitsuba gives it one that is measured by what rests in the scene
+            shadow.d = dr.select(infinite, seen.d, shadow.d)
+            shadow.maxt = dr.select(infinite, dr.inf, shadow.maxt)
+            asks &= dr.any(weight != 0)
+            blocked, near = scene.occluded(shadow, moment, asks)
+            met |= near
+            clear = asks & ~blocked
+
+            towards = surface.to_local(seen.d)
+            choice = lobe
+            if self._images:
+                # a lamp's image takes two segments more
+                matt = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
+                upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
+                cones = self._images.seen_from(surface.world.p, upwards, matt)
+                # what is left of the number where no cone is chosen
+                lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
+            value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
+            if self._images:
+                pdf = dr.fma(1 - cones.chance, pdf, cones.density(seen.d))
+                chosen_weight = _redirected(bsdf, context, surface, cones, choice, place, chosen, chosen_weight)
+            value = si.to_world_mueller(value, -towards, si.wi)
+            share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, pdf))
+            radiance = dr.fma(throughput, dr.select(clear, value * weight * share, 0.0), radiance)
+
+            # the way the surface sends the path on
+            chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
+            following = surface.world.spawn_ray(surface.to_world(chosen.wo))
+            ray.o, ray.d, ray.maxt = following.o, following.d, following.maxt
+            throughput = dr.select(goes_on, throughput * chosen_weight, throughput)
+            stretch *= dr.select(goes_on, chosen.eta, 1.0)
+            before = mi.Interaction3f(surface.world)
+            before_pdf = chosen.pdf
+            before_delta = mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+            goes_on &= dr.any(throughput != 0)
+            depth = dr.select(si.is_valid(), depth + 1, depth)
+
+            if self._max_depth > self._roulette_depth:
+                survival = dr.minimum(dr.max(throughput) * stretch * stretch, _ROULETTE_MOST)
+                at_risk = depth >= roulette_depth
+                throughput = dr.select(at_risk, throughput * dr.rcp(survival), throughput)
+                goes_on &= ~at_risk | (luck < survival)
+            active = goes_on & (depth + 1 < most)
+            left = goes_on & ~active
+            state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray
+            return *state, active, left
+
+        left = active & (most <= 1)
+        active &= most > 1
+        state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, left
+        if self._max_depth == 2:
+            end = step(*state)  # the loop itself costs time
+        else:
+            end = dr.while_loop(state, lambda *values: values[-2], step, label="paths")
+        _, depth, met, throughput, radiance, _, *before, ray, _, left = end
+
+        # the last segment matters only where it runs into light
+        if not (scene.has_sky or self._lamps):
+            return radiance, met
+        if not scene.has_sky:
+            left &= self._near_lamps(ray)
+        if self._lamps:
+            surface = scene.intersect(ray, moment, depth == 0, left)
+            si, near = surface.rest, surface.met
+        else:
+            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+            si.t, near = scene.distance(ray, moment, left)
+            si.wi, si.wavelengths = -ray.d, ray.wavelengths
+        met |= left & near
+        # the throughput of a path that has ended may be anything
+        return dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance), met
+
+    def _near_lamps(self, ray: Any) -> Any:
+        """Whether a ray runs into the box around a light."""
+        import drjit as dr
+
+        inverse, near = inverse_of(ray.d), self._scene.mi.Bool(False)
+        for box in self._lamps:
+            near |= meets_box(ray, inverse, dr.inf, box)
+        return near
+
+
+def _redirected(
+    bsdf: Any, context: Any, surface: Surface, cones: Cones, choice: Any, place: Any, chosen: Any, weight: Any
+) -> Any:
+    """Weight of a surface's sample where some are drawn from cones instead; `chosen` becomes what was drawn."""
+    import drjit as dr
+    import mitsuba as mi
+
+    direction, drawn = cones.sample(choice, place)
+    towards = surface.to_local(direction)
+    value, pdf = bsdf.eval_pdf(context, surface.rest, towards, drawn)
+    delta = ~drawn & mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+    own, pdf = 1 - cones.chance, dr.select(drawn, pdf, chosen.pdf)
+    mixed = dr.fma(own, pdf, cones.density(dr.select(drawn, direction, surface.to_world(chosen.wo))))
+    weight = dr.select(drawn, value / mixed, weight * dr.select(delta, dr.rcp(own), pdf / mixed))
+    chosen.wo = dr.select(drawn, towards, chosen.wo)
+    chosen.pdf = dr.select(delta, chosen.pdf, mixed)
+    chosen.eta = dr.select(drawn, 1.0, chosen.eta)
+    chosen.sampled_type = dr.select(drawn, +mi.BSDFFlags.DiffuseReflection, chosen.sampled_type)
+    return dr.select(mixed > 0, weight, 0.0)
+
+
+def power_heuristic(a: Any, b: Any) -> Any:
+    """Power heuristic of exponent 2: the weight of the strategy with density `a`."""
+    import drjit as dr
+
+    a, b = a * a, b * b
+    share = a / (a + b)
+    return dr.select(dr.isfinite(share), share, 0.0)

@@ -1,0 +1,307 @@
+"""A video as a source of flux: Φ of any mosaic pixels over any stretch of time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.video.arrays import ArrayVideo
+from hesim_render.sources.video.clock import Clock
+from hesim_render.sources.video.colours import to_linear_srgb
+from hesim_render.sources.video.file import FileVideo
+from hesim_render.sources.video.folder import FolderVideo
+from hesim_render.sources.video.geometry import Resampler, mapping
+from hesim_render.sources.video.inversion import camera_matrix, lux_of, spectral_matrix
+from hesim_render.sources.video.linear import Lineariser
+from hesim_render.sources.video.motion import MotionVideo
+from hesim_render.sources.video.options import WHITE_LUX, VideoOptions
+from hesim_render.sources.video.picture import Reader
+from hesim_render.spectral import spectrum as spectra
+
+Source = str | Path | NDArray
+
+
+def open_video(source: Source, options: VideoOptions) -> Reader:
+    """The reader that fits: an array or ``.npy`` file, a folder of numbered pictures, or a video file.
+
+    Raises
+    ------
+    SpecError
+        If there is no such thing, or it is none of them.
+    """
+    if isinstance(source, np.ndarray) or str(source).lower().endswith(".npy"):
+        return ArrayVideo(source, options.bit_depth, options.fps)
+    path = Path(source)
+    if path.is_dir():
+        return FolderVideo(path, options.bit_depth, options.fps)
+    if not path.is_file():
+        raise SpecError("no such file or folder", file=source)
+    if options.bit_depth is not None:
+        raise RangeError("bit_depth", options.bit_depth, "none for a video file, which says so itself")
+    return FileVideo(path, options.fps)
+
+
+class VideoFlux:
+    """Φ = V(x) · Σ_c M[filter, c] · (linear R, G, B averaged over the pixel's footprint); implements `FluxSource`.
+
+    M comes from `hesim_render.sources.video.inversion`; V is 1 unless `lens_shading` is asked for. Negative rates, of
+    colours outside the sensor's gamut, count as 0. Each picture is turned into the rates of all mosaic pixels once,
+    when it is first needed; two or three such maps are kept.
+
+    Parameters
+    ----------
+    source : path of a video file, a folder or a ``.npy`` file, or an array [time, row, col(, channel)].
+    sensor : region and lens.
+    options : see `VideoOptions`.
+
+    Attributes
+    ----------
+    clock : the pictures' times.
+    cut_short : what tells that the file once was longer, else empty.
+
+    Raises
+    ------
+    SpecError
+        If the video cannot be read, or lacks colour tags or a clock that nobody gave.
+    RangeError
+        If options do not fit the video or the sensor.
+    """
+
+    is_static = False
+
+    def __init__(self, source: Source, sensor: Sensor, options: VideoOptions | None = None) -> None:
+        import drjit as dr
+
+        self.options = options = options or VideoOptions()
+        self.sensor = sensor
+        self._reader = open_video(source, options)
+        name = self._reader.name
+        self.tags = self._reader.tags.with_given(
+            transfer=options.transfer, gamma=options.gamma, primaries=options.primaries, matrix=options.matrix,
+            range=options.range,
+        )  # fmt: skip
+        self.tags.require(["transfer", "primaries", "matrix", "range"], name)
+        shape = self._reader.format
+        if (shape.layout == "yuv") == (self.tags.matrix == "rgb"):
+            raise RangeError(
+                "matrix", self.tags.matrix, f"one for {'YUV' if shape.layout == 'yuv' else 'RGB'} pictures"
+            )
+        timing = self._reader.timing
+        if timing is None:
+            raise SpecError("has no usable time stamps: give the frame rate (fps)", file=name)
+        factor = 1
+        if options.interpolation == "motion":
+            factor = options.motion_factor
+            self._reader = MotionVideo(self._reader, factor)
+            shape = self._reader.format
+        self._is_held = options.interpolation == "none"
+        self.cut_short = timing.cut_short
+        self.clock = Clock(timing, options.slow_motion, options.duty, factor)
+        periods = np.diff(timing.begin_s)
+        self._is_irregular = periods.size > 0 and periods.max() > 1.01 * periods.min()
+        self.mapping = mapping(shape.width, shape.height, sensor.rows, sensor.cols, options.fit)
+        self.filter_matrix = self._filter_matrix()
+
+        types = jit()
+        weights = self.filter_matrix @ to_linear_srgb(self.tags.primaries or "bt709")
+        self._weights = types.Float(weights.astype(np.float32).ravel())
+        self._filter = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32) * 3)
+        self._shading = types.Float(sensor.relative_illumination.ravel()) if options.lens_shading else None
+        self._lineariser, self._resample = Lineariser(shape, self.tags), Resampler(self.mapping)
+        self._maps: dict[int, Any] = {}
+        self._edges = self.clock.hold_us[1:-1] if self._is_held else self.clock.middle_us
+        dr.eval(self._weights, self._filter)
+
+    def _filter_matrix(self) -> NDArray[np.float64]:
+        """[filter, 3] of linear sRGB, e⁻/s."""
+        options, filters = self.options, self.sensor.layout.filters
+        light = spectra.illuminant(options.illuminant)
+        self.white_lux = options.white_lux or WHITE_LUX
+        if options.white_e_per_s is not None:
+            self.white_lux = lux_of(self.sensor, light, options.white_e_per_s, options.white_filter or "")
+        if options.mode == "spectral":
+            return spectral_matrix(self.sensor, filters, light, self.white_lux)
+        return camera_matrix(self.sensor, filters, light, self.white_lux, options.camera, options.others, options.luma)
+
+    def notes(self) -> list[str]:
+        """What a person should know before trusting the result, in sentences."""
+        found = []
+        scale = min(self.mapping.rows.scale, self.mapping.cols.scale)
+        if scale < 1:
+            found.append(f"the pictures are enlarged {1 / scale:.3g} times: the sensor sees their pixels as squares")
+        spec, period_us = self.sensor.spec.evs, self.clock.period_us
+        if spec is not None and self._is_held and spec.tick_us is not None and period_us > spec.tick_us:
+            found.append(
+                f"pictures come every {period_us:.0f} µs, event comparisons every {spec.tick_us} µs: events gather "
+                "where pictures change; interpolation spreads them"
+            )
+        if spec is not None and self._is_held and spec.tick_us is None:
+            found.append(
+                "the sensor's event pixels are asynchronous: their ln x goes in a straight line from the middle of one "
+                "picture to that of the next, so that events are not half a picture late; frames see held pictures"
+            )
+        if self._is_irregular:
+            found.append("the video's time stamps are irregular and were kept; fps makes them regular")
+        return found
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Times strictly inside the interval at which the next picture takes over, µs."""
+        return self.clock.inner(self._edges, begin_us, end_us)
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Middles of the exposures: times at which a picture is what the scene was, held or not.
+
+        Who goes in a straight line from sample to sample follows the scene then. Sampled where a held picture ends, it
+        would come half a picture late.
+        """
+        return self.clock.inner(self.clock.middle_us, begin_us, end_us)
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """Mean Φ of each listed pixel over its own interval, which may span several pictures.
+
+        Before the first and after the last picture's time these two are held.
+
+        Returns
+        -------
+        half_a, half_b : the same Dr.Jit Float [n], e⁻/s: a video has no Monte-Carlo error.
+
+        Raises
+        ------
+        RangeError
+            If a pixel lies outside the region or an interval ends before it begins.
+        """
+        import drjit as dr
+
+        types = jit()
+        pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
+        if pixels.size == 0:
+            nothing = dr.zeros(types.Float, 0)
+            return nothing, nothing
+        count = self.sensor.rows * self.sensor.cols
+        if pixels.max() >= count:
+            raise RangeError("pixel", int(pixels.max()), f"0 to {count - 1}")
+        begin, end = _intervals(begin_us, end_us)
+        index = types.UInt32(pixels)
+        total: Any = 0.0
+        for number, share in self._shares(begin, end).items():
+            total = dr.fma(dr.gather(types.Float, self._flux_of(number), index), _device(share), total)
+            dr.eval(total)  # here, so that the pictures of a long interval can go one by one
+        return total, total
+
+    def _shares(self, begin: NDArray, end: NDArray) -> dict[int, NDArray[np.float64]]:
+        """By how much each picture counts in the means over intervals (one, or one per pixel), in order of time."""
+        edges = self._edges
+        first, last = float(begin.min()), float(end.max())
+        cells = range(
+            int(np.searchsorted(edges, first, side="right")), int(np.searchsorted(edges, last, side="left")) + 1
+        )
+        if len(cells) <= 1:  # a point in time on an edge belongs to what begins there
+            cells = range(cells.start, cells.start + 1)
+        bounds = np.concatenate([[-np.inf], edges, [np.inf]])
+        found: dict[int, NDArray[np.float64]] = {}
+        for cell in cells:
+            low, high = np.clip(begin, bounds[cell], bounds[cell + 1]), np.clip(end, bounds[cell], bounds[cell + 1])
+            length = end - begin
+            share = np.where(length > 0, (high - low) / np.where(length > 0, length, 1.0), 1.0)
+            if self._is_held:
+                found[cell] = share
+                continue
+            # cell k goes from the middle of picture k - 1 to that of picture k; the mean of a straight line is
+            # its value half-way
+            before, after = max(cell - 1, 0), min(cell, edges.size - 1)
+            part = np.zeros(())
+            if after > before:
+                part = ((low + high) / 2 - edges[before]) / (edges[after] - edges[before])
+            found[before] = found.get(before, 0.0) + share * (1 - part)
+            if after > before:
+                found[after] = found.get(after, 0.0) + share * part
+        return found
+
+    def _flux_of(self, number: int) -> Any:
+        """Φ of all mosaic pixels in one picture, Dr.Jit Float [row · cols + col], e⁻/s."""
+        import drjit as dr
+
+        found = self._maps.get(number)
+        if found is not None:
+            return found
+        types = jit()
+        for old in [kept for kept in self._maps if not number - 1 <= kept <= number + 1]:
+            del self._maps[old]
+        planes = self._resample(self._lineariser.linear(self._reader.read(number)))
+        if len(planes) == 1:
+            planes = planes * 3
+        flux: Any = 0.0
+        for channel, plane in enumerate(planes):
+            flux = dr.fma(dr.gather(types.Float, self._weights, self._filter + channel), plane, flux)
+        flux = dr.maximum(flux, 0.0)
+        if self._shading is not None:
+            flux *= self._shading
+        dr.eval(flux)
+        self._maps[number] = flux
+        return flux
+
+    def start_digest(self) -> None:
+        """Hash the input beside what follows; `describe` waits for it."""
+        self._reader.start_digest()
+
+    def describe(self) -> dict[str, Any]:
+        """What the manifest says of the video: the input and its hash, colours, scale, times, interpolation."""
+        options = self.options
+        return {
+            **self._reader.describe(),
+            "colour": self.tags.as_dict(),
+            "mode": options.mode,
+            "others": options.others if options.mode == "matrix" else None,
+            "luma": list(options.luma) if options.mode == "matrix" and options.others == "luma" else None,
+            "camera": None if options.camera is None else options.camera.model_dump(mode="json"),
+            "illuminant": options.illuminant,
+            "white_lux": self.white_lux,
+            "white_e_per_s": options.white_e_per_s,
+            "white_filter": options.white_filter,
+            "filters": self.sensor.layout.filters,
+            "linear_srgb_to_e_per_s": self.filter_matrix.tolist(),
+            "lens_shading": options.lens_shading,
+            "fit": options.fit,
+            **self.mapping.describe(),
+            "fps": options.fps,
+            "slow_motion": options.slow_motion,
+            "duty": options.duty,
+            "picture_period_us": self.clock.period_us,
+            "length_us": self.clock.end_us,
+            "interpolation": options.interpolation,
+            "motion_factor": options.motion_factor if options.interpolation == "motion" else None,
+            "cut_short": self.cut_short or None,
+            "notes": self.notes(),
+        }
+
+    def close(self) -> None:
+        """Let go of the file and of the device's memory."""
+        self._maps.clear()
+        self._reader.close()
+
+
+def _intervals(begin_us: ArrayLike, end_us: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both ends as float64, scalars where they are the same for all pixels."""
+    begin, end = (np.asarray(value, dtype=np.float64) for value in (begin_us, end_us))
+    if not np.all(end >= begin):
+        raise RangeError("interval", "an end before its begin", "begin_us <= end_us")
+    if begin.ndim or end.ndim:
+        ends = (begin.min(), begin.max(), end.min(), end.max())
+        if ends[0] == ends[1] and ends[2] == ends[3]:
+            return np.asarray(ends[0]), np.asarray(ends[2])
+    return begin, end
+
+
+def _device(share: NDArray[np.float64]) -> Any:
+    import drjit as dr
+
+    types = jit()
+    if share.ndim == 0:
+        return dr.opaque(types.Float, float(np.float32(share)))
+    return types.Float(np.ascontiguousarray(share, dtype=np.float32))

@@ -1,0 +1,179 @@
+"""Where on the picture each mosaic pixel looks, and its mean over the pixel's footprint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+
+Fit = Literal["cover", "stretch", "pixel"]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Rows or columns: which source pixels the sensor's pixels see, and with what share.
+
+    Parameters
+    ----------
+    first : [pixel], first source pixel of each footprint.
+    weight : [pixel, tap], shares of the source pixels from there on; they sum to 1.
+    scale : source pixels to a sensor pixel.
+    begin : where the first sensor pixel begins, in source pixels.
+    """
+
+    first: NDArray[np.uint32]
+    weight: NDArray[np.float32]
+    scale: float
+    begin: float
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether each sensor pixel is one source pixel."""
+        return self.weight.shape[1] == 1
+
+
+def axis(pixels: int, source: int, scale: float) -> Axis:
+    """Footprints of `scale` source pixels each, centred on the source: exact overlaps with its square pixels."""
+    begin = (source - pixels * scale) / 2
+    if scale == 1:
+        begin = float(np.floor(begin))  # whole pixels stay whole where an odd number of them is cut off
+    edges = np.clip(begin + np.arange(pixels + 1) * scale, 0, source)
+    edges = np.where(np.abs(edges - np.rint(edges)) < 1e-9 * source, np.rint(edges), edges)
+    low, high = edges[:-1], edges[1:]
+    first = np.minimum(np.floor(low), source - 1)
+    taps = int(np.max(np.ceil(high) - first))
+    place = first[:, None] + np.arange(taps)
+    share = np.clip(np.minimum(place + 1, high[:, None]) - np.maximum(place, low[:, None]), 0, None)
+    return Axis(
+        first.astype(np.uint32), (share / share.sum(axis=1, keepdims=True)).astype(np.float32), scale, float(begin)
+    )
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """From the picture to the read-out region; box footprints in linear light, so that no light is lost or made."""
+
+    rows: Axis
+    cols: Axis
+    source_shape: tuple[int, int]
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether picture and region are the same pixels."""
+        shape = (self.rows.first.size, self.cols.first.size)
+        return shape == self.source_shape and self.rows.is_plain and self.cols.is_plain
+
+    def describe(self) -> dict[str, Any]:
+        """Plain values for the manifest."""
+        return {
+            "picture_px_per_sensor_px": [self.cols.scale, self.rows.scale],
+            "first_picture_px": [self.cols.begin, self.rows.begin],
+        }
+
+
+def mapping(source_width: int, source_height: int, rows: int, cols: int, fit: Fit = "cover") -> Mapping:
+    """How a picture fills a region of `rows` × `cols` sensor pixels.
+
+    ``cover``: one scale for both axes, the largest at which the picture covers the region; what stands out is cut
+    off evenly. ``stretch``: each axis its own. ``pixel``: one picture pixel to a sensor pixel, from the middle.
+
+    Raises
+    ------
+    RangeError
+        If a picture of fit ``pixel`` is smaller than the region.
+    """
+    scales = source_height / rows, source_width / cols
+    if fit == "pixel":
+        if source_height < rows or source_width < cols:
+            raise RangeError(
+                "size of the pictures",
+                f"{source_width}x{source_height}",
+                f"at least the {cols}x{rows} px read out (with fit 'pixel'; 'cover' enlarges)",
+            )
+        scales = 1.0, 1.0
+    elif fit == "cover":
+        scales = min(scales), min(scales)
+    return Mapping(
+        axis(rows, source_height, scales[0]), axis(cols, source_width, scales[1]), (source_height, source_width)
+    )
+
+
+class Resampler:
+    """Applies a mapping to planes on the device: along columns first, then along rows."""
+
+    def __init__(self, mapping: Mapping) -> None:
+        import drjit as dr
+
+        types = jit()
+        self._mapping = mapping
+        rows, cols = mapping.rows.first.size, mapping.cols.first.size
+        self._shape, self._width = (rows, cols), mapping.source_shape[1]
+        if mapping.is_identity:
+            return
+        self._first = [types.UInt32(axis.first) for axis in (mapping.rows, mapping.cols)]
+        self._weight = [
+            types.Float(np.ascontiguousarray(axis.weight.T).ravel()) for axis in (mapping.rows, mapping.cols)
+        ]
+        dr.eval(self._first, self._weight)
+
+    def __call__(self, planes: list[Any]) -> list[Any]:
+        """[row · width + col] of the picture to [row · cols + col] of the region, Dr.Jit Float, not evaluated."""
+        import drjit as dr
+
+        types = jit()
+        if self._mapping.is_identity:
+            return planes
+        dr.eval(planes)
+        rows, cols = self._shape
+        if not self._mapping.rows.is_plain:
+            index = dr.arange(types.UInt32, rows * self._width)
+            row = index // self._width
+            planes = self._sum(planes, row, index - row * self._width, 0, self._width)
+            dr.eval(planes)
+            first_row = None
+        else:
+            first_row = self._first[0]
+        index = dr.arange(types.UInt32, rows * cols)
+        row = index // cols
+        col = index - row * cols
+        source_row = row if first_row is None else dr.gather(types.UInt32, first_row, row)
+        return self._sum_cols(planes, source_row, col)
+
+    def _sum(self, planes: list[Any], row: Any, col: Any, which: int, width: int) -> list[Any]:
+        """Weighted sum of source rows."""
+        import drjit as dr
+
+        types = jit()
+        first = dr.gather(types.UInt32, self._first[which], row)
+        last = self._mapping.source_shape[0] - 1
+        totals: list[Any] = [0.0 for _ in planes]
+        for tap in range(self._mapping.rows.weight.shape[1]):
+            weight = dr.gather(types.Float, self._weight[which], row + tap * self._shape[which])
+            place = dr.minimum(first + tap, last) * width + col
+            totals = [
+                dr.fma(weight, dr.gather(types.Float, plane, place), total)
+                for plane, total in zip(planes, totals, strict=True)
+            ]
+        return totals
+
+    def _sum_cols(self, planes: list[Any], source_row: Any, col: Any) -> list[Any]:
+        """Weighted sum of source columns in the given lines."""
+        import drjit as dr
+
+        types = jit()
+        first = dr.gather(types.UInt32, self._first[1], col)
+        last = self._width - 1
+        totals: list[Any] = [0.0 for _ in planes]
+        for tap in range(self._mapping.cols.weight.shape[1]):
+            weight = dr.gather(types.Float, self._weight[1], col + tap * self._shape[1])
+            place = source_row * self._width + dr.minimum(first + tap, last)
+            totals = [
+                dr.fma(weight, dr.gather(types.Float, plane, place), total)
+                for plane, total in zip(planes, totals, strict=True)
+            ]
+        return totals

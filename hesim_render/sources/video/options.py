@@ -1,0 +1,92 @@
+"""Everything a person can say about a video: one model, checked, that goes into the manifest as it is."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, model_validator
+
+from hesim_render.mosaic.colour_profile import Camera
+from hesim_render.sources.video.colours import Primaries, Range, YuvMatrix
+from hesim_render.sources.video.geometry import Fit
+from hesim_render.sources.video.inversion import LUMA
+from hesim_render.specs.files import Strict
+from hesim_render.specs.problems import spec_error
+from hesim_render.spectral.transfer import InputTransfer
+
+#: Illuminance on a perfect diffuser of value 1 where nobody says: a bright studio.
+WHITE_LUX = 1000.0
+
+
+class VideoOptions(Strict):
+    """How a video stands for a scene in front of the sensor.
+
+    Parameters
+    ----------
+    fps : pictures per second of the video's clock. Needed for folders and arrays; for files instead of their own
+        time stamps.
+    slow_motion : how much slower that clock runs than the scene did (3200 pictures/s stored at 25: 128).
+    duty : part of the picture period in which the shutter was open.
+    interpolation : between pictures: ``none`` holds each, ``linear`` goes in a straight line from middle to middle,
+        ``motion`` does so after `motion_factor` - 1 motion-compensated pictures were put between every two.
+    motion_factor : see there.
+    transfer, gamma, primaries, matrix, range : colour tags, where they are missing or wrong (`ColourTags`).
+    bit_depth : of integer values in arrays and TIFF, where it is not all bits of their type.
+    mode : ``matrix`` or ``spectral``, see `hesim_render.sources.video.inversion`.
+    others, luma : what filters see in mode ``matrix`` that are no colour of the camera.
+    camera : whose matrix and white balance mode ``matrix`` undoes; default the sensor's own under the illuminant.
+    illuminant : light on the perfect diffuser.
+    white_lux : illuminance on a perfect diffuser of linear value 1.
+    white_e_per_s, white_filter : or its photo-electron rate behind a filter.
+    fit : how the picture fills the region, see `hesim_render.sources.video.geometry.mapping`.
+    lens_shading : whether the sensor's relative illumination applies; the video then is the scene, not the image.
+    """
+
+    fps: float | None = Field(None, ge=1e-4, le=1e9)
+    slow_motion: float = Field(1.0, ge=1e-6, le=1e9)
+    duty: float = Field(1.0, ge=1e-6, le=1)
+    interpolation: Literal["none", "linear", "motion"] = "none"
+    motion_factor: int = Field(4, ge=2, le=64)
+    transfer: InputTransfer | None = None
+    gamma: float | None = Field(None, ge=0.1, le=10)
+    primaries: Primaries | None = None
+    matrix: YuvMatrix | None = None
+    range: Range | None = None
+    bit_depth: int | None = Field(None, ge=1, le=16)
+    mode: Literal["matrix", "spectral"] = "matrix"
+    others: Literal["luma", "spectral"] = "luma"
+    luma: tuple[float, float, float] = LUMA
+    camera: Camera | None = None
+    illuminant: str = "D65"
+    white_lux: float | None = Field(None, ge=1e-6, le=1e9)
+    white_e_per_s: float | None = Field(None, ge=1e-6, le=1e15)
+    white_filter: str | None = None
+    fit: Fit = "cover"
+    lens_shading: bool = False
+
+    @model_validator(mode="after")
+    def _consistent(self) -> VideoOptions:
+        if self.white_lux is not None and self.white_e_per_s is not None:
+            raise ValueError("white_lux and white_e_per_s: give one of them")
+        if (self.white_e_per_s is None) != (self.white_filter is None):
+            raise ValueError("white_e_per_s needs white_filter, and white_filter needs white_e_per_s")
+        if self.gamma is not None and self.transfer not in (None, "gamma"):
+            raise ValueError(f"gamma belongs to transfer 'gamma', not {self.transfer!r}")
+        if self.mode == "spectral" and self.camera is not None:
+            raise ValueError("camera belongs to mode 'matrix'")
+        return self
+
+    @classmethod
+    def of(cls, **given: Any) -> VideoOptions:
+        """From keywords; those that are None count as not given.
+
+        Raises
+        ------
+        SpecError
+            For an unknown name or a value out of range, with the name.
+        """
+        wanted = {name: value for name, value in given.items() if value is not None}
+        try:
+            return cls(**wanted)
+        except ValidationError as error:
+            raise spec_error(error, cls, wanted) from None

@@ -1,0 +1,1 @@
+"""Spectra, colorimetry, transfer functions and waveforms of light."""
