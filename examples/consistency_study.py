@@ -33,9 +33,9 @@ def observer(number):
     """The sensor with x̄, ȳ or z̄ (per watt) behind all its pixels, so that its flux is a tristimulus value."""
     curve = spectra.colour_matching_functions()[number]
     table = {"wavelength_nm": curve.wavelength_nm.tolist(), "value": curve.values.tolist(), "basis": "energy"}
-    every = {f"pixels.{letter}.filter": "red" for letter in "RGBrgb"}
+    every = {f"pixels.{letter}.filter": "curve" for letter in "RGBrgb"}
     sensor = hr.load_sensor(
-        "eiger", {"filters.red": table, "quantum_efficiency": 1.0, "lens.transmittance": 1.0, **every}
+        "eiger", {"filters": {"curve": table}, "quantum_efficiency": 1.0, "lens.transmittance": 1.0, **every}
     )
     return sensor.crop(*SIZE)
 
