@@ -58,6 +58,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _moved.MOVED:
+        return importlib.import_module(f"hesim_render.{name}")
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'hesim_render' has no attribute {name!r}")

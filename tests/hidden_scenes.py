@@ -53,7 +53,7 @@ def pop_in() -> Scene:
 def thin_rod() -> Scene:
     """A bright rod of 0.1 pixel that sweeps over a dark wall."""
     rod = {"name": "rod", "shape": "box", "size_m": [0.0013, 0.6, 0.0013], "reflectance": 0.95}
-    return scene([rod], [track("rod", (0, [-0.4, 0, 0]), (25_000, [0.4, 0, 0]))])
+    return scene([rod], [track("rod", (0, [-0.2, 0, 0]), (25_000, [0.2, 0, 0]))])
 
 
 def flakes(count: int, seed: int = 0) -> Scene:

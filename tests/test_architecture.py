@@ -142,9 +142,11 @@ def test_names_of_before_give_the_modules_of_today():
         assert importlib.import_module(f"hesim_render.{old}") is importlib.import_module(f"hesim_render.{MOVED[old]}")
     from hesim_render.renderer.reference import WindowReference
 
+    import hesim_render as hr
     from hesim_render import spectra
     from hesim_render.recording import Recording
     from hesim_render.sensor import Sensor, load_sensor
 
+    assert hr.renderer.flux.RenderedFlux.__module__ == "hesim_render.sources.render.exact"
     assert spectra.__name__ == "hesim_render.spectral.spectrum" and spectra.__spec__.name == spectra.__name__
     assert Recording.__module__ == "hesim_render.recording.recording" and Sensor and load_sensor and WindowReference

@@ -87,9 +87,13 @@ def test_rays_follow_scatter_quality_and_what_is_near_by():
     bright[6] = 30.0
     rays, _, _ = rays_of(pilot_of(bright, np.zeros(9)))
     assert rays[4] > 128 and rays[2] == 64  # two pixels off the edge of something bright; four off
-    seen_closer = Closer(np.array([4]), np.array([2.0], np.float32), np.array([2.0], np.float32))
+    seen_closer = Closer(np.array([4]), np.array([8]), np.array([2.0], np.float32), np.array([2.0], np.float32))
     rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), closer=[seen_closer]))
     assert rays[4] > 256 and rays[2] == 64
+    # what 256 rays did not meet, as many are looked for with
+    nothing = np.zeros(1, np.float32)
+    rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), closer=[Closer(np.array([4]), np.array([256]), nothing, nothing)]))
+    assert rays[4] == 256 and rays[3] == 64
 
 
 def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():

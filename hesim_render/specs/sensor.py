@@ -28,7 +28,7 @@ NonNegative = Field(ge=0)
 class GeometrySpec(Strict):
     rows: int = Field(ge=1, le=65_535)
     cols: int = Field(ge=1, le=65_535)
-    pitch_um: float = Field(ge=0.1, le=1000)
+    pitch_um: float = Field(ge=0.1, le=1e5)
     fill_factor: float = Field(1.0, ge=1e-6, le=1)
     crosstalk: float = Field(0.0, ge=0, le=0.5, description="part of a pixel's electrons its 4 neighbours collect")
 
@@ -206,8 +206,8 @@ class EvsSpec(Strict):
     reference: Literal["previous_sample", "last_event"]
     tick_us: int | None = Field(None, ge=1, le=10**9, description="period of the fixed comparisons (previous_sample)")
     window_us: int = Field(ge=1, le=10**9, description="integration window that ends at each sample")
-    contrast_threshold_on: float = Field(ge=1e-3, le=100)
-    contrast_threshold_off: float = Field(ge=1e-3, le=100)
+    contrast_threshold_on: float = Field(ge=1e-6, le=100)
+    contrast_threshold_off: float = Field(ge=1e-6, le=100)
     threshold_mismatch_std: float = Field(0.0, ge=0, lt=0.5, description="std over pixels of θ, relative")
     threshold_hardware_v: float | None = Field(None, ge=1e-9, le=1e6, description="Θ; β0 = θ/Θ where it is known")
     signal_reference: SignalReferenceSpec
