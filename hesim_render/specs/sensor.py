@@ -22,7 +22,6 @@ from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectra import Spectrum
 
 Role = Literal["aps", "evs"]
-NonNegative = Field(ge=0)
 
 
 #: Smallest threshold where a change gives as many events as it has thresholds.
@@ -313,8 +312,7 @@ class SensorSpec(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> SensorSpec:
-        problems = list(sensor_problems(self))
-        if problems:
+        if problems := list(sensor_problems(self)):
             raise ValueError("\n".join(problems))
         return self
 
