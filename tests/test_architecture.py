@@ -147,6 +147,6 @@ def test_names_of_before_give_the_modules_of_today():
     from hesim_render.recording import Recording
     from hesim_render.sensor import Sensor, load_sensor
 
-    assert hr.renderer.flux.RenderedFlux.__module__ == "hesim_render.sources.render.exact"
+    assert hr.renderer.__name__ == "hesim_render.sources.render"
     assert spectra.__name__ == "hesim_render.spectral.spectrum" and spectra.__spec__.name == spectra.__name__
     assert Recording.__module__ == "hesim_render.recording.recording" and Sensor and load_sensor and WindowReference

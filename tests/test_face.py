@@ -89,5 +89,4 @@ def test_shells_complete_commands_and_names():
     assert completed("sim") == ["simulate"]
     assert completed("simulate", "color") == ["colorchecker"]
     assert completed("simulate", "dark", "--sensor", "dav") == ["davis346"]
-    assert completed("lab", "refer") == ["reference-bayer", "reference-mono"]
     assert completed("video", "x", "--without", "evs.m") == ["evs.mismatch"]

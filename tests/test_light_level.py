@@ -186,7 +186,7 @@ def test_things_stand_where_they_do_at_the_start():
         ({"illuminance_lux": 1.0, "plane_point_m": None}, "plane_point_m is required beside a level"),
         ({"irradiance_w_m2": 1.0, "plane_normal": None}, "plane_normal is required beside a level"),
         ({}, "plane_point_m goes with illuminance_lux or irradiance_w_m2"),
-        ({"illuminance_lux": 0.0}, "greater than"),
+        ({"illuminance_lux": 0.0}, "greater than or equal to"),
         ({"illuminance_lux": 1.0, "plane_normal": (0, 0, 0)}, "zero vector"),
     ],
 )

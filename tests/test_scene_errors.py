@@ -204,7 +204,7 @@ def test_a_card_moved_by_a_matrix_is_seen_where_a_translation_puts_it():
             camera={"origin_m": (0, 0, 1)},
             motion=[{"object": "target", "pivot_m": (0.2, 0, 0), "keyframes": [{"t_us": 0}, {"t_us": 1000, **key}]}],
         )
-        source = hr.renderer.flux.RenderedFlux(scene, mono(24, 24), 4)
+        source = RenderedFlux(scene, mono(24, 24), 4)
         return np.array(source.mean_flux(np.arange(576, dtype=np.uint32), 1000.0, 1001.0)[0])
 
     moved = seen({"matrix": pose(turn((0, 0, 1), 30), (0.05, 0, 0)).tolist()})

@@ -387,3 +387,9 @@ def test_the_docs_mark_the_required_keys():
     for group, model in (("", SensorSpec), ("aps.", ApsSpec), ("evs.", EvsSpec)):
         own = {group + name for name in model.model_fields}
         assert own - named <= {"geometry", "lens", "aps", "evs", "noise", "sources", "assumptions"}
+
+
+def test_a_threshold_that_would_make_billions_of_events_is_refused():
+    with pytest.raises(SpecError, match=r"evs\.contrast_threshold_off.*at least 0.0001 with reference 'last_event'"):
+        read_sensor("davis346", {"evs.contrast_threshold_off": 1e-6})
+    assert read_sensor("eiger", {"evs.contrast_threshold_off": 1e-6}).evs.contrast_threshold_off == 1e-6

@@ -96,8 +96,10 @@ def simulate(
     if quality is not None and (exact or samples is not None):
         other = "samples" if samples is not None else "exact"
         raise ConflictError(
+            "quality",
+            quality,
             f"give --quality or --{other} (quality, {other}), not both: --quality asks for an error and gives each "
-            f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number"
+            f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number",
         )
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     noise = noise_models(sensor, clean, without)
@@ -118,9 +120,11 @@ def simulate(
                 on_estimate(expected)
             if max_minutes is not None and expected.seconds > 60 * max_minutes:
                 raise TooLongError(
+                    "max_minutes",
+                    max_minutes,
                     f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
                     "(max_minutes=None), or ask for less: a shorter --duration, a smaller --roi, or a larger error, "
-                    f"such as --quality {2 * rendering[0].quality:g}"
+                    f"such as --quality {2 * rendering[0].quality:g}",
                 )
             if isinstance(told, ProgressReport):
                 told.expect(expected.seconds)

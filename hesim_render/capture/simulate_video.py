@@ -124,8 +124,10 @@ def simulate_video(
             on_estimate(expected)
         if max_minutes is not None and expected.seconds > 60 * max_minutes:
             raise TooLongError(
+                "max_minutes",
+                max_minutes,
                 f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
-                "(max_minutes=None), or ask for less: a shorter --duration or a smaller --roi"
+                "(max_minutes=None), or ask for less: a shorter --duration or a smaller --roi",
             )
         settings = {
             "clean": clean,

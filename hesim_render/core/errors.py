@@ -82,11 +82,15 @@ class RangeError(HesimError, ValueError):
         super().__init__(f"{name} is {value!r}; expected {expected}")
 
 
-class ConflictError(HesimError, ValueError):
+class ConflictError(RangeError):
     """Arguments that exclude each other were given together, or one without another that it needs."""
 
+    def __init__(self, name: str, value: object, message: str) -> None:
+        self.name, self.value = name, value
+        HesimError.__init__(self, message)
 
-class TooLongError(HesimError):
+
+class TooLongError(ConflictError):
     """A run would take longer than was allowed; the message says how long, and what takes less."""
 
 

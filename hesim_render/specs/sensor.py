@@ -22,7 +22,10 @@ from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.spectrum import Spectrum
 
 Role = Literal["aps", "evs"]
-NonNegative = Field(ge=0)
+
+
+#: Smallest threshold where a change gives as many events as it has thresholds.
+_LEAST_THRESHOLD = 1e-4
 
 
 class GeometrySpec(Strict):
@@ -206,8 +209,8 @@ class EvsSpec(Strict):
     reference: Literal["previous_sample", "last_event"]
     tick_us: int | None = Field(None, ge=1, le=10**9, description="period of the fixed comparisons (previous_sample)")
     window_us: int = Field(ge=1, le=10**9, description="integration window that ends at each sample")
-    contrast_threshold_on: float = Field(ge=1e-6, le=100)
-    contrast_threshold_off: float = Field(ge=1e-6, le=100)
+    contrast_threshold_on: float = Field(ge=1e-9, le=100)
+    contrast_threshold_off: float = Field(ge=1e-9, le=100)
     threshold_mismatch_std: float = Field(0.0, ge=0, lt=0.5, description="std over pixels of θ, relative")
     threshold_hardware_v: float | None = Field(None, ge=1e-9, le=1e6, description="Θ; β0 = θ/Θ where it is known")
     signal_reference: SignalReferenceSpec
@@ -239,6 +242,10 @@ class EvsSpec(Strict):
                 raise ValueError(f"window_us {self.window_us} is longer than tick_us {self.tick_us}")
         elif self.photoreceptor_cutoff_hz is None:
             raise ValueError("reference 'last_event' needs photoreceptor_cutoff_hz, the bandwidth of its noise")
+        for key in ("contrast_threshold_on", "contrast_threshold_off"):
+            # a change of some thresholds is as many events there
+            if self.reference == "last_event" and getattr(self, key) < _LEAST_THRESHOLD:
+                raise ValueError(f"{key} must be at least {_LEAST_THRESHOLD:g} with reference 'last_event'")
         if self.refractory_period_us is not None and self.reference != "last_event":
             raise ValueError("refractory_period_us belongs to reference 'last_event'; a fixed tick has none")
         if self.readout_buffer_events is not None and self.readout_max_events_per_s is None:
@@ -306,8 +313,7 @@ class SensorSpec(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> SensorSpec:
-        problems = list(sensor_problems(self))
-        if problems:
+        if problems := list(sensor_problems(self)):
             raise ValueError("\n".join(problems))
         return self
 
