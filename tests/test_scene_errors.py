@@ -7,7 +7,7 @@ from rendering import make_scene, mono
 import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.exact import require_finite
+from hesim_render.sources.render.exact import RenderedFlux, require_finite
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.specs.scene import TrackSpec
 
