@@ -23,6 +23,7 @@ import numpy as np
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.core import backend
 from hesim_render.sources.video import VideoFlux, VideoOptions
 
 WIDTH, HEIGHT, FPS = 1296, 1024, 3200
@@ -152,7 +153,7 @@ def main():
     parser.add_argument("--repeat", type=int, default=4)
     given = parser.parse_args()
     megapixels = WIDTH * HEIGHT * 1e-6
-    print(f"{WIDTH}x{HEIGHT}, {given.pictures} pictures, {hr.backend.select().describe()}, {os.cpu_count()} cores")
+    print(f"{WIDTH}x{HEIGHT}, {given.pictures} pictures, {backend.select().describe()}, {os.cpu_count()} cores")
     print(
         "Mpixel/s by the clock, and in brackets per second of one core; "
         f"bounds on two cores: APS {BOUND_APS}, EVS {BOUND_EVS}"
