@@ -10,7 +10,7 @@ CHILD = """
 import sys
 import numpy as np
 import hesim_render as hr
-from hesim_render.errors import HesimError
+from hesim_render.core.errors import HesimError
 
 def numbers(node, key=""):
     for name, value in node.items() if isinstance(node, dict) else enumerate(node):

@@ -259,3 +259,10 @@ def test_good_events_give_false_alarms_at_the_stated_rate(tmp_path, monkeypatch,
             count[finding["check"]] = count.get(finding["check"], 0) + 1
     assert binom.sf(10, seeds, 0.05) < 2e-4
     assert max(count.values(), default=0) < 11, count
+
+
+def test_a_calibration_that_was_never_checked_is_not_called_clean():
+    from hesim_render.calibrate.report.parts import findings
+
+    assert findings({}) == ""
+    assert "nothing was found" in findings({"findings": []})

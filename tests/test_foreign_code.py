@@ -28,7 +28,7 @@ NAMES = ("constant", "perspective", "sphere", "roughplastic", "hair", "path", "h
 ATTEMPT = """
 import sys
 import hesim_render as hr
-from hesim_render.errors import HesimError
+from hesim_render.core.errors import HesimError
 sensor = hr.load_sensor("reference-mono").crop(8, 8)
 for given in eval(sys.argv[1]):
     try:

@@ -14,9 +14,9 @@ from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
 #: A lock that is taken twice: native code that never comes back, and that no signal wakes.
 _NEVER = """
 import ctypes, sys
-from hesim_render import manifest
+from hesim_render.recording import manifest
 from hesim_render.cli import main
-from hesim_render.output import OutputFolder
+from hesim_render.core.output import OutputFolder
 def never():
     folder = OutputFolder(sys.argv[1], "marker")
     (folder.path / "half").write_text("x")

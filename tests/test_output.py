@@ -94,7 +94,7 @@ def test_killed_at_any_step_of_a_commit(tmp_path, can):
 import os, sys, runpy
 sys.path.insert(0, sys.argv[1])
 import hesim_render.cli
-from hesim_render.output import OutputFolder
+from hesim_render.core.output import OutputFolder
 def run(arguments):
     made = OutputFolder("r", "marker", True)
     with open(made.path / "marker", "w") as stream: stream.write("new")

@@ -103,19 +103,24 @@ def test_a_short_run_is_silent_where_there_is_no_terminal():
 
 
 def test_a_stream_that_nobody_reads_is_no_reason_to_stop():
+    tried = []
+
     class Closed(io.StringIO):
         def write(self, text):
+            tried.append(text)
             raise BrokenPipeError
 
     view = progress._Lines("x", Closed())
     view.say("still here")
+    view.say("and here")
+    assert tried == ["x: still here\n", "x: and here\n"]
 
 
 _ON_A_TERMINAL = """
 import time
-from hesim_render import progress
-from hesim_render.progress import progress_report
-from hesim_render.terminal import say
+from hesim_render.core import progress
+from hesim_render.core.progress import progress_report
+from hesim_render.cli.terminal import say
 progress._LEAST_LATE_S = 0.0
 with progress_report("star") as report:
     report(1, 10, "rays")

@@ -280,7 +280,7 @@ def test_a_full_disk_is_one_clear_error(limit, tmp_path):
     code = """
 import resource, signal, sys
 import recordings
-from hesim_render.errors import OutputError
+from hesim_render.core.errors import OutputError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 try:
@@ -303,7 +303,7 @@ def test_a_disk_that_is_full_of_events_is_one_clear_error(limit, tmp_path):
     code = """
 import resource, signal, sys
 import recordings
-from hesim_render.errors import OutputError
+from hesim_render.core.errors import OutputError
 from hesim_render.recording import RecordingWriter
 sensor = recordings.sensor_like("eiger")
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.capture.error_meter import ErrorMeter
+from hesim_render.capture.event_flux import EventFlux, Window
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.progress import Progress
@@ -189,7 +190,7 @@ class Capture:
         edges = self._flux.slice_edges_us(begin, self._duration_us)
         bounds = np.concatenate([[begin], edges, [float(self._duration_us)]])
         waiting, open_frames = list(self._exposures), []
-        window = _Window(self._slice_samples())
+        window = Window(self._slice_samples())
         for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
             while waiting and waiting[0].start_us < end:
                 open_frames.append(self._open(waiting.pop(0)))
@@ -298,7 +299,7 @@ class Capture:
             dr.scatter(total, dr.gather(types.Float, total, index) + half * seconds, index)
         dr.eval(frame.half_a, frame.half_b)
 
-    def _sample_events(self, window: _Window, begin_us: float, end_us: float) -> Iterator[NDArray]:
+    def _sample_events(self, window: Window, begin_us: float, end_us: float) -> Iterator[NDArray]:
         """Event samples whose windows meet one slice; a window may straddle several slices."""
         if self._stage is None:
             return
@@ -362,44 +363,6 @@ class Capture:
             line_time_us=exposure.line_time_us,
             index=exposure.index,
         )
-
-
-class EventFlux:
-    """Truth of the event pixels: mean flux over all samples, with both halves kept apart."""
-
-    def __init__(self, count: int) -> None:
-        self._half_a, self._half_b = np.zeros(count), np.zeros(count)
-        self.samples = 0
-
-    def add(self, half_a: Any, half_b: Any) -> None:
-        self._half_a += np.array(half_a)
-        self._half_b += np.array(half_b)
-        self.samples += 1
-
-    def mean_e_per_s(self) -> NDArray[np.float32]:
-        """[event pixel], e⁻/s."""
-        return ((self._half_a + self._half_b) / (2 * max(1, self.samples))).astype(np.float32)
-
-    def stderr_e_per_s(self) -> NDArray[np.float32]:
-        """[event pixel], standard error of that mean from its two halves, e⁻/s."""
-        return (np.abs(self._half_a - self._half_b) / (2 * max(1, self.samples))).astype(np.float32)
-
-
-class _Window:
-    """Mean flux of the event window being filled, and which of all samples it belongs to."""
-
-    def __init__(self, ends_us: NDArray[np.int64]) -> None:
-        self.ends_us = ends_us
-        self.next = 0
-        self.half_a: Any = 0.0
-        self.half_b: Any = 0.0
-
-    def add(self, half_a: Any, half_b: Any, share: float) -> None:
-        self.half_a, self.half_b = self.half_a + half_a * share, self.half_b + half_b * share
-
-    def reset(self) -> None:
-        self.next += 1
-        self.half_a = self.half_b = 0.0
 
 
 def _noting(blocks: Iterable[Block], times: deque[int]) -> Iterator[Block]:

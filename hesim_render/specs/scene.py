@@ -32,6 +32,8 @@ from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.target import ReflectanceSpec, TargetSpec
 from hesim_render.specs.waveform import WaveformSpec
 
+#: Of a file that a scene names.
+OUTSIDE = "lies outside of the scene's folder; put it there, or let it (--allow-outside, allow_outside=True)"
 #: How often something repeats.
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
@@ -337,8 +339,7 @@ def read_scene(
         for location, name in _named_files(data):
             if leads_out(file.parent, name):
                 raise SpecError(
-                    f"{name!r} lies outside of the scene's folder; put it there, or let it (--allow-outside, "
-                    "allow_outside=True)",
+                    f"{name!r} {OUTSIDE}",
                     file=file,
                     line=line_of(data, location),
                     key=".".join(map(str, location)),

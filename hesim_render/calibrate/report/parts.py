@@ -13,8 +13,10 @@ from hesim_render.calibrate.report.svg import number
 
 
 def findings(section: Mapping[str, Any]) -> str:
-    """What in the captures is not as the model supposes, one line each."""
-    found = section.get("findings", [])
+    """What in the captures is not as the model supposes, one line each; nothing of a calibration without checks."""
+    if "findings" not in section:
+        return ""
+    found = section["findings"]
     if not found:
         return "<p>Checks of the captures: nothing was found that is not as the noise model supposes.</p>"
     lines = "".join(f"<li><b>{escape(f['check'])}</b>{_chance(f['p_value'])}: {escape(f['text'])}</li>" for f in found)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading
 from hesim_render.sources.video.colours import ColourTags
-from hesim_render.sources.video.digest import Digest
+from hesim_render.sources.video.digest import Hashed
 from hesim_render.sources.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
 
 
@@ -62,7 +62,7 @@ def without_alpha(image: NDArray, bits: int, where: str) -> NDArray:
     return image[..., 0] if image.shape[2] == 1 else image
 
 
-class ArrayVideo:
+class ArrayVideo(Hashed):
     """Pictures [time, row, col] or [time, row, col, channel] of an array.
 
     Parameters
@@ -92,7 +92,6 @@ class ArrayVideo:
                 file=self.name,
             )
         self._array = array
-        self._digest: Digest | None = None
         self._bits = picture_bits(array.dtype, bit_depth, self.name)
         self.count, height, width = array.shape[:3]
         layout: PictureLayout = "grey" if array.ndim == 3 or array.shape[3] == 1 else "interleaved"
@@ -110,16 +109,10 @@ class ArrayVideo:
         for picture in self._array:
             yield np.ascontiguousarray(picture).data
 
-    def start_digest(self) -> None:
-        self._digest = Digest(self._pieces)
-
     def describe(self) -> Mapping[str, Any]:
-        if self._digest is None:
-            self.start_digest()
-        assert self._digest is not None
         return {
             "source": self.name,
-            "sha256": self._digest.hexdigest(),
+            "sha256": self._sha256(),
             "pictures": self.count,
             "size_px": [self.format.width, self.format.height],
             "values": str(self._array.dtype),
@@ -127,6 +120,5 @@ class ArrayVideo:
         }
 
     def close(self) -> None:
-        if self._digest is not None:
-            self._digest.stop()
+        self._stop_digest()
         self._array = None

@@ -49,3 +49,27 @@ class Digest:
         """End soon: nobody wants the hash any more."""
         self._is_stopped = True
         self._thread.join()
+
+
+class Hashed:
+    """An input whose data are hashed; `_pieces` gives them."""
+
+    _digest: Digest | None = None
+
+    def _pieces(self) -> Iterable[Any]:
+        raise NotImplementedError
+
+    def start_digest(self) -> None:
+        """Begin to hash, beside what follows."""
+        self._digest = Digest(self._pieces)
+
+    def _sha256(self) -> str:
+        """The hash, in hexadecimal digits; waits for it."""
+        if self._digest is None:
+            self.start_digest()
+        assert self._digest is not None
+        return self._digest.hexdigest()
+
+    def _stop_digest(self) -> None:
+        if self._digest is not None:
+            self._digest.stop()

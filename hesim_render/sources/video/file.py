@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.video.digest import Digest
+from hesim_render.sources.video.digest import Hashed
 from hesim_render.sources.video.picture import Planes, Timing
 from hesim_render.sources.video.pyav import frame_format, planes_of, reason, tags_of
 
 _PIECE_BYTES = 1 << 20
 
 
-class FileVideo:
+class FileVideo(Hashed):
     """The first video stream of a file; a handful of pictures are in memory.
 
     The file is read once through without decoding, for the time stamps of all its pictures; they are honoured, be
@@ -40,7 +40,6 @@ class FileVideo:
         self.name = str(path)
         self._path = Path(path)
         self._container: Any = None
-        self._digest: Digest | None = None
         self._open()
         self._pts, timing, self.count = self._scan()
         if fps is not None:
@@ -183,16 +182,10 @@ class FileVideo:
             while piece := file.read(_PIECE_BYTES):
                 yield piece
 
-    def start_digest(self) -> None:
-        self._digest = Digest(self._pieces)
-
     def describe(self) -> Mapping[str, Any]:
-        if self._digest is None:
-            self.start_digest()
-        assert self._digest is not None
         return {
             "source": self.name,
-            "sha256": self._digest.hexdigest(),
+            "sha256": self._sha256(),
             "pictures": self.count,
             "size_px": [self.format.width, self.format.height],
             "codec": self._codec,
@@ -201,8 +194,7 @@ class FileVideo:
         }
 
     def close(self) -> None:
-        if self._digest is not None:
-            self._digest.stop()
+        self._stop_digest()
         self._close_container()
 
     def _close_container(self) -> None:

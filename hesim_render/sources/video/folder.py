@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.video.arrays import picture_bits, without_alpha
 from hesim_render.sources.video.colours import ColourTags
-from hesim_render.sources.video.digest import Digest
+from hesim_render.sources.video.digest import Hashed
 from hesim_render.sources.video.picture import PictureFormat, PictureLayout, Planes, Timing, check_values
 from hesim_render.sources.video.pyav import decode_picture
 from hesim_render.spectral.transfer import InputTransfer
@@ -59,7 +59,7 @@ def numbered_pictures(folder: Path) -> list[Path]:
     return [found[number] for number in numbers]
 
 
-class FolderVideo:
+class FolderVideo(Hashed):
     """Numbered pictures of one size and type.
 
     Parameters
@@ -79,7 +79,6 @@ class FolderVideo:
         self.name = str(folder)
         self._files = numbered_pictures(self._folder)
         self._bit_depth = bit_depth
-        self._digest: Digest | None = None
         self.count = len(self._files)
         self.timing = None if fps is None else Timing.regular(self.count, fps)
         self.format, self.tags, planes = self._open(self._files[0])
@@ -121,16 +120,10 @@ class FolderVideo:
             with path.open("rb") as file:
                 yield f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode()
 
-    def start_digest(self) -> None:
-        self._digest = Digest(self._pieces)
-
     def describe(self) -> Mapping[str, Any]:
-        if self._digest is None:
-            self.start_digest()
-        assert self._digest is not None
         return {
             "source": self.name,
-            "sha256": self._digest.hexdigest(),
+            "sha256": self._sha256(),
             "pictures": self.count,
             "first": self._files[0].name,
             "last": self._files[-1].name,
@@ -140,8 +133,7 @@ class FolderVideo:
         }
 
     def close(self) -> None:
-        if self._digest is not None:
-            self._digest.stop()
+        self._stop_digest()
         self._kept = None
 
 

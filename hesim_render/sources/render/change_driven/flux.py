@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,8 @@ from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import Sample
-from hesim_render.sources.render.change_driven.error_target import Noise, NoiseUnit, Role
+from hesim_render.sources.render.change_driven.error_target import Noise, Role
+from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.pilot import Pilot, take_pilot
@@ -39,97 +40,6 @@ QUALITY = 0.5
 #: Pixels that are worked on at a time, for bounded memory.
 _BAND_PIXELS = 1 << 17
 _ALWAYS_US = (-np.inf, np.inf)
-
-
-@dataclass(frozen=True)
-class Flux:
-    """Flux of pixels in some windows, arrays [window, pixel].
-
-    Parameters
-    ----------
-    half_a, half_b : two independent estimates, e⁻/s.
-    error : expected standard error of their mean, e⁻/s.
-    """
-
-    half_a: NDArray[np.float32]
-    half_b: NDArray[np.float32]
-    error: NDArray[np.float32]
-
-    @classmethod
-    def zeros(cls, windows: int, pixels: int) -> Flux:
-        return cls(*(np.zeros((windows, pixels), np.float32) for _ in range(3)))
-
-    @property
-    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        return self.half_a, self.half_b, self.error
-
-    def at(self, place: Any) -> Flux:
-        """Of some pixels."""
-        return Flux(*(values[:, place] for values in self.arrays))
-
-    def put(self, place: Any, flux: Flux) -> None:
-        """Take the flux of some pixels."""
-        for values, found in zip(self.arrays, flux.arrays, strict=True):
-            values[:, place] = found
-
-
-@dataclass
-class _Still:
-    """Pixels of a region whose flux is the same at all times, as far as that is known yet.
-
-    Parameters
-    ----------
-    span_us : for which it is asked whether anything can come near; None where all may change, or nothing moves at all.
-    known : [pixel], which are; `flux`, [1, pixel], theirs.
-    """
-
-    span_us: tuple[float, float] | None
-    known: NDArray[np.bool_]
-    flux: Flux
-
-
-@dataclass(frozen=True)
-class _Band:
-    """Some of the listed pixels.
-
-    Parameters
-    ----------
-    place : [n], places in the list.
-    sites : the pixels and their neighbours.
-    unit : noise of the sites.
-    apart : whether the pixels have no neighbours to ask.
-    pilot_rays : of each pixel in each window.
-    quality : wanted error in units of noise.
-    """
-
-    place: NDArray[np.int64]
-    sites: Sites
-    unit: NoiseUnit
-    apart: bool
-    pilot_rays: int
-    quality: float
-
-    @property
-    def index(self) -> NDArray[np.uint32]:
-        """Numbers of the pixels on the full sensor."""
-        return self.sites.index[self.sites.listed]
-
-
-@dataclass
-class Counts:
-    """What was done so far.
-
-    Parameters
-    ----------
-    pilot_rays, rays : of pilots, and of what they asked for.
-    pairs : pairs of a pixel and a window that were rendered.
-    values : flux of so many pairs was given; the rest was filled in, or known.
-    """
-
-    pilot_rays: int = 0
-    rays: int = 0
-    pairs: int = 0
-    values: int = 0
 
 
 class ChangeDrivenFlux:
@@ -188,7 +98,7 @@ class ChangeDrivenFlux:
         self.is_static = not self._tracer.parts.groups and self._tracer.camera is None
         self.counts = Counts()
         self._index = self.sensor.layout.full_index.ravel()
-        self._kept: dict[Role, _Still] = {}
+        self._kept: dict[Role, Still] = {}
 
     @property
     def progress(self) -> Callable[[int], None] | None:
@@ -335,18 +245,18 @@ class ChangeDrivenFlux:
         wanted = quality if events else quality / tuning.frame_margin
         return traced_again(self._tracer, index, begin_us, end_us, unit, wanted, self._gain, tuning)
 
-    def _still_pixels(self, role: Role) -> _Still:
+    def _still_pixels(self, role: Role) -> Still:
         if role not in self._kept:
             may_rest = bool(self._tracer.parts.groups) and self._tracer.camera is None
             count = self._index.size
-            self._kept[role] = _Still(
+            self._kept[role] = Still(
                 _ALWAYS_US if may_rest else None,
                 np.zeros(count, np.bool_),
                 Flux.zeros(1, count if may_rest else 0),
             )
         return self._kept[role]
 
-    def _bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[_Band]:
+    def _bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
         """The listed pixels, some rows at a time."""
         index, geometry = self._index[pixel], self.sensor.spec.geometry
         order, apart, tuning = np.argsort(index, kind="stable"), self._noise.is_apart(role), self._tuning
@@ -357,11 +267,11 @@ class ChangeDrivenFlux:
         for first in range(0, order.size, _BAND_PIXELS):
             place = order[first : first + _BAND_PIXELS]
             sites = Sites.alone(index[place]) if apart else Sites.around(index[place], geometry.rows, geometry.cols)
-            yield _Band(place, sites, self._noise.of(role, sites.index), apart, rays, quality)
+            yield Band(place, sites, self._noise.of(role, sites.index), apart, rays, quality)
 
     def _pilot(
         self,
-        band: _Band,
+        band: Band,
         windows: Windows,
         numbers: NDArray[np.int64],
         span_us: tuple[float, float] | None,
@@ -376,7 +286,7 @@ class ChangeDrivenFlux:
 
     def _render(
         self,
-        band: _Band,
+        band: Band,
         windows: Windows,
         numbers: NDArray[np.int64],
         what: Plan,

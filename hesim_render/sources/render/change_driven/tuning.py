@@ -2,7 +2,8 @@
 
 Fitted on the scenes `star`, `sweep` and `glass` of `benchmarks/change_driven.py` (`benchmarks/allocation.py` fits the
 gains); judged on the scenes of `tests/random_scenes.py` and of `tests/test_hidden_scenes.py`. None was chosen on the
-former. The latter have shown that `ray_weight`, `frame_pilot_rays` and `frame_margin` are needed, and how large.
+former. The latter have shown that `ray_weight`, `frame_pilot_rays` and `frame_margin` are needed, and how large, and
+that a pair needs as many rays as small things were looked for with (`zoom_rays`).
 """
 
 from __future__ import annotations

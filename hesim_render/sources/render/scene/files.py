@@ -11,10 +11,10 @@ from typing import Any
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
+from hesim_render.specs.scene import OUTSIDE
 
 #: Mitsuba 3.9 orders parameters by the numbers in their names, and crashes where one does not fit.
 _LONG_NUMBER = re.compile(r"\d{10,}")
-OUTSIDE = "lies outside of the scene's folder {root}; put it there, or let it (--allow-outside, allow_outside=True)"
 
 
 def check_xml(file: Path, root: Path | None, find: Callable[[str], str]) -> None:
@@ -84,4 +84,4 @@ def _names(element: ElementTree.Element) -> list[str]:
 
 def _require(path: Path, root: Path, name: str, file: Path | None) -> None:
     if leads_out(root, path):
-        raise SpecError(f"{name!r} {OUTSIDE.format(root=root)}", file=file)
+        raise SpecError(f"{name!r} {OUTSIDE}", file=file)
