@@ -102,6 +102,7 @@ def simulate(
             f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number",
         )
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
+    backend.jit()
     noise = noise_models(sensor, clean, without)
     settings: dict[str, Any] = {"clean": clean, "without": list(without)}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:

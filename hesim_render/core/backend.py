@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render.core.errors import BackendError
+from hesim_render.core.interrupts import interrupts_held
 
 OLDEST_LLVM = 17
 BACKEND_VARIABLE = "HESIM_RENDER_BACKEND"  # "llvm" or "cuda" forces one
@@ -283,4 +284,5 @@ def variant() -> str:
 @functools.cache
 def jit() -> Any:
     """Module with the Dr.Jit array types of the selected backend (``drjit.llvm.ad`` or ``drjit.cuda.ad``)."""
-    return importlib.import_module(f"drjit.{select().backend}.ad")
+    with interrupts_held():
+        return importlib.import_module(f"drjit.{select().backend}.ad")

@@ -63,9 +63,9 @@ class Tracer:
         progress: Callable[[int], None] | None,
         block_rays: int,
     ) -> None:
+        mi, types = mitsuba(), jit()
         import drjit as dr
 
-        mi, types = mitsuba(), jit()
         self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
         scene, _ = in_absolute_light(scene)
         self.built = build(mi, scene.spec, responses)

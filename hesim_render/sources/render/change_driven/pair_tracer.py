@@ -99,9 +99,9 @@ class PairTracer(Tracer):
         progress: Callable[[int], None] | None = None,
         block_rays: int = BLOCK_RAYS,
     ) -> None:
+        super().__init__(scene, sensor, responses, progress, block_rays)
         import drjit as dr
 
-        super().__init__(scene, sensor, responses, progress, block_rays)
         types = jit()
         self._seed = seed
         self.parts = MovingScene(self.built)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core import backend
 from hesim_render.core.errors import SpecError
+from hesim_render.core.interrupts import interrupts_held
 from hesim_render.sources.render.scene.files import check_xml, require_state_inside
 from hesim_render.spectral.spectrum import Spectrum
 
@@ -36,10 +37,11 @@ def mitsuba() -> Any:
         If no backend works here.
     """
     wanted = backend.variant()
-    import mitsuba as mi
+    with interrupts_held():
+        import mitsuba as mi
 
-    if mi.variant() != wanted:
-        mi.set_variant(wanted)
+        if mi.variant() != wanted:
+            mi.set_variant(wanted)
     mi.set_log_level(mi.LogLevel.Error)
     resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs know it as an object
     if str(resolver[0]) != str(_home(mi)):

@@ -1,0 +1,34 @@
+"""Interrupts that wait: native libraries lose a KeyboardInterrupt that comes while they are loaded."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """SIGINT and SIGTERM wait until the block is left, if Python handles them.
+
+    Raised while a native extension is imported, a KeyboardInterrupt turns into another exception, ends the process from
+    C++, or is lost. Only the main thread gets signals; elsewhere nothing is held.
+    """
+    held: list[tuple[int, FrameType | None]] = []
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before = signal.getsignal(number)
+            if callable(before):
+                handlers[number] = before
+                signal.signal(number, lambda *told: held.append(told))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if held:
+            number, frame = held[0]
+            handlers[signal.Signals(number)](number, frame)
