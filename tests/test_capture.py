@@ -8,9 +8,10 @@ from hesim_render.capture.loop import Capture, noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.schedule import exposures, ticks_us
+from hesim_render.sources.window_by_window import WindowByWindow
 
 
-class RampFlux:
+class RampFlux(WindowByWindow):
     """Φ = (1 + col) · (base + slope · t), exactly integrated; halves differ by ±1 % if asked to."""
 
     is_static = False

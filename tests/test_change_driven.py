@@ -126,11 +126,11 @@ def test_a_run_goes_on_where_another_one_stopped(reference):
 
 def test_instants_are_the_same_however_long_the_run():
     source = ChangeDrivenFlux(hr.load_scene("camera-sweep"), noisy(32, 24))
-    whole = source.instants_us(0, 100_000)
-    part = source.instants_us(31_000, 57_000)
+    whole = source._clock.instants_us(0, 100_000)
+    part = source._clock.instants_us(31_000, 57_000)
     np.testing.assert_array_equal(part, whole[(whole >= 31_000) & (whole <= 57_000)])
     assert np.all(np.diff(whole) > 0) and {0, 1000, 31_000, 100_000} <= set(whole.tolist())
-    blocks = instant_blocks(source.instants_us, 1, 0, 100_000)
+    blocks = instant_blocks(source._clock.instants_us, 1, 0, 100_000)
     ends = [end for block in blocks for end in block.end_us[block.wanted]]
     assert np.all(np.diff(ends) > 0)
 

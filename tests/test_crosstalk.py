@@ -10,11 +10,12 @@ from hesim_render.capture.loop import Capture, noise_models
 from hesim_render.core.backend import jit
 from hesim_render.recording.frame import Frame
 from hesim_render.sources.crosstalk import CrosstalkFlux, mixed, with_crosstalk
+from hesim_render.sources.window_by_window import WindowByWindow
 
 PART = 0.12
 
 
-class Still:
+class Still(WindowByWindow):
     """A source that shows an image of flux, e⁻/s, with two halves that differ."""
 
     is_static = True
@@ -43,7 +44,8 @@ class Rising(Still):
     is_static = False
 
     def slice_edges_us(self, begin_us, end_us):
-        return np.arange(3000.0, end_us, 3000.0)
+        edges = np.arange(3000.0, end_us, 3000.0)
+        return edges[edges > begin_us]
 
     sample_times_us = slice_edges_us
 

@@ -17,6 +17,7 @@ from hesim_render.pixels.evs.processes import BandNoise
 from hesim_render.pixels.evs.readout import EventReadout, scan_start_row
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.specs.sensor import read_sensor
 
 K, T_REF_US, WINDOW_US = 0.2, 10_000, 1000  # of reference-mono: I = 2 DN per electron of a window
@@ -416,13 +417,14 @@ def test_default_buffer_is_what_one_tick_reads():
     assert model(evs__readout_max_events_per_s=1.0).readout_buffer_events == 1
 
 
-class Flicker:
+class Flicker(WindowByWindow):
     """A source of flux that goes up and down between slices."""
 
     is_static = False
 
     def slice_edges_us(self, begin_us, end_us):
-        return np.arange(1000.0, end_us, 1000.0)
+        edges = np.arange(1000.0, end_us, 1000.0)
+        return edges[edges > begin_us]
 
     sample_times_us = slice_edges_us
 

@@ -9,12 +9,14 @@ from hesim_render.capture.loop import Capture, noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.flicker import FlickerFlux, SampledFlickerFlux, flickering, light_parts
-from hesim_render.sources.protocol import Sample, SampledFlux
+from hesim_render.sources.flicker import FlickerFlux, flickering
+from hesim_render.sources.light_parts import light_parts
+from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.specfilm import reference_flux
 from hesim_render.sources.scene import Scene
+from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral.waveform import Mains, Pwm
 
 CARD = {"type": "flat", "width_m": 0.4, "height_m": 0.3, "reflectance": {"flat": 0.5}}
@@ -26,7 +28,7 @@ def card(*lights):
     return make_scene(target=CARD, light=list(lights), camera={"fit": "target", "fit_margin": 1.5})
 
 
-class Formula:
+class Formula(WindowByWindow):
     """Φ = base · (1 + slope t), the mean exactly; counts what it is asked for."""
 
     def __init__(self, base=1e5, slope_per_s=0.0, pace_us=200.0):
@@ -253,7 +255,7 @@ def test_emitters_of_a_mitsuba_scene_flicker_by_name(tmp_path):
 
 def test_ticks_under_mains_flicker_give_the_analytic_events():
     sensor = mono(4, 4)
-    flux = flickering_formula([Mains(50, 0.9, 40), None], [Formula(3e5), Formula(2e4)])
+    flux = FlickerFlux([Mains(50, 0.9, 40), None], [Formula(3e5), Formula(2e4)])
     _, events = run(flux, sensor, 100_000)
     end = np.arange(1, 101) * 1e-3
     wave = np.sin(200 * np.pi * end + np.radians(40)) - np.sin(200 * np.pi * (end - 1e-3) + np.radians(40))
@@ -265,11 +267,6 @@ def test_ticks_under_mains_flicker_give_the_analytic_events():
     for pixel in range(16):
         own = events[events["y"] * 4 + events["x"] == pixel]
         assert [(int(e["t_us"]), int(e["polarity"])) for e in own] == expected
-
-
-def flickering_formula(waveforms, sources):
-    kind = SampledFlickerFlux if sources[0].is_static or isinstance(sources[0], SampledFlux) else FlickerFlux
-    return kind(waveforms, sources)
 
 
 def log_level(flux):
@@ -295,7 +292,7 @@ def travel(levels, theta_on, theta_off):
 
 def test_asynchronous_events_under_mains_flicker_are_the_analytic_number():
     # the level goes up and down between its extremes, at a third of 10 ms and every 5 ms after that
-    flux = flickering_formula([Mains(50, 0.8, 60)], [Formula(1e6)])
+    flux = FlickerFlux([Mains(50, 0.8, 60)], [Formula(1e6)])
     _, events = run(flux, davis(), 200_000)
     low, high = log_level(1e6 * 0.2), log_level(1e6 * 1.8)
     start = log_level(1e6 * (1 + 0.8 * np.cos(np.radians(60) + 200 * np.pi * 0.5e-6)))
@@ -315,7 +312,7 @@ def test_asynchronous_events_under_mains_flicker_are_the_analytic_number():
 def test_every_edge_of_a_pulsed_light_is_followed(window_us):
     changes = {"evs.threshold_mismatch_std": 0, "evs.window_us": window_us, "evs.contrast_threshold_off": 0.23}
     sensor = hr.load_sensor("davis346", changes).crop(2, 2)
-    flux = SampledFlickerFlux([Pwm(500, 0.25, 0)], [Formula(1e6)], window_us)
+    flux = FlickerFlux([Pwm(500, 0.25, 0)], [Formula(1e6)], window_us)
     _, events = run(flux, sensor, 19_000)
     low, high = log_level(0.0), log_level(4e6)
     # begins lit; off at 0.5, 2.5 … 18.5 ms, on at 2, 4 … 18 ms
@@ -340,7 +337,7 @@ def product_mean(base, slope, begin, end):
 def test_motion_within_an_exposure_does_not_lose_the_products_covariance():
     # Φ triples within 20 ms: the product of the means alone is several per cent off
     for kind in (Formula, Windows):
-        flux = flickering_formula([Mains(50, 0.4, 70)], [kind(1e5, 100.0)])
+        flux = FlickerFlux([Mains(50, 0.4, 70)], [kind(1e5, 100.0)])
         rows = np.arange(6, dtype=np.uint32)
         begin, end = rows * 500.0, rows * 500.0 + np.array([9000.0, 4000, 7000, 13_000, 100, 0])
         a, b = flux.mean_flux(rows, begin, end)
@@ -355,7 +352,7 @@ def test_motion_within_an_exposure_does_not_lose_the_products_covariance():
 
 
 def test_windows_are_what_the_mean_over_each_would_be():
-    flux = flickering_formula([Mains(50, 0.4, 70), None], [Windows(1e5, 100.0), Windows(3e4, 100.0)])
+    flux = FlickerFlux([Mains(50, 0.4, 70), None], [Windows(1e5, 100.0), Windows(3e4, 100.0)])
     begin = np.arange(12) * 1500.0
     end = begin + 1500.0
     pixels = np.arange(3, dtype=np.uint32)
@@ -367,7 +364,7 @@ def test_windows_are_what_the_mean_over_each_would_be():
         steady = 3e4 * (1 + 100 * (begin[k] + 750) * 1e-6)
         expected = product_mean(1e5, 100.0, begin[k] * 1e-6, end[k] * 1e-6) + steady
         np.testing.assert_allclose(seen[k], expected, rtol=2e-4)
-    still = flickering_formula([Mains(50, 0.4, 70)], [Windows(1e5)])
+    still = FlickerFlux([Mains(50, 0.4, 70)], [Windows(1e5)])
     for k, sample in enumerate(still.flux_of_blocks(pixels, blocks)):
         np.testing.assert_allclose(
             np.array(sample.half_a) / 1.01, product_mean(1e5, 0, begin[k] * 1e-6, end[k] * 1e-6), rtol=1e-5
@@ -391,7 +388,6 @@ def test_edges_of_the_motion_are_passed_on_and_times_are_those_of_both():
     sensor = mono(32, 24)
     plain = RenderedFlux(light_parts(scene)[0][1], sensor, 2)
     flux = flickering(scene, lambda part, _: RenderedFlux(part, sensor, 2))
-    assert not isinstance(flux, SampledFlux)
     np.testing.assert_array_equal(flux.slice_edges_us(0, 5000), plain.slice_edges_us(0, 5000))
     times = flux.sample_times_us(0, 5000)
     assert np.isin(plain.sample_times_us(0, 5000), times).all()

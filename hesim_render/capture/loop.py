@@ -5,25 +5,28 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.capture.error_meter import ErrorMeter
-from hesim_render.capture.event_flux import EventFlux, Window
+from hesim_render.capture.event_flux import EventFlux
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
-from hesim_render.mosaic.schedule import CELL_US, Block, Exposure, exposures, instant_blocks, tick_blocks, ticks_us
+from hesim_render.mosaic.schedule import Block, Exposure, exposures, tick_blocks
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
-from hesim_render.sources.protocol import FluxSource, SampledFlux
+from hesim_render.sources.protocol import FluxSource
+from hesim_render.sources.still import StillFlux
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import RecordingWriter
@@ -61,11 +64,20 @@ def noise_models(
 
 @dataclass
 class _OpenFrame:
-    """A frame being exposed: both halves of its electrons, one entry per frame pixel."""
+    """A frame being exposed: both halves of its electrons, one entry per frame pixel; None before the first piece."""
 
     exposure: Exposure
-    half_a: Any
-    half_b: Any
+    half_a: Any = None
+    half_b: Any = None
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Part of an exposure in which the source does not change its state."""
+
+    frame: _OpenFrame
+    begin_us: float
+    end_us: float
 
 
 class Capture:
@@ -98,7 +110,7 @@ class Capture:
         begin_us: int = 0,
         pixels: dict[str, Any] | None = None,
     ) -> None:
-        self._flux, self._sensor, self._aps, self._seed = flux, sensor, aps, seed
+        self._sensor, self._aps, self._seed = sensor, aps, seed
         self._begin_us, self._duration_us = begin_us, duration_us
         layout = sensor.layout
         # the source as frame and as event pixels see it: one, but where crosstalk is off for one of them
@@ -113,12 +125,22 @@ class Capture:
         self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else none
         every = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
         self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
+        if flux.is_static:
+            self._frame_source, self._event_source = self._still_sources()
         self._stage = EvsStage(evs, seed) if evs is not None else None
         if self._stage is not None and pixels is not None:
             self._stage.resume(pixels)
         self._pixel_state: dict[str, Any] = {}
         self._event_flux = EventFlux(self._evs_pixel.size)
         self.errors = {"frames": ErrorMeter(), "events": ErrorMeter()}
+
+    def _still_sources(self) -> tuple[FluxSource, FluxSource]:
+        """Both sources, each rendered once, with all the pixels that it is asked for."""
+        frame_pixel = self._aps_pixel if self._exposures else self._aps_pixel[:0]
+        if self._frame_source is self._event_source:
+            still = StillFlux(self._frame_source, np.concatenate([frame_pixel, self._evs_pixel]))
+            return still, still
+        return StillFlux(self._frame_source, frame_pixel), StillFlux(self._event_source, self._evs_pixel)
 
     @property
     def event_pixels(self) -> NDArray[np.uint32]:
@@ -131,24 +153,21 @@ class Capture:
         return self._pixel_state
 
     def event_blocks(self) -> Iterator[Block]:
-        """Windows in which a source that implements `SampledFlux` is asked for event pixels."""
+        """Windows in which the source is asked for event pixels."""
         if self._stage is None:
             return
         spec = self._stage.noise.spec
         if spec.reference == "previous_sample":
             yield from tick_blocks(spec, self._begin_us, self._duration_us)
             return
-        source, begin = self._event_source, self._stage.t_us
-        assert isinstance(source, SampledFlux)
-        if begin is None:
-            begin = self._begin_us + spec.window_us
-            start, end = np.array([[self._begin_us], [begin]], np.float64)
-            yield Block(start, end, np.ones(1, np.bool_))
-        # up to the first instant that is not before the end: events before the end come with it
-        cell = self._duration_us // CELL_US * CELL_US
-        instants = source.instants_us(cell, cell + CELL_US)
-        beyond = int(instants[np.searchsorted(instants, self._duration_us)])
-        yield from instant_blocks(source.instants_us, spec.window_us, begin, beyond)
+        known_us = self._stage.t_us
+        if known_us is None:
+            yield from self._event_source.sample_blocks(spec.window_us, self._begin_us, self._duration_us)
+            return
+        # the last sample of the run before is known
+        blocks = self._event_source.sample_blocks(spec.window_us, known_us - spec.window_us, self._duration_us)
+        next(blocks)
+        yield from blocks
 
     @property
     def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:
@@ -165,42 +184,22 @@ class Capture:
         """Events lost in the sensor's read-out so far."""
         return self._stage.dropped if self._stage is not None else 0
 
-    def _slice_samples(self) -> NDArray[np.int64]:
-        """Times at which event pixels are sampled where the source is not asked for blocks: ticks, or its own pace."""
-        if self._stage is None:
-            return np.empty(0, np.int64)
-        spec = self._stage.noise.spec
-        if spec.reference == "previous_sample":
-            times = ticks_us(spec, self._duration_us)
-            return times[times > self._begin_us]
-        inner = np.rint(self._flux.sample_times_us(self._begin_us, self._duration_us)).astype(np.int64)
-        first = self._begin_us + spec.window_us
-        times = np.unique(np.concatenate([[first], inner, [self._duration_us]]))
-        return times[(times >= first) & (times <= self._duration_us)]
-
     def run(self, progress: Progress | None = None) -> Iterator[Frame | NDArray]:
         """Frames and blocks of events (`EVENT_DTYPE`), each kind in order of time."""
-        if self._flux.is_static:
-            yield from self._run_static(progress)
-            return
-        if isinstance(self._event_source, SampledFlux):
-            yield from self._run_sampled(self._event_source, progress)
-            return
-        begin = min([float(self._begin_us), *(float(exposure.start_us) for exposure in self._exposures)])
-        edges = self._flux.slice_edges_us(begin, self._duration_us)
-        bounds = np.concatenate([[begin], edges, [float(self._duration_us)]])
-        waiting, open_frames = list(self._exposures), []
-        window = Window(self._slice_samples())
-        for begin, end in zip(bounds[:-1], bounds[1:], strict=True):
-            while waiting and waiting[0].start_us < end:
-                open_frames.append(self._open(waiting.pop(0)))
-            for frame in open_frames:
-                self._expose(frame, begin, end)
-            while open_frames and open_frames[0].exposure.end_us <= end:
-                yield self._read_out(open_frames.pop(0))
-            yield from self._sample_events(window, begin, end)
+        pieces = self._pieces()
+        piece = next(pieces, None)
+        for t_us, events in self._event_samples():
+            while piece is not None and piece.end_us <= t_us:
+                yield from self._expose(piece)
+                piece = next(pieces, None)
+            yield events
             if progress is not None:
-                progress(end, self._duration_us, "simulated µs")
+                progress(min(t_us, self._duration_us), self._duration_us, "simulated µs")
+        while piece is not None:
+            yield from self._expose(piece)
+            if progress is not None and self._stage is None:
+                progress(piece.end_us, self._duration_us, "simulated µs")
+            piece = next(pieces, None)
 
     def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
         """Run, and write frames, events and the truth of the event pixels as they come."""
@@ -214,73 +213,48 @@ class Capture:
             writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
 
-    def _run_static(self, progress: Progress | None) -> Iterator[Frame | NDArray]:
-        """A scene that stands still: its flux is rendered once and serves all times."""
-        frame_pixel = self._aps_pixel if self._exposures else np.empty(0, np.uint32)
-        if self._frame_source is self._event_source:
-            (frame_a, frame_b), (event_a, event_b) = self._static_flux(self._frame_source, frame_pixel, self._evs_pixel)
-        else:
-            ((frame_a, frame_b),) = self._static_flux(self._frame_source, frame_pixel)
-            ((event_a, event_b),) = self._static_flux(self._event_source, self._evs_pixel)
-        for exposure in self._exposures:
-            seconds = exposure.exposure_us * S_PER_US
-            yield self._read_out(_OpenFrame(exposure, frame_a * seconds, frame_b * seconds))
+    def _event_samples(self) -> Iterator[tuple[int, NDArray]]:
+        """Time of each sample and the events up to it."""
         if self._stage is None:
             return
-        self._event_flux.add(event_a, event_b)
-        for t_us in self._slice_samples():
-            yield self._step(event_a, event_b, int(t_us))
-            if progress is not None:
-                progress(float(t_us), self._duration_us, "simulated µs")
+        times: deque[int] = deque()
+        blocks = _noting(self.event_blocks(), times)
+        for sample in self._event_source.flux_of_blocks(self._evs_pixel, blocks):
+            t_us = times.popleft()
+            if t_us > self._duration_us:
+                self._pixel_state = self._stage.state()
+            else:
+                self._event_flux.add(sample.half_a, sample.half_b)
+            events = self._step(sample.half_a, sample.half_b, t_us)
+            yield t_us, events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
+        self._pixel_state = self._pixel_state or self._stage.state()
 
-    def _run_sampled(self, source: SampledFlux, progress: Progress | None) -> Iterator[Frame | NDArray]:
-        """A source without slices: all event samples in one go, each frame in one piece when its time has come."""
-        waiting = list(self._exposures)
-        if self._stage is not None:
-            times: deque[int] = deque()
-            samples = source.flux_of_blocks(self._evs_pixel, _noting(self.event_blocks(), times))
-            for sample in samples:
-                t_us = times.popleft()
-                while waiting and waiting[0].end_us <= t_us:
-                    yield self._whole_frame(waiting.pop(0))
-                if t_us > self._duration_us:
-                    self._pixel_state = self._stage.state()
-                else:
-                    self._event_flux.add(sample.half_a, sample.half_b)
-                events = self._step(sample.half_a, sample.half_b, t_us)
-                yield events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
-                if progress is not None:
-                    progress(min(t_us, self._duration_us), self._duration_us, "simulated µs")
-            self._pixel_state = self._pixel_state or self._stage.state()
-        for exposure in waiting:
-            yield self._whole_frame(exposure)
-            if progress is not None and self._stage is None:
-                progress(exposure.end_us, self._duration_us, "simulated µs")
+    def _pieces(self) -> Iterator[_Piece]:
+        """Exposures, cut where the source moves to its next state, in order of their ends."""
+        waiting: list[tuple[float, int, _Piece]] = []
+        for exposure in self._exposures:
+            # nothing of this exposure ends before it begins
+            while waiting and waiting[0][0] <= exposure.start_us:
+                yield heappop(waiting)[2]
+            frame = _OpenFrame(exposure)
+            edges = self._frame_source.slice_edges_us(exposure.start_us, exposure.end_us)
+            for begin, end in pairwise([float(exposure.start_us), *edges, exposure.end_us]):
+                heappush(waiting, (end, exposure.index, _Piece(frame, begin, end)))
+        while waiting:
+            yield heappop(waiting)[2]
 
-    def _whole_frame(self, exposure: Exposure) -> Frame:
-        frame = self._open(exposure)
-        self._expose(frame, -np.inf, np.inf)
-        return self._read_out(frame)
+    def _expose(self, piece: _Piece) -> Iterator[Frame]:
+        """Add the part of each row's exposure that lies in a piece; the frame, if this is its last."""
+        frame = piece.frame
+        if frame.half_a is None:
+            import drjit as dr
 
-    def _static_flux(self, source: FluxSource, *lists: NDArray[np.uint32]) -> Iterator[tuple[Any, Any]]:
-        """Both halves of the flux of each list of pixels, from one render of all of them."""
-        wanted = np.zeros(self._sensor.rows * self._sensor.cols, dtype=bool)
-        for pixels in lists:
-            wanted[pixels] = True
-        place = np.cumsum(wanted) - 1  # of each mosaic pixel among the wanted
-        halves = source.mean_flux(np.flatnonzero(wanted).astype(np.uint32), 0.0, float(self._duration_us))
-        for pixels in lists:
-            yield _take(halves[0], place[pixels]), _take(halves[1], place[pixels])
+            frame.half_a, frame.half_b = (dr.zeros(jit().Float, self._aps_pixel.size) for _ in range(2))
+        self._add(frame, piece.begin_us, piece.end_us)
+        if piece.end_us >= frame.exposure.end_us:
+            yield self._read_out(frame)
 
-    def _open(self, exposure: Exposure) -> _OpenFrame:
-        import drjit as dr
-
-        types = jit()
-        count = self._aps_pixel.size
-        return _OpenFrame(exposure, dr.zeros(types.Float, count), dr.zeros(types.Float, count))
-
-    def _expose(self, frame: _OpenFrame, begin_us: float, end_us: float) -> None:
-        """Add the part of each row's exposure that lies in one slice."""
+    def _add(self, frame: _OpenFrame, begin_us: float, end_us: float) -> None:
         import drjit as dr
 
         starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
@@ -298,25 +272,6 @@ class Capture:
             # every index occurs once, so this is no race and the sum's order is that of time
             dr.scatter(total, dr.gather(types.Float, total, index) + half * seconds, index)
         dr.eval(frame.half_a, frame.half_b)
-
-    def _sample_events(self, window: Window, begin_us: float, end_us: float) -> Iterator[NDArray]:
-        """Event samples whose windows meet one slice; a window may straddle several slices."""
-        if self._stage is None:
-            return
-        length = self._stage.noise.spec.window_us
-        while window.next < len(window.ends_us):
-            t_us = int(window.ends_us[window.next])
-            first, last = max(t_us - length, begin_us), min(t_us, end_us)
-            if t_us - length >= end_us:
-                return
-            if last > first:
-                half_a, half_b = self._event_source.mean_flux(self._evs_pixel, first, last)
-                window.add(half_a, half_b, (last - first) / length)
-            if t_us > end_us:
-                return
-            self._event_flux.add(window.half_a, window.half_b)
-            yield self._step(window.half_a, window.half_b, t_us)
-            window.reset()
 
     def _step(self, half_a: Any, half_b: Any, t_us: int) -> NDArray:
         assert self._stage is not None
@@ -370,12 +325,3 @@ def _noting(blocks: Iterable[Block], times: deque[int]) -> Iterator[Block]:
     for block in blocks:
         times.extend(np.rint(block.end_us[block.wanted]).astype(np.int64).tolist())
         yield block
-
-
-def _take(array: Any, index: NDArray) -> Any:
-    import drjit as dr
-
-    types = jit()
-    taken = dr.gather(types.Float, array, types.UInt32(index.astype(np.uint32)))
-    dr.eval(taken)
-    return taken

@@ -13,7 +13,7 @@ from hesim_render.core.output import discard_unfinished
 #: Exit status of what was interrupted: 128 + SIGINT, as shells have it.
 INTERRUPTED = 130
 #: So long Python has to end the run itself, s.
-GRACE_S = 1.5
+GRACE_S = 1.2
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

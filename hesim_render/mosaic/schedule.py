@@ -131,7 +131,7 @@ def instant_blocks(
 
     Parameters
     ----------
-    instants_us : see `SampledFlux.instants_us`.
+    instants_us : whole µs from one time to another, both among them; multiples of `CELL_US` too.
     """
     length = BLOCK_INTERVALS * CELL_US
     for number in range(int(begin_us // length), -(-int(np.ceil(end_us)) // length)):
@@ -142,6 +142,24 @@ def instant_blocks(
             wanted[0] = False
             if wanted.any():
                 yield Block(ends - window_us, ends, wanted)
+
+
+def blocks_of_run(
+    instants_us: Callable[[float, float], NDArray[np.int64]], window_us: int, begin_us: int, end_us: int
+) -> Iterator[Block]:
+    """Windows of a run in `instant_blocks`: a first one that begins with it, and one that ends with it or just after.
+
+    Parameters
+    ----------
+    instants_us : see `instant_blocks`.
+    """
+    first = begin_us + window_us
+    yield Block(np.array([begin_us], np.float64), np.array([first], np.float64), np.ones(1, np.bool_))
+    # up to the first instant that is not before the end: events before the end come with it
+    cell = end_us // CELL_US * CELL_US
+    instants = instants_us(cell, cell + CELL_US)
+    beyond = int(instants[np.searchsorted(instants, end_us)])
+    yield from instant_blocks(instants_us, window_us, first, beyond)
 
 
 def ticks_us(spec: EvsSpec, duration_us: int) -> NDArray[np.int64]:

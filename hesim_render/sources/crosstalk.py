@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.protocol import FluxSource, Sample, SampledFlux
+from hesim_render.sources.protocol import FluxSource, Sample
 
 
 def mixed(image: NDArray, part: float) -> NDArray:
@@ -30,11 +30,7 @@ def mixed(image: NDArray, part: float) -> NDArray:
 
 def with_crosstalk(flux: FluxSource, shape: tuple[int, int], part: float) -> FluxSource:
     """The source as the pixels of a region [row, col] see it; itself where no part leaves a pixel."""
-    if part <= 0:
-        return flux
-    return (
-        SampledCrosstalkFlux(flux, shape, part) if isinstance(flux, SampledFlux) else CrosstalkFlux(flux, shape, part)
-    )
+    return flux if part <= 0 else CrosstalkFlux(flux, shape, part)
 
 
 class CrosstalkFlux:
@@ -62,7 +58,6 @@ class CrosstalkFlux:
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
         """See `FluxSource.mean_flux`; both halves are mixed alike."""
-
         types = jit()
         own = np.asarray(pixel, dtype=np.int64).ravel()
         sites = self._sites(own)
@@ -77,6 +72,19 @@ class CrosstalkFlux:
             begin, end = intervals.real[number], intervals.imag[number]
         halves = self._flux.mean_flux(asked.astype(np.uint32), begin, end)
         return self._mix(halves, [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)])
+
+    def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
+        """See `FluxSource.sample_blocks`."""
+        return self._flux.sample_blocks(window_us, begin_us, end_us)
+
+    def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
+        """See `FluxSource.flux_of_blocks`."""
+        types = jit()
+        sites = self._sites(np.asarray(pixel, dtype=np.int64).ravel())
+        asked, place = np.unique(sites, return_inverse=True)
+        index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
+        for sample in self._flux.flux_of_blocks(asked.astype(np.uint32), blocks):
+            yield Sample(*self._mix((sample.half_a, sample.half_b), index))
 
     def _sites(self, own: NDArray[np.int64]) -> NDArray[np.int64]:
         """Each pixel and its four neighbours, itself where it lacks one, [5, n]."""
@@ -104,22 +112,3 @@ class CrosstalkFlux:
             )
         dr.eval(result)
         return result[0], result[1]
-
-
-class SampledCrosstalkFlux(CrosstalkFlux):
-    """The same of a source that is asked for many windows at once; implements `SampledFlux`."""
-
-    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        """See `SampledFlux.instants_us`."""
-        assert isinstance(self._flux, SampledFlux)
-        return self._flux.instants_us(begin_us, end_us)
-
-    def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
-        """See `SampledFlux.flux_of_blocks`."""
-        types = jit()
-        sites = self._sites(np.asarray(pixel, dtype=np.int64).ravel())
-        asked, place = np.unique(sites, return_inverse=True)
-        index = [types.UInt32(where.astype(np.uint32)) for where in place.reshape(sites.shape)]
-        assert isinstance(self._flux, SampledFlux)
-        for sample in self._flux.flux_of_blocks(asked.astype(np.uint32), blocks):
-            yield Sample(*self._mix((sample.half_a, sample.half_b), index))

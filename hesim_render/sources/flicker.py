@@ -17,76 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.mosaic.schedule import CELL_US, Block
-from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample, SampledFlux
+from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
+from hesim_render.sources.light_parts import light_parts
+from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample
 from hesim_render.sources.scene import Scene
-from hesim_render.specs.light import LightSpec
-from hesim_render.specs.waveform import WaveformSpec
+from hesim_render.sources.still import Kept
 from hesim_render.spectral.waveform import Waveform
 
 #: Most steps in which an event window that is passing a jump is followed.
 _WINDOW_STEPS = 8
-
-
-def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
-    """The scene once for each different waveform, lit only by the lights that have it; first those without any.
-
-    Scenes without flicker are one part, themselves. A level of a Mitsuba scene is of all its light: it has to be a
-    factor already (`in_absolute_light`).
-    """
-    own = scene.spec.mitsuba
-    if own is not None:
-        assert not own.has_level
-        return _mitsuba_parts(scene)
-    lights = scene.spec.lights
-    flickering = [_flicker(light.waveform) for light in lights]
-    if not any(flickering):
-        return [(None, scene)]
-    parts: list[tuple[Waveform | None, Scene]] = []
-    for kind in _different(flickering):
-        lit = [
-            light.model_copy(update={"waveform": None}) if has == kind else light.unlit()
-            for light, has in zip(lights, flickering, strict=True)
-        ]
-        if any(light.is_lit for light in lit):
-            parts.append((kind.load() if kind else None, _with_lights(scene, lit)))
-    return parts or [(None, scene)]
-
-
-def _flicker(spec: WaveformSpec | None) -> WaveformSpec | None:
-    """A waveform that changes, or None."""
-    return None if spec is None or spec.load().is_constant else spec
-
-
-def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None]:
-    """Each once, None first."""
-    found: list[WaveformSpec | None] = [None] if None in kinds else []
-    for kind in kinds:
-        if kind not in found:
-            found.append(kind)
-    return found
-
-
-def _with_lights(scene: Scene, lights: list[LightSpec]) -> Scene:
-    return Scene(scene.spec.model_copy(update={"light": tuple(lights)}))
-
-
-def _mitsuba_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
-    own = scene.spec.mitsuba
-    assert own is not None
-    named = {name: spec for name, spec in own.waveforms.items() if _flicker(spec) is not None}
-    if not named:
-        return [(None, scene)]
-    parts: list[tuple[Waveform | None, Scene]] = []
-    for kind in _different([None, *named.values()]):
-        lights = (
-            {"unlit": (*own.unlit, *named)}
-            if kind is None
-            else {"lit": tuple(name for name, spec in named.items() if spec == kind and own.may_shine(name))}
-        )
-        part = own.model_copy(update={"waveforms": {}, **lights})
-        parts.append((kind.load() if kind else None, Scene(scene.spec.model_copy(update={"mitsuba": part}))))
-    return parts
 
 
 def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_us: float = 1.0) -> FluxSource:
@@ -104,8 +43,6 @@ def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_
         return make(parts[0][1], 1.0)
     waveforms = [waveform for waveform, _ in parts]
     sources = [make(part, 1.0 if waveform is None else waveform.highest) for waveform, part in parts]
-    if sources[0].is_static or all(isinstance(source, SampledFlux) for source in sources):
-        return SampledFlickerFlux(waveforms, sources, window_us)
     return FlickerFlux(waveforms, sources, window_us)
 
 
@@ -132,7 +69,7 @@ class FlickerFlux:
         first = self.sources[0]
         self.sensor, self.view = getattr(first, "sensor", None), getattr(first, "view", None)
         self.is_static = False
-        self._still = _StillFlux(self.sources) if first.is_static else None
+        self._still = Kept(self.sources) if first.is_static else None
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Those of the scene's motion, µs."""
@@ -229,19 +166,19 @@ class FlickerFlux:
             dr.eval(totals)
         return totals[0], totals[1]
 
-
-class SampledFlickerFlux(FlickerFlux):
-    """The same where the sources take many windows at once, or nothing moves; implements `SampledFlux`."""
+    def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
+        """See `FluxSource.sample_blocks`."""
+        return blocks_of_run(self.instants_us, window_us, begin_us, end_us)
 
     def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        """See `SampledFlux.instants_us`."""
+        """Whole µs, from `begin_us` to `end_us` with both, that follow motion and light; multiples of `CELL_US` too."""
         inner = np.rint(self.sample_times_us(begin_us - 1, end_us + 1)).astype(np.int64)
         cells = np.arange(begin_us // CELL_US, end_us // CELL_US + 1, dtype=np.int64) * CELL_US
         every = np.unique(np.concatenate([np.rint([begin_us, end_us]).astype(np.int64), inner, cells]))
         return every[(every >= begin_us) & (every <= end_us)]
 
     def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
-        """See `SampledFlux.flux_of_blocks`.
+        """See `FluxSource.flux_of_blocks`.
 
         Windows in which light and image both change are cut into pieces, which are windows of their own.
         """
@@ -256,7 +193,6 @@ class SampledFlickerFlux(FlickerFlux):
         mine, *others = itertools.tee(map(self._cut, blocks), 1 + len(self.sources))
         streams = []
         for source, cut in zip(self.sources, others, strict=True):
-            assert isinstance(source, SampledFlux)
             streams.append(source.flux_of_blocks(pixels, (pieces for pieces, _ in cut)))
         samples = zip(*streams, strict=True)
         for pieces, counts in mine:
@@ -343,47 +279,6 @@ class SampledFlickerFlux(FlickerFlux):
         for source, weight in zip(self._auditable, self._weights(low, high), strict=True):
             np.add.at(total, pair, share * weight * source.reference_flux(pixel[pair], low, high, quality, events))
         return total
-
-
-class _StillFlux:
-    """Flux of sources that stand still: every pixel is rendered once, when it is first asked for."""
-
-    def __init__(self, sources: Sequence[FluxSource]) -> None:
-        self._sources = sources
-        self._known = np.zeros(0, dtype=np.bool_)
-        self._kept: list[list[Any]] = [[] for _ in sources]  # both halves of each source, by mosaic index
-
-    def halves(self, pixel: NDArray[np.uint32]) -> list[tuple[Any, Any]]:
-        """Both halves of each source, Dr.Jit Float [n] each."""
-        import drjit as dr
-
-        types = jit()
-        self._reach(int(pixel.max()) + 1 if pixel.size else 0)
-        fresh = np.unique(pixel[~self._known[pixel]])
-        if fresh.size:
-            where = types.UInt32(fresh)
-            for source, kept in zip(self._sources, self._kept, strict=True):
-                for whole, half in zip(kept, source.mean_flux(fresh, 0.0, 1.0), strict=True):
-                    dr.scatter(whole, half, where)
-                dr.eval(kept)
-            self._known[fresh] = True
-        index = types.UInt32(pixel)
-        found = [(dr.gather(types.Float, a, index), dr.gather(types.Float, b, index)) for a, b in self._kept]
-        dr.eval(found)
-        return found
-
-    def _reach(self, size: int) -> None:
-        """Make room for mosaic indices below `size`."""
-        import drjit as dr
-
-        missing = size - self._known.size
-        if missing <= 0:
-            return
-        types = jit()
-        self._known = np.concatenate([self._known, np.zeros(missing, dtype=np.bool_)])
-        for kept in self._kept:
-            room = [types.Float(np.zeros(missing, np.float32)) for _ in range(2)]
-            kept[:] = [dr.concat([*old]) for old in zip(kept, room, strict=True)] if kept else room
 
 
 def _weighted(halves: Sequence[tuple[Any, Any]], weights: Sequence[ArrayLike]) -> tuple[Any, Any]:

@@ -1,6 +1,7 @@
 """The hinge of the house: who can say how many photo-electrons per second each pixel gets.
 
-The renderer and the video path implement `FluxSource`; nothing downstream knows which one it is.
+Every source answers the calls of `FluxSource`: renders, flickering light, crosstalk, video, what stands still. Nothing
+downstream knows which one it is.
 """
 
 from __future__ import annotations
@@ -15,8 +16,27 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.mosaic.schedule import Block
 
 
+@dataclass(frozen=True)
+class Sample:
+    """Φ of event pixels in one window.
+
+    Parameters
+    ----------
+    half_a, half_b : Dr.Jit Float [n], e⁻/s, as `FluxSource.mean_flux` gives them.
+    error : [n], e⁻/s, the standard error that the source expects; None where it has none.
+    """
+
+    half_a: Any
+    half_b: Any
+    error: NDArray[np.float32] | None = None
+
+
 class FluxSource(Protocol):
-    """Noise-free photo-electron rate Φ of physical pixels, each through its own filter."""
+    """Noise-free photo-electron rate Φ of physical pixels, each through its own filter.
+
+    Frames ask for the mean over each row's exposure (`mean_flux`), piece by piece where the source has slices. Event
+    pixels are asked for in many windows at once (`flux_of_blocks`).
+    """
 
     #: True where Φ does not depend on time: one call then serves all times.
     is_static: bool
@@ -24,16 +44,15 @@ class FluxSource(Protocol):
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly between `begin_us` and `end_us` at which the source moves to its next state.
 
-        Between two edges the source may be frozen where it cannot do better (object poses); callers
-        must not let one `mean_flux` call straddle an edge.
+        Between two edges the source may be frozen where it cannot do better (object poses); no `mean_flux` call may
+        straddle an edge. Empty for a source that takes intervals of any length.
         """
         ...
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly between `begin_us` and `end_us` close enough together to follow the motion.
 
-        For sensors without a tick of their own: the image moves about half a pixel, or less, from
-        one time to the next. Empty for a static source.
+        The image moves about half a pixel, or less, from one time to the next. Empty for a static source.
         """
         ...
 
@@ -54,34 +73,17 @@ class FluxSource(Protocol):
         """
         ...
 
+    def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
+        """Windows in which the pixels of a sensor without a tick of its own are sampled.
 
-@dataclass(frozen=True)
-class Sample:
-    """Φ of event pixels in one window.
+        The first one begins when the run begins. The last one ends when the run ends, or at the source's next instant:
+        a source whose instants do not depend on begin and end of a run gives the same at a time whatever else it is
+        asked for.
 
-    Parameters
-    ----------
-    half_a, half_b : Dr.Jit Float [n], e⁻/s, as `FluxSource.mean_flux` gives them.
-    error : [n], e⁻/s, the standard error that the source expects; None where it has none.
-    """
-
-    half_a: Any
-    half_b: Any
-    error: NDArray[np.float32] | None = None
-
-
-@runtime_checkable
-class SampledFlux(FluxSource, Protocol):
-    """A source that is better asked for many windows at once than for one after another.
-
-    It has no slice edges: `mean_flux` takes intervals of any length. What it gives at a time is the same whatever else
-    it is asked for: `instants_us` and the cuts between blocks do not depend on begin and end of a run.
-    """
-
-    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        """Whole µs, from `begin_us` to `end_us` with both, at which sensors without a tick of their own are sampled.
-
-        Multiples of `schedule.CELL_US` are among them.
+        Parameters
+        ----------
+        window_us : length of a window.
+        begin_us, end_us : of the run.
         """
         ...
 
@@ -97,7 +99,7 @@ class SampledFlux(FluxSource, Protocol):
 
 
 @runtime_checkable
-class AuditableFlux(SampledFlux, Protocol):
+class AuditableFlux(FluxSource, Protocol):
     """A source whose values can be found again by other random numbers."""
 
     @property

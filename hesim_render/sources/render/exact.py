@@ -16,6 +16,7 @@ from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.timeline import Timeline
 from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
 from hesim_render.sources.scene import Scene
+from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral.spectrum import Spectrum
 
 #: Largest motion of an object within a slice, pixels.
@@ -56,7 +57,7 @@ def require_finite(half_a: Any, half_b: Any, scene: Scene, layout: Layout, pixel
         )
 
 
-class RenderedFlux:
+class RenderedFlux(WindowByWindow):
     """Φ = V(x) · ∫ L(x, t, λ) R(λ) dλ in e⁻/s, by path tracing; implements `FluxSource`.
 
     R = A_pix·FF·G·τ_lens·C_f·η·λ/(hc) with G = π/(1 + 4N²(1 + |m|)²) is the pixel's own response; L is

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.flicker import light_parts
+from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.render.frozen import FrozenPixels, Work
 from hesim_render.sources.render.scene.mitsuba_version import using_variant
 from hesim_render.sources.scene import Scene

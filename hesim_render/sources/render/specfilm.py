@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.flicker import light_parts
+from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.render.camera import MITSUBA_AXES, View, place_camera
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.light_level import in_absolute_light

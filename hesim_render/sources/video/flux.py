@@ -22,6 +22,7 @@ from hesim_render.sources.video.linear import Lineariser
 from hesim_render.sources.video.motion import MotionVideo
 from hesim_render.sources.video.options import WHITE_LUX, VideoOptions
 from hesim_render.sources.video.picture import Reader
+from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral import spectrum as spectra
 
 Source = str | Path | NDArray
@@ -47,12 +48,13 @@ def open_video(source: Source, options: VideoOptions) -> Reader:
     return FileVideo(path, options.fps)
 
 
-class VideoFlux:
+class VideoFlux(WindowByWindow):
     """Φ = V(x) · Σ_c M[filter, c] · (linear R, G, B averaged over the pixel's footprint); implements `FluxSource`.
 
     M comes from `hesim_render.sources.video.inversion`; V is 1 unless `lens_shading` is asked for. Negative rates, of
     colours outside the sensor's gamut, count as 0. Each picture is turned into the rates of all mosaic pixels once,
-    when it is first needed; two or three such maps are kept.
+    when it is first needed. Maps of a few pictures are kept, as many as an event window reaches back: pictures are read
+    in order, each once.
 
     Parameters
     ----------
@@ -116,6 +118,8 @@ class VideoFlux:
         self._lineariser, self._resample = Lineariser(shape, self.tags), Resampler(self.mapping)
         self._maps: dict[int, Any] = {}
         self._edges = self.clock.hold_us[1:-1] if self._is_held else self.clock.middle_us
+        window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 0
+        self._reach = 1 + int(window_us // np.diff(self._edges).min()) if self._edges.size > 1 else 1
         dr.eval(self._weights, self._filter)
 
     def _filter_matrix(self) -> NDArray[np.float64]:
@@ -231,7 +235,7 @@ class VideoFlux:
         if found is not None:
             return found
         types = jit()
-        for old in [kept for kept in self._maps if not number - 1 <= kept <= number + 1]:
+        for old in [kept for kept in self._maps if abs(kept - number) > self._reach]:
             del self._maps[old]
         planes = self._resample(self._lineariser.linear(self._reader.read(number)))
         if len(planes) == 1:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.protocol import Sample, SampledFlux
+from hesim_render.sources.protocol import FluxSource, Sample
 
 #: Units noted in a run, about.
 _UNITS = 200_000
@@ -68,7 +68,7 @@ class _Open:
 
 
 class NotedFlux:
-    """Another source; implements `SampledFlux`.
+    """Another source; implements `FluxSource`.
 
     Units are drawn evenly over the pixels of each stretch or frame, independently of each other and of all values.
 
@@ -87,7 +87,7 @@ class NotedFlux:
 
     def __init__(
         self,
-        source: SampledFlux,
+        source: FluxSource,
         event_pixel: NDArray[np.uint32],
         samples: int,
         frames: int,
@@ -111,8 +111,8 @@ class NotedFlux:
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         return self.source.sample_times_us(begin_us, end_us)
 
-    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        return self.source.instants_us(begin_us, end_us)
+    def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
+        return self.source.sample_blocks(window_us, begin_us, end_us)
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
         """See `FluxSource.mean_flux`."""
@@ -132,7 +132,7 @@ class NotedFlux:
         return halves
 
     def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
-        """See `SampledFlux.flux_of_blocks`."""
+        """See `FluxSource.flux_of_blocks`."""
         among = np.flatnonzero(np.isin(pixel, self._event_pixel))
         times: deque[tuple[float, float]] = deque()
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
-from hesim_render.mosaic.schedule import Block
+from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
@@ -43,7 +43,7 @@ _ALWAYS_US = (-np.inf, np.inf)
 
 
 class ChangeDrivenFlux:
-    """Φ in e⁻/s where only what changes is rendered; implements `SampledFlux`.
+    """Φ in e⁻/s where only what changes is rendered; implements `FluxSource`.
 
     The same integral as `RenderedFlux`, with two differences: objects and camera move through every window,
     ray by ray, and each pixel gets as many rays as its own noise asks for. Random numbers are a pure function of
@@ -121,9 +121,9 @@ class ChangeDrivenFlux:
         """None: motion is followed ray by ray."""
         return np.empty(0)
 
-    def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        """See `SampledFlux.instants_us`."""
-        return self._clock.instants_us(begin_us, end_us)
+    def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
+        """See `FluxSource.sample_blocks`."""
+        return blocks_of_run(self._clock.instants_us, window_us, begin_us, end_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval that follow all motion, the camera's too, µs."""
@@ -326,7 +326,7 @@ class ChangeDrivenFlux:
     # ---- many windows -----------------------------------------------------------------------------
 
     def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
-        """See `SampledFlux.flux_of_blocks`."""
+        """See `FluxSource.flux_of_blocks`."""
         types = jit()
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
         work: _Blocks | None = None

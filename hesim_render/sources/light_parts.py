@@ -1,0 +1,71 @@
+"""A scene once for each different waveform of its lights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hesim_render.sources.scene import Scene
+from hesim_render.specs.light import LightSpec
+from hesim_render.specs.waveform import WaveformSpec
+from hesim_render.spectral.waveform import Waveform
+
+
+def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
+    """The scene once for each different waveform, lit only by the lights that have it; first those without any.
+
+    Scenes without flicker are one part, themselves. A level of a Mitsuba scene is of all its light: it has to be a
+    factor already (`in_absolute_light`).
+    """
+    own = scene.spec.mitsuba
+    if own is not None:
+        assert not own.has_level
+        return _mitsuba_parts(scene)
+    lights = scene.spec.lights
+    flickering = [_flicker(light.waveform) for light in lights]
+    if not any(flickering):
+        return [(None, scene)]
+    parts: list[tuple[Waveform | None, Scene]] = []
+    for kind in _different(flickering):
+        lit = [
+            light.model_copy(update={"waveform": None}) if has == kind else light.unlit()
+            for light, has in zip(lights, flickering, strict=True)
+        ]
+        if any(light.is_lit for light in lit):
+            parts.append((kind.load() if kind else None, _with_lights(scene, lit)))
+    return parts or [(None, scene)]
+
+
+def _flicker(spec: WaveformSpec | None) -> WaveformSpec | None:
+    """A waveform that changes, or None."""
+    return None if spec is None or spec.load().is_constant else spec
+
+
+def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None]:
+    """Each once, None first."""
+    found: list[WaveformSpec | None] = [None] if None in kinds else []
+    for kind in kinds:
+        if kind not in found:
+            found.append(kind)
+    return found
+
+
+def _with_lights(scene: Scene, lights: list[LightSpec]) -> Scene:
+    return Scene(scene.spec.model_copy(update={"light": tuple(lights)}))
+
+
+def _mitsuba_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
+    own = scene.spec.mitsuba
+    assert own is not None
+    named = {name: spec for name, spec in own.waveforms.items() if _flicker(spec) is not None}
+    if not named:
+        return [(None, scene)]
+    parts: list[tuple[Waveform | None, Scene]] = []
+    for kind in _different([None, *named.values()]):
+        lights = (
+            {"unlit": (*own.unlit, *named)}
+            if kind is None
+            else {"lit": tuple(name for name, spec in named.items() if spec == kind and own.may_shine(name))}
+        )
+        part = own.model_copy(update={"waveforms": {}, **lights})
+        parts.append((kind.load() if kind else None, Scene(scene.spec.model_copy(update={"mitsuba": part}))))
+    return parts

@@ -1,0 +1,90 @@
+"""A source that stands still: rendered once, it serves all times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.sources.protocol import FluxSource
+from hesim_render.sources.window_by_window import WindowByWindow
+
+
+class Kept:
+    """Flux of sources that stand still: every pixel is rendered once, when it is first asked for.
+
+    Parameters
+    ----------
+    sources : asked for the same pixels.
+    """
+
+    def __init__(self, sources: Sequence[FluxSource]) -> None:
+        self._sources = sources
+        self._known = np.zeros(0, dtype=np.bool_)
+        self._kept: list[list[Any]] = [[] for _ in sources]  # both halves of each source, by mosaic index
+
+    def halves(self, pixel: NDArray[np.uint32]) -> list[tuple[Any, Any]]:
+        """Both halves of each source, Dr.Jit Float [n] each."""
+        import drjit as dr
+
+        types = jit()
+        self._reach(int(pixel.max()) + 1 if pixel.size else 0)
+        fresh = np.unique(pixel[~self._known[pixel]])
+        if fresh.size:
+            where = types.UInt32(fresh)
+            for source, kept in zip(self._sources, self._kept, strict=True):
+                for whole, half in zip(kept, source.mean_flux(fresh, 0.0, 1.0), strict=True):
+                    dr.scatter(whole, half, where)
+                dr.eval(kept)
+            self._known[fresh] = True
+        index = types.UInt32(pixel)
+        found = [(dr.gather(types.Float, a, index), dr.gather(types.Float, b, index)) for a, b in self._kept]
+        dr.eval(found)
+        return found
+
+    def _reach(self, size: int) -> None:
+        """Make room for mosaic indices below `size`."""
+        import drjit as dr
+
+        missing = size - self._known.size
+        if missing <= 0:
+            return
+        types = jit()
+        self._known = np.concatenate([self._known, np.zeros(missing, dtype=np.bool_)])
+        for kept in self._kept:
+            room = [types.Float(np.zeros(missing, np.float32)) for _ in range(2)]
+            kept[:] = [dr.concat([*old]) for old in zip(kept, room, strict=True)] if kept else room
+
+
+class StillFlux(WindowByWindow):
+    """A static source, whose pixels are rendered together when one of them is first asked for.
+
+    Parameters
+    ----------
+    source : does not change.
+    pixel : [n], mosaic indices of all pixels that will be asked for.
+    """
+
+    is_static = True
+
+    def __init__(self, source: FluxSource, pixel: NDArray[np.uint32]) -> None:
+        self._kept, self._pixel = Kept([source]), np.unique(pixel)
+        self._is_rendered = False
+
+    def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """None."""
+        return np.empty(0)
+
+    def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """None."""
+        return np.empty(0)
+
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+        """See `FluxSource.mean_flux`."""
+        if not self._is_rendered:
+            self._kept.halves(self._pixel)
+            self._is_rendered = True
+        return self._kept.halves(pixel)[0]
