@@ -9,6 +9,7 @@ from videos import moving_bar, srgb_to_linear
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.video import VideoFlux, VideoOptions
+from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock
 from hesim_render.sources.video.geometry import mapping
 from hesim_render.sources.video.picture import Timing
@@ -312,10 +313,13 @@ def test_the_same_seed_gives_the_same_recording():
 
 
 def test_memory_stays_the_same_however_long_the_video():
-    """20 000 pictures mapped on one: what is kept of them is at most three flux maps."""
+    """20 000 pictures mapped on one: at most three flux maps are kept, and one more for each picture in a window."""
     one = np.full((1, 32, 32), 200, np.uint8)
     pictures = np.lib.stride_tricks.as_strided(one, (20_000, 32, 32), (0, 32, 1))
-    sensor = mono(32, 32, aps__frame_rate_hz=10)
+    longer = VideoFlux(pictures, mono(32, 32, evs__window_us=1000), VideoOptions.of(fps=3200, transfer="srgb"))
+    longer.mean_flux(np.zeros(1, np.uint32), 0, 1e6)
+    assert len(longer._maps) <= 3 + 3
+    sensor = mono(32, 32, aps__frame_rate_hz=10, evs__window_us=300)
     flux = VideoFlux(pictures, sensor, VideoOptions.of(fps=3200, transfer="srgb"))
     pixels = np.arange(1024, dtype=np.uint32)
     kept = set()
@@ -427,3 +431,17 @@ def test_a_long_file_runs_in_bounded_memory(tmp_path):
             gc.collect()
             sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6)
     assert k > 9900 and max(sizes) - sizes[4] < 20
+
+
+@pytest.mark.parametrize("interpolation", ["none", "linear"])
+@pytest.mark.parametrize("window_us", [300, 1000, 2500])
+def test_frames_and_events_together_read_each_picture_once_and_in_order(window_us, interpolation, monkeypatch):
+    """A video file is decoded from its begin to its end: going back in it costs a second of decoding."""
+    pictures = np.random.default_rng(1).integers(0, 255, (120, 8, 8), np.uint8)
+    read = []
+    monkeypatch.setattr(
+        ArrayVideo, "read", lambda self, number, real=ArrayVideo.read: read.append(number) or real(self, number)
+    )
+    sensor = mono(8, 8, evs__tick_us=2500, evs__window_us=window_us, aps__exposure_us=20_000, aps__frame_rate_hz=40)
+    hr.simulate_video(pictures, sensor, fps=2000, transfer="srgb", interpolation=interpolation)
+    assert read == sorted(set(read)) and len(read) > 60

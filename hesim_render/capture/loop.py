@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from itertools import pairwise
+from itertools import pairwise, tee
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
-from hesim_render.sources.protocol import FluxSource
+from hesim_render.sources.protocol import FluxSource, Sample
 from hesim_render.sources.still import StillFlux
 
 if TYPE_CHECKING:
@@ -188,13 +187,18 @@ class Capture:
         """Frames and blocks of events (`EVENT_DTYPE`), each kind in order of time."""
         pieces = self._pieces()
         piece = next(pieces, None)
-        for t_us, events in self._event_samples():
-            while piece is not None and piece.end_us <= t_us:
+        blocks, asked = tee(self.event_blocks())
+        samples = self._event_source.flux_of_blocks(self._evs_pixel, asked)
+        for begin_us, end_us in _wanted(blocks):
+            # what ends before a window comes first: a source may forget what lies behind
+            while piece is not None and piece.end_us <= begin_us:
                 yield from self._expose(piece)
                 piece = next(pieces, None)
-            yield events
+            yield self._compare(next(samples), int(end_us))
             if progress is not None:
-                progress(min(t_us, self._duration_us), self._duration_us, "simulated µs")
+                progress(min(end_us, self._duration_us), self._duration_us, "simulated µs")
+        if self._stage is not None:
+            self._pixel_state = self._pixel_state or self._stage.state()
         while piece is not None:
             yield from self._expose(piece)
             if progress is not None and self._stage is None:
@@ -213,21 +217,15 @@ class Capture:
             writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
 
-    def _event_samples(self) -> Iterator[tuple[int, NDArray]]:
-        """Time of each sample and the events up to it."""
-        if self._stage is None:
-            return
-        times: deque[int] = deque()
-        blocks = _noting(self.event_blocks(), times)
-        for sample in self._event_source.flux_of_blocks(self._evs_pixel, blocks):
-            t_us = times.popleft()
-            if t_us > self._duration_us:
-                self._pixel_state = self._stage.state()
-            else:
-                self._event_flux.add(sample.half_a, sample.half_b)
-            events = self._step(sample.half_a, sample.half_b, t_us)
-            yield t_us, events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
-        self._pixel_state = self._pixel_state or self._stage.state()
+    def _compare(self, sample: Sample, t_us: int) -> NDArray:
+        """Events of the run up to a sample."""
+        assert self._stage is not None
+        if t_us > self._duration_us:
+            self._pixel_state = self._stage.state()
+        else:
+            self._event_flux.add(sample.half_a, sample.half_b)
+        events = self._step(sample.half_a, sample.half_b, t_us)
+        return events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
 
     def _pieces(self) -> Iterator[_Piece]:
         """Exposures, cut where the source moves to its next state, in order of their ends."""
@@ -320,8 +318,8 @@ class Capture:
         )
 
 
-def _noting(blocks: Iterable[Block], times: deque[int]) -> Iterator[Block]:
-    """The same blocks; the ends of their wanted windows are appended to `times`."""
+def _wanted(blocks: Iterable[Block]) -> Iterator[tuple[float, float]]:
+    """Begin and end of every wanted window, in order of time."""
     for block in blocks:
-        times.extend(np.rint(block.end_us[block.wanted]).astype(np.int64).tolist())
-        yield block
+        ends = np.rint(block.end_us[block.wanted])
+        yield from zip(block.begin_us[block.wanted].tolist(), ends.tolist(), strict=True)

@@ -119,7 +119,10 @@ class VideoFlux(WindowByWindow):
         self._maps: dict[int, Any] = {}
         self._edges = self.clock.hold_us[1:-1] if self._is_held else self.clock.middle_us
         window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 0
-        self._reach = 1 + int(window_us // np.diff(self._edges).min()) if self._edges.size > 1 else 1
+        # so many pictures behind the latest one are asked for again: by frames, after an event window
+        self._reach = 1 if self._is_held else 2
+        if self._edges.size > 1:
+            self._reach += int(window_us // np.diff(self._edges).min())
         dr.eval(self._weights, self._filter)
 
     def _filter_matrix(self) -> NDArray[np.float64]:
