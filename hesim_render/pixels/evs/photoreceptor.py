@@ -59,7 +59,8 @@ class Photoreceptor:
         self._node_rate: Any = None  # a at the last node
 
     def _rate_at(self, log: Any) -> Any:
-        return _rate(self._noise.corner_hz(log) if self._spec.follows_light else self._spec.cutoff_hz)
+        spec = self._spec
+        return _rate(self._noise.on_device.corner_hz(log, spec) if spec.follows_light else spec.cutoff_hz)
 
     def _node_at(self, t_us: float) -> int:
         return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding

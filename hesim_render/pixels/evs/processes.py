@@ -41,7 +41,7 @@ class BandNoise:
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         cutoff_hz = noise.spec.photoreceptor_cutoff_hz
         assert cutoff_hz is not None
-        self._key, self._seed = noise.device_key, seed
+        self._key, self._seed = noise.on_device.key, seed
         self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz)
         h = math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / NODES_PER_CUTOFF_PERIOD  # a·period
         self._transition = math.exp(-h) * np.array([[1.0 + h, h], [-h, 1.0 - h]])
@@ -102,7 +102,7 @@ class LeakProcess:
     STATE = ("_due_us", "_count")
 
     def __init__(self, noise: EvsNoise, seed: int) -> None:
-        self._key = noise.device_key
+        self._key = noise.on_device.key
         self._stream_key = stream_key(seed, Stream.EVS_LEAK)
         self._mean_us = US_PER_S / noise.leak_rate_hz
         self._due_us: Any = None  # Float64

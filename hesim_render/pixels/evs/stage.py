@@ -18,6 +18,7 @@ from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.arrays import restore, saved, take
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
@@ -148,7 +149,7 @@ class _PreviousSample:
         level, variance = self._noise.log_level(electrons)
         if self._photoreceptor:
             level = self._photoreceptor.follow(level, t_us)
-        word = philox(self._seed, Stream.EVS, self._noise.device_key, t_us).next_uint32x4()
+        word = philox(self._seed, Stream.EVS, self._noise.on_device.key, t_us).next_uint32x4()
         deviate = normal_pair(word[0], word[1])[0]
         if not self._independent:
             level = dr.fma(dr.sqrt(variance), deviate, level)
@@ -158,10 +159,10 @@ class _PreviousSample:
         change = level - self._level
         if self._independent:
             change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
-        theta_on, theta_off = self._noise.device_thresholds
+        theta_on, theta_off = self._noise.on_device.thresholds
         on, off = change > theta_on, change < -theta_off
         if self._noise.leak_rate_hz > 0:
-            probability = -math.expm1(-self._noise.leak_rate_hz * (t_us - self._t_us) * S_PER_US)
+            probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
             on |= ~off & (word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1)))
         polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
         dr.schedule(polarity)
@@ -254,7 +255,7 @@ class _LastEvent:
         if self._refractory:
             return self._crossings_with_dead_time(self._refractory, level, begin_us, end_us)
         types = jit()
-        theta_on, theta_off = self._noise.device_thresholds
+        theta_on, theta_off = self._noise.on_device.thresholds
         distance = level - self._reference
         theta = dr.select(distance > 0, theta_on, theta_off)
         crossed = dr.mulsign(dr.floor(dr.abs(distance) / theta), distance)  # thresholds, with the direction
@@ -285,8 +286,9 @@ class _LastEvent:
         """The same where pixels rest after each event, a leak event too; both kinds come out together."""
         due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
         due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
+        levels, thresholds = (self._level, level), self._noise.on_device.thresholds
         self._reference, t_us, pixel, polarity = refractory.crossings(
-            self._reference, (self._level, level), self._noise.device_thresholds, begin_us, end_us, (due_us, due_pixel)
+            self._reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel)
         )
         self._level = level
         return _events(self._stamp(t_us), pixel, polarity, self._cols)
