@@ -144,6 +144,22 @@ def test_formulas_draw_nothing_and_need_no_device(kind):
     assert used == {"hesim_render.core.device_types", "hesim_render.core.namespace"}
 
 
+#: What keeps the state of any object, and loop states that hold values of several kinds.
+OF_ANY_KIND = {"saved", "restore", "_off_device", "_on_device"}
+
+
+@pytest.mark.parametrize("name", [n for n in EVERY if package_of(n).split(".")[0] in ("pixels", "sensor")] + [
+    n for n in EVERY if package_of(n).startswith(("sources.render.transport", "sources.render.sampling"))
+])  # fmt: skip
+def test_values_on_the_device_have_named_types(name):
+    """`Any` tells a reader nothing; `core/device_types.py` has a name for each kind of array."""
+    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef) and node.name not in OF_ANY_KIND:
+            given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            for annotation in [node.returns, *(argument.annotation for argument in given)]:
+                assert not (isinstance(annotation, ast.Name) and annotation.id == "Any"), f"{node.name}, {node.lineno}"
+
+
 def test_names_of_before_give_the_modules_of_today():
     from hesim_render._moved import MOVED
 

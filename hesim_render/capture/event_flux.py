@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
+
+from hesim_render.core.device_types import Float
 
 
 class EventFlux:
@@ -15,7 +15,7 @@ class EventFlux:
         self._half_a, self._half_b = np.zeros(count), np.zeros(count)
         self.samples = 0
 
-    def add(self, half_a: Any, half_b: Any) -> None:
+    def add(self, half_a: Float, half_b: Float) -> None:
         self._half_a += np.array(half_a)
         self._half_b += np.array(half_b)
         self.samples += 1
@@ -35,10 +35,10 @@ class Window:
     def __init__(self, ends_us: NDArray[np.int64]) -> None:
         self.ends_us = ends_us
         self.next = 0
-        self.half_a: Any = 0.0
-        self.half_b: Any = 0.0
+        self.half_a: Float = 0.0
+        self.half_b: Float = 0.0
 
-    def add(self, half_a: Any, half_b: Any, share: float) -> None:
+    def add(self, half_a: Float, half_b: Float, share: float) -> None:
         self.half_a, self.half_b = self.half_a + half_a * share, self.half_b + half_b * share
 
     def reset(self) -> None:

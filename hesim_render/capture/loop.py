@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.capture.event_flux import EventFlux, Window
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
@@ -64,8 +65,8 @@ class _OpenFrame:
     """A frame being exposed: both halves of its electrons, one entry per frame pixel."""
 
     exposure: Exposure
-    half_a: Any
-    half_b: Any
+    half_a: Float
+    half_b: Float
 
 
 class Capture:
@@ -262,7 +263,7 @@ class Capture:
         self._expose(frame, -np.inf, np.inf)
         return self._read_out(frame)
 
-    def _static_flux(self, source: FluxSource, *lists: NDArray[np.uint32]) -> Iterator[tuple[Any, Any]]:
+    def _static_flux(self, source: FluxSource, *lists: NDArray[np.uint32]) -> Iterator[Halves]:
         """Both halves of the flux of each list of pixels, from one render of all of them."""
         wanted = np.zeros(self._sensor.rows * self._sensor.cols, dtype=bool)
         for pixels in lists:
@@ -318,7 +319,7 @@ class Capture:
             yield self._step(window.half_a, window.half_b, t_us)
             window.reset()
 
-    def _step(self, half_a: Any, half_b: Any, t_us: int) -> NDArray:
+    def _step(self, half_a: Float, half_b: Float, t_us: int) -> NDArray:
         assert self._stage is not None
         seconds = self._stage.noise.spec.window_us * S_PER_US
         noise = self._sensor.evs
@@ -372,7 +373,7 @@ def _noting(blocks: Iterable[Block], times: deque[int]) -> Iterator[Block]:
         yield block
 
 
-def _take(array: Any, index: NDArray) -> Any:
+def _take(array: Float, index: NDArray) -> Float:
     import drjit as dr
 
     types = jit()

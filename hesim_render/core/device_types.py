@@ -38,3 +38,21 @@ Generator: TypeAlias = Any
 DeviceTypes: TypeAlias = Any
 #: A number, a NumPy array, or an array on the device: what a formula takes.
 Values: TypeAlias = Any
+
+#: Both halves of an estimate, of independent rays: their mean is the value, their difference tells its error.
+Halves: TypeAlias = tuple[Float, Float]
+#: What a symbolic loop or branch carries from step to step.
+LoopState: TypeAlias = tuple[Any, ...]
+
+# Of Mitsuba, which only `sources.render` imports:
+
+#: The module of the variant in use.
+MitsubaModule: TypeAlias = Any
+#: A scene, shape, emitter, surface, integrator, or their parameters.
+MitsubaObject: TypeAlias = Any
+#: ``Ray3f``: origin, direction, ``maxt``, wavelengths; one ray a lane.
+Ray: TypeAlias = Any
+#: ``Interaction3f``, ``SurfaceInteraction3f`` or ``PreliminaryIntersection3f``: where rays have met something.
+Interaction: TypeAlias = Any
+#: One Float for each of the four wavelengths of a ray.
+Bands: TypeAlias = Any

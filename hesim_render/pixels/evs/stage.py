@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
 from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
@@ -28,7 +29,7 @@ from hesim_render.pixels.normal import normal_pair
 
 
 class _Mode(Protocol):
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]: ...
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]: ...
 
 
 def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
@@ -97,7 +98,7 @@ class EvsStage:
         """Events lost in the read-out so far."""
         return self._readout.dropped if self._readout is not None else 0
 
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         """Take one sample.
 
         Parameters
@@ -139,10 +140,10 @@ class _PreviousSample:
         self._independent = noise.spec.noise_mode == "independent"
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
         self._t_us = 0
-        self._level: Any = None  # ln x, with the noise of its instant where that is shared
-        self._variance: Any = None  # s²/x² of the last sample, where noise is independent
+        self._level: Float = None  # ln x, with the noise of its instant where that is shared
+        self._variance: Float = None  # s²/x² of the last sample, where noise is independent
 
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
 
         types = jit()
@@ -171,7 +172,7 @@ class _PreviousSample:
         pixel = np.flatnonzero(found != 0)  # in row-major order
         return _events(t_us, pixel, found[pixel], self._cols)
 
-    def _keep(self, level: Any, variance: Any, t_us: int) -> None:
+    def _keep(self, level: Float, variance: Float, t_us: int) -> None:
         import drjit as dr
 
         self._t_us, self._level = t_us, level
@@ -193,10 +194,10 @@ class _LastEvent:
         self._noise = noise
         self._cols = noise.layout.evs_shape[1]
         self._t_us = 0
-        self._log: Any = None  # ln x of the last sample
-        self._spread: Any = None  # s/x of the last sample
-        self._level: Any = None  # ln x with its noise, at the end of the last segment
-        self._reference: Any = None  # level of the last event
+        self._log: Float = None  # ln x of the last sample
+        self._spread: Float = None  # s/x of the last sample
+        self._level: Float = None  # ln x with its noise, at the end of the last segment
+        self._reference: Float = None  # level of the last event
         self._band_noise = None if noise.is_noiseless else BandNoise(noise, seed)
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
         self._refractory: Refractory | None = None
@@ -204,7 +205,7 @@ class _LastEvent:
             self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
         self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
 
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
 
         parts: list[NDArray[np.void]] = []
@@ -248,7 +249,7 @@ class _LastEvent:
         """Whole µs after the last sample: the end of the one an event falls in, so that steps do not overlap."""
         return np.maximum(np.ceil(t_us), self._t_us + 1)
 
-    def _crossings(self, level: Any, begin_us: float, end_us: float) -> NDArray[np.void]:
+    def _crossings(self, level: Float, begin_us: float, end_us: float) -> NDArray[np.void]:
         """Events of one segment in which the level goes on a straight line to `level`, unsorted."""
         import drjit as dr
 
@@ -281,7 +282,7 @@ class _LastEvent:
         return _events(self._stamp(t_us), np.repeat(found, repeats), np.sign(theta_signed), self._cols)
 
     def _crossings_with_dead_time(
-        self, refractory: Refractory, level: Any, begin_us: float, end_us: float
+        self, refractory: Refractory, level: Float, begin_us: float, end_us: float
     ) -> NDArray[np.void]:
         """The same where pixels rest after each event, a leak event too; both kinds come out together."""
         due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
