@@ -129,8 +129,10 @@ def test_level_and_noise_of_event_pixels(library, law):
     corner = evs.corner_hz(k, log, EVENT_BETA[0] * 800.0, 5.0, 3000.0, xp)
     same(library, corner, np.clip(3000.0 * dn_per_electron * ELECTRONS / 800.0, 5.0, 3000.0), atol=2e-3)
     # with full anticorrelation s² touches 0 where the two noises are equal, and stays a variance
-    opposed = evs.Coefficients.of((0.8, 3.0, 0.1, 0.05, -1.0), 1.0, "linear", NUMPY)
-    assert np.all(on_host(evs.voltage_variance(opposed, library.take(np.linspace(0.49, 0.51, 999)), xp)) >= 0)
+    opposed = evs.Coefficients.of((0.8, 3.0, 0.3, 0.11, -1.0), 1.0, "linear", NUMPY)
+    touching = 0.11 / 0.3 + np.linspace(-1e-7, 1e-7, 999)
+    assert np.min((opposed.light * touching + opposed.cross) * touching + opposed.dark) < 0  # by rounding
+    assert np.all(on_host(evs.voltage_variance(opposed, library.take(touching), xp)) >= 0)
 
 
 def test_event_probabilities_against_the_normal_law():
