@@ -120,7 +120,10 @@ def test_importing_the_package_loads_nothing_heavy():
 
 
 def test_calibration_runs_where_drjit_and_mitsuba_cannot_be_imported():
-    """It must run on captures of real sensors, on any machine."""
+    """It must run on captures of real sensors, on any machine: of the pixels it reads the formulas, not the samplers.
+
+    `test_formulas.py` calls these formulas and fits captures in such a process.
+    """
     code = (
         "import sys; sys.modules['drjit'] = sys.modules['mitsuba'] = None; "
         "import hesim_render.calibrate.aps.calibration, hesim_render.calibrate.evs.calibration"
@@ -130,6 +133,31 @@ def test_calibration_runs_where_drjit_and_mitsuba_cannot_be_imported():
         if package_of(name).split(".")[0] == "calibrate":
             used = {package_of(other).split(".")[0] for other in modules_imported(name)}
             assert not used & {"sources", "capture", "sensor", "isp"}, name
+            pixels = {other for other in modules_imported(name) if package_of(other).split(".")[0] == "pixels"}
+            assert all(other.endswith(".formulas") for other in pixels), name
+
+
+@pytest.mark.parametrize("kind", ("aps", "evs"))
+def test_formulas_draw_nothing_and_need_no_device(kind):
+    """They stand on the array namespace alone: no generator, no backend, no sampler."""
+    used = modules_imported(f"hesim_render.pixels.{kind}.formulas")
+    assert used == {"hesim_render.core.device_types", "hesim_render.core.namespace"}
+
+
+#: What keeps the state of any object, and loop states that hold values of several kinds.
+OF_ANY_KIND = {"saved", "restore", "_off_device", "_on_device"}
+
+
+@pytest.mark.parametrize("name", [n for n in EVERY if package_of(n).split(".")[0] in ("pixels", "sensor")] + [
+    n for n in EVERY if package_of(n).startswith(("sources.render.transport", "sources.render.sampling"))
+])  # fmt: skip
+def test_values_on_the_device_have_named_types(name):
+    """`Any` tells a reader nothing; `core/device_types.py` has a name for each kind of array."""
+    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef) and node.name not in OF_ANY_KIND:
+            given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+            for annotation in [node.returns, *(argument.annotation for argument in given)]:
+                assert not (isinstance(annotation, ast.Name) and annotation.id == "Any"), f"{node.name}, {node.lineno}"
 
 
 def test_names_of_before_give_the_modules_of_today():

@@ -1,12 +1,16 @@
 """What a block is rendered of, and what is filled in; numbers of rays."""
 
+import dataclasses
+import inspect
+import re
+
 import numpy as np
 import pytest
 
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Closer, Pilot, allocate
 from hesim_render.sources.render.change_driven.plan import changes, fill_in, longer
-from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
+from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
 
 
 def marks(flux, least=1.0):
@@ -103,3 +107,15 @@ def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():
     assert not rays_of(Pilot(flux, flux, 0.2 * flux, 0.1 * flux, flux))[1].any()
     # what is hidden for the most part is the sum of what is seen, not the whole less what is hidden
     assert not rays_of(Pilot(flux, flux, 0.1 * flux, 0.2 * flux, 3 * flux))[1].any()
+
+
+def test_every_tuning_constant_says_its_unit_its_origin_and_what_it_is_for():
+    text = inspect.getdoc(Tuning).partition("Parameters\n----------\n")[2]
+    entries = re.findall(r"^(\w[\w, ]*) : ((?:.*)(?:\n    .*)*)", text, re.MULTILINE)
+    told = {name: entry for names, entry in entries for name in names.split(", ")}
+    assert set(told) == {field.name for field in dataclasses.fields(Tuning)}
+    for name, entry in told.items():
+        assert re.match(r"[^.]+, [FHC]\. ", entry), name  # unit, origin
+        assert re.search("Without|Half as many|Larger", entry), name
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        TUNING.change = 1.0

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,11 @@ def test_dir_shows_the_public_names_and_no_others():
     assert [name for name in dir(hr) if not name.startswith("__")] == [n for n in hr.__all__ if n != "__version__"]
     child = "import hesim_render as hr; print(set(hr.__all__) <= set(dir(hr)))"  # before any was used
     assert subprocess.run([sys.executable, "-c", child], capture_output=True, text=True).stdout == "True\n"
+
+
+def test_the_package_says_that_it_is_typed():
+    """A type checker reads the annotations of an installed package only beside this file, empty by PEP 561."""
+    assert (Path(hr.__file__).parent / "py.typed").read_bytes() == b""
 
 
 def test_descriptions_are_short_and_say_what_is_what():

@@ -411,7 +411,7 @@ def test_what_a_calibration_cannot_be_used_for_is_one_clear_error(session, tmp_p
     text = calibration.read_text()
     for before, after, said in (
         ("  K:\n    value: ", "  K:\n    reason: none\n    value: null #", r"aps\.K: not identifiable"),
-        ("  K:\n", "  gain:\n", "it lacks 'K'"),
+        ("  K:\n", "  gain:\n", r"changed\.yaml:\d+: aps\.K: required key is missing"),
         ("bit_depth: 10", "bit_depth: 12", "of frames of 12 bits, the sensor has 10"),
     ):
         (tmp_path / "changed.yaml").write_text(text.replace(before, after))

@@ -51,6 +51,29 @@ def moments(law):
 LEVELS = (1.0, 5.0, 25.0, 500.0, 5000.0)
 
 
+@pytest.mark.parametrize(
+    ("term", "gone"), (("read", (0,)), ("shot", (1, 3, 4)), ("dark_current", (2, 5)), ("prnu", ()), ("dsnu", ()))
+)
+def test_a_term_takes_its_part_of_the_polynomial_along(term, gone):
+    beta = [4.0, 0.3, 20.0, 1e-5, 0.2, 50.0]
+    kept = [0.0 if k in gone else b for k, b in enumerate(beta)]
+    for given in (beta, None):
+        changes = {"aps.beta": [[given]]} if given else {"aps.dark_current_e_per_s": 300.0}
+        spec = read_sensor("reference-mono", {"geometry.rows": 8, "geometry.cols": 8, **changes})
+        noise = ApsNoise(spec.aps, Layout.full(spec), 1).without(term)
+        if given:
+            assert noise.to_polynomial() == [[kept]]
+            dark, light = (float(noise.variance_dn2(e, 20_000)) for e in (0.0, 1000.0))
+            signal, t = spec.aps.system_gain_dn_per_e * 1000.0, 0.02
+            assert dark == pytest.approx(kept[0] + kept[2] * t + kept[5] * t**2, rel=1e-12)
+            gain = kept[1] + kept[3] * signal + kept[4] * t
+            assert light - dark == pytest.approx(gain * signal, rel=1e-12)
+        else:
+            physical = [(0.2 * spec.aps.read_noise_e) ** 2, 0.2, 0.04 * 300.0, 0.0, 0.0, 0.0]
+            expected = [0.0 if k in gone else b for k, b in enumerate(physical)]
+            assert noise.to_polynomial()[0][0] == pytest.approx(expected, rel=1e-12)
+
+
 @pytest.mark.parametrize("law", ("poisson", "gaussian"))
 @pytest.mark.parametrize("gain", (0.2, 0.9))
 @pytest.mark.parametrize("electrons", (*LEVELS, 19_990.0, 40_000.0))

@@ -13,7 +13,7 @@ from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.sampling.sampler import sampler_class
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import moving_scene as moving
-from hesim_render.sources.render.transport.closed_form import meets_ball
+from hesim_render.sources.render.transport.intersections import meets_ball
 
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
 LAMP = {

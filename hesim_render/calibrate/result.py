@@ -18,7 +18,8 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.guard import read_text
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import check_place, output_errors, replacing
-from hesim_render.specs.calibration import SCHEMA_VERSION, file_digest, read_calibration, read_maps
+from hesim_render.specs.calibration import file_digest, read_calibration, read_maps
+from hesim_render.specs.calibration_spec import SCHEMA_VERSION
 
 __all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
 
 #: Values looked at of each picture, and bins of a decade of the histogram from the first bin's end on.
 _VALUES, _BINS, _FIRST, _DECADES = 1 << 15, 50, 1e-5, 10
@@ -24,12 +24,12 @@ class ErrorMeter:
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS * _DECADES + 2, np.int64)
         self._square, self._values, self._pictures = 0.0, 0, 0
-        self._where: tuple[NDArray[np.int64], Any] | None = None
+        self._where: tuple[NDArray[np.int64], UInt32] | None = None
 
     def add(
         self,
-        half_a: Any,
-        half_b: Any,
+        half_a: Float,
+        half_b: Float,
         noise: Callable[[NDArray[np.float64], NDArray[np.int64]], NDArray[np.float64]],
     ) -> None:
         """One picture.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
+
+from hesim_render.core.device_types import Float
 
 
 class EventFlux:
@@ -15,7 +15,7 @@ class EventFlux:
         self._half_a, self._half_b = np.zeros(count), np.zeros(count)
         self.samples = 0
 
-    def add(self, half_a: Any, half_b: Any) -> None:
+    def add(self, half_a: Float, half_b: Float) -> None:
         self._half_a += np.array(half_a)
         self._half_b += np.array(half_b)
         self.samples += 1

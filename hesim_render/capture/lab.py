@@ -18,6 +18,7 @@ from ruamel.yaml import YAML
 
 from hesim_render.capture.bench import Bench, set_up
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import OutputFolder, output_errors
@@ -183,13 +184,13 @@ class _Session:
             for k, name in enumerate(("n_on", "n_off")):
                 archive.add_pieces(name, (len(counts), *level.shape), counts[0][k].dtype, (pair[k] for pair in counts))
 
-    def _electrons(self, signal_dn: NDArray[np.float64]) -> Any:
+    def _electrons(self, signal_dn: NDArray[np.float64]) -> Float:
         """Electrons of one event window, flat on the device."""
         assert self.bench.evs is not None
         seconds = self.bench.evs.spec.window_us * S_PER_US
         return jit().Float((signal_dn / self.bench.event_dn_per_e_per_s * seconds).astype(np.float32).ravel())
 
-    def _counts(self, levels: Sequence[Any], trials: int, what: str) -> tuple[NDArray, NDArray]:
+    def _counts(self, levels: Sequence[Float], trials: int, what: str) -> tuple[NDArray, NDArray]:
         """ON and OFF events [y, x] of `trials` arrivals at the last level, the levels being shown in turn."""
         evs = self.bench.evs
         assert evs is not None and evs.spec.tick_us is not None

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.capture.event_flux import EventFlux
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
@@ -66,8 +67,8 @@ class _OpenFrame:
     """A frame being exposed: both halves of its electrons, one entry per frame pixel; None before the first piece."""
 
     exposure: Exposure
-    half_a: Any = None
-    half_b: Any = None
+    half_a: Float = None
+    half_b: Float = None
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,7 @@ class Capture:
             dr.scatter(total, dr.gather(types.Float, total, index) + half * seconds, index)
         dr.eval(frame.half_a, frame.half_b)
 
-    def _step(self, half_a: Any, half_b: Any, t_us: int) -> NDArray:
+    def _step(self, half_a: Float, half_b: Float, t_us: int) -> NDArray:
         assert self._stage is not None
         seconds = self._stage.noise.spec.window_us * S_PER_US
         noise = self._sensor.evs

@@ -14,7 +14,8 @@ from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
-from hesim_render.pixels.aps.model import ADC_VARIANCE_DN2, APS_TERMS, ApsNoise
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, dark_variance_dn2, light_gain_dn
+from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.recording.manifest import sensor_spec
 from hesim_render.specs.calibration import NoiseFile, as_written, read_calibration, read_maps
 from hesim_render.specs.sensor import SensorSpec
@@ -24,7 +25,7 @@ Map = float | NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FrameNoise:
-    """Noise of frames over the region read out, in the calibrated form (`hesim_render.pixels.aps.model`).
+    """Noise of frames over the region read out, in the calibrated form (`hesim_render.pixels.aps.formulas`).
 
     Parameters
     ----------
@@ -181,10 +182,9 @@ class FrameNoise:
 
     def variance(self, position: tuple[int, int]) -> tuple[float, float, float]:
         """a, b, c of the variance a + b I + c I² at a position of the tile, DN²; rounding to whole DN included."""
-        b0, b1, b2, b3, b4, b5 = self.beta[position]
-        t = self.exposure_us * S_PER_US
-        constant = b0 + b2 * t + b5 * t * t + self.residual_dn2 + ADC_VARIANCE_DN2
-        return float(constant), float(b1 + b4 * t), float(b3 + self.response_std**2)
+        beta, t = self.beta[position], self.exposure_us * S_PER_US
+        constant = dark_variance_dn2(beta, t) + self.residual_dn2 + ADC_VARIANCE_DN2
+        return float(constant), float(light_gain_dn(beta, 0.0, t)), float(beta[3] + self.response_std**2)
 
     def corrected(self, signal_dn: NDArray[np.float32]) -> NDArray[np.float32]:
         """A frame without what its sensor's maps say, DN.

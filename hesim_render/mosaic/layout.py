@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError
+from hesim_render.core.plain import PlainState
 from hesim_render.specs.sensor import Role, SensorSpec
 
 
 @dataclass(frozen=True, repr=False)
-class Layout:
+class Layout(PlainState):
     """Read-out region of a sensor; all arrays are [row, col] with (0, 0) at the top left.
 
     Parameters

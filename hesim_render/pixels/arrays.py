@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import DeviceArray, Float, UInt32
 
 
-def to_device(value: Any) -> Any:
+def to_device(value: float | NDArray) -> Float:
     """A number as an opaque Dr.Jit Float (a new one compiles nothing), an array as a flat Float."""
     import drjit as dr
 
@@ -19,7 +21,7 @@ def to_device(value: Any) -> Any:
     return dr.opaque(types.Float, float(value))
 
 
-def take(value: Any, index: Any) -> Any:
+def take(value: DeviceArray, index: UInt32) -> DeviceArray:
     """Entries `index` of a device array; a number stays a number."""
     import drjit as dr
 

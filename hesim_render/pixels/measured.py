@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs.calibration import as_written, read_calibration, read_maps
-from hesim_render.specs.geometry import Region
+from hesim_render.specs.calibration import MeasuredMaps
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
 _EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "bad_pixels": ("b", 1.0)}
@@ -26,7 +25,7 @@ def require_region(layout: Layout) -> None:
         Where they do not; the message names the region they are of.
     """
     if layout.spec.noise is not None:
-        _offset(layout, read_calibration(layout.spec.noise.path))
+        _offset(layout, layout.spec.noise.measured)
 
 
 def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
@@ -67,60 +66,56 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
     return scaled[y : y + height, x : x + width].astype(np.float32)
 
 
-def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[dict[str, NDArray], tuple[int, int]] | None:
+def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping[str, NDArray], tuple[int, int]] | None:
     """Maps of a section, whole, and where the region read out begins in them (row, col of the mosaic)."""
-    noise = layout.spec.noise
-    if noise is None:
+    if layout.spec.noise is None:
         return None
-    data = read_calibration(noise.path)
-    if section not in data:
+    measured = layout.spec.noise.measured
+    if section not in measured.sections:
         return None
-    offset = _offset(layout, data)
-    maps = read_maps(noise.path, section, data, names)
-    height, width = _region(layout, data)[2:]
+    offset = _offset(layout, measured)
+    found = measured.sections[section]
+    maps = {name: found[name] for name in names if name in found}
+    height, width = _region(layout, measured)[2:]
     grid = layout.spec.evs_grid
     if section == "evs" and grid is not None:
         tile_rows, tile_cols = layout.tile_shape
         height, width = height // tile_rows * grid.rows_per_tile, width // tile_cols * grid.cols_per_tile
     for name in names:
         if name not in maps and not name.startswith("threshold_"):  # thresholds are known only where steps were shown
-            raise SpecError(f"its map file of {section!r} holds no {name!r}", file=noise.path)
+            raise SpecError(f"its map file of {section!r} holds no {name!r}", file=measured.file)
     for name, values in maps.items():
         wanted = (height,) if values.ndim == 1 else (height, width)
         if values.shape != wanted:
             raise SpecError(
                 f"map {name} is of size {values.shape}, the region captured of {wanted}; state roi in capture.yaml "
                 "where only a part of the sensor was captured",
-                file=noise.path,
+                file=measured.file,
             )
         kind, largest = _EXPECTED.get(name, _THRESHOLD)
         if values.dtype.kind not in kind:
-            raise SpecError(f"map {name} holds {values.dtype.name}", file=noise.path)
+            raise SpecError(f"map {name} holds {values.dtype.name}", file=measured.file)
         if not np.all(np.abs(values) <= largest):
-            raise SpecError(f"map {name} holds values that are not finite, or beyond {largest:g}", file=noise.path)
+            raise SpecError(f"map {name} holds values that are not finite, or beyond {largest:g}", file=measured.file)
     return maps, offset
 
 
-def _region(layout: Layout, data: dict[str, Any]) -> tuple[int, int, int, int]:
+def _region(layout: Layout, measured: MeasuredMaps) -> tuple[int, int, int, int]:
     """Row, column, rows and columns that were captured."""
-    roi = data["capture"].get("roi")
+    roi = measured.roi
     if roi is None:
         return 0, 0, layout.spec.geometry.rows, layout.spec.geometry.cols
-    assert layout.spec.noise is not None
-    with as_written(layout.spec.noise.path):
-        region = Region.model_validate(roi)
-    return region.y, region.x, region.height_px, region.width_px
+    return roi.y, roi.x, roi.height_px, roi.width_px
 
 
-def _offset(layout: Layout, data: dict[str, Any]) -> tuple[int, int]:
-    assert layout.spec.noise is not None
-    row, col, rows, cols = _region(layout, data)
+def _offset(layout: Layout, measured: MeasuredMaps) -> tuple[int, int]:
+    row, col, rows, cols = _region(layout, measured)
     inside = row <= layout.row0 and layout.row0 + layout.rows <= row + rows
     inside &= col <= layout.col0 and layout.col0 + layout.cols <= col + cols
     if not inside:
         region = f"{cols}x{rows}+{col}+{row}"
         raise SpecError(
             f"was measured on {region} of the sensor; read out that region or a part of it (--roi {region})",
-            file=layout.spec.noise.path,
+            file=measured.file,
         )
     return layout.row0 - row, layout.col0 - col

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
 
 
-def normal_pair(radius_word: Any, angle_word: Any) -> tuple[Any, Any]:
+def normal_pair(radius_word: UInt32, angle_word: UInt32) -> tuple[Float, Float]:
     """Two independent N(0, 1) deviates of two UInt32 words (Box & Muller 1958).
 
     Dr.Jit's own normal generator uses 23 bits for the radius, which makes its tail coarse beyond

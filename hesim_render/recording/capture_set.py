@@ -12,13 +12,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
 from hesim_render.core.npz import member_header, read_arrays, stream_member
-from hesim_render.specs.files import Strict, load_yaml, validate
-from hesim_render.specs.geometry import Region
+from hesim_render.specs.capture import CaptureSpec
+from hesim_render.specs.files import load_yaml, validate
 from hesim_render.specs.sensor import SensorSpec, read_sensor
 
 #: Largest clean signal of an event pixel: a thousand times the largest DN of 16 bits, for bright lights.
@@ -28,43 +27,6 @@ SIGNAL_RANGE = (
 )
 #: Largest number that a capture may state, and in which doubles are still whole.
 _MOST = 2.0**53
-
-
-class SignalReference(Strict):
-    """Unit of the EVS signal: I = k · Φ · t_ref, in DN of this exposure seen through `filter`."""
-
-    k: PositiveFloat
-    t_ref_us: PositiveFloat
-    filter: str = "own"
-
-
-class CaptureSpec(Strict):
-    """``capture.yaml``."""
-
-    bit_depth: int = Field(ge=1, le=16)
-    tile_rows: PositiveInt
-    tile_cols: PositiveInt
-    notes: str = ""
-    sensor: str | None = None
-    roi: Region | None = Field(None, description="the whole sensor where it is left out")
-    theta_hardware_v: PositiveFloat | None = None
-    signal_reference: SignalReference | None = None
-    illuminant: str | None = Field(None, description="light on a neutral scene: tells filters that frames lack")
-    contrast_of: Literal["signal", "voltage"] = "signal"
-    evs_tile_rows: PositiveInt | None = Field(
-        None, description="event pixels of a tile, where they are not one a pixel"
-    )
-    evs_tile_cols: PositiveInt | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> CaptureSpec:
-        if (self.evs_tile_rows is None) != (self.evs_tile_cols is None):
-            raise ValueError("evs_tile_rows and evs_tile_cols are given together or not at all")
-        return self
-
-    @property
-    def full_scale_dn(self) -> int:
-        return 2**self.bit_depth - 1
 
 
 @dataclass(frozen=True)

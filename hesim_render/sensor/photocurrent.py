@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
@@ -66,14 +67,14 @@ def band_weights(
 
 
 def photocurrent(
-    spectral_radiance: Any,
+    spectral_radiance: NDArray | Float,
     wavelength_nm: ArrayLike,
     sensor: Sensor,
     exposure_us: float,
     *,
     filter: str | None = None,
     quadrature: Quadrature = "trapezoid",
-) -> Any:
+) -> NDArray[np.float64] | Float:
     """I_c of Eq. 1: mean electrons that a radiance gives within an exposure.
 
     I_c = Δt · V · ∫ P_c(λ) C_f(λ) L(λ) dλ with P_c = A_pix·FF·G·τ_lens·η·λ/(h c) (see
@@ -135,7 +136,7 @@ def _numpy(radiance: NDArray, weights: NDArray, sensor: Sensor, filter: str | No
     return electrons * sensor.relative_illumination
 
 
-def _drjit(radiance: Any, weights: NDArray, sensor: Sensor, filter: str | None) -> Any:
+def _drjit(radiance: Float, weights: NDArray, sensor: Sensor, filter: str | None) -> Float:
     import drjit as dr
 
     types = jit()

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.plain import PlainState
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.model import ApsNoise
 from hesim_render.pixels.evs.model import EvsNoise
@@ -23,8 +24,10 @@ from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 
 
 @dataclass(frozen=True, repr=False)
-class Sensor:
+class Sensor(PlainState):
     """One sensor file over one read-out region.
+
+    It holds all that its file and a calibration's maps told: a pickle or a copy of it needs none of these files.
 
     Parameters
     ----------

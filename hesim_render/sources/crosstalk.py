@@ -9,12 +9,12 @@ falls into its own exposure, also with a rolling shutter.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Halves, UInt32
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 
@@ -56,7 +56,7 @@ class CrosstalkFlux:
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         return self._flux.sample_times_us(begin_us, end_us)
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """See `FluxSource.mean_flux`; both halves are mixed alike."""
         types = jit()
         own = np.asarray(pixel, dtype=np.int64).ravel()
@@ -100,7 +100,7 @@ class CrosstalkFlux:
             ]
         )
 
-    def _mix(self, halves: tuple[Any, Any], index: list[Any]) -> tuple[Any, Any]:
+    def _mix(self, halves: Halves, index: list[UInt32]) -> Halves:
         import drjit as dr
 
         types = jit()

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
 from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample
@@ -100,7 +100,7 @@ class FlickerFlux:
         shape = np.broadcast_shapes(np.shape(begin_us), np.shape(end_us))
         return [np.ones(shape) if w is None else w.mean(begin_us, end_us) for w in self._waveforms]
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval; see `FluxSource.mean_flux`."""
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
         begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
@@ -131,7 +131,7 @@ class FlickerFlux:
 
     def _piece(
         self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, weights: list[NDArray[np.float64]]
-    ) -> tuple[Any, Any]:
+    ) -> Halves:
         """Every source's mean times that of its waveform; sources that are dark meanwhile are not asked."""
         lit = [number for number, weight in enumerate(weights) if np.any(weight)]
         halves = [self.sources[number].mean_flux(pixel, begin, end) for number in lit]
@@ -140,9 +140,7 @@ class FlickerFlux:
             return types.Float(np.zeros(pixel.size, np.float32)), types.Float(np.zeros(pixel.size, np.float32))
         return _weighted(halves, [weights[number] for number in lit])
 
-    def _pieces(
-        self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]
-    ) -> tuple[Any, Any]:
+    def _pieces(self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]) -> Halves:
         """The same piece by piece; a pixel takes part in those that meet its interval."""
         import drjit as dr
 
@@ -281,7 +279,7 @@ class FlickerFlux:
         return total
 
 
-def _weighted(halves: Sequence[tuple[Any, Any]], weights: Sequence[ArrayLike]) -> tuple[Any, Any]:
+def _weighted(halves: Sequence[Halves], weights: Sequence[ArrayLike]) -> Halves:
     """Σ weight · half, of both halves; weights are one number or one for each pixel."""
     import drjit as dr
 

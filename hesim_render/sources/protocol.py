@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.device_types import Float, Halves
 from hesim_render.mosaic.schedule import Block
 
 
@@ -26,8 +27,8 @@ class Sample:
     error : [n], e⁻/s, the standard error that the source expects; None where it has none.
     """
 
-    half_a: Any
-    half_b: Any
+    half_a: Float
+    half_b: Float
     error: NDArray[np.float32] | None = None
 
 
@@ -56,7 +57,7 @@ class FluxSource(Protocol):
         """
         ...
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval, e⁻/s.
 
         Parameters

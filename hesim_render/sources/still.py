@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Halves
 from hesim_render.sources.protocol import FluxSource
 from hesim_render.sources.window_by_window import WindowByWindow
 
@@ -24,9 +24,9 @@ class Kept:
     def __init__(self, sources: Sequence[FluxSource]) -> None:
         self._sources = sources
         self._known = np.zeros(0, dtype=np.bool_)
-        self._kept: list[list[Any]] = [[] for _ in sources]  # both halves of each source, by mosaic index
+        self._kept: list[list[Float]] = [[] for _ in sources]  # both halves of each source, by mosaic index
 
-    def halves(self, pixel: NDArray[np.uint32]) -> list[tuple[Any, Any]]:
+    def halves(self, pixel: NDArray[np.uint32]) -> list[Halves]:
         """Both halves of each source, Dr.Jit Float [n] each."""
         import drjit as dr
 
@@ -82,7 +82,7 @@ class StillFlux(WindowByWindow):
         """None."""
         return np.empty(0)
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """See `FluxSource.mean_flux`."""
         if not self._is_rendered:
             self._kept.halves(self._pixel)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.device_types import Float, Halves
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import Sample
 
@@ -26,7 +26,7 @@ class WindowByWindow(ABC):
         """See `FluxSource.sample_times_us`."""
 
     @abstractmethod
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """See `FluxSource.mean_flux`."""
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
@@ -42,8 +42,8 @@ class WindowByWindow(ABC):
         for block in blocks:
             for begin, end in zip(block.begin_us[block.wanted], block.end_us[block.wanted], strict=True):
                 bounds = [begin, *self.slice_edges_us(begin, end), end]
-                total_a: Any = 0.0
-                total_b: Any = 0.0
+                total_a: Float = 0.0
+                total_b: Float = 0.0
                 for low, high in pairwise(bounds):
                     half_a, half_b = self.mean_flux(pixel, low, high)
                     share = (high - low) / (end - begin) if end > begin else 1.0

@@ -6,45 +6,53 @@ import contextlib
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import inside, reading, reason
 from hesim_render.core.npz import read_arrays
 from hesim_render.core.units import S_PER_US
+from hesim_render.specs.calibration_spec import SECTIONS, CalibrationSpec
 from hesim_render.specs.files import Strict
+from hesim_render.specs.geometry import Region
+from hesim_render.specs.problems import spec_error
 from hesim_render.specs.yamlfile import read_yaml
-
-SCHEMA_VERSION = 1
-_SECTIONS = ("aps", "evs")
 
 
 def read_calibration(file: str | Path) -> dict[str, Any]:
-    """A ``calibration.yaml`` as plain dictionaries, lists and numbers.
+    """A ``calibration.yaml`` as plain dictionaries, lists and numbers, checked by `CalibrationSpec`.
 
     Raises
     ------
     SpecError
-        If it cannot be read, is of another schema, or lacks what every calibration has.
+        If it cannot be read, is of another schema, or is not as 'calibrate' writes it; with lines and keys.
     """
     path = Path(file)
     data = read_yaml(path, with_lines=False)
-    if data.get("schema_version") != SCHEMA_VERSION:
-        raise SpecError(f"expected {SCHEMA_VERSION}, a calibration of this version", file=path, key="schema_version")
-    if not isinstance(data.get("capture"), dict):
-        raise SpecError("expected a mapping, what 'calibrate' says of the captures", file=path, key="capture")
-    for section in _SECTIONS:
-        part = data.get(section, {"maps": {"file": ""}})
-        maps = part.get("maps") if isinstance(part, dict) else None
-        if not isinstance(maps, dict) or not isinstance(maps.get("file"), str):
-            raise SpecError("expected a mapping with the maps' file", file=path, key=f"{section}.maps")
-        if not isinstance(maps.get("sha256", ""), str):
-            raise SpecError("expected a SHA-256 in hexadecimal digits", file=path, key=f"{section}.maps.sha256")
+    try:
+        CalibrationSpec.model_validate(data)
+    except ValidationError as error:
+        raise spec_error(error, CalibrationSpec, read_yaml(path), path) from None
     return data
+
+
+#: Maps that a sensor takes from each section; thresholds are known only where contrast steps were captured.
+SENSOR_MAPS = {
+    "aps": ("n_row", "n_blc", "n_dp"),
+    "evs": ("bad_pixels", "threshold_on_relative", "threshold_off_relative"),
+}
 
 
 @contextlib.contextmanager
@@ -99,39 +107,89 @@ def read_maps(
     data = read_calibration(path) if data is None else data
     if section not in data:
         raise SpecError(f"holds no section {section!r}; run 'calibrate {section}'", file=path)
-    maps, digest = map_file(path, data, section), data[section]["maps"].get("sha256")
-    if digest is not None and digest != file_digest(maps):
-        raise SpecError(f"is not the one that {path.name} was written with; run 'calibrate {section}' again", file=maps)
-    return read_arrays(maps, only=names, kinds="bifu")
+    return _maps_and_digest(path, data, section, names)[0]
+
+
+def _maps_and_digest(
+    file: Path, data: Mapping[str, Any], section: str, names: Iterable[str] | None
+) -> tuple[dict[str, NDArray], str]:
+    """Maps of a section that is there, and the SHA-256 of their file, which must be the one stated."""
+    maps = map_file(file, data, section)
+    digest = file_digest(maps)
+    if data[section]["maps"].get("sha256", digest) != digest:
+        raise SpecError(f"is not the one that {file.name} was written with; run 'calibrate {section}' again", file=maps)
+    return read_arrays(maps, only=names, kinds="bifu"), digest
+
+
+@dataclass(frozen=True)
+class MeasuredMaps:
+    """What a sensor keeps of its calibration: no file is needed afterwards.
+
+    Attributes
+    ----------
+    sha256 : of the calibration and its maps; two of one hash are equal.
+    file : for errors.
+    roi : region that was captured, None for the whole sensor.
+    sections : arrays of ``aps`` and ``evs``, as far as they were calibrated, by name.
+    """
+
+    sha256: str
+    file: Path = field(compare=False)
+    roi: Region | None = field(compare=False)
+    sections: Mapping[str, Mapping[str, NDArray]] = field(compare=False, repr=False)
 
 
 class NoiseFile(Strict):
-    """The calibration a sensor file points at. A dump holds the SHA-256 of it and its maps, not its place."""
+    """The calibration a sensor file points at, and its maps, read once.
+
+    A dump holds the SHA-256 of the calibration and its maps, not its place.
+    """
 
     file: str
     sha256: str | None = Field(None, description="of the calibration and its maps; they are refused if they differ")
     folder: Path = Field(Path(), exclude=True)
+    _measured: MeasuredMaps | None = PrivateAttr(None)
 
     @model_validator(mode="before")
     @classmethod
     def _shorthand(cls, data: Any) -> Any:
         return {"file": data} if isinstance(data, str) else data
 
+    @property
+    def measured(self) -> MeasuredMaps:
+        """The maps that a simulation takes from the calibration; the first call reads them.
+
+        Raises
+        ------
+        SpecError
+            If they cannot be read, or are not those that the calibration or `sha256` names.
+        """
+        if self._measured is None:
+            self.keep_maps(self.read())
+        assert self._measured is not None
+        return self._measured
+
+    def keep_maps(self, data: Mapping[str, Any]) -> None:
+        """Read the maps of the calibration `data`, and keep them; raises as `measured`."""
+        digest = hashlib.sha256(bytes.fromhex(file_digest(self.path)))
+        sections = {}
+        for section in SECTIONS:
+            if section in data:
+                sections[section], own = _maps_and_digest(self.path, data, section, SENSOR_MAPS[section])
+                digest.update(bytes.fromhex(own))
+        if self.sha256 not in (None, digest.hexdigest()):
+            raise SpecError("it, or a map of it, is not the one this sensor was written with", file=self.path)
+        roi = data["capture"].get("roi")
+        region = None if roi is None else Region.model_validate(roi)
+        self._measured = MeasuredMaps(digest.hexdigest(), self.path, region, sections)
+
     @model_serializer(mode="wrap")
     def _with_hash(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {**handler(self), "sha256": self.sha256 or self.digest()}
+        return {**handler(self), "sha256": self.sha256 or self.measured.sha256}
 
     @property
     def path(self) -> Path:
         return self.folder / self.file
-
-    def digest(self) -> str:
-        data = read_calibration(self.path)
-        files = [self.path, *(map_file(self.path, data, section) for section in _SECTIONS if section in data)]
-        digest = hashlib.sha256()
-        for file in files:
-            digest.update(bytes.fromhex(file_digest(file)))
-        return digest.hexdigest()
 
     def read(self) -> dict[str, Any]:
         """The calibration.
@@ -142,27 +200,35 @@ class NoiseFile(Strict):
             If it cannot be read, or is not the one that `sha256` names.
         """
         data = read_calibration(self.path)
-        if not any(section in data for section in _SECTIONS):
+        if not any(section in data for section in SECTIONS):
             raise SpecError("holds neither a section 'aps' nor 'evs'", file=self.path)
-        if self.sha256 is not None and self.sha256 != self.digest():
-            raise SpecError("it, or a map of it, is not the one this sensor was written with", file=self.path)
+        if self.sha256 is not None:
+            self.keep_maps(data)
         return data
 
 
-def apply_calibration(sensor: dict[str, Any], noise: NoiseFile) -> None:
-    """Replace a sensor file's own noise by the calibrated one, in place; the file itself is valid.
+class NoisePart(Strict):
+    """What of a sensor file is read before the rest of it."""
+
+    noise: NoiseFile
+
+
+def apply_calibration(sensor: dict[str, Any], noise: NoiseFile) -> dict[str, Any]:
+    """Replace a sensor file's own noise by the calibrated one, in place, and return the calibration; the file is valid.
 
     Frames take K, the black level and the variance polynomial (0 where a term is not identified), and what
-    is known of read noise, dark current, DSNU, PRNU and full well; their fixed maps stay in the calibration's
-    map file. Events take the coefficients of each position, thresholds, mismatch, leak and signal reference.
+    is known of read noise, dark current, DSNU, PRNU and full well; their fixed maps are kept by
+    `NoiseFile`. Events take the coefficients of each position, thresholds, mismatch, leak and signal reference.
 
     Raises
     ------
     SpecError
         If the calibration cannot be read, does not fit the sensor, or lacks a parameter that a simulation needs.
     """
+    data = noise.read()
     with as_written(noise.path):
-        _apply(sensor, noise, noise.read())
+        _apply(sensor, noise, data)
+    return data
 
 
 def _apply(sensor: dict[str, Any], noise: NoiseFile, data: Mapping[str, Any]) -> None:

@@ -14,15 +14,14 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PositiveInt, field_validator, model_validator
 
 from hesim_render.core.errors import HesimWarning, SpecError
-from hesim_render.specs.calibration import NoiseFile, apply_calibration
+from hesim_render.specs.calibration import NoiseFile, NoisePart, apply_calibration
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor_checks import sensor_problems, unused
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.spectral.spectrum import Spectrum
+from hesim_render.spectral.spectrum import Spectrum, product
 
 Role = Literal["aps", "evs"]
-
 
 #: Smallest threshold where a change gives as many events as it has thresholds.
 _LEAST_THRESHOLD = 1e-4
@@ -227,10 +226,7 @@ class EvsSpec(Strict):
         None, ge=1e-3, le=1e12, description="events beyond are lost; default no limit"
     )
     readout_buffer_events: int | None = Field(
-        None,
-        ge=1,
-        le=10**12,
-        description="events that can wait for the read-out; default what it takes in tick_us, or in 1 ms",
+        None, ge=1, le=10**12, description="that can wait for the read-out; default what it takes in tick_us or 1 ms"
     )
 
     @model_validator(mode="after")
@@ -307,8 +303,6 @@ class SensorSpec(Strict):
 
     def filter_response(self, name: str) -> Spectrum:
         """τ_lens · C_f · η of a filter: electrons per photon that reaches the lens."""
-        from hesim_render.spectral.spectrum import product
-
         return product(self.filters[name].load(), self.quantum_efficiency.load(), self.lens.transmittance.load())
 
     @model_validator(mode="after")
@@ -333,16 +327,19 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     file = locate(name_or_path, "sensors")
     data, changes = load_yaml(file), dict(overrides or {})
     folder = Path.cwd() if "noise" in changes else file.parent
-    given = changes.pop("noise", data.get("noise"))
+    given, calibration = changes.pop("noise", data.get("noise")), None
     if given is not None or any(key.startswith("noise.") for key in changes):
         given = {"file": given} if isinstance(given, str) else given
         if not isinstance(given, Mapping) or not isinstance(given.get("file"), str):
             raise SpecError("expected the path of a calibration.yaml", file=file, key="noise")
         data.pop("noise", None)
         validate(SensorSpec, data, file, changes)
-        apply_calibration(data, NoiseFile(file=given["file"], sha256=given.get("sha256"), folder=folder))
+        noise = validate(NoisePart, {"noise": {**given, "folder": folder}}, file, {}).noise
+        calibration = apply_calibration(data, noise)
         data["noise"] = {**given, "folder": folder}
     spec = validate(SensorSpec, data, file, changes)
+    if spec.noise is not None and calibration is not None:
+        spec.noise.keep_maps(calibration)  # now: the sensor needs no file afterwards
     problems = [SpecError(text, file=file, line=line_of(data, key.split(".")), key=key) for key, text in unused(spec)]
     if problems and not changes:
         raise SpecError.together(problems)

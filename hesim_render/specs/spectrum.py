@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, SerializerFunctionWrapHandler, ValidationInfo, model_serializer, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
+)
 
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
@@ -41,6 +48,7 @@ class SpectrumSpec(Strict):
     fwhm_nm: float | None = Field(None, gt=0, description="full width at half maximum of that Gaussian")
     scale: float = Field(1.0, description="multiplies all values")
     folder: Path = Field(Path(), exclude=True)
+    _table: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(None)  # of `csv`, read once
 
     @model_validator(mode="before")
     @classmethod
@@ -112,7 +120,10 @@ class SpectrumSpec(Strict):
         if self.flat is not None:
             return spectra.constant(self.flat, *(self.band_nm or (300.0, 1100.0)))
         if self.csv is not None:
-            return spectra.read_csv(self.folder / self.csv, self.column)
+            if self._table is None:
+                found = spectra.read_csv(self.folder / self.csv, self.column)
+                self._table = tuple(found.wavelength_nm.tolist()), tuple(found.values.tolist())
+            return Spectrum(np.array(self._table[0]), np.array(self._table[1]))
         if self.illuminant is not None:
             return spectra.illuminant(self.illuminant)
         if self.colorchecker is not None:

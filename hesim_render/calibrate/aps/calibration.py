@@ -12,7 +12,7 @@ from scipy.ndimage import rank_filter
 
 from hesim_render.calibrate.aps.common_mode import row_noise, without_rows
 from hesim_render.calibrate.aps.composite import Composite, clear_of_clipping, compose, light_signal, saturation_dn
-from hesim_render.calibrate.aps.dark import ADC_VARIANCE_DN2, DarkModel, fit_dark
+from hesim_render.calibrate.aps.dark import DarkModel, fit_dark
 from hesim_render.calibrate.aps.fitted import ApsCalibration, Position
 from hesim_render.calibrate.aps.output import content, maps
 from hesim_render.calibrate.aps.photon_transfer import linearity, photon_transfer
@@ -20,6 +20,7 @@ from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_varianc
 from hesim_render.calibrate.moments import Moments, Progress, measure
 from hesim_render.calibrate.result import check_calibration, check_report, write_section
 from hesim_render.core.errors import SpecError
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet, FrameStack, read_captures
 
 _POOR_FIT_SIGMAS = 8.0

@@ -13,11 +13,10 @@ from scipy.stats import chi2 as chi2_law
 from scipy.stats import norm
 
 from hesim_render.calibrate.aps.common_mode import FrameDrift, Shared, frame_drift
-from hesim_render.calibrate.aps.dark import ADC_VARIANCE_DN2
 from hesim_render.calibrate.aps.fitted import ApsCalibration
 from hesim_render.calibrate.finding import ALARM, Finding
 from hesim_render.calibrate.moments import Moments
-from hesim_render.calibrate.polynomial import polynomial
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 
 #: Part of the temporal variance, and of a parameter's standard error, below which a drift does no harm.
 _LEAST_PART, _LEAST_ERRORS = 1e-3, 0.5

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from hesim_render.calibrate.aps.dark import ADC_VARIANCE_DN2, DarkModel
+from hesim_render.calibrate.aps.dark import DarkModel
 from hesim_render.calibrate.aps.variance import variance_map
 from hesim_render.calibrate.moments import Moments
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.specs.sensor import SensorSpec
 from hesim_render.spectral import spectrum as spectra
 

@@ -9,11 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.moments import Moments
 from hesim_render.core.errors import SpecError
-
-#: ADC error variance of a step of 1 DN.
-ADC_VARIANCE_DN2 = 1 / 12
-#: Below this temporal variance (ADC taken out) rounding hides the noise and biases the means.
-HIDDEN_VARIANCE_DN2 = 0.24
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2
 
 
 @dataclass(frozen=True)

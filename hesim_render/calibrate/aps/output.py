@@ -12,11 +12,11 @@ from scipy.special import ndtr
 from hesim_render.calibrate.aps.checks import check_frames
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.composite import signal_at_event_pixels
-from hesim_render.calibrate.aps.dark import ADC_VARIANCE_DN2
 from hesim_render.calibrate.aps.fitted import ApsCalibration, Position
 from hesim_render.calibrate.aps.variance import TERMS, VarianceFit, variance_map
 from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.moments import Moments
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet
 
 _FIGURE_PX = 320

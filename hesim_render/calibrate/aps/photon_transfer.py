@@ -12,7 +12,7 @@ from hesim_render.calibrate.aps.dark import DarkModel
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit
 from hesim_render.calibrate.estimate import estimated, not_identifiable
 from hesim_render.calibrate.moments import Moments
-from hesim_render.recording.capture_set import CaptureSpec
+from hesim_render.specs.capture import CaptureSpec
 
 _FLAT_SPREAD = 0.1
 

@@ -16,8 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from hesim_render.calibrate.aps.dark import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2
-from hesim_render.calibrate.polynomial import polynomial
+from hesim_render.pixels.aps.formulas import (
+    ADC_VARIANCE_DN2,
+    HIDDEN_VARIANCE_DN2,
+    fourth_cumulant_dn4,
+    polynomial,
+)
 
 TERMS = ("1", "I", "t", "I^2", "I*t", "t^2")
 #: The order in which terms go where the data cannot tell them apart.
@@ -215,7 +219,7 @@ def _p_value(bins: Pooled, chi2: float, dof: int) -> float:
 def _expected_chi2(bins: Pooled, beta: NDArray) -> float:
     """χ²/dof where light and dark current are counts of gain K = β1: s² scatters by κ₄/n more, κ₄ = K³ (I + D t)/K."""
     predicted = np.maximum(polynomial(beta, bins.signal_dn, bins.exposure_s), _FLOOR_DN2)
-    fourth = max(beta[1], 0.0) ** 2 * np.maximum(predicted - max(beta[0], 0.0), 0.0)
+    fourth = fourth_cumulant_dn4(max(beta[1], 0.0), np.maximum(predicted - max(beta[0], 0.0), 0.0))
     more = bins.weight(predicted + ADC_VARIANCE_DN2) * fourth / (bins.freedom + 1)
     return 1 + float(np.average(more, weights=bins.pixels))
 

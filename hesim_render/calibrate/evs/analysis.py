@@ -14,12 +14,13 @@ from hesim_render.calibrate.evs.defects import EventDefects, bad_event_pixels, b
 from hesim_render.calibrate.evs.dispersion import Dispersion, dispersion_in_time, static_mismatch
 from hesim_render.calibrate.evs.fitted import NO_FIT, EventFit, best_start, fit_events, with_mismatch_error
 from hesim_render.calibrate.evs.medians import Typical
-from hesim_render.calibrate.evs.model import Law
+from hesim_render.calibrate.evs.model import Law, coefficients, from_natural
 from hesim_render.calibrate.evs.starts import multi_start
 from hesim_render.calibrate.evs.steps import Steps, read_steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, fit_thresholds, why_not
 from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
+from hesim_render.pixels.evs.formulas import voltage
 from hesim_render.recording.capture_set import CaptureSet
 
 #: A difference of log-likelihood that decides between the shot laws; below it the paper's stands.
@@ -243,8 +244,8 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
         return steps.contrast
     if not (fit.identified("A") and fit.identified("B")):
         return None
-    a, b = fit.values[:2]
-    return np.log((a * steps.signal_dn * np.exp(steps.contrast) + b) / (a * steps.signal_dn + b))
+    k = coefficients(from_natural(fit.values))
+    return np.log(voltage(k, steps.signal_dn * np.exp(steps.contrast)) / voltage(k, steps.signal_dn))
 
 
 def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from hesim_render.calibrate.evs.cells import Cells, PixelCounts
-from hesim_render.calibrate.evs.model import Law, log_likelihood, log_probability
+from hesim_render.calibrate.evs.model import Law, coefficients, log_likelihood, log_probability, relative_variance
 
 _ROUNDS = 300
 #: A search whose ln L rises by less in so many rounds has come to where it will.
@@ -67,10 +67,10 @@ def _approach(cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequ
     v = -ndtri(p)
     u = v / np.sqrt(np.maximum(cells.relative**2 - (cells.spread * v) ** 2, 0.1))
     weight = cells.total * np.exp(-v * v) / p  # inverse variance of u, but for a factor
-    shot = cells.signal_dn if law == "linear" else np.sqrt(cells.signal_dn)
-    scale = np.exp(_REACH_OF_C)[:, None]  # [scale, 1], against [fit, scale, cell]
-    w, e = start[:, 2, None, None] * scale**2, start[:, 3, None, None] * scale
-    base = theta_v / np.sqrt(2 * np.maximum((1 + e * shot) ** 2 + w * shot**2, 1e-12))
+    many = np.repeat(start[:, None], _REACH_OF_C.size, axis=1)  # [fit, scale, 6], against cells
+    many[..., 2] *= np.exp(2 * _REACH_OF_C)
+    many[..., 3] *= np.exp(_REACH_OF_C)
+    base = theta_v / np.sqrt(2 * relative_variance(coefficients(many), cells.signal_dn, law))
     slope = base * cells.signal_dn
     aa, ab, bb = (np.sum(weight * x * y, axis=-1) for x, y in ((slope, slope), (slope, base), (base, base)))
     ay, by = np.sum(weight * slope * u, axis=-1), np.sum(weight * base * u, axis=-1)
@@ -80,7 +80,7 @@ def _approach(cells: Cells, start: NDArray, theta_v: float, law: Law, free: Sequ
     best = np.argmin(cost, axis=1)
     near, row = np.array(start), np.arange(len(start))
     near[:, 0], near[:, 1] = a[row, best], np.log(np.maximum(b[row, best], 1e-12))
-    near[:, 2], near[:, 3] = w[row, best, 0], e[row, best, 0]
+    near[:, 2:4] = many[row, best, 2:4]
     return np.where(np.isfinite(cost[row, best])[:, None], near, start)
 
 

@@ -10,34 +10,54 @@ what is not known: the mean of Q(u (r + m z)) over a normal z is exactly Q(r u /
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr
 
 from hesim_render.calibrate.evs.cells import Cells
+from hesim_render.core.namespace import NUMPY
+from hesim_render.pixels.evs.formulas import (
+    Coefficients,
+    ShotLaw,
+    exceedance,
+    over_thresholds,
+    shot_root,
+    static_threshold_over_noise,
+    voltage,
+    voltage_variance,
+)
 
-Law = Literal["linear", "sqrt"]
+Law = ShotLaw
 #: Order of the parameters of the fit, with C and D as w = C² (1 − D²) and e = C D: g = (1 + e y)² + w y² has neither
 #: the singularity of (C, D) at C = 0 nor, as C √(1 − D²) would, a slope that vanishes at |D| = 1 and traps a search.
 PARAMETERS = ("A", "ln B", "w", "e", "rho", "leak")
 _SMALLEST = 1e-300
+#: Least g, so that a search that runs far off meets no division by 0.
+_LEAST_VARIANCE = 1e-12
 _LARGEST_U = 1e6
 _HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
 
 
 def threshold_over_noise(parameters: NDArray, signal_dn: NDArray, theta_v: float, law: Law) -> tuple[NDArray, NDArray]:
     """u [..., bin] and ∂ ln u / ∂ (A, ln B, w, e) [..., bin, 4]; `parameters` [..., 6] as `PARAMETERS`."""
-    a, b, w, e = (parameters[..., k, None] for k in range(4))
-    b = np.exp(b)
-    shot = signal_dn if law == "linear" else np.sqrt(signal_dn)
-    x = a * signal_dn + b
-    g = np.maximum((1 + e * shot) ** 2 + w * shot**2, 1e-12)
+    k = coefficients(parameters)
+    shot, e = shot_root(signal_dn, law, NUMPY), parameters[..., 3, None]
+    x, g = voltage(k, signal_dn), relative_variance(k, signal_dn, law)
     # a search may run far off; beyond this, P is 0 in double precision all the same
-    u = np.minimum(theta_v * x / np.sqrt(2 * g), _LARGEST_U)
-    slopes = np.stack([signal_dn / x, b / x, -0.5 * shot**2 / g, -shot * (1 + e * shot) / g], axis=-1)
+    u = np.minimum(static_threshold_over_noise(theta_v, x, g, NUMPY), _LARGEST_U)
+    slopes = np.stack([signal_dn / x, k.base / x, -0.5 * shot**2 / g, -shot * (1 + e * shot) / g], axis=-1)
     return u, slopes
+
+
+def coefficients(parameters: NDArray) -> Coefficients:
+    """The pixel model's coefficients [..., 1] in the gauge β0 = β4 = 1: β1 = A, β2 = B, β3 = C, β5 = D."""
+    a, b, w, e = (parameters[..., k, None] for k in range(4))
+    return Coefficients(slope=a, base=np.exp(b), light=w + e * e, cross=2 * e, dark=1.0)
+
+
+def relative_variance(k: Coefficients, signal_dn: NDArray, law: Law) -> NDArray[np.float64]:
+    """g = s²/β4² at the signals [bin]."""
+    return np.maximum(voltage_variance(k, shot_root(signal_dn, law, NUMPY), NUMPY), _LEAST_VARIANCE)
 
 
 def natural(parameters: NDArray, covariance: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -69,13 +89,12 @@ def log_probability(parameters: NDArray, cells: Cells, theta_v: float, law: Law)
     u, slopes = threshold_over_noise(parameters, cells.signal_dn, theta_v, law)
     rho, leak = parameters[..., 4, None], parameters[..., 5, None]
     on = cells.polarity > 0
-    widened = np.sqrt(1 + (cells.spread * u) ** 2)
-    scale = cells.relative * u / widened
+    scale = over_thresholds(u, cells.relative, cells.spread, NUMPY)
     v = (1 - cells.polarity * rho) * scale
     logarithm = log_ndtr(-v)
     hazard = np.exp(-0.5 * v * v - _HALF_LOG_2PI - logarithm)
     jacobian = np.zeros((*v.shape, 6))
-    jacobian[..., :4] = (-hazard * v / widened**2)[..., None] * slopes
+    jacobian[..., :4] = (-hazard * v / (1 + (cells.spread * u) ** 2))[..., None] * slopes
     jacobian[..., 4] = hazard * cells.polarity * scale
     with np.errstate(divide="ignore"):
         both = np.where(on, np.logaddexp(logarithm, np.log(leak)), logarithm)
@@ -103,7 +122,7 @@ def both_probabilities(
 
 def mean_probability(u: NDArray, mismatch: NDArray | float) -> NDArray:
     """Mean of Q over the pixels' thresholds."""
-    return ndtr(-u / np.sqrt(1 + (mismatch * u) ** 2))
+    return exceedance(over_thresholds(u, 1.0, mismatch, NUMPY), 1.0)
 
 
 def probability_variance(u: NDArray, mismatch: NDArray | float, relative: NDArray | float = 1.0) -> NDArray:
@@ -112,7 +131,7 @@ def probability_variance(u: NDArray, mismatch: NDArray | float, relative: NDArra
     weights = weights / weights.sum()
     mean, square = np.zeros(u.shape), np.zeros(u.shape)
     for z, weight in zip(nodes, weights, strict=True):
-        p = ndtr(-u * (relative + mismatch * z))
+        p = exceedance(u * (relative + mismatch * z), 1.0)
         mean += weight * p
         square += weight * p * p
     return np.maximum(square - mean * mean, 0.0)

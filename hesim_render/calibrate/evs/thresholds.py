@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.special import ndtr
 
 from hesim_render.calibrate.estimate import Spread
 from hesim_render.calibrate.evs.cells import PixelThresholds
 from hesim_render.calibrate.evs.steps import GROUPS, Steps
+from hesim_render.pixels.evs.formulas import exceedance
 
 _ROUNDS = 100
 #: Thresholds of pixels, in standard deviations, over which a mean is taken; and their weights.
@@ -209,7 +209,7 @@ def _fit_curves(rates: list[NDArray], step: NDArray, n: float, start: NDArray | 
 def curve(values: NDArray, polarity: float, step: NDArray) -> NDArray[np.float64]:
     """P [step] of the pooled curve of one polarity (+1 ON, −1 OFF); `values` are (θ₊, θ₋, s, κ)."""
     theta = values[0] if polarity > 0 else values[1]
-    return ndtr(-(theta - polarity * step) / _widths(values, step))
+    return exceedance(theta - polarity * step, _widths(values, step))
 
 
 def _widths(values: NDArray, step: NDArray) -> NDArray[np.float64]:
@@ -250,7 +250,7 @@ def _totals(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Mean and variance in time of a pixel's events over all steps, for each of `thresholds`."""
     noise = np.sqrt(max(width**2 - max(m2, 0.0) * theta**2, 1e-4 * width**2))
-    p = ndtr(-(thresholds[:, None] - signed) / (noise * np.maximum(1 + slope * signed / theta, 0.2)))
+    p = exceedance(thresholds[:, None] - signed, noise * np.maximum(1 + slope * signed / theta, 0.2))
     return trials * p.sum(axis=1), trials * (p * (1 - p)).sum(axis=1)
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.polynomial import polynomial
 from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, span_of
 from hesim_render.calibrate.report.svg import COLOURS, Plot, number, picture, table
+from hesim_render.pixels.aps.formulas import polynomial
 
 
 def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from hesim_render.core.plain import PlainState
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
-from hesim_render.pixels.arrays import take
 from hesim_render.pixels.measured import frame_maps
 from hesim_render.specs.sensor import ApsSpec
 
@@ -23,7 +22,7 @@ _LEAST_SPREAD_REL = 1e-6
 
 
 @dataclass(frozen=True)
-class FixedPattern:
+class FixedPattern(PlainState):
     """Maps over one read-out region, each computed on first use; keyed by the full sensor's pixels.
 
     Parameters
@@ -96,19 +95,3 @@ class FixedPattern:
         lower, upper = special.gammaincinv(shape, special.ndtr(z)), special.gammainccinv(shape, special.ndtr(-z))
         rate = np.where(z < 0, lower, upper) / shape * spec.dark_current_now_e_per_s
         return np.interp(self._deviates(Stream.DARK_CURRENT), z, rate).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """What the formulas need of each pixel: floats, NumPy arrays or Dr.Jit arrays alike."""
-
-    response: Any  # 1 + PRNU
-    dark_e_per_s: Any
-    offset_dn: Any  # N_FP
-    beta: tuple[Any, ...] | None
-
-
-def gathered(pixels: Pixels, index: Any) -> Pixels:
-    """Entries `index` of the maps; numbers stay numbers."""
-    beta = None if pixels.beta is None else tuple(take(b, index) for b in pixels.beta)
-    return Pixels(take(pixels.response, index), take(pixels.dark_e_per_s, index), take(pixels.offset_dn, index), beta)

@@ -1,50 +1,35 @@
-"""Noise of frame pixels: electrons in, DN out; the formulas and the sampler in one place.
+"""Noise model of a sensor's frame pixels: its parameters over a region, mean and variance, and a call to sample it.
 
-Physical form, per pixel, I_e light electrons, D dark current in e⁻/s, t exposure in s, K gain in DN/e⁻::
-
-    N_e = min( Poisson( (1 + PRNU)·I_e + D·t ), full well ) + N(0, σ_r²)
-    DN  = clip( round( K·N_e + N_FP + N_tr + N_res ), 0, 2^bits − 1 )
-
-Polynomial form (``aps.beta`` given), I = K·(1 + PRNU)·I_e in DN, per tile position::
-
-    mean = I + t·N_DP + N_FP
-    Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC, without N_tr
-
-Both are one model: a count of mean m, Poisson or Gaussian with variance m, is worth `gain` DN each and
-sits on `fixed` DN; a Gaussian is added to the sum. N_FP = black + N_row + N_BLC. N_tr is one Gaussian
-number of every row of a frame, shared by its pixels (temporal row noise). The ADC rounds once:
-no uniform noise is added, and every variance here leaves out its q²/12.
+The formulas are in `hesim_render.pixels.aps.formulas`, the sampler is in `hesim_render.pixels.aps.sampler`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32, Values
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.rng import Stream, philox
+from hesim_render.core.namespace import NUMPY, Namespace
+from hesim_render.core.plain import PlainState
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
-from hesim_render.pixels.aps.fixed_pattern import FixedPattern, Pixels, gathered
-from hesim_render.pixels.aps.poisson import poisson
-from hesim_render.pixels.arrays import to_device
-from hesim_render.pixels.normal import normal_pair
+from hesim_render.pixels.aps import formulas
+from hesim_render.pixels.aps.fixed_pattern import FixedPattern
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, Pixels, PixelValue
+from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
 from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.sensor import ApsSpec
 
 APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk")
 
-ADC_VARIANCE_DN2 = 1.0 / 12.0
-
 
 @dataclass(frozen=True)
-class ApsNoise:
+class ApsNoise(PlainState):
     """Noise model of a sensor's frame pixels over one read-out region.
 
     Parameters
@@ -108,53 +93,40 @@ class ApsNoise:
         return FixedPattern(self.spec, self.layout, self.device_seed, self.off)
 
     @cached_property
-    def _device_pixels(self) -> Pixels:
-        """The maps as Dr.Jit arrays (or opaque numbers), flat."""
-        beta = None
-        if self.spec.beta is not None:
-            table = np.array(self.spec.beta)
-            uniform = np.all(table == table[:1, :1], axis=(0, 1))
-            tiled = self.layout.tiled(table)
-            beta = tuple(to_device(table[0, 0, k] if uniform[k] else tiled[..., k]) for k in range(6))
-        maps = self.fixed_pattern
-        return Pixels(to_device(maps.response), to_device(maps.dark_e_per_s), to_device(maps.offset_dn), beta)
+    def beta(self) -> NDArray[np.float64] | None:
+        """[tile_row, tile_col, 6] of the polynomial form, 0 where a term is switched off; None in the physical form."""
+        if self.spec.beta is None:
+            return None
+        return np.array(self.spec.beta, dtype=np.float64) * [term not in self.off for term in BETA_TERMS]
 
-    def _host_pixels(self, position: tuple[int, int] | None, image: bool) -> Pixels:
-        """The same for the formulas on the host: one position's nominal values, or the maps."""
-        spec = self.spec
-        table = None if spec.beta is None else np.array(spec.beta, dtype=np.float64)
-        if image:
-            if position is not None:
-                raise RangeError("position", position, "none, as an image has the position of each pixel")
-            beta = None if table is None else tuple(np.moveaxis(self.layout.tiled(table), -1, 0))
-            maps = self.fixed_pattern
-            return Pixels(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
+    @property
+    def pixels(self) -> Pixels:
+        """What the formulas need of each pixel over the region: maps [row, col], or numbers where all are alike."""
+        beta = None if self.beta is None else tuple(np.moveaxis(self.layout.tiled(self.beta), -1, 0))
+        maps = self.fixed_pattern
+        return Pixels(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
+
+    def _nominal_pixel(self, position: tuple[int, int] | None) -> Pixels:
+        """A pixel of a position without any fixed pattern."""
         known = self.layout.spec.positions("aps")
         chosen = known[0] if position is None else tuple(position)
         if chosen not in known:
             raise RangeError("position", position, "(tile_row, tile_col) of a frame pixel of the tile")
-        dark = 0.0 if "dark_current" in self.off else spec.dark_current_now_e_per_s
-        return Pixels(1.0, dark, spec.black_level_dn, None if table is None else tuple(table[chosen]))
+        dark = 0.0 if "dark_current" in self.off else self.spec.dark_current_now_e_per_s
+        return Pixels(1.0, dark, self.spec.black_level_dn, None if self.beta is None else tuple(self.beta[chosen]))
 
     # ---- the model --------------------------------------------------------------------------------
 
-    def _gain_and_remainder(self, signal_dn: Any, t: Any, beta: Any, xp: ModuleType) -> tuple[Any, Any]:
-        """g = β1 + β3 I + β4 t in DN, and β0 + β2 t + β5 t² in DN²; I is taken up to full scale."""
-        light = 0.0 if "shot" in self.off else 1.0
-        dark = 0.0 if "dark_current" in self.off else 1.0
-        read = 0.0 if "read" in self.off else 1.0
-        gain = light * (beta[1] + beta[3] * xp.minimum(signal_dn, float(self.full_scale_dn)) + beta[4] * t)
-        return gain, read * beta[0] + dark * (beta[2] * t + beta[5] * t * t)
-
     def _refused(self, exposure_us: float) -> str:
         """Why the polynomial cannot be a variance at this exposure, or nothing."""
-        if self.spec.beta is None:
+        if self.beta is None:
             return ""
+        t = exposure_us * S_PER_US
         for position in self.layout.spec.positions("aps"):
-            beta = np.array(self.spec.beta, dtype=np.float64)[position]
-            ends = np.array([0.0, self.full_scale_dn])
-            gain, remainder = self._gain_and_remainder(ends, exposure_us * S_PER_US, beta, np)
-            for name, value in (("β1 + β3 I + β4 t", np.min(gain)), ("β0 + β2 t + β5 t²", remainder)):
+            beta = self.beta[position]
+            gain = np.min(formulas.light_gain_dn(beta, np.array([0.0, self.full_scale_dn]), t))
+            remainder = formulas.dark_variance_dn2(beta, t)
+            for name, value in (("β1 + β3 I + β4 t", gain), ("β0 + β2 t + β5 t²", remainder)):
                 if value < 0:
                     return (
                         f"position {position}: {name} is {value:.4g}, negative between 0 and {self.full_scale_dn} DN "
@@ -162,24 +134,31 @@ class ApsNoise:
                     )
         return ""
 
-    def _parts(self, electrons: Any, t: Any, pixels: Pixels, xp: ModuleType) -> tuple[Any, Any, Any, Any]:
-        """(fixed DN, gain in DN per count, mean count, Gaussian variance in DN²) of the signal."""
-        gain_dn_per_e = self.spec.system_gain_dn_per_e
-        light = pixels.response * electrons
-        dark = pixels.dark_e_per_s * t
-        residual = 0.0 if "residual" in self.off else self.spec.residual_noise_dn**2
+    def value(self, electrons: Values, exposure_s: Values, pixels: Pixels, xp: Namespace) -> PixelValue:
+        """Law of the pixels' values, without N_FP and row noise.
+
+        Parameters
+        ----------
+        electrons : mean photo-electrons I_e of the exposure, numbers or arrays like those of `pixels`.
+        """
+        gain = self.spec.system_gain_dn_per_e
         if pixels.beta is None:
-            read = 0.0 if "read" in self.off else (gain_dn_per_e * self.spec.read_noise_e) ** 2
-            # without shot noise of the light, that of the dark current remains
-            fixed, mean = (light * gain_dn_per_e, 0.0 * light + dark) if "shot" in self.off else (0.0, light + dark)
-            return fixed, gain_dn_per_e, mean, read + residual
-        choose = np.where if xp is np else xp.select
-        signal = gain_dn_per_e * light
-        gain, remainder = self._gain_and_remainder(signal, t, pixels.beta, xp)
-        noisy = gain > 0.0
-        mean = choose(noisy, signal / choose(noisy, gain, 1.0), 0.0)
-        fixed = gain_dn_per_e * dark + choose(noisy, 0.0, signal)
-        return fixed, gain, mean, xp.maximum(remainder, 0.0) + residual
+            read_noise_e = 0.0 if "read" in self.off else self.spec.read_noise_e
+            shot = "shot" not in self.off
+            value = formulas.physical_value(electrons, exposure_s, pixels, gain, read_noise_e, shot)
+        else:
+            value = formulas.calibrated_value(electrons, exposure_s, pixels, gain, float(self.full_scale_dn), xp)
+        residual_dn2 = 0.0 if "residual" in self.off else self.spec.residual_noise_dn**2
+        return replace(value, gaussian_dn2=value.gaussian_dn2 + residual_dn2)
+
+    def _on_host(
+        self, electrons: NDArray[np.float64], exposure_us: float, position: tuple[int, int] | None
+    ) -> tuple[PixelValue, Pixels]:
+        """Law of the values of an image, or of a number at one position."""
+        if electrons.ndim and position is not None:
+            raise RangeError("position", position, "none, as an image has the position of each pixel")
+        pixels = self.pixels if electrons.ndim else self._nominal_pixel(position)
+        return self.value(electrons, exposure_us * S_PER_US, pixels, NUMPY), pixels
 
     def _checked(self, electrons: ArrayLike, exposure_us: float) -> NDArray[np.float64]:
         values = np.asarray(electrons, dtype=np.float64)
@@ -216,9 +195,8 @@ class ApsNoise:
         of samples is lower.
         """
         values = self._checked(electrons, exposure_us)
-        pixels = self._host_pixels(position, values.ndim > 0)
-        fixed, gain, mean, _ = self._parts(values, exposure_us * S_PER_US, pixels, np)
-        return np.asarray(fixed + gain * mean + pixels.offset_dn, dtype=np.float64)
+        value, pixels = self._on_host(values, exposure_us, position)
+        return np.asarray(value.mean_dn + pixels.offset_dn, dtype=np.float64)
 
     def variance_dn2(
         self, electrons: ArrayLike, exposure_us: float, position: tuple[int, int] | None = None, adc: bool = False
@@ -229,11 +207,9 @@ class ApsNoise:
         the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the variance
         itself is above 0.24 DN².
         """
-        values = self._checked(electrons, exposure_us)
-        pixels = self._host_pixels(position, values.ndim > 0)
-        _, gain, mean, gaussian = self._parts(values, exposure_us * S_PER_US, pixels, np)
+        value, _ = self._on_host(self._checked(electrons, exposure_us), exposure_us, position)
         shared = self.row_noise_dn**2 + (ADC_VARIANCE_DN2 if adc else 0.0)
-        return np.asarray(gain * gain * mean + gaussian + shared, dtype=np.float64)
+        return np.asarray(value.variance_dn2 + shared, dtype=np.float64)
 
     def noise_equivalent_e(self, electrons: NDArray, exposure_us: float) -> NDArray[np.float64]:
         """Standard deviation of a frame pixel in electrons at its input, PRNU included.
@@ -250,28 +226,27 @@ class ApsNoise:
         [n], electrons.
         """
         signal = np.maximum(np.asarray(electrons, dtype=np.float64), 0.0)
-        _, gain, mean, gaussian = self._parts(signal, exposure_us * S_PER_US, self._host_pixels(None, False), np)
-        temporal_dn2 = gain * gain * mean + gaussian + self.row_noise_dn**2 + ADC_VARIANCE_DN2
-        fixed_e = self.spec.prnu_rel * signal
-        return np.sqrt(temporal_dn2 / self.spec.system_gain_dn_per_e**2 + fixed_e**2)
+        value = self.value(signal, exposure_us * S_PER_US, self._nominal_pixel(None), NUMPY)
+        variance = value.variance_dn2 + self.row_noise_dn**2 + ADC_VARIANCE_DN2
+        spec = self.spec
+        return formulas.noise_equivalent_e(variance, spec.system_gain_dn_per_e, spec.prnu_rel, signal, NUMPY)
 
     def to_polynomial(self) -> list[list[list[float]]]:
         """The variance as [tile_row][tile_col][β0 … β5] in DN and s; exact for the physical form.
 
         β0 = K²σ_r², β1 = K, β2 = K²D, the others 0: PRNU is spatial and never enters β3. N_res and N_tr are not in it.
         """
-        gain, spec = self.spec.system_gain_dn_per_e, self.spec
-        physical = [gain**2 * spec.read_noise_e**2, gain, gain**2 * spec.dark_current_now_e_per_s, 0.0, 0.0, 0.0]
-        term = ("read", "shot", "dark_current", "shot", "shot", "dark_current")
+        if self.beta is not None:
+            return self.beta.tolist()
+        spec = self.spec
+        physical = formulas.physical_beta(spec.system_gain_dn_per_e, spec.read_noise_e, spec.dark_current_now_e_per_s)
+        cell = [0.0 if term in self.off else b for term, b in zip(BETA_TERMS, physical, strict=True)]
         tile_rows, tile_cols = self.layout.tile_shape
-        table = spec.beta or [[physical] * tile_cols] * tile_rows
-        return [
-            [[0.0 if t in self.off else b for t, b in zip(term, cell, strict=True)] for cell in row] for row in table
-        ]
+        return [[list(cell) for _ in range(tile_cols)] for _ in range(tile_rows)]
 
     # ---- the sampler ------------------------------------------------------------------------------
 
-    def sample(self, electrons: Any, exposure_us: float, seed: int, frame: int = 0) -> NDArray[np.uint16]:
+    def sample(self, electrons: ArrayLike | Float, exposure_us: float, seed: int, frame: int = 0) -> NDArray[np.uint16]:
         """One noisy frame.
 
         Parameters
@@ -296,7 +271,9 @@ class ApsNoise:
         dn = self.sample_dn(electrons, exposure_us, seed, frame)
         return dn.numpy().astype(np.uint16).reshape(self.layout.shape)
 
-    def sample_dn(self, electrons: Any, exposure_us: float, seed: int, frame: int = 0, first_pixel: int = 0) -> Any:
+    def sample_dn(
+        self, electrons: Float, exposure_us: float, seed: int, frame: int = 0, first_pixel: int = 0
+    ) -> UInt32:
         """As `sample`, for a flat Dr.Jit array and without a copy to the host.
 
         Parameters
@@ -308,48 +285,9 @@ class ApsNoise:
         -------
         UInt32 [n], DN; not yet evaluated.
         """
-        import drjit as dr
-
-        types = jit()
         self._check_exposure(exposure_us)
-        count = dr.width(electrons)
-        index = dr.arange(types.UInt32, count) + dr.opaque(types.UInt32, first_pixel)
-        pixels = self._device_pixels
-        if count != self.layout.rows * self.layout.cols:
-            pixels = gathered(pixels, index)
-        t = dr.opaque(types.Float, exposure_us * S_PER_US)
-        fixed, gain, mean, gaussian = self._parts(electrons, t, pixels, dr)
-
-        key = self._pixel_key(index)
-        generator = philox(seed, Stream.APS, key, frame)
-        word = generator.next_uint32x4()
-        if self.spec.law == "poisson":
-            counts = poisson(mean, generator, (word[0], word[1]))
-            deviate = normal_pair(word[2], word[3])[0]
-        else:
-            shot, deviate = normal_pair(word[0], word[1])
-            counts = dr.fma(dr.sqrt(mean), shot, mean)
-        full_well_dn = self.spec.full_well_e * self.spec.system_gain_dn_per_e
-        level = dr.minimum(dr.fma(gain, counts, fixed), full_well_dn) + pixels.offset_dn
-        level = dr.fma(dr.sqrt(types.Float(gaussian)), deviate, level)
-        if self.row_noise_dn > 0:
-            # of the row on the full sensor: every pixel of it draws the same number
-            row = key // dr.opaque(types.UInt32, self.layout.spec.geometry.cols)
-            word = philox(seed, Stream.ROW_NOISE, row, frame).next_uint32x4()
-            level = dr.fma(dr.opaque(types.Float, self.row_noise_dn), normal_pair(word[0], word[1])[0], level)
-        # not clip: of a level that is no number it makes the largest integer, which no ADC of fewer bits gives
-        return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(self.full_scale_dn)), 0.0))
+        return draw_dn(self, self._device_maps, electrons, exposure_us, seed, frame, first_pixel)
 
     @cached_property
-    def _keys(self) -> Any:
-        return jit().UInt32(self.layout.full_index.ravel())
-
-    def _pixel_key(self, index: Any) -> Any:
-        """Full-sensor index of the region's pixels: rows as wide as the sensor's need no table."""
-        import drjit as dr
-
-        types = jit()
-        sensor_cols = self.layout.spec.geometry.cols
-        if self.layout.cols == sensor_cols:
-            return index + dr.opaque(types.UInt32, self.layout.row0 * sensor_cols)
-        return dr.gather(types.UInt32, self._keys, index)
+    def _device_maps(self) -> DeviceMaps:
+        return DeviceMaps(self.layout, self.fixed_pattern, self.beta)

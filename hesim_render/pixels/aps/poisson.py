@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Float64, Generator, Mask, UInt32
 
 #: From this mean on transformed rejection is used; its hat holds for means of 10 and more.
 _REJECTION_FROM = 10.0
@@ -13,7 +13,7 @@ _REJECTION_FROM = 10.0
 _SEARCH_LIMIT = 100
 
 
-def poisson(mean: Any, generator: Any, words: tuple[Any, Any] | None = None) -> Any:
+def poisson(mean: Float, generator: Generator, words: tuple[UInt32, UInt32] | None = None) -> Float:
     """Poisson deviates, exact to the accuracy of single precision at every mean up to 1e7.
 
     Below a mean of 10: inversion by sequential search in double precision, from a 64-bit uniform.
@@ -41,7 +41,7 @@ def poisson(mean: Any, generator: Any, words: tuple[Any, Any] | None = None) -> 
     return dr.select(mean < _REJECTION_FROM, _search(mean, *words), _transformed_rejection(mean, generator, *words))
 
 
-def _search(mean: Any, high: Any, low: Any) -> Any:
+def _search(mean: Float, high: UInt32, low: UInt32) -> Float:
     """Smallest k with P(K ≤ k) > u, u = (high, low) as a 64-bit fraction; for means below 10.
 
     The distance of u from the cumulated probability is kept in units of the next term μᵏ/k!: one
@@ -56,10 +56,10 @@ def _search(mean: Any, high: Any, low: Any) -> Any:
     inverse = dr.select(active, 1.0 / wide, 0.0)
     rest = dr.select(active, uniform * dr.exp(wide), 0.0)
 
-    def beyond(rest: Any, count: Any, inverse: Any) -> Any:
+    def beyond(rest: Float64, count: Float64, inverse: Float64) -> Mask:
         return (rest >= 1.0) & (count < _SEARCH_LIMIT)
 
-    def step(rest: Any, count: Any, inverse: Any) -> tuple[Any, Any, Any]:
+    def step(rest: Float64, count: Float64, inverse: Float64) -> tuple[Float64, Float64, Float64]:
         count = count + 1.0
         return (rest - 1.0) * (count * inverse), count, inverse
 
@@ -67,7 +67,7 @@ def _search(mean: Any, high: Any, low: Any) -> Any:
     return types.Float(count)
 
 
-def _transformed_rejection(mean: Any, generator: Any, u_word: Any, v_word: Any) -> Any:
+def _transformed_rejection(mean: Float, generator: Generator, u_word: UInt32, v_word: UInt32) -> Float:
     """Hörmann's PTRS for means of 10 and more; 0 elsewhere."""
     import drjit as dr
 
@@ -80,10 +80,10 @@ def _transformed_rejection(mean: Any, generator: Any, u_word: Any, v_word: Any) 
     key = (types.UInt64(generator.seed[0]) << 32) | types.UInt64(generator.seed[1])
     pixel, low, high = (generator.counter[k] for k in range(3))
 
-    def pending(count: Any, active: Any, attempt: Any) -> Any:
+    def pending(count: Float, active: Mask, attempt: UInt32) -> Mask:
         return active
 
-    def retry(count: Any, active: Any, attempt: Any) -> tuple[Any, Any, Any]:
+    def retry(count: Float, active: Mask, attempt: UInt32) -> tuple[Float, Mask, UInt32]:
         attempt = attempt + 1
         word = types.Philox4x32(key, pixel, low, high ^ (attempt << 16)).next_uint32x4()
         first, first_accepted = _propose(mean, word[0], word[1])
@@ -95,7 +95,7 @@ def _transformed_rejection(mean: Any, generator: Any, u_word: Any, v_word: Any) 
     return dr.select(needed, count, 0.0)
 
 
-def _propose(mean: Any, u_word: Any, v_word: Any) -> tuple[Any, Any]:
+def _propose(mean: Float, u_word: UInt32, v_word: UInt32) -> tuple[Float, Mask]:
     """One proposal of PTRS: a count, and whether it is accepted."""
     import drjit as dr
 
@@ -120,7 +120,7 @@ def _propose(mean: Any, u_word: Any, v_word: Any) -> tuple[Any, Any]:
     return count, inside & (v * inverse_alpha * scale <= hat * dr.exp(-deviance))
 
 
-def _log_probability(count: Any, mean: Any) -> tuple[Any, Any]:
+def _log_probability(count: Float, mean: Float) -> tuple[Float, Float]:
     """Poisson probability as exp(−deviance) / scale (Loader 2000): bd0 + Stirling error, and √(2πk)."""
     import drjit as dr
 

@@ -1,34 +1,28 @@
-"""Noise of event pixels: from electrons of a window to the log voltage, its noise and event probabilities.
+"""Noise model of a sensor's event pixels: its parameters over a region, the log voltage and event probabilities.
 
-With N the electrons of one window of t_evs that ends at the sample, per event position::
-
-    I  = K·Φ·t_ref·r, Φ = N/t_evs        DN of the signal reference; r: its filter over the pixel's own
-    x  = β1 I + β2                        voltage, the photodiode's baseline included
-    s² = (β3 I)² + β4² + 2 β5 β3 β4 I     "linear" shot law
-    s² = β3² I + β4² + 2 β5 β3 β4 √I      "sqrt" shot law
-    S  = ln x₁/x₀,  σ_n² = s₀²/x₀² + s₁²/x₁²,  ΔV = S + σ_n·z
-    P₊ = Q((θ₊ − S)/σ_n),  P₋ = Q((θ₋ + S)/σ_n)
-
-θ are natural-log thresholds; each pixel's own is θ·(1 + mismatch·z), drawn from the device seed or measured.
+The formulas are in `hesim_render.pixels.evs.formulas`, the sampler is in `hesim_render.pixels.evs.stage`. With N the
+electrons of one window of t_evs that ends at the sample, the signal is I = K·(N/t_evs)·t_ref·r in DN of the signal
+reference, r its filter over the pixel's own. Each pixel's thresholds are drawn from the device seed, or measured.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
-from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
+from hesim_render.core.namespace import NUMPY
+from hesim_render.core.plain import PlainState
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
-from hesim_render.pixels.arrays import to_device
+from hesim_render.pixels.evs import formulas
+from hesim_render.pixels.evs.formulas import Coefficients
+from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
 from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.sensor import EvsCoefficients, EvsSpec, PhotoreceptorSpec
@@ -41,26 +35,9 @@ LEAST_THRESHOLD_REL = 0.05
 #: Least noise that deviations of the clean signal are measured against, in thresholds.
 LEAST_NOISE_THETA = 0.05
 
-Map = float | NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class _Coefficients:
-    """x and s² as functions of the window's electrons N; arrays over positions or pixels.
-
-    x = slope·N + base, s² = dark + cross·√N^c + light·N^l, with (c, l) = (2, 2) for the linear shot law
-    (√N² = N) and (1, 1) for the sqrt law.
-    """
-
-    slope: Any
-    base: Any
-    light: Any
-    cross: Any
-    dark: Any
-
 
 @dataclass(frozen=True, eq=False)
-class EvsNoise:
+class EvsNoise(PlainState):
     """Noise model of a sensor's event pixels over one read-out region.
 
     Parameters
@@ -130,7 +107,7 @@ class EvsNoise:
     @property
     def is_noiseless(self) -> bool:
         """True where ln x has no temporal noise at any signal."""
-        table = self._table
+        table = self.table
         return not (np.any(table.light) or np.any(table.dark))
 
     # ---- per-position coefficients and per-pixel thresholds -----------------------------------------
@@ -142,25 +119,17 @@ class EvsNoise:
         return reference.k_dn_per_e * reference.t_ref_us / self.spec.window_us * np.asarray(self.signal_scale)
 
     @cached_property
-    def _table(self) -> _Coefficients:
-        """Coefficients of each event position, float64 [positions]."""
+    def table(self) -> Coefficients:
+        """Coefficients of each event position for electrons of the window, float64 [position]."""
         spec = self.spec
         count = len(self.layout.spec.positions("evs"))
         entries = spec.coefficients * (count if len(spec.coefficients) == 1 else 1)
-        beta1, beta2, beta3, beta4, beta5 = (
-            np.array([getattr(entry, name) for entry in entries], dtype=np.float64) for name in _BETA_NAMES
+        gone = {"beta3": "shot" in self.off, "beta4": "dark_current" in self.off}
+        beta = tuple(
+            np.array([0.0 if gone.get(name) else getattr(entry, name) for entry in entries], dtype=np.float64)
+            for name in EvsCoefficients.model_fields
         )
-        beta3 = 0.0 * beta3 if "shot" in self.off else beta3
-        beta4 = 0.0 * beta4 if "dark_current" in self.off else beta4
-        dn_per_electron = self._dn_per_electron
-        linear = spec.shot_law == "linear"
-        return _Coefficients(
-            slope=beta1 * dn_per_electron,
-            base=beta2,
-            light=beta3**2 * (dn_per_electron**2 if linear else dn_per_electron),
-            cross=2 * beta5 * beta3 * beta4 * (dn_per_electron if linear else np.sqrt(dn_per_electron)),
-            dark=beta4**2,
-        )
+        return Coefficients.of(beta, self._dn_per_electron, spec.shot_law, NUMPY)
 
     def _threshold_map(self, nominal: float, polarity: str, stream: Stream) -> Map:
         spread = self.spec.threshold_mismatch_std
@@ -183,73 +152,24 @@ class EvsNoise:
         return self._threshold_map(self.spec.contrast_threshold_off, "off", Stream.THRESHOLD_OFF)
 
     @cached_property
-    def device_thresholds(self) -> tuple[Any, Any]:
-        """θ₊ and θ₋ as Dr.Jit Floats: flat arrays over the event grid, or numbers."""
-        return to_device(self.threshold_on_map), to_device(self.threshold_off_map)
-
-    @cached_property
-    def device_key(self) -> Any:
-        """Full-sensor index of each event pixel, UInt32, flat: what random numbers are keyed by."""
-        return jit().UInt32(self.layout.full_index.ravel()[self.layout.evs_pixel.ravel()])
-
-    @cached_property
-    def _device_coefficients(self) -> _Coefficients:
-        return _Coefficients(**{name: self._by_position(values) for name, values in vars(self._table).items()})
-
-    def _by_position(self, values: NDArray[np.float64]) -> Any:
-        """An opaque number where all positions agree; else a table looked up by each pixel's position."""
-        import drjit as dr
-
-        if np.all(values == values[0]):
-            return to_device(values[0])
-        return dr.gather(jit().Float, to_device(values), self._device_position)
-
-    @cached_property
-    def _device_position(self) -> Any:
-        import drjit as dr
-
-        position = jit().UInt32(self.layout.evs_position.ravel().astype(np.uint32))
-        dr.eval(position)
-        return position
-
-    @cached_property
-    def _device_corner_level(self) -> Any:
-        """x above its baseline at the photoreceptor's reference signal: β1·signal_dn."""
-        assert self.spec.photoreceptor is not None and self.spec.photoreceptor.signal_dn is not None
-        table = self._table
-        return self._by_position(table.slope / self._dn_per_electron * self.spec.photoreceptor.signal_dn)
+    def on_device(self) -> EventPixels:
+        """The same on the device, for the stage that samples it."""
+        thresholds = self.threshold_on_map, self.threshold_off_map
+        reference = None if self.photoreceptor is None else self.photoreceptor.signal_dn
+        # x above its baseline there: β1·signal_dn
+        level = None if reference is None else self.table.slope / self._dn_per_electron * reference
+        return EventPixels(self.layout, self.table, self.spec.shot_law, thresholds, level)
 
     # ---- the model ----------------------------------------------------------------------------------
 
-    def log_level(self, electrons: Any) -> tuple[Any, Any]:
+    def log_level(self, electrons: Float) -> tuple[Float, Float]:
         """ln x and its noise variance s²/x² of every event pixel, on Dr.Jit.
 
         Parameters
         ----------
         electrons : Float [event pixels], noise-free electrons of the window that ends at the sample.
         """
-        import drjit as dr
-
-        return self._log_level(electrons, self._device_coefficients, dr)
-
-    def corner_hz(self, log: Any) -> Any:
-        """Corner of each pixel's photoreceptor at ln x, on Dr.Jit: f_c·I/signal_dn between the file's two limits."""
-        import drjit as dr
-
-        spec = self.spec.photoreceptor
-        assert spec is not None and spec.min_cutoff_hz is not None
-        signal = (dr.exp(log) - self._device_coefficients.base) / self._device_corner_level
-        return dr.clip(spec.cutoff_hz * signal, spec.min_cutoff_hz, spec.cutoff_hz)
-
-    def _log_level(self, electrons: Any, k: _Coefficients, xp: ModuleType) -> tuple[Any, Any]:
-        x = k.slope * electrons + k.base
-        return xp.log(x), self._variance(electrons, k, xp) / (x * x)
-
-    def _variance(self, electrons: Any, k: _Coefficients, xp: ModuleType) -> Any:
-        """s²."""
-        root = electrons if self.spec.shot_law == "linear" else xp.sqrt(electrons)
-        # with full anticorrelation s² is a square that can be 0: rounding must not take it below
-        return xp.maximum((k.light * root + k.cross) * root + k.dark, 0.0)
+        return self.on_device.log_level(electrons)
 
     def noise_equivalent_e(self, electrons: NDArray, position: NDArray[np.integer]) -> NDArray:
         """The change of a window's electrons that equals one standard deviation of ln x, or θ/20 if that is more.
@@ -267,11 +187,10 @@ class EvsNoise:
         [..., n], electrons: the larger of s and θ/20·x, over the slope dx/dN.
         """
         kind = np.result_type(electrons, np.float32)
-        k = _Coefficients(**{name: values.astype(kind)[position] for name, values in vars(self._table).items()})
+        k = self.table.each(lambda values: values.astype(kind)[position])
         theta = min(self.spec.contrast_threshold_on, self.spec.contrast_threshold_off)
         counted = np.maximum(electrons, kind.type(0))
-        floor = kind.type(LEAST_NOISE_THETA * theta) * (k.slope * counted + k.base)
-        return np.maximum(np.sqrt(self._variance(counted, k, np)), floor) / k.slope
+        return formulas.noise_equivalent(k, counted, kind.type(LEAST_NOISE_THETA * theta), self.spec.shot_law, NUMPY)
 
     def log_signal(self, electrons_per_s: NDArray[np.float64], event_pixel: NDArray[np.integer]) -> NDArray[np.float64]:
         """ln x, noise-free, of a flux.
@@ -282,8 +201,9 @@ class EvsNoise:
         event_pixel : [n], places on the event grid, row-major.
         """
         where = self.layout.evs_position.ravel()[event_pixel]
-        k = _Coefficients(**{name: values[where] for name, values in vars(self._table).items()})
-        return self._log_level(np.maximum(electrons_per_s, 0.0) * (self.spec.window_us * S_PER_US), k, np)[0]
+        k = self.table.each(lambda values: values[where])
+        electrons = np.maximum(electrons_per_s, 0.0) * (self.spec.window_us * S_PER_US)
+        return formulas.log_level(k, electrons, self.spec.shot_law, NUMPY)[0]
 
     def _position_number(self, position: int | tuple[int, int] | None) -> int:
         known = self.layout.spec.positions("evs")
@@ -313,7 +233,7 @@ class EvsNoise:
 
         Returns
         -------
-        p_on, p_off : P₊ and P₋ of the module's head. Leak events are a process of their own, not included.
+        p_on, p_off : as in `hesim_render.pixels.evs.formulas`. Leak events are a process of their own, not included.
 
         Raises
         ------
@@ -338,21 +258,14 @@ class EvsNoise:
         if any(values.ndim for values in levels):
             if position is not None:
                 raise RangeError("position", position, "none, as an image has the position of each pixel")
-            where: Any = self.layout.evs_position
+            where: NDArray[np.uint8] | int = self.layout.evs_position
             theta_on, theta_off = self.threshold_on_map, self.threshold_off_map
         else:
             where = self._position_number(position)
             theta_on, theta_off = self.spec.contrast_threshold_on, self.spec.contrast_threshold_off
-        table = _Coefficients(**{name: values[where] for name, values in vars(self._table).items()})
-        (log_0, variance_0), (log_1, variance_1) = (self._log_level(e, table, np) for e in levels)
-        change, sigma = log_1 - log_0, np.sqrt(variance_0 + variance_1)
-        return _exceedance(theta_on - change, sigma), _exceedance(theta_off + change, sigma)
-
-
-_BETA_NAMES = tuple(name for name in EvsCoefficients.model_fields)
-
-
-def _exceedance(margin: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """P(σ·z > margin) = Q(margin/σ); without noise 1 where the margin is negative, else 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(sigma > 0, special.ndtr(-margin / sigma), np.where(margin < 0, 1.0, 0.0))
+        k = self.table.each(lambda values: values[where])
+        (log_0, variance_0), (log_1, variance_1) = (
+            formulas.log_level(k, e, self.spec.shot_law, NUMPY) for e in levels
+        )  # fmt: skip
+        sigma = np.sqrt(variance_0 + variance_1)
+        return formulas.event_probabilities(theta_on, theta_off, log_1 - log_0, sigma)

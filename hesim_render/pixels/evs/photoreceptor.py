@@ -14,9 +14,9 @@ photoreceptor is a second-order system whose corner rises with the photocurrent 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.model import EvsNoise
 
@@ -27,7 +27,7 @@ NODES_PER_CORNER_PERIOD = 32
 _SERIES_BELOW = 0.1
 
 
-def _rate(corner_hz: Any) -> Any:
+def _rate(corner_hz: Float) -> Float:
     """a in 1/µs of both poles of a corner frequency."""
     return corner_hz * (math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / US_PER_S)
 
@@ -53,18 +53,19 @@ class Photoreceptor:
         self._period_us = US_PER_S / (NODES_PER_CORNER_PERIOD * spec.cutoff_hz)
         self._t_us = 0.0
         self._node = 0  # the last node at or before the present
-        self._input: Any = None  # u
-        self._state: tuple[Any, Any] = (None, None)  # z, y
-        self._rate: Any = None  # a in 1/µs up to the next node: a number, or one per pixel
-        self._node_rate: Any = None  # a at the last node
+        self._input: Float = None  # u
+        self._state: tuple[Float, Float] = (None, None)  # z, y
+        self._rate: Float = None  # a in 1/µs up to the next node: a number, or one per pixel
+        self._node_rate: Float = None  # a at the last node
 
-    def _rate_at(self, log: Any) -> Any:
-        return _rate(self._noise.corner_hz(log) if self._spec.follows_light else self._spec.cutoff_hz)
+    def _rate_at(self, log: Float) -> Float:
+        spec = self._spec
+        return _rate(self._noise.on_device.corner_hz(log, spec) if spec.follows_light else spec.cutoff_hz)
 
     def _node_at(self, t_us: float) -> int:
         return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding
 
-    def start(self, log: Any, t_us: int) -> Any:
+    def start(self, log: Float, t_us: int) -> Float:
         """Begin settled at the light of the first sample; returns y."""
         self._t_us, self._node = float(t_us), self._node_at(t_us)
         self._input, self._state = log, (log, log)
@@ -76,7 +77,7 @@ class Photoreceptor:
         last = math.ceil(end_us / self._period_us - 1e-6) - 1
         return [node * self._period_us for node in range(self._node + 1, last + 1)]
 
-    def to(self, log: Any, t_us: float) -> Any:
+    def to(self, log: Float, t_us: float) -> Float:
         """y at `t_us`, ln x having gone on a straight line to `log`; no node lies in between."""
         import drjit as dr
 
@@ -110,7 +111,7 @@ class Photoreceptor:
         self._node = node
         return self._state[1]
 
-    def follow(self, log: Any, t_us: int) -> Any:
+    def follow(self, log: Float, t_us: int) -> Float:
         """y at the next sample, over all nodes in between; the first call begins settled."""
         import drjit as dr
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Float64, UInt32
 from hesim_render.core.rng import Stream, philox, stream_key
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.model import EvsNoise
@@ -41,7 +41,7 @@ class BandNoise:
     def __init__(self, noise: EvsNoise, seed: int) -> None:
         cutoff_hz = noise.spec.photoreceptor_cutoff_hz
         assert cutoff_hz is not None
-        self._key, self._seed = noise.device_key, seed
+        self._key, self._seed = noise.on_device.key, seed
         self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz)
         h = math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / NODES_PER_CUTOFF_PERIOD  # a·period
         self._transition = math.exp(-h) * np.array([[1.0 + h, h], [-h, 1.0 - h]])
@@ -50,10 +50,10 @@ class BandNoise:
         fresh = np.eye(2) - self._transition @ self._transition.T
         self._fresh = self._amplitude * np.linalg.cholesky(fresh)
         self._node = 0  # the last node at or before the present
-        self._value: Any = None  # u at that node
-        self._state: tuple[Any, Any] = (None, None)  # u and u'/a at the next one
+        self._value: Float = None  # u at that node
+        self._state: tuple[Float, Float] = (None, None)  # u and u'/a at the next one
 
-    def _deviates(self, node: int) -> tuple[Any, Any]:
+    def _deviates(self, node: int) -> tuple[Float, Float]:
         word = philox(self._seed, Stream.EVS, self._key, node & ((1 << 48) - 1)).next_uint32x4()
         return normal_pair(word[0], word[1])
 
@@ -69,7 +69,7 @@ class BandNoise:
         )
         dr.schedule(self._state)
 
-    def start(self, t_us: int) -> Any:
+    def start(self, t_us: int) -> Float:
         """Begin in the stationary state; the noise at `t_us`."""
         import drjit as dr
 
@@ -84,7 +84,7 @@ class BandNoise:
         last = math.ceil(end_us / self._period_us) - 1
         return [node * self._period_us for node in range(self._node + 1, last + 1)]
 
-    def at(self, t_us: float) -> Any:
+    def at(self, t_us: float) -> Float:
         """The noise at `t_us`, which lies at most one node ahead of the present."""
         import drjit as dr
 
@@ -102,13 +102,13 @@ class LeakProcess:
     STATE = ("_due_us", "_count")
 
     def __init__(self, noise: EvsNoise, seed: int) -> None:
-        self._key = noise.device_key
+        self._key = noise.on_device.key
         self._stream_key = stream_key(seed, Stream.EVS_LEAK)
         self._mean_us = US_PER_S / noise.leak_rate_hz
-        self._due_us: Any = None  # Float64
-        self._count: Any = None  # events so far
+        self._due_us: Float64 = None
+        self._count: UInt32 = None  # events so far
 
-    def _wait_us(self, key: Any, count: Any) -> Any:
+    def _wait_us(self, key: UInt32, count: UInt32) -> Float64:
         import drjit as dr
 
         types = jit()
@@ -127,7 +127,7 @@ class LeakProcess:
         import drjit as dr
 
         types = jit()
-        pixel: Any = dr.compress(self._due_us <= float(t_us))
+        pixel: UInt32 = dr.compress(self._due_us <= float(t_us))
         while dr.width(pixel):
             due_us = dr.gather(types.Float64, self._due_us, pixel)
             count = dr.gather(types.UInt32, self._count, pixel) + 1
@@ -136,5 +136,5 @@ class LeakProcess:
             dr.scatter(self._due_us, following, pixel)
             dr.scatter(self._count, count, pixel)
             yield np.array(due_us), np.array(pixel)
-            again: Any = dr.compress(following <= float(t_us))
+            again: UInt32 = dr.compress(following <= float(t_us))
             pixel = dr.gather(types.UInt32, pixel, again)

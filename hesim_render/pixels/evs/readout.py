@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,7 +78,9 @@ class EventReadout:
         return before < self._capacity
 
 
-def _running(add: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
+def _running(
+    add: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Each map w → clip(w + add, low, high) after all before it, as one such map; log₂ n passes.
 
     Clips of sums are closed under composition, which makes the buffer a prefix scan (Hillis & Steele 1986).

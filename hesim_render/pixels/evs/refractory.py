@@ -7,12 +7,11 @@ period the change amplifier is released, and the reference is the level of that 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.pixels.arrays import take
 
 #: An event lies at least so long after the begin of its segment: rounding may have kept it from the one before.
@@ -38,13 +37,13 @@ class Refractory:
 
     def crossings(
         self,
-        reference: Any,
-        levels: tuple[Any, Any],
-        thresholds: tuple[Any, Any],
+        reference: Float,
+        levels: tuple[Float, Float],
+        thresholds: tuple[Float, Float],
         begin_us: float,
         end_us: float,
         leak: tuple[NDArray[np.float64], NDArray[np.uint32]],
-    ) -> tuple[Any, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
+    ) -> tuple[Float, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
         """Events of one segment in which the level goes on a straight line from `levels[0]` to `levels[1]`.
 
         Parameters

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
 from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.arrays import restore, saved, take
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
@@ -27,7 +29,7 @@ from hesim_render.pixels.normal import normal_pair
 
 
 class _Mode(Protocol):
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]: ...
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]: ...
 
 
 def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
@@ -96,7 +98,7 @@ class EvsStage:
         """Events lost in the read-out so far."""
         return self._readout.dropped if self._readout is not None else 0
 
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         """Take one sample.
 
         Parameters
@@ -138,17 +140,17 @@ class _PreviousSample:
         self._independent = noise.spec.noise_mode == "independent"
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
         self._t_us = 0
-        self._level: Any = None  # ln x, with the noise of its instant where that is shared
-        self._variance: Any = None  # s²/x² of the last sample, where noise is independent
+        self._level: Float = None  # ln x, with the noise of its instant where that is shared
+        self._variance: Float = None  # s²/x² of the last sample, where noise is independent
 
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
 
         types = jit()
         level, variance = self._noise.log_level(electrons)
         if self._photoreceptor:
             level = self._photoreceptor.follow(level, t_us)
-        word = philox(self._seed, Stream.EVS, self._noise.device_key, t_us).next_uint32x4()
+        word = philox(self._seed, Stream.EVS, self._noise.on_device.key, t_us).next_uint32x4()
         deviate = normal_pair(word[0], word[1])[0]
         if not self._independent:
             level = dr.fma(dr.sqrt(variance), deviate, level)
@@ -158,10 +160,10 @@ class _PreviousSample:
         change = level - self._level
         if self._independent:
             change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
-        theta_on, theta_off = self._noise.device_thresholds
+        theta_on, theta_off = self._noise.on_device.thresholds
         on, off = change > theta_on, change < -theta_off
         if self._noise.leak_rate_hz > 0:
-            probability = -math.expm1(-self._noise.leak_rate_hz * (t_us - self._t_us) * S_PER_US)
+            probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
             on |= ~off & (word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1)))
         polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
         dr.schedule(polarity)
@@ -170,7 +172,7 @@ class _PreviousSample:
         pixel = np.flatnonzero(found != 0)  # in row-major order
         return _events(t_us, pixel, found[pixel], self._cols)
 
-    def _keep(self, level: Any, variance: Any, t_us: int) -> None:
+    def _keep(self, level: Float, variance: Float, t_us: int) -> None:
         import drjit as dr
 
         self._t_us, self._level = t_us, level
@@ -192,10 +194,10 @@ class _LastEvent:
         self._noise = noise
         self._cols = noise.layout.evs_shape[1]
         self._t_us = 0
-        self._log: Any = None  # ln x of the last sample
-        self._spread: Any = None  # s/x of the last sample
-        self._level: Any = None  # ln x with its noise, at the end of the last segment
-        self._reference: Any = None  # level of the last event
+        self._log: Float = None  # ln x of the last sample
+        self._spread: Float = None  # s/x of the last sample
+        self._level: Float = None  # ln x with its noise, at the end of the last segment
+        self._reference: Float = None  # level of the last event
         self._band_noise = None if noise.is_noiseless else BandNoise(noise, seed)
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
         self._refractory: Refractory | None = None
@@ -203,7 +205,7 @@ class _LastEvent:
             self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
         self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
 
-    def step(self, electrons: Any, t_us: int) -> NDArray[np.void]:
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
 
         parts: list[NDArray[np.void]] = []
@@ -247,14 +249,14 @@ class _LastEvent:
         """Whole µs after the last sample: the end of the one an event falls in, so that steps do not overlap."""
         return np.maximum(np.ceil(t_us), self._t_us + 1)
 
-    def _crossings(self, level: Any, begin_us: float, end_us: float) -> NDArray[np.void]:
+    def _crossings(self, level: Float, begin_us: float, end_us: float) -> NDArray[np.void]:
         """Events of one segment in which the level goes on a straight line to `level`, unsorted."""
         import drjit as dr
 
         if self._refractory:
             return self._crossings_with_dead_time(self._refractory, level, begin_us, end_us)
         types = jit()
-        theta_on, theta_off = self._noise.device_thresholds
+        theta_on, theta_off = self._noise.on_device.thresholds
         distance = level - self._reference
         theta = dr.select(distance > 0, theta_on, theta_off)
         crossed = dr.mulsign(dr.floor(dr.abs(distance) / theta), distance)  # thresholds, with the direction
@@ -280,13 +282,14 @@ class _LastEvent:
         return _events(self._stamp(t_us), np.repeat(found, repeats), np.sign(theta_signed), self._cols)
 
     def _crossings_with_dead_time(
-        self, refractory: Refractory, level: Any, begin_us: float, end_us: float
+        self, refractory: Refractory, level: Float, begin_us: float, end_us: float
     ) -> NDArray[np.void]:
         """The same where pixels rest after each event, a leak event too; both kinds come out together."""
         due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
         due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
+        levels, thresholds = (self._level, level), self._noise.on_device.thresholds
         self._reference, t_us, pixel, polarity = refractory.crossings(
-            self._reference, (self._level, level), self._noise.device_thresholds, begin_us, end_us, (due_us, due_pixel)
+            self._reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel)
         )
         self._level = level
         return _events(self._stamp(t_us), pixel, polarity, self._cols)

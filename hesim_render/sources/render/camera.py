@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import atan2, degrees, radians, tan
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Point2, Point3, Vector3
 from hesim_render.core.errors import SpecError
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sensor.lens import pixel_centres_mm
@@ -278,7 +278,7 @@ class RayFactory:
         self._origin = [dr.opaque(types.Float, float(v)) for v in view.camera_to_world[:3, 3]]
         self._near = dr.opaque(types.Float, view.near_m) if view.near_m > 0 else None
 
-    def rays(self, row: Any, col: Any, aperture: Any, blur: Any | None) -> tuple[Any, Any]:
+    def rays(self, row: Float, col: Float, aperture: Point2, blur: Point2 | None) -> tuple[Point3, Vector3]:
         """Origin and unit direction in world space, the camera at rest.
 
         Parameters

@@ -11,12 +11,12 @@ import contextlib
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Bands, Float, UInt32
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.lens import Lens
@@ -108,10 +108,10 @@ def render_cube(
         padded = np.pad(group, (0, _BANDS_PER_RAY - group.size), mode="edge")
         wavelengths = [dr.opaque(jit().Float, float(band)) for band in padded]
 
-        def choose(pixel: Any, u: Any, wavelengths: list[Any] = wavelengths) -> list[Any]:
+        def choose(pixel: UInt32, u: Float, wavelengths: list[Float] = wavelengths) -> list[Float]:
             return wavelengths
 
-        def weigh(pixel: Any, spectrum: Any) -> list[Any]:
+        def weigh(pixel: UInt32, spectrum: Bands) -> list[Float]:
             return [spectrum[k] * tracer.radiance_scale for k in range(_BANDS_PER_RAY)]
 
         halves = tracer.trace(pixels, t_us, t_us, choose, weigh)

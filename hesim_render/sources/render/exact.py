@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
@@ -30,7 +30,7 @@ def used_responses(sensor: Sensor) -> dict[str, Spectrum]:
     return {name: response for name, response in sensor.responses.items() if name in used}
 
 
-def require_finite(half_a: Any, half_b: Any, scene: Scene, layout: Layout, pixel: NDArray[np.uint32]) -> None:
+def require_finite(half_a: Float, half_b: Float, scene: Scene, layout: Layout, pixel: NDArray[np.uint32]) -> None:
     """Refuse flux that is not a number or infinite.
 
     Parameters
@@ -133,7 +133,7 @@ class RenderedFlux(WindowByWindow):
         """Times strictly inside the interval that follow all motion, the camera's too, µs."""
         return self._timeline.sample_times_us(begin_us, end_us)
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval; see `FluxSource.mean_flux`.
 
         Returns
@@ -156,12 +156,12 @@ class RenderedFlux(WindowByWindow):
         require_finite(half_a, half_b, self.scene, self.sensor.layout, pixels)
         return half_a, half_b
 
-    def _choose(self, pixel: Any, u: Any) -> list[Any]:
+    def _choose(self, pixel: UInt32, u: Float) -> list[Float]:
         import drjit as dr
 
         return self._wavelengths.sample(dr.gather(jit().UInt32, self._filter, pixel), u)
 
-    def _weigh(self, pixel: Any, radiance: Any) -> list[Any]:
+    def _weigh(self, pixel: UInt32, radiance: Bands) -> list[Float]:
         """Wavelengths are distributed as R, so Φ = V · ∫R dλ · mean of L."""
         import drjit as dr
 

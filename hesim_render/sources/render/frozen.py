@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import MITSUBA_AXES, place_camera
 from hesim_render.sources.render.exact import used_responses
@@ -55,7 +55,7 @@ class FrozenPixels:
     view : the placed camera; `is_dark`, whether nothing emits; `is_static`, whether nothing moves.
     """
 
-    def __init__(self, mi: Any, waveform: Waveform | None, scene: Scene, sensor: Sensor) -> None:
+    def __init__(self, mi: MitsubaModule, waveform: Waveform | None, scene: Scene, sensor: Sensor) -> None:
         self._mi, self.waveform, self._scene = mi, waveform, scene
         self._built = build(mi, scene.spec, used_responses(sensor))
         self.view = place_camera(scene.spec, sensor, self._built.mitsuba_sensor())
@@ -67,7 +67,7 @@ class FrozenPixels:
         self._full_index = sensor.layout.full_index.ravel()
         scale = scene.spec.mitsuba.radiance_scale if scene.spec.mitsuba is not None else 1.0
         self._factor = sensor.relative_illumination.ravel().astype(np.float64) * scale
-        self._cameras: dict[int, tuple[Any, Any]] = {}
+        self._cameras: dict[int, tuple[MitsubaObject, MitsubaObject]] = {}
         responses = used_responses(sensor)
         for number, name in enumerate(sensor.layout.filters):
             if name not in responses or self.is_dark:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.sources.render.sampling.sampler import sampler_class
@@ -169,7 +170,7 @@ class _Meter:
             self._sampler.rest()
         return np.concatenate(found)
 
-    def _level(self) -> Any:
+    def _level(self) -> Float:
         """Of one ray a lane."""
         import drjit as dr
 
@@ -198,7 +199,7 @@ class _Meter:
         return dr.sum(total) / len(total) * self._wavelengths.total(index)
 
 
-def _beyond_one(mi: Any, built: BuiltScene, spec: SceneSpec, key: str) -> Any:
+def _beyond_one(mi: MitsubaModule, built: BuiltScene, spec: SceneSpec, key: str) -> MitsubaObject | None:
     """The scene's integrator as it goes on from a surface: its paths one segment shorter; None where they end there."""
     plugin = built.integrator_plugin
     if plugin is None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.light_parts import light_parts
@@ -47,7 +48,9 @@ class ReferenceFlux:
         return np.take_along_axis(flux, choose, axis=0)[0], np.take_along_axis(stderr, choose, axis=0)[0]
 
 
-def perspective_dict(mi: Any, view: View, camera_to_world: NDArray[np.float64], film: dict[str, Any]) -> dict[str, Any]:
+def perspective_dict(
+    mi: MitsubaModule, view: View, camera_to_world: NDArray[np.float64], film: dict[str, Any]
+) -> dict[str, Any]:
     """Mitsuba's perspective sensor over exactly the read-out region."""
     left, right, top, bottom = view.region_mm
     width, height = right - left, bottom - top
@@ -132,7 +135,7 @@ def reference_flux(
 
 
 def _renders(
-    mi: Any, scene: Scene, sensor: Sensor, samples: int, t_us: float, repeats: int, seed: int
+    mi: MitsubaModule, scene: Scene, sensor: Sensor, samples: int, t_us: float, repeats: int, seed: int
 ) -> tuple[View, NDArray[np.float64]]:
     """The placed camera and [repeat, row, col, filter] before relative illumination, lights at their mean."""
     built = build(mi, scene.spec, used_responses(sensor))

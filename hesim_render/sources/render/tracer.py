@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
@@ -26,9 +26,9 @@ from hesim_render.spectral.spectrum import Spectrum
 BLOCK_RAYS = 1 << 20
 
 #: (mosaic index, u in [0, 1)) → the four wavelengths of a ray, nm.
-Wavelengths = Callable[[Any, Any], list[Any]]
+Wavelengths = Callable[[UInt32, Float], list[Float]]
 #: (mosaic index, radiance at those four) → the quantities to average.
-Values = Callable[[Any, Any], list[Any]]
+Values = Callable[[UInt32, Bands], list[Float]]
 
 
 class Tracer:
@@ -79,7 +79,7 @@ class Tracer:
         self._sampler = sampler_class(mi.variant())()
         self._full_cols = dr.opaque(types.UInt32, self.sensor.spec.geometry.cols)
 
-    def _row_and_col(self, index: Any) -> tuple[Any, Any]:
+    def _row_and_col(self, index: UInt32) -> tuple[UInt32, UInt32]:
         """Of a pixel's number on the full sensor; that is what its random numbers follow, too."""
         row = index // self._full_cols
         return row, index - row * self._full_cols
@@ -146,7 +146,7 @@ class PixelTracer(Tracer):
         end_us: ArrayLike,
         wavelengths: Wavelengths,
         values: Values,
-    ) -> list[tuple[Any, Any]]:
+    ) -> list[Halves]:
         """Averages over the rays of each listed pixel, the camera moving through the pixel's own interval.
 
         Returns
@@ -171,7 +171,7 @@ class PixelTracer(Tracer):
             # wrapped on the host in double precision, pixel by pixel: no rounding depends on the others
             local = self.camera.local_us(begin) if self.camera.repeat else begin - self.camera.knots_us[0]
             times = [np.broadcast_to(v, pixel.shape).astype(np.float32) for v in (local, end - begin)]
-        parts: list[list[tuple[Any, Any]]] = []
+        parts: list[list[Halves]] = []
         room = self._block_rays // self.samples
         for first in range(0, pixel.size, room):
             part = slice(first, first + room)
@@ -189,7 +189,7 @@ class PixelTracer(Tracer):
         times: list[NDArray[np.float32]] | None,
         wavelengths: Wavelengths,
         values: Values,
-    ) -> list[tuple[Any, Any]]:
+    ) -> list[Halves]:
         """Both halves of a few pixels."""
         import drjit as dr
 
@@ -214,14 +214,14 @@ class PixelTracer(Tracer):
 
     def _rays_of(
         self,
-        pixel: Any,
-        index: Any,
-        half: Any,
-        sample: Any,
-        spread: list[Any] | None,
+        pixel: UInt32,
+        index: UInt32,
+        half: UInt32,
+        sample: UInt32,
+        spread: list[Float] | None,
         wavelengths: Wavelengths,
         values: Values,
-    ) -> list[Any]:
+    ) -> list[Float]:
         """The wanted quantities of one ray per lane."""
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(index)

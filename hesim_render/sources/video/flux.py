@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.video.arrays import ArrayVideo
@@ -116,7 +117,7 @@ class VideoFlux(WindowByWindow):
         self._filter = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32) * 3)
         self._shading = types.Float(sensor.relative_illumination.ravel()) if options.lens_shading else None
         self._lineariser, self._resample = Lineariser(shape, self.tags), Resampler(self.mapping)
-        self._maps: dict[int, Any] = {}
+        self._maps: dict[int, Float] = {}
         self._edges = self.clock.hold_us[1:-1] if self._is_held else self.clock.middle_us
         window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 0
         # so many pictures behind the latest one are asked for again: by frames, after an event window
@@ -169,7 +170,7 @@ class VideoFlux(WindowByWindow):
         """
         return self.clock.inner(self.clock.middle_us, begin_us, end_us)
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval, which may span several pictures.
 
         Before the first and after the last picture's time these two are held.
@@ -195,7 +196,7 @@ class VideoFlux(WindowByWindow):
             raise RangeError("pixel", int(pixels.max()), f"0 to {count - 1}")
         begin, end = _intervals(begin_us, end_us)
         index = types.UInt32(pixels)
-        total: Any = 0.0
+        total: Float = 0.0
         for number, share in self._shares(begin, end).items():
             total = dr.fma(dr.gather(types.Float, self._flux_of(number), index), _device(share), total)
             dr.eval(total)  # here, so that the pictures of a long interval can go one by one
@@ -230,7 +231,7 @@ class VideoFlux(WindowByWindow):
                 found[after] = found.get(after, 0.0) + share * part
         return found
 
-    def _flux_of(self, number: int) -> Any:
+    def _flux_of(self, number: int) -> Float:
         """Φ of all mosaic pixels in one picture, Dr.Jit Float [row · cols + col], e⁻/s."""
         import drjit as dr
 
@@ -243,7 +244,7 @@ class VideoFlux(WindowByWindow):
         planes = self._resample(self._lineariser.linear(self._reader.read(number)))
         if len(planes) == 1:
             planes = planes * 3
-        flux: Any = 0.0
+        flux: Float = 0.0
         for channel, plane in enumerate(planes):
             flux = dr.fma(dr.gather(types.Float, self._weights, self._filter + channel), plane, flux)
         flux = dr.maximum(flux, 0.0)
@@ -305,7 +306,7 @@ def _intervals(begin_us: ArrayLike, end_us: ArrayLike) -> tuple[NDArray[np.float
     return begin, end
 
 
-def _device(share: NDArray[np.float64]) -> Any:
+def _device(share: NDArray[np.float64]) -> Float:
     import drjit as dr
 
     types = jit()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.errors import RangeError
 
 Fit = Literal["cover", "stretch", "pixel"]
@@ -121,7 +122,7 @@ class Resampler:
         ]
         dr.eval(self._first, self._weight)
 
-    def __call__(self, planes: list[Any]) -> list[Any]:
+    def __call__(self, planes: list[Float]) -> list[Float]:
         """[row · width + col] of the picture to [row · cols + col] of the region, Dr.Jit Float, not evaluated."""
         import drjit as dr
 
@@ -144,14 +145,14 @@ class Resampler:
         source_row = row if first_row is None else dr.gather(types.UInt32, first_row, row)
         return self._sum_cols(planes, source_row, col)
 
-    def _sum(self, planes: list[Any], row: Any, col: Any, which: int, width: int) -> list[Any]:
+    def _sum(self, planes: list[Float], row: UInt32, col: UInt32, which: int, width: int) -> list[Float]:
         """Weighted sum of source rows."""
         import drjit as dr
 
         types = jit()
         first = dr.gather(types.UInt32, self._first[which], row)
         last = self._mapping.source_shape[0] - 1
-        totals: list[Any] = [0.0 for _ in planes]
+        totals: list[Float] = [0.0 for _ in planes]
         for tap in range(self._mapping.rows.weight.shape[1]):
             weight = dr.gather(types.Float, self._weight[which], row + tap * self._shape[which])
             place = dr.minimum(first + tap, last) * width + col
@@ -161,14 +162,14 @@ class Resampler:
             ]
         return totals
 
-    def _sum_cols(self, planes: list[Any], source_row: Any, col: Any) -> list[Any]:
+    def _sum_cols(self, planes: list[Float], source_row: UInt32, col: UInt32) -> list[Float]:
         """Weighted sum of source columns in the given lines."""
         import drjit as dr
 
         types = jit()
         first = dr.gather(types.UInt32, self._first[1], col)
         last = self._width - 1
-        totals: list[Any] = [0.0 for _ in planes]
+        totals: list[Float] = [0.0 for _ in planes]
         for tap in range(self._mapping.cols.weight.shape[1]):
             weight = dr.gather(types.Float, self._weight[1], col + tap * self._shape[1])
             place = source_row * self._width + dr.minimum(first + tap, last)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
 from hesim_render.sources.video.colours import ColourTags, code_scale, yuv_to_rgb
 from hesim_render.sources.video.picture import PictureFormat, Planes
 from hesim_render.spectral.transfer import decode
@@ -54,12 +53,12 @@ class Lineariser:
         self._index = dr.arange(types.UInt32, shape.width * shape.height)
         dr.eval(self._table, self._by_code, self._index)
 
-    def _opaque(self, *values: float) -> list[Any]:
+    def _opaque(self, *values: float) -> list[Float]:
         import drjit as dr
 
         return [dr.opaque(self._types.Float, float(np.float32(value))) for value in values]
 
-    def linear(self, planes: Planes) -> list[Any]:
+    def linear(self, planes: Planes) -> list[Float]:
         """[R, G, B] or [grey] as Dr.Jit Float [row · width + col], not evaluated."""
         shape = self._shape
         if shape.layout == "yuv":
@@ -74,12 +73,12 @@ class Lineariser:
             return [self._gather(self._by_code, self._types.UInt32(code)) for code in codes]
         return [self._light(self._scaled(code)) for code in codes]
 
-    def _gather(self, table: Any, index: Any) -> Any:
+    def _gather(self, table: Float, index: UInt32) -> Float:
         import drjit as dr
 
         return dr.gather(self._types.Float, table, index)
 
-    def _interleaved(self, picture: NDArray) -> list[Any]:
+    def _interleaved(self, picture: NDArray) -> list[Float]:
         """R, G and B of [row, col, 3]; bytes are taken out of whole words, which is three times as fast."""
         import drjit as dr
 
@@ -97,7 +96,7 @@ class Lineariser:
         both = (low >> shift) | ((high << 1) << (31 - shift))
         return [types.Float((both >> (8 * channel)) & 0xFF) for channel in range(3)]
 
-    def _samples(self, plane: NDArray) -> Any:
+    def _samples(self, plane: NDArray) -> Float:
         """A function from indices into a plane (None: all of it, in order) to its values as Float."""
         import drjit as dr
 
@@ -107,7 +106,7 @@ class Lineariser:
             words = types.UInt32(_words(flat))
             every = dr.arange(types.UInt32, flat.size)
 
-            def pick(index: Any) -> Any:
+            def pick(index: UInt32) -> Float:
                 where = every if index is None else index
                 return types.Float((dr.gather(types.UInt32, words, where >> 1) >> ((where & 1) << 4)) & 0xFFFF)
 
@@ -116,11 +115,11 @@ class Lineariser:
         array = kind(flat)
         return lambda index: types.Float(array if index is None else dr.gather(kind, array, index))
 
-    def _scaled(self, value: Any) -> Any:
+    def _scaled(self, value: Float) -> Float:
         offset, scale = self._scale
         return value if self._shape.bits == 0 else (value - offset) * scale
 
-    def _light(self, value: Any) -> Any:
+    def _light(self, value: Float) -> Float:
         """Linear light of picture values, from the table."""
         import drjit as dr
 
@@ -130,13 +129,13 @@ class Lineariser:
         low = self._gather(self._table, index)
         return dr.fma(place - types.Float(index), self._gather(self._table, index + 1) - low, low)
 
-    def _yuv(self, planes: Planes) -> list[Any]:
+    def _yuv(self, planes: Planes) -> list[Float]:
         luma = self._scaled(self._samples(planes[0])(None))
         offset, scale = self._chroma_scale
         cb, cr = ((value - offset) * scale for value in self._chroma(planes[1:]))
         return [row[0] * luma + row[1] * cb + row[2] * cr for row in self._matrix]
 
-    def _chroma(self, planes: Planes) -> list[Any]:
+    def _chroma(self, planes: Planes) -> list[Float]:
         """Both chroma planes at every luma sample."""
         shape = self._shape
         if shape.chroma_shift == (0, 0):
@@ -155,7 +154,7 @@ class Lineariser:
             found.append(lines[0] if down[2] is None else lines[0] + (lines[1] - lines[0]) * down[2])
         return found
 
-    def _between(self, place: Any, shift: int, count: int, aligned: bool) -> tuple[Any, Any, Any]:
+    def _between(self, place: UInt32, shift: int, count: int, aligned: bool) -> tuple[UInt32, UInt32, Float | None]:
         """Chroma samples before and after a luma position along one axis, and how far it is between them."""
         import drjit as dr
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 
@@ -114,7 +114,7 @@ class NotedFlux:
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
         return self.source.sample_blocks(window_us, begin_us, end_us)
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """See `FluxSource.mean_flux`."""
         halves = self.source.mean_flux(pixel, begin_us, end_us)
         count = len(pixel)
@@ -173,7 +173,7 @@ class NotedFlux:
             self.events.append(Units(pixel[one.place], begin, end, core, flux, difference, np.array(one.error)))
 
 
-def _mean_and_difference(halves: tuple[Any, Any], place: NDArray[np.int64]) -> NDArray[np.float64]:
+def _mean_and_difference(halves: Halves, place: NDArray[np.int64]) -> NDArray[np.float64]:
     """Mean and half the difference of both halves at some places, [2, k]."""
     import drjit as dr
 

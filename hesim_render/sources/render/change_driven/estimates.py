@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +33,11 @@ class Flux:
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         return self.half_a, self.half_b, self.error
 
-    def at(self, place: Any) -> Flux:
+    def at(self, place: slice | NDArray) -> Flux:
         """Of some pixels."""
         return Flux(*(values[:, place] for values in self.arrays))
 
-    def put(self, place: Any, flux: Flux) -> None:
+    def put(self, place: slice | NDArray, flux: Flux) -> None:
         """Take the flux of some pixels."""
         for values, found in zip(self.arrays, flux.arrays, strict=True):
             values[:, place] = found

@@ -11,12 +11,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Halves
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
@@ -132,7 +132,7 @@ class ChangeDrivenFlux:
 
     # ---- one window of each pixel -----------------------------------------------------------------
 
-    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> tuple[Any, Any]:
+    def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval, however long; see `FluxSource.mean_flux`."""
         types = jit()
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()

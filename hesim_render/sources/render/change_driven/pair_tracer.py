@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Mask, MitsubaObject, UInt32, UInt64
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
@@ -233,7 +233,7 @@ class PairTracer(Tracer):
         far = self.parts.resting_distance(ray)
         return float(dr.min(far * dr.dot(ray.d, mi.Vector3f(axis)))[0])
 
-    def _key(self, stream: Stream, repeat: int = 0) -> Any:
+    def _key(self, stream: Stream, repeat: int = 0) -> UInt64:
         import drjit as dr
 
         mitsuba()  # the variant may have been changed by other code
@@ -263,7 +263,7 @@ class PairTracer(Tracer):
         lanes: Sequence[NDArray[np.uint32]],
         packets: NDArray[np.int64],
         moments: Moments,
-        key: Any,
+        key: UInt64,
         out: PairFlux,
         part: slice,
     ) -> None:
@@ -304,9 +304,9 @@ class PairTracer(Tracer):
         pixels: NDArray[np.uint32],
         window: NDArray[np.uint32],
         moments: Moments,
-        key: Any,
+        key: UInt64,
         samples: int,
-        footprint: Any,
+        footprint: Float,
         out: PilotFlux,
         part: slice,
     ) -> None:
@@ -334,7 +334,9 @@ class PairTracer(Tracer):
         out.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
         out.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, bits, samples))
 
-    def _rays_of(self, pixel: Any, window: Any, moments: Moments, footprint: Any) -> tuple[Any, ...]:
+    def _rays_of(
+        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float
+    ) -> tuple[Float, Float, Float, Mask]:
         """What an integrator's `flux` returns of one ray per lane, on the optical axis's scale."""
         import drjit as dr
 
@@ -356,14 +358,14 @@ class PairTracer(Tracer):
         return self._integrator.flux(sampler, primary, now, which)
 
 
-def _bits(kind: Any, condition: Any, count: int) -> Any:
+def _bits(kind: type[UInt32], condition: Mask, count: int) -> UInt32:
     """1 where a condition holds, one entry a lane even if it is a single one."""
     import drjit as dr
 
     return dr.select(condition, kind(1), dr.zeros(kind, count))
 
 
-def _told(integrator: Any, property_name: str) -> int:
+def _told(integrator: MitsubaObject, property_name: str) -> int:
     """A depth that an integrator was given, -1 for none; Mitsuba tells it only in words."""
     for line in str(integrator).splitlines():
         name, _, value = line.strip().rstrip(",").partition(" = ")

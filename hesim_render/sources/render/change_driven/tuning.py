@@ -1,9 +1,14 @@
 """Constants of change-driven rendering, in one place.
 
-Fitted on the scenes `star`, `sweep` and `glass` of `benchmarks/change_driven.py` (`benchmarks/allocation.py` fits the
-gains); judged on the scenes of `tests/random_scenes.py` and of `tests/test_hidden_scenes.py`. None was chosen on the
-former. The latter have shown that `ray_weight`, `frame_pilot_rays` and `frame_margin` are needed, and how large, and
-that a pair needs as many rays as small things were looked for with (`zoom_rays`).
+Each says where it comes from by a letter:
+
+- F: fitted on the scenes `star`, `sweep` and `glass` of `benchmarks/change_driven.py` (the gains by
+  `benchmarks/allocation.py`).
+- H: the scenes of `tests/test_hidden_scenes.py`, on which nothing was fitted, showed that it is needed and how large.
+- C: chosen, not fitted: a bound on work, or a size that follows from the others.
+
+All were judged on the scenes of `tests/random_scenes.py` and of `tests/test_hidden_scenes.py`; none was chosen on the
+former.
 """
 
 from __future__ import annotations
@@ -18,30 +23,59 @@ from numpy.typing import NDArray
 class Tuning:
     """How the rays of a run are spent.
 
+    A *wanted error* is quality times the noise of the pixel, in its flux. Ray numbers are of one pixel in one window or
+    exposure. "Without" says what happens where a constant is left out of the method.
+
     Parameters
     ----------
-    pilot_rays : of each pixel in each window where its role's pixels lie next to each other; they tell whether it
-        changes and how many rays it gets. Half as many: edges are seen in steps of an eighth.
-    frame_pilot_rays : of each frame pixel in each exposure.
-    lone_pilot_rays : the same where they lie apart (event pixels of a hybrid tile), which have no neighbours to ask.
-    zoom_rays : of a pixel by which something comes that the pilot could miss, at most; a pair gets as many, if the
-        thing is small.
-    zoom_room, gloss_room : all these rays in a window, over the pixels of the picture, for small things and for others.
-    zoom_margin_px : around their outlines.
-    small_px : least extent, up to which a thing is small.
-    footprint_px : width of the area in which the pilot's rays start: edges are noticed before they enter the pixel.
-    tolerance : of a value's deviation, in wanted errors.
-    change : of a pilot's flux that counts, in tolerances. Larger: what is filled in is further off; smaller: more
-        pixels are rendered.
-    least_rays, most_rays : of a pair.
-    ray_weight : what a single ray of a pair brings at most, in wanted errors: others may see what no pilot ray saw.
-    ray_factor, ray_power : rays are (factor · scatter/wanted error)^(1/power): the error of stratified rays falls
-        faster than that of independent ones.
-    unseen_area : part of a pixel's area in which the pilot may have missed what the next pixels show.
-    most_unseen_rays : that a pair gets for that.
-    bright_rays : that a pair gets for each noise unit by which a pixel up to two away is brighter.
-    frame_margin : by which the wanted error of an exposure is smaller: much may move meanwhile, and rays gain less.
-    knot_factor : times as many rays where a pair stands for the half of a block.
+    pilot_rays : rays, F. Of the pilot pass where a role's pixels lie next to each other; they tell whether a pixel
+        changes and how many rays it gets. Half as many: edges are seen in steps of an eighth of a pixel.
+    lone_pilot_rays : rays, F. The same where pixels lie apart (event pixels of a hybrid tile). Without (as few as
+        `pilot_rays`): such pixels have no neighbours to ask, and changes are missed.
+    frame_pilot_rays : rays, H. Of the pilot of a frame pixel in an exposure. Without: what passes in a small part of
+        the exposure is missed.
+    zoom_rays : rays, H. Most that a pilot sends to a pixel by which something comes that it could miss; a pair gets as
+        many, if the thing is small. Without: objects smaller than a pixel come and go unseen, or are met by one ray
+        that weighs far too much.
+    zoom_room, gloss_room : rays over pixels of the picture, C. All these rays in a window, for small things and for
+        others. Without: a scene of many small or glossy objects takes more rays for looking than for its picture.
+    zoom_margin_px : px, C. Added around their outlines. Without: a pixel that an outline only touches is not looked at.
+    small_px : px, F. Largest least extent of a thing that is small. Without (0): as without `zoom_rays`.
+    footprint_px : px, F. Width of the area in which the pilot's rays start. Without (1): edges are noticed only after
+        they have entered the pixel.
+    lone_footprint_px : px, F. The same where pixels lie apart. Without: as above, with no neighbour to notice them.
+    tolerance : wanted errors, C. Deviation of a value up to which it is not called off. Without: nothing
+        says how far from the truth a straight line may be.
+    change : tolerances, F. Change of a pilot's flux that counts. Larger: what is filled in is further off; smaller:
+        more pixels are rendered.
+    great : changes that count, F. From such a change on, the pixels next to it are rendered too. Without: an edge's
+        faint outskirts are filled in by straight lines.
+    huge : changes that count, F. From such a change on, those two pixels away are rendered too. Without: as above, of
+        lamps and their glare.
+    huge_windows : windows, F. How much longer, before and after, a huge change counts. Without (0): the first trace of
+        a lamp that comes is filled in.
+    least_rays : rays, C. Fewest of a pair: two halves of four. Without: the difference of the halves tells no error.
+    ray_weight : wanted errors, H. What a single ray of a pair brings at most. Without: a ray that sees what no pilot
+        ray saw (a lamp through a gap) makes a value that is far off, and its stated error with it.
+    most_rays : rays, C. Most of a pair. Without: one pixel that sees a lamp in a rough mirror takes all the time.
+    matt_gain, path_gain : (factor, power), no unit, F. Standard error of n stratified rays is factor · n^-power of
+        the scatter, for direct light on matt surfaces and for paths. Without (1, 0.5): the error of independent rays
+        is planned for, which takes several times as many.
+    frame_margin : factor, H. By which the wanted error of an exposure is smaller than `quality` says. Without (1): the
+        error is too large where much moves within the exposure, as rays gain less there than the fit says.
+    unseen_area : part of a pixel, F. In which the pilot may have missed what the next pixels show. Without (0): an edge
+        that the pilot of 16 rays just missed gets the rays of an even area.
+    most_unseen_rays : rays, F. Most that a pair gets for that. Without: every pixel next to a lamp gets `most_rays`.
+    bright_rays : rays per noise unit, F. That a pair gets where a pixel up to two away is brighter by one. Without (0):
+        as without `unseen_area`, next to lamps.
+    knot_factor : factor, F. Times as many rays where a pair ends a block. Without (1): the straight lines of all
+        windows that are filled in from there carry its error.
+    audit_pilot_rays : rays, C. Of the audit's own pilot. Without (as few as `pilot_rays`): the audit's reference has
+        as poor a plan as the values that it judges.
+    least_audit_rays : rays, C. Fewest of the audit's trace. Without: as above.
+    audit_ray_weight : wanted errors of the audit, C. As `ray_weight`. Without (as large): the reference is no better
+        than what it judges.
+    most_audit_times : traces, C. Most of one value. Without: a few values take the time of the whole audit.
     """
 
     pilot_rays: int = 16

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows
@@ -51,14 +51,14 @@ class Moments:
     tracks, groups : so many.
     """
 
-    length_us: Any
-    times: Any
-    boxes: Any
-    bins: Any
+    length_us: Float
+    times: Float
+    boxes: Float
+    bins: UInt32
     tracks: int
     groups: int
 
-    def at(self, window: Any, share: Any) -> Moment:
+    def at(self, window: UInt32, share: Float) -> Moment:
         """A share of each lane's window."""
         import drjit as dr
 

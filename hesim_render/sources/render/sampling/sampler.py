@@ -26,13 +26,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, UInt32, UInt64
+
 #: Bits of an index that one table of the third generator matrix covers.
 _TABLE_BITS = 11
 #: 2^32 over the golden ratio: what successive draws are apart before they are hashed.
 _ODD = 0x9E3779B9
 
 
-def permute(index: Any, mask: int, key: Any) -> Any:
+def permute(index: UInt32, mask: UInt32 | int, key: UInt32) -> UInt32:
     """Kensler's hashed permutation of 0 … mask, mask + 1 a power of two; UInt32 in and out."""
     i = index ^ key
     i = i * 0xE170893D
@@ -55,14 +57,14 @@ def permute(index: Any, mask: int, key: Any) -> Any:
     return (i + key) & mask
 
 
-def scramble(x: Any) -> Any:
+def scramble(x: UInt32) -> UInt32:
     """A hash of UInt32 to UInt32, one to one, each bit of which depends about evenly on all."""
     x = (x ^ (x >> 16)) * 0x7FEB352D
     x = (x ^ (x >> 15)) * 0x846CA68B
     return x ^ (x >> 16)
 
 
-def zero_two_point(index: Any) -> tuple[Any, Any]:
+def zero_two_point(index: UInt32) -> tuple[UInt32, UInt32]:
     """Point of the (0, 2)-sequence of van der Corput and Sobol', as two UInt32 binary fractions.
 
     The second generator matrix is Pascal's triangle modulo 2, the fifth Kronecker power of [[1, 1], [0, 1]]: five
@@ -94,22 +96,22 @@ def third_coordinates(first_bit: int, bits: int) -> NDArray[np.uint32]:
 
 
 @functools.cache
-def sampler_class(variant: str) -> Any:
+def sampler_class(variant: str) -> type[MitsubaObject]:
     """`CounterSampler` for one Mitsuba variant (its base class differs between variants)."""
     import drjit as dr
     import mitsuba
 
-    mi: Any = mitsuba
+    mi: MitsubaModule = mitsuba
     assert mi.variant() == variant
 
-    def _unit(bits: Any) -> Any:
+    def _unit(bits: UInt32) -> Float:
         """The middle of one of 2^23 strata: at 0 itself some surfaces send no ray on, and the sample would be lost."""
         return (mi.Float(bits >> 9) + 0.5) * 2.0**-23
 
     class CounterSampler(mi.Sampler):
         """See the module. Its state is plain Dr.Jit arrays: only those take part in symbolic loops."""
 
-        def __init__(self, props: Any = None) -> None:
+        def __init__(self, props: MitsubaObject = None) -> None:
             super().__init__(props if props is not None else mi.Properties())
             self._tables = [mi.UInt32(third_coordinates(first, _TABLE_BITS)) for first in (0, _TABLE_BITS)]
             dr.make_opaque(*self._tables)
@@ -117,12 +119,20 @@ def sampler_class(variant: str) -> Any:
 
         def rest(self) -> None:
             """Let go of a wavefront: what is left of one changes the next one's kernel, which then compiles anew."""
-            self.keys: Any = ()
+            self.keys: tuple[UInt32, ...] | UInt32 = ()
             self.sample, self.dimension = mi.UInt32(), mi.UInt32()
-            self._mask: Any = 0
+            self._mask: UInt32 | int = 0
             self._bits = 0
 
-        def setup(self, key: Any, pixel: Any, half: Any, sample: Any, samples_per_half: Any, most: int = 0) -> None:
+        def setup(
+            self,
+            key: UInt64,
+            pixel: UInt32,
+            half: UInt32,
+            sample: UInt32,
+            samples_per_half: UInt32 | int,
+            most: int = 0,
+        ) -> None:
             """Start one wavefront.
 
             Parameters
@@ -137,34 +147,34 @@ def sampler_class(variant: str) -> Any:
             self._bits = max(0, ((most or samples_per_half) - 1).bit_length())
             self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
 
-        def _draw(self) -> tuple[Any, Any]:
+        def _draw(self) -> tuple[UInt32, list[UInt32]]:
             """Index of the point to take, and the random bits that shift its coordinates."""
             self.dimension = self.dimension + 1
             bits = [scramble(key + self.dimension * _ODD) for key in self.keys]
             return (permute(self.sample, self._mask, bits[0]) if self._bits else self.sample), bits
 
-        def next_1d(self, active: Any = True) -> Any:
+        def next_1d(self, active: Mask = True) -> Float:
             return self.next_2d()[0]
 
-        def next_2d(self, active: Any = True) -> Any:
+        def next_2d(self, active: Mask = True) -> Point2:
             point, bits = self._draw()
             x, y = zero_two_point(point)
             return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2]))
 
-        def next_3d(self) -> tuple[Any, Any]:
+        def next_3d(self) -> tuple[Point2, Float]:
             """A pair, and a third number stratified with it; for up to 2^22 samples in a half."""
             point, bits = self._draw()
             x, y = zero_two_point(point)
             return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2])), _unit(self._third(point) ^ bits[3])
 
-        def _third(self, point: Any) -> Any:
+        def _third(self, point: UInt32) -> UInt32:
             """Third coordinate of a point, as a binary fraction."""
             z = dr.gather(mi.UInt32, self._tables[0], point & ((1 << _TABLE_BITS) - 1))
             if self._bits > _TABLE_BITS:
                 z ^= dr.gather(mi.UInt32, self._tables[1], point >> _TABLE_BITS)
             return z
 
-        def next_vertex(self) -> tuple[Any, Any, Any, Any]:
+        def next_vertex(self) -> tuple[Point2, Float, Point2, Float]:
             """What a path needs where it meets a surface.
 
             Returns

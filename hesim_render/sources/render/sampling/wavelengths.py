@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import table
 from hesim_render.spectral.spectrum import Spectrum
 
@@ -60,13 +60,13 @@ class WavelengthSampler:
         self._starts = types.UInt32(np.concatenate(starts).astype(np.uint32).ravel())
         dr.make_opaque(self._cells, self._shares, self._totals, self._starts)
 
-    def total(self, filter_index: Any) -> Any:
+    def total(self, filter_index: UInt32) -> Float:
         """∫R dλ of each lane's filter, e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹ × nm."""
         import drjit as dr
 
         return dr.gather(jit().Float, self._totals, filter_index)
 
-    def sample(self, filter_index: Any, u: Any) -> list[Any]:
+    def sample(self, filter_index: UInt32, u: Float) -> list[Float]:
         """Four wavelengths in nm, one from each quarter of the response's integral, at (u + k)/4.
 
         Parameters
@@ -90,7 +90,7 @@ class WavelengthSampler:
             low.append(first)
             high.append(dr.select(several, end, first))
 
-        def halve(low: list[Any], high: list[Any]) -> tuple[list[Any], list[Any]]:
+        def halve(low: list[UInt32], high: list[UInt32]) -> tuple[list[UInt32], list[UInt32]]:
             new_low, new_high = [], []
             for place, a, b in zip(places, low, high, strict=True):
                 middle = (a + b + 1) >> 1
@@ -99,7 +99,7 @@ class WavelengthSampler:
                 new_high.append(dr.select(beyond, b, dr.minimum(middle - 1, b)))
             return new_low, new_high
 
-        def unsure(low: list[Any], high: list[Any]) -> Any:
+        def unsure(low: list[UInt32], high: list[UInt32]) -> Mask:
             return functools.reduce(operator.or_, (a < b for a, b in zip(low, high, strict=True)))
 
         # no step nearly always; only in the tails does a bin hold many cells

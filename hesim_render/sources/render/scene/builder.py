@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
@@ -51,10 +52,10 @@ class BuiltScene:
     integrator_plugin : what a Mitsuba scene's integrator was made of; None where it was made before.
     """
 
-    mi: Any
-    scene: Any
-    integrator: Any
-    parameters: Any
+    mi: MitsubaModule
+    scene: MitsubaObject
+    integrator: MitsubaObject
+    parameters: MitsubaObject
     groups: dict[str, list[Movable]]
     trajectories: dict[str, Trajectory]
     is_dark: bool
@@ -93,7 +94,7 @@ class BuiltScene:
         return self.camera
 
 
-def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = None) -> BuiltScene:
+def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = None) -> BuiltScene:
     """Load a scene for rendering.
 
     Parameters
@@ -152,7 +153,7 @@ def build(mi: Any, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = N
     )
 
 
-def _describe(mi: Any, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
+def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
     """Mitsuba's dictionary of a scene file, which shape ids belong to each movable name, and the shapes' paint."""
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
@@ -184,7 +185,7 @@ def _paint(item: ObjectSpec, name: str) -> Paint:
     return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
 
 
-def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
+def _object(mi: MitsubaModule, item: ObjectSpec, name: str, folder: Path) -> MitsubaObject:
     placement = np.eye(4)
     placement[:3, :3] = rotation_about(item.rotation_axis, item.rotation_deg)
     placement[:3, 3] = item.position_m
@@ -211,7 +212,9 @@ def _object(mi: Any, item: ObjectSpec, name: str, folder: Path) -> Any:
     return make_mesh(mi, name, vertices, faces, bsdf, uv)
 
 
-def _mesh_file(mi: Any, item: ObjectSpec, placement: NDArray[np.float64], bsdf: dict[str, Any], folder: Path) -> Any:
+def _mesh_file(
+    mi: MitsubaModule, item: ObjectSpec, placement: NDArray[np.float64], bsdf: dict[str, Any], folder: Path
+) -> MitsubaObject:
     """A mesh file, scaled so that its bounding box becomes `size_m` and centred on the object's place."""
     path = folder / str(item.mesh)
     if not path.is_file():

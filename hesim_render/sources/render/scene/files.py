@@ -9,6 +9,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
 from hesim_render.specs.scene import OUTSIDE
@@ -60,7 +61,9 @@ def require_short_number(name: str, file: Path | None) -> None:
         raise SpecError(f"the name {name[:40]!r} holds too large a number", file=file)
 
 
-def require_state_inside(mi: Any, state: Any, root: Path, find: Callable[[str], str], file: Path | None) -> None:
+def require_state_inside(
+    mi: MitsubaModule, state: Any, root: Path, find: Callable[[str], str], file: Path | None
+) -> None:
     """The same of a scene that Mitsuba has parsed, before anything is made of it."""
     for node in state.nodes:
         for key in node.props:

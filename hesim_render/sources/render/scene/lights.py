@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform
 from hesim_render.specs.light import LightSpec, irradiance
@@ -73,7 +74,7 @@ def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
     return frame
 
 
-def emitters(mi: Any, given: Sequence[LightSpec]) -> dict[str, Any]:
+def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
     """Entries of the Mitsuba scene for its lights, at their time means.
 
     ``uniform``: L = E/π from everywhere, as of a plane under an even sky, visible behind the scene; several
@@ -154,7 +155,7 @@ def _beam(light: LightSpec, level: Spectrum, key: str) -> dict[str, Any]:
     return {"type": "point", "position": list(light.position_m or ()), "intensity": strength}
 
 
-def _area(mi: Any, light: LightSpec, level: Spectrum | None, key: str) -> dict[str, Any]:
+def _area(mi: MitsubaModule, light: LightSpec, level: Spectrum | None, key: str) -> dict[str, Any]:
     frame, geometry = area_light_frame(light), geometry_on_plane(light, key)
     rectangle: dict[str, Any] = {
         "type": "rectangle",

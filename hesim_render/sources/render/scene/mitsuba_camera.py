@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import radians, tan
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.sources.render.scene.mitsuba_version import box_corners
 from hesim_render.sources.render.scene.plugins import Used
 
@@ -30,7 +30,7 @@ class MitsubaCamera:
     near_m: float
 
     @classmethod
-    def of(cls, mi: Any, scene: Any, used: Used) -> MitsubaCamera:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject, used: Used) -> MitsubaCamera:
         """The first sensor of a loaded scene.
 
         Parameters
@@ -64,7 +64,7 @@ class MitsubaCamera:
         return cls(to_world, picture, float(told["near_clip"]))
 
 
-def _farthest(scene: Any, to_world: NDArray[np.float64]) -> float:
+def _farthest(scene: MitsubaObject, to_world: NDArray[np.float64]) -> float:
     """Largest depth along the axis of anything in a scene; minus infinity where there is nothing."""
     if not scene.shapes():
         return -np.inf

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.files import require_short_number
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
@@ -44,14 +45,14 @@ class MitsubaScene:
     camera : its first sensor, where there is one and the scene file has no camera.
     """
 
-    scene: Any
-    integrator: Any
+    scene: MitsubaObject
+    integrator: MitsubaObject
     integrator_plugin: dict[str, Any] | None
     exact_because: str | None
     camera: MitsubaCamera | None
 
 
-def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
+def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
     """A scene of Mitsuba's own, with the emitters that are wanted.
 
     Raises
@@ -72,7 +73,7 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
     elif not spec.allow_outside and source.file is not None:
         root = path.parent
 
-    def load(review: Callable[[Any], None]) -> Any:
+    def load(review: Callable[[Any], None]) -> MitsubaObject:
         with as_spec_error(*where):
             if source.file is not None:
                 return load_scene(mi, path, review, root)
@@ -120,13 +121,13 @@ def load_mitsuba(mi: Any, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
     return MitsubaScene(scene, integrator, plugin, reason, seen)
 
 
-def path_tracer(mi: Any, depth: int) -> Any:
+def path_tracer(mi: MitsubaModule, depth: int) -> MitsubaObject:
     """Mitsuba's, for paths of so many segments."""
     return mi.load_dict({"type": "path", "max_depth": depth, **_ROULETTE})
 
 
 def _plugin_dict(
-    mi: Any, node: Mapping[str, Any], file: Path | None = None, key: str = "mitsuba.inline"
+    mi: MitsubaModule, node: Mapping[str, Any], file: Path | None = None, key: str = "mitsuba.inline"
 ) -> dict[str, Any]:
     """A dictionary as YAML writes it: 4×4 lists become transforms, lists of numbers in spectra become text.
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core import backend
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.interrupts import interrupts_held
 from hesim_render.sources.render.scene.files import check_xml, require_state_inside
@@ -28,7 +29,7 @@ _EVEN = 1e-9
 _NOTHING = 1e-37
 
 
-def mitsuba() -> Any:
+def mitsuba() -> MitsubaModule:
     """The mitsuba module, its variant set to the selected backend's, its log kept to errors.
 
     Raises
@@ -50,7 +51,7 @@ def mitsuba() -> Any:
     return mi
 
 
-def _home(mi: Any) -> Path:
+def _home(mi: MitsubaModule) -> Path:
     """Folder of Mitsuba's own plugins and data.
 
     It comes first wherever files are looked for: Mitsuba takes ``plugins/TYPE.so`` from the first folder that has it,
@@ -71,7 +72,7 @@ def _have_threads() -> None:
 
 
 @contextmanager
-def using_variant(name: str | None) -> Iterator[Any]:
+def using_variant(name: str | None) -> Iterator[MitsubaModule]:
     """The mitsuba module in another variant for a while (``scalar_spectral``); None keeps the backend's.
 
     Raises
@@ -108,7 +109,9 @@ def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[N
         raise SpecError(f"Mitsuba cannot read this scene: {' '.join(lines)[:400]}", file=file, key=key) from None
 
 
-def load_scene(mi: Any, source: Path | dict[str, Any], review: Callable[[Any], None], root: Path | None = None) -> Any:
+def load_scene(
+    mi: MitsubaModule, source: Path | dict[str, Any], review: Callable[[Any], None], root: Path | None = None
+) -> MitsubaObject:
     """A scene from an XML file or a dictionary, nothing merged.
 
     Parameters
@@ -205,13 +208,13 @@ def spectrum_dict(spectrum: Spectrum) -> dict[str, Any]:
 
 
 def make_mesh(
-    mi: Any,
+    mi: MitsubaModule,
     name: str,
     vertices: NDArray[np.float64],
     faces: NDArray[np.uint32],
     bsdf: dict[str, Any],
     texcoords: NDArray[np.float64] | None = None,
-) -> Any:
+) -> MitsubaObject:
     """A flat-shaded mesh from arrays: vertices [n, 3] in metres, faces [m, 3], texture coordinates [n, 2]."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
@@ -225,7 +228,7 @@ def make_mesh(
     return mesh
 
 
-def transform(mi: Any, matrix: NDArray[np.float64] | Sequence[Sequence[float]]) -> Any:
+def transform(mi: MitsubaModule, matrix: NDArray[np.float64] | Sequence[Sequence[float]]) -> MitsubaObject:
     """A 4×4 matrix as Mitsuba's scalar transform."""
     return mi.ScalarTransform4f(np.asarray(matrix, dtype=np.float64))
 
@@ -233,7 +236,7 @@ def transform(mi: Any, matrix: NDArray[np.float64] | Sequence[Sequence[float]]) 
 class Movable:
     """One shape of a loaded scene whose pose can be set: initial geometry, moved by a rigid pose."""
 
-    def __init__(self, parameters: Any, prefix: str, shape: Any) -> None:
+    def __init__(self, parameters: MitsubaObject, prefix: str, shape: MitsubaObject) -> None:
         self._parameters = parameters
         self.prefix = prefix
         self._to_world: NDArray[np.float64] | None = None

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 
 #: Rendered in both modes as Mitsuba renders them, by the kind of plugin.
@@ -182,7 +183,7 @@ def require_known(name: Any, file: Path | None, key: str) -> None:
         raise SpecError(f"type {name!r} is no plugin of Mitsuba's that is known here", file=file, key=key)
 
 
-def used_plugins(mi: Any, state: Any, file: Path | None) -> list[Used]:
+def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]:
     """All plugins of a parsed scene, in order; `file` is the scene file, for a dictionary within it."""
     nodes, types = list(state.nodes), mi.Properties.Type
     owners: list[list[Any]] = [[] for _ in nodes]
@@ -204,7 +205,7 @@ def used_plugins(mi: Any, state: Any, file: Path | None) -> list[Used]:
     return found
 
 
-def _place(mi: Any, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
+def _place(mi: MitsubaModule, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
     """Arguments of a `SpecError` for where a node stands."""
     told, own = mi.parser.file_location(state, node), node.props.id()
     if match := _PLACE.fullmatch(told):
@@ -214,7 +215,7 @@ def _place(mi: Any, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
     return {"file": file, "key": f"mitsuba.inline{inside}"}
 
 
-def _made(mi: Any, value: Any, place: Mapping[str, Any], owner: Any) -> Iterator[Used]:
+def _made(mi: MitsubaModule, value: Any, place: Mapping[str, Any], owner: Any) -> Iterator[Used]:
     """An object that was made before, and what is in it."""
     if not isinstance(value, mi.Object):
         return

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Mask, Point3, UInt32, Vector3
 from hesim_render.core.tables import table
 
 if TYPE_CHECKING:
@@ -20,11 +21,11 @@ if TYPE_CHECKING:
 class DevicePose:
     """Rigid poses, one a lane: x → R x + shift; `columns` are those of R."""
 
-    columns: tuple[Any, Any, Any]
-    shift: Any
+    columns: tuple[Vector3, Vector3, Vector3]
+    shift: Vector3
 
     @classmethod
-    def about(cls, w: Any, v: Any, pivot: Any, shift: Any) -> DevicePose:
+    def about(cls, w: Float, v: Vector3, pivot: Point3, shift: Vector3) -> DevicePose:
         """x → R (x − pivot) + pivot + shift, R from the unit quaternion (w, v)."""
         import drjit as dr
 
@@ -41,38 +42,38 @@ class DevicePose:
         return cls(rest.columns, shift + pivot - rest.turn_to_world(pivot))
 
     @classmethod
-    def none(cls, vector: Any) -> DevicePose:
+    def none(cls, vector: type[Vector3]) -> DevicePose:
         """Of what stays where it is."""
         import drjit as dr
 
         return cls((vector(1, 0, 0), vector(0, 1, 0), vector(0, 0, 1)), dr.zeros(vector))
 
-    def where(self, condition: Any, other: DevicePose) -> DevicePose:
+    def where(self, condition: Mask, other: DevicePose) -> DevicePose:
         """This pose in lanes where a condition holds, another one in the rest."""
         import drjit as dr
 
         columns = (dr.select(condition, a, b) for a, b in zip(self.columns, other.columns, strict=True))
         return DevicePose(tuple(columns), dr.select(condition, self.shift, other.shift))
 
-    def turn_to_world(self, direction: Any) -> Any:
+    def turn_to_world(self, direction: Vector3) -> Vector3:
         import drjit as dr
 
         (x, y, z), (first, second, third) = direction, self.columns
         return dr.fma(first, x, dr.fma(second, y, third * z))
 
-    def to_world(self, point: Any) -> Any:
+    def to_world(self, point: Point3) -> Point3:
         import drjit as dr
 
         (x, y, z), (first, second, third) = point, self.columns
         return dr.fma(first, x, dr.fma(second, y, dr.fma(third, z, self.shift)))
 
-    def turn_to_rest(self, direction: Any) -> Any:
+    def turn_to_rest(self, direction: Vector3) -> Vector3:
         import drjit as dr
 
         vector = type(self.shift)
         return vector(*(dr.dot(column, vector(direction)) for column in self.columns))
 
-    def to_rest(self, point: Any) -> Any:
+    def to_rest(self, point: Point3) -> Point3:
         return self.turn_to_rest(type(self.shift)(point) - self.shift)
 
 
@@ -117,7 +118,7 @@ class Tracks:
         self._most = 1 << max(0, max(map(len, rows)) - 1).bit_length()
         dr.make_opaque(self._heads, self._rows, self._times)
 
-    def pose(self, number: Any, local_us: Any) -> DevicePose:
+    def pose(self, number: UInt32, local_us: Float) -> DevicePose:
         """Pose of every lane at its own time.
 
         Parameters

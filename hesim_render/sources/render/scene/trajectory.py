@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from functools import cached_property
 from math import degrees, radians
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.device_types import Float
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.specs.scene import KeyframeSpec, TrackSpec
 
@@ -194,7 +195,7 @@ class Trajectory:
         times = np.unique((knots + self.period_us * first[:, None]).ravel())
         return times[(times > begin_us) & (times < end_us)]
 
-    def pose_at(self, local_us: Any) -> DevicePose:
+    def pose_at(self, local_us: Float) -> DevicePose:
         """Pose of every lane at its own time.
 
         Parameters

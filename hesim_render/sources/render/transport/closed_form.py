@@ -9,12 +9,25 @@ any case.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hesim_render.core.device_types import (
+    DeviceArray,
+    Float,
+    Interaction,
+    Mask,
+    MitsubaModule,
+    MitsubaObject,
+    Point3,
+    Ray,
+    UInt32,
+    Vector3,
+)
+from hesim_render.sources.render.transport.intersections import meets_ball, to_ball, to_face
 
 #: Faces and balls of a part that are tried one by one, at most: paths of four segments among 3, 6, 12, 24 and 48 faces
 #: took 0.93, 0.83, 1.06, 1.08 and 1.7 times as long as with Embree (AVX-512).
@@ -44,7 +57,7 @@ class Face:
     surface: dict[str, NDArray[np.float64]]
 
 
-def faces_of(mi: Any, shape: Any) -> list[Face]:
+def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
     """The faces of a mesh if they are all it is, not too many, and flat to light as well; else none."""
     if not shape.is_mesh() or shape.face_count() > 2 * _MOST or shape.face_count() % 2:
         return []
@@ -96,7 +109,7 @@ def _parallelogram(
     return (own, on_u, on_v), (opposite, int(np.argmax(same[on_u])), int(np.argmax(same[on_v])))
 
 
-def _at_corners(mi: Any, shape: Any) -> dict[str, NDArray[np.float64]]:
+def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np.float64]]:
     """What Mitsuba says of a mesh's surface at the corners of its triangles, [faces, 2, 3 corners, ...] each."""
     import drjit as dr
 
@@ -123,11 +136,11 @@ class Ball:
 class SimpleForm:
     """Faces and balls, each with its shape of Mitsuba."""
 
-    faces: list[tuple[Face, Any]]
-    balls: list[tuple[Ball, Any]]
+    faces: list[tuple[Face, MitsubaObject]]
+    balls: list[tuple[Ball, MitsubaObject]]
 
     @classmethod
-    def of(cls, mi: Any, scene: Any) -> SimpleForm | None:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> SimpleForm | None:
         """That of all shapes of a scene, if they are nothing else and not too many."""
         form = cls([], [])
         for shape in scene.shapes():
@@ -151,14 +164,14 @@ class Part:
     apart : whether most rays pass far from them: Mitsuba is then asked only about rays that meet a ball around them.
     """
 
-    def __init__(self, mi: Any, scene: Any, apart: bool) -> None:
+    def __init__(self, mi: MitsubaModule, scene: MitsubaObject, apart: bool) -> None:
         import drjit as dr
 
         self._mi = mi
         #: Middle and square of the radius of each ball, and its shape.
-        self._balls: list[tuple[Any, Any, Any]] = []
+        self._balls: list[tuple[Point3, Float, MitsubaObject]] = []
         #: Rows of the map to u, v and height of each face, its first triangle, and its shape.
-        self._faces: list[tuple[list[tuple[Any, Any]], int, Any]] = []
+        self._faces: list[tuple[list[tuple[Vector3, Float]], int, MitsubaObject]] = []
         #: What Mitsuba said of their surfaces: one value for both triangles, or one for each.
         self._surfaces: list[dict[str, list[Any]]] = []
         #: What Mitsuba searches, and the ball around it.
@@ -185,7 +198,7 @@ class Part:
         """Faces that are tried one by one."""
         return len(self._faces)
 
-    def nearest(self, ray: Any, coherent: Any, active: Any) -> tuple[Any, Any]:
+    def nearest(self, ray: Ray, coherent: Mask, active: Mask) -> tuple[Interaction, UInt32]:
         """The first surface before a ray's `maxt`.
 
         Parameters
@@ -207,7 +220,7 @@ class Part:
         found = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
         found.t, end = mi.Float(dr.inf), ray.maxt
 
-        def take(closer: Any, t: Any, shape: Any) -> Any:
+        def take(closer: Mask, t: Float, shape: MitsubaObject) -> Float:
             found.valid |= closer
             found.t, found.shape = dr.select(closer, t, found.t), dr.select(closer, shape, found.shape)
             return dr.select(closer, t, end)
@@ -222,7 +235,7 @@ class Part:
             found.prim_uv = dr.select(closer, place, found.prim_uv)
         return found, face
 
-    def blocks(self, ray: Any, active: Any) -> Any:
+    def blocks(self, ray: Ray, active: Mask) -> Mask:
         """Whether anything lies on a ray before its `maxt`."""
         if self._scene is not None:
             return self._scene.ray_test(ray, active & self._near(ray))
@@ -235,7 +248,7 @@ class Part:
             blocked |= inside & (t >= 0) & (t < ray.maxt)
         return blocked & active
 
-    def surface(self, hit: Any, face: Any, ray: Any, flags: Any, active: Any) -> Any:
+    def surface(self, hit: Interaction, face: UInt32, ray: Ray, flags: MitsubaObject, active: Mask) -> Interaction:
         """What a ray has met, `SurfaceInteraction3f` in the part's own frame; its t is infinite where that is nothing.
 
         Parameters
@@ -249,7 +262,7 @@ class Part:
             self._describe_faces(si, ray, hit, face)
         return si
 
-    def _describe_faces(self, si: Any, ray: Any, hit: Any, face: Any) -> None:
+    def _describe_faces(self, si: Interaction, ray: Ray, hit: Interaction, face: UInt32) -> None:
         """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one."""
         import drjit as dr
 
@@ -259,7 +272,7 @@ class Part:
         for number, ((_, triangle, _), told) in enumerate(zip(self._faces, self._surfaces, strict=True), start=1):
             here = face == number
 
-            def chosen(name: str, told: dict[str, list[Any]] = told) -> Any:
+            def chosen(name: str, told: dict[str, list[Any]] = told) -> DeviceArray:
                 return dr.select(second, told[name][1], told[name][0]) if len(told[name]) == 2 else told[name][0]
 
             n, shading = dr.select(here, chosen("n"), n), dr.select(here, chosen("shading"), shading)
@@ -275,12 +288,12 @@ class Part:
         si.shape = dr.select(here, hit.shape, si.shape)
         si.wi = dr.select(here, si.sh_frame.to_local(-ray.d), si.wi)
 
-    def _near(self, ray: Any) -> Any:
+    def _near(self, ray: Ray) -> Mask:
         """Whether a ray meets the ball around all, where there is one."""
         return self._mi.Bool(True) if self._around is None else meets_ball(ray, ray.maxt, self._around)
 
 
-def _on_device(mi: Any, values: NDArray[np.float64]) -> list[Any]:
+def _on_device(mi: MitsubaModule, values: NDArray[np.float64]) -> list[Any]:
     """Values of both triangles, [2, ...], or one where they are alike."""
     alike = np.allclose(values[0], values[1], rtol=0, atol=_SAME * np.abs(values).max())
     kept = values[:1] if alike else values
@@ -289,53 +302,7 @@ def _on_device(mi: Any, values: NDArray[np.float64]) -> list[Any]:
     return [tuple(mi.Point2f(row) for row in value) for value in kept]
 
 
-def _ball_around(box: Any, factor: float) -> Ball:
+def _ball_around(box: MitsubaObject, factor: float) -> Ball:
     """About the middle of a box, its radius `factor` times half the diagonal."""
     low, high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
     return Ball((low + high) / 2, float((factor * np.linalg.norm(high - low) / 2) ** 2))
-
-
-def to_ball(ray: Any, middle: Any, square: Any) -> Any:
-    """Distance along a ray to a ball; negative or not a number where it lies behind or is missed."""
-    import drjit as dr
-
-    to = middle - ray.o
-    along = dr.dot(to, ray.d)
-    # of the two roots the one without cancellation, and the other by their product
-    root = dr.sqrt(square - dr.squared_norm(dr.fma(-along, ray.d, to)))
-    far = along + dr.mulsign(root, along)
-    other = (dr.squared_norm(to) - square) * dr.rcp(far)
-    first, second = dr.select(far < other, far, other), dr.select(far < other, other, far)
-    return dr.select(first >= 0, first, second)
-
-
-def to_face(ray: Any, rows: Sequence[tuple[Any, Any]]) -> tuple[Any, Any, Any]:
-    """Distance along a ray to a face's plane, the place there, and whether it lies on the face.
-
-    Where the ray runs along the plane they are not numbers, and it does not.
-
-    Parameters
-    ----------
-    rows : of the map to u, v and height: three of a vector and a number.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    (u_row, u_0), (v_row, v_0), (normal, height) = rows
-    t = -(dr.dot(normal, ray.o) + height) * dr.rcp(dr.dot(normal, ray.d))
-    point = dr.fma(ray.d, t, ray.o)
-    u, v = dr.dot(u_row, point) + u_0, dr.dot(v_row, point) + v_0
-    # not dr.minimum and dr.maximum: what those do about NaN takes time
-    return t, mi.Point2f(u, v), (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
-
-
-def meets_ball(ray: Any, length: Any, ball: tuple[Any, Any]) -> Any:
-    """Whether the first `length` metres of a ray meet a ball, given by its middle and the square of its radius."""
-    import drjit as dr
-
-    middle, square = ball
-    to = middle - ray.o
-    along, far = dr.dot(to, ray.d), dr.squared_norm(to)
-    # from outside it has to lie ahead, and its near side, whatever the radius, no farther than the ray goes
-    ahead = (far <= square) | ((along > 0) & ((along <= length) | (dr.square(along - length) <= square)))
-    return ahead & (dr.fma(-along, along, far) <= square)

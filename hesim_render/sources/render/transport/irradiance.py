@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.device_types import Float, MitsubaModule, Point2, Point3, Vector3
 
 #: Area over squared distance below which a rectangle counts as a point at its middle: the sum over edges loses its
 #: digits in float32 there, and the middle is right to about this part.
@@ -18,7 +21,7 @@ class RectangleLight:
     frame : [4, 4]; columns are half the width, half the height, the unit normal and the middle, metres.
     """
 
-    def __init__(self, mi: Any, frame: Any) -> None:
+    def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64]) -> None:
         import drjit as dr
 
         self._mi = mi
@@ -31,7 +34,7 @@ class RectangleLight:
         self._area_m2 = mi.Float(area)
         dr.make_opaque(self._half_width, self._half_height, self._normal, self._middle, self._corners, self._area_m2)
 
-    def irradiance(self, point: Any, normal: Any) -> Any:
+    def irradiance(self, point: Point3, normal: Vector3) -> Float:
         """∫ cos θ dω over the rectangle, what lies below the horizon cut off; sr.
 
         Lambert's formula, ½ |Σ γ_i (Γ_i · n)| with γ_i the angle that edge i subtends and Γ_i the unit normal of the
@@ -68,7 +71,7 @@ class RectangleLight:
         exact = dr.select(self._area_m2 < _SMALL_SR * square, dr.maximum(as_point, 0.0), 0.5 * abs(total))
         return dr.select(before > 0, exact, 0.0)
 
-    def sample(self, point: Any, normal: Any, place: Any) -> tuple[Any, Any]:
+    def sample(self, point: Point3, normal: Vector3, place: Point2) -> tuple[Point3, Float]:
         """A point drawn evenly on the rectangle, and its share of the irradiance: the mean of that is `irradiance`.
 
         Parameters
@@ -85,7 +88,7 @@ class RectangleLight:
         return drawn, dr.select(square > 0, self._area_m2 * cosines / (square * square), 0.0)
 
 
-def _edge(first: Any, second: Any, normal: Any) -> Any:
+def _edge(first: Vector3, second: Vector3, normal: Vector3) -> Float:
     """γ (Γ · n) of one edge."""
     import drjit as dr
 

@@ -7,13 +7,25 @@ tried in its own frame, at the ray's own time, where the ray meets the box that 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from hesim_render.core.device_types import (
+    Float,
+    Interaction,
+    LoopState,
+    Mask,
+    MitsubaModule,
+    MitsubaObject,
+    Point2,
+    Ray,
+    UInt32,
+    Vector3,
+)
 from hesim_render.core.tables import table
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
-from hesim_render.sources.render.transport.closed_form import SimpleForm, to_ball, to_face
+from hesim_render.sources.render.transport.closed_form import SimpleForm
+from hesim_render.sources.render.transport.intersections import to_ball, to_face
 from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
 
 #: Entries of a row of the tables of balls and of faces.
@@ -30,13 +42,13 @@ class Fleet:
     numbers : of each group among all of the scene's; `tracks` of all of these.
     """
 
-    def __init__(self, mi: Any, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks) -> None:
+    def __init__(self, mi: MitsubaModule, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks) -> None:
         import drjit as dr
 
         self._mi, self._tracks = mi, tracks
         heads: list[list[float]] = []
-        balls: list[Any] = []
-        faces: list[Any] = []
+        balls: list[Sequence[float]] = []
+        faces: list[Sequence[float]] = []
         for form, number in zip(forms, numbers, strict=True):
             heads.append([number, len(balls), len(balls) + len(form.balls), 0])
             heads.append([len(faces), len(faces) + len(form.faces), 0, 0])
@@ -51,7 +63,7 @@ class Fleet:
         self._count = mi.UInt32(len(forms))
         dr.make_opaque(self._heads, self._balls, self._faces, self._count)
 
-    def nearest(self, ray: Any, moment: Moment, length: Any, active: Any) -> tuple[Any, ...]:
+    def nearest(self, ray: Ray, moment: Moment, length: Float, active: Mask) -> tuple[Interaction, UInt32, Mask]:
         """The first surface before a distance.
 
         Parameters
@@ -70,23 +82,23 @@ class Fleet:
         mi = self._mi
         inverse = inverse_of(ray.d)
 
-        def visit(k: Any, t: Any, place: Any, which: Any, ball: Any, group: Any, met: Any) -> tuple[Any, ...]:
+        def visit(k: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32, met: Mask) -> LoopState:
             number, first_ball, last_ball, _ = dr.gather(mi.Array4u, self._heads, 2 * k)
             near = active & meets_box(ray, inverse, length, moment.box(number))
             met |= near
 
-            def look(t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
+            def look(t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
                 local = self._at_rest(ray, number, moment)
                 first_face, last_face, _, _ = dr.gather(mi.Array4u, self._heads, 2 * k + 1)
 
-                def try_ball(j: Any, t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
+                def try_ball(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
                     x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
                     own = to_ball(local, mi.Point3f(x, y, z), square)
                     closer = near & (own >= 0) & (own < t)
                     t, which, ball = dr.select(closer, own, t), dr.select(closer, j, which), ball | closer
                     return j + 1, t, place, which, ball, dr.select(closer, number, group)
 
-                def try_face(j: Any, t: Any, place: Any, which: Any, ball: Any, group: Any) -> tuple[Any, ...]:
+                def try_face(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
                     own, spot, inside = to_face(local, self._rows(j))
                     closer = near & inside & (own >= 0) & (own < t)
                     t, which, place = (
@@ -111,28 +123,28 @@ class Fleet:
         )
         return self._hit(t, t < length, place, which, ball), group, met
 
-    def blocks(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+    def blocks(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Mask, Mask]:
         """Whether anything lies on a ray before its `maxt`; and whether it came through the box of any."""
         import drjit as dr
 
         mi = self._mi
         inverse = inverse_of(ray.d)
 
-        def visit(k: Any, blocked: Any, met: Any) -> tuple[Any, ...]:
+        def visit(k: UInt32, blocked: Mask, met: Mask) -> LoopState:
             number, first_ball, last_ball, _ = dr.gather(mi.Array4u, self._heads, 2 * k)
             near = active & meets_box(ray, inverse, ray.maxt, moment.box(number))
             met |= near
 
-            def look(blocked: Any) -> tuple[Any]:
+            def look(blocked: Mask) -> tuple[Mask]:
                 local = self._at_rest(ray, number, moment)
                 first_face, last_face, _, _ = dr.gather(mi.Array4u, self._heads, 2 * k + 1)
 
-                def try_ball(j: Any, blocked: Any) -> tuple[Any, Any]:
+                def try_ball(j: UInt32, blocked: Mask) -> tuple[UInt32, Mask]:
                     x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
                     t = to_ball(local, mi.Point3f(x, y, z), square)
                     return j + 1, blocked | (near & (t >= 0) & (t < ray.maxt))
 
-                def try_face(j: Any, blocked: Any) -> tuple[Any, Any]:
+                def try_face(j: UInt32, blocked: Mask) -> tuple[UInt32, Mask]:
                     t, _, inside = to_face(local, self._rows(j))
                     return j + 1, blocked | (near & inside & (t >= 0) & (t < ray.maxt))
 
@@ -148,24 +160,24 @@ class Fleet:
         _, blocked, met = dr.while_loop(state, lambda k, *_: k < self._count, visit, label="moving groups")
         return blocked, met
 
-    def pose(self, group: Any, moment: Moment) -> DevicePose:
+    def pose(self, group: UInt32, moment: Moment) -> DevicePose:
         """Of the group of each lane's number."""
         return self._tracks.pose(group, moment.local_us(group))
 
-    def _at_rest(self, ray: Any, group: Any, moment: Moment) -> Any:
+    def _at_rest(self, ray: Ray, group: UInt32, moment: Moment) -> Ray:
         pose = self.pose(group, moment)
         local = type(ray)(ray)
         local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
         return local
 
-    def _rows(self, face: Any) -> list[tuple[Any, Any]]:
+    def _rows(self, face: UInt32) -> list[tuple[Vector3, Float]]:
         import drjit as dr
 
         mi = self._mi
         found = [dr.gather(mi.Vector4f, self._faces, 4 * face + k) for k in range(3)]
         return [(mi.Vector3f(row.x, row.y, row.z), row.w) for row in found]
 
-    def _hit(self, t: Any, found: Any, place: Any, which: Any, ball: Any) -> Any:
+    def _hit(self, t: Float, found: Mask, place: Point2, which: UInt32, ball: Mask) -> Interaction:
         """What Mitsuba takes for the description of a surface."""
         import drjit as dr
 
@@ -190,9 +202,9 @@ class Fleet:
         return hit
 
 
-def _number(mi: Any, shape: Any) -> int:
+def _number(mi: MitsubaModule, shape: MitsubaObject) -> int:
     """By which Dr.Jit knows a shape."""
     import drjit as dr
 
-    number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+    number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(number[0])

@@ -22,10 +22,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import pi
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hesim_render.core.device_types import (
+    Float,
+    Interaction,
+    Mask,
+    MitsubaModule,
+    MitsubaObject,
+    Ray,
+    UInt32,
+    Vector3,
+)
 from hesim_render.core.tables import table
 from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.paint import Paint
@@ -115,7 +125,7 @@ class MattIntegrator:
         mi = self._scene.mi
         numbers = {}
         for name, shape in self._scene.shapes.items():
-            number: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+            number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
             numbers[int(number[0])] = rows.get(name, [0.0] * _ROW)
         rows_of = np.zeros((max(numbers, default=0) + 1, _ROW))
         for place, row in numbers.items():
@@ -130,7 +140,9 @@ class MattIntegrator:
         self._emitted = mi.Float(np.array([*emitted, [0.0] * len(responses)], np.float32).ravel())
         self._filters, self._colours = mi.UInt32(len(responses)), mi.UInt32(len(colours))
 
-    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any]:
+    def flux(
+        self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
+    ) -> tuple[Float, Float, Float, Mask]:
         """One ray a lane.
 
         Parameters
@@ -152,7 +164,7 @@ class MattIntegrator:
         surface = scene.intersect(ray, moment, True, mi.Bool(True), mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
         si, met = surface.rest, surface.met
         hit = si.is_valid()
-        which: Any = dr.reinterpret_array(mi.UInt32, si.shape)
+        which: UInt32 = dr.reinterpret_array(mi.UInt32, si.shape)
         first = 2 * dr.select(hit, which, 0)
         one, other, both, lamp = dr.gather(mi.Vector4f, self._rows, first)
         front = mi.Frame3f.cos_theta(si.wi) > 0
@@ -194,13 +206,13 @@ class MattIntegrator:
 class _Lamp:
     """A rectangle; strength is its radiance."""
 
-    def __init__(self, mi: Any, frame: Any, geometry: float) -> None:
+    def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64], geometry: float) -> None:
         import drjit as dr
 
         self._rectangle = RectangleLight(mi, frame)
         self._scale = dr.opaque(mi.Float, 1 / geometry)
 
-    def seen_from(self, point: Any, normal: Any, sampler: Any) -> tuple[Any, Any, Any]:
+    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """e_k and r at surface points, and the ray that tells whether the point drawn on the light is seen.
 
         Parameters
@@ -215,13 +227,13 @@ class _Lamp:
 class _Point:
     """A point; strength is its intensity."""
 
-    def __init__(self, mi: Any, position: Any, geometry: float) -> None:
+    def __init__(self, mi: MitsubaModule, position: NDArray[np.float64], geometry: float) -> None:
         import drjit as dr
 
         self._position, self._scale = mi.Point3f(position), dr.opaque(mi.Float, 1 / geometry)
         dr.make_opaque(self._position)
 
-    def seen_from(self, point: Any, normal: Any, sampler: Any) -> tuple[Any, Any, Any]:
+    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`."""
         import drjit as dr
 
@@ -234,13 +246,13 @@ class _Point:
 class _Beam:
     """Parallel light; strength is the irradiance across it."""
 
-    def __init__(self, mi: Any, direction: Any, geometry: float) -> None:
+    def __init__(self, mi: MitsubaModule, direction: NDArray[np.float64], geometry: float) -> None:
         import drjit as dr
 
         self._towards, self._scale = mi.Vector3f(-direction), dr.opaque(mi.Float, 1 / geometry)
         dr.make_opaque(self._towards)
 
-    def seen_from(self, point: Any, normal: Any, sampler: Any) -> tuple[Any, Any, Any]:
+    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`."""
         import drjit as dr
 
@@ -251,10 +263,10 @@ class _Beam:
 class _Sky:
     """The same light from everywhere; strength is its radiance, e_k is 1."""
 
-    def __init__(self, mi: Any) -> None:
+    def __init__(self, mi: MitsubaModule) -> None:
         self._mi = mi
 
-    def seen_from(self, point: Any, normal: Any, sampler: Any) -> tuple[Any, Any, Any]:
+    def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
         """See `_Lamp.seen_from`; directions are drawn by their cosine, so that r is 1 as well."""
         mi = self._mi
         local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())

@@ -9,10 +9,11 @@ density of the mixture is the density of all: one-sample multiple importance sam
 from __future__ import annotations
 
 from math import pi
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Point3, Vector3
 
 #: Part of the directions that are drawn from the images, together. In a scene with floor, mirror and three more things
 #: 0.03 to 0.1 had the same noise within a tenth, 0.3 had more.
@@ -41,7 +42,7 @@ class LampImages:
         mirror where x · normal > offset.
     """
 
-    def __init__(self, mi: Any, images: list[Image]) -> None:
+    def __init__(self, mi: MitsubaModule, images: list[Image]) -> None:
         import drjit as dr
 
         self._mi = mi
@@ -53,7 +54,7 @@ class LampImages:
         dr.make_opaque(self._images)
 
     @classmethod
-    def of(cls, mi: Any, scene: Any) -> LampImages:
+    def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> LampImages:
         """Those of the area lights of a Mitsuba scene in its flat, perfectly reflecting shapes."""
         lamps = [shape.bbox() for shape in scene.shapes() if shape.is_emitter()]
         found: list[Image] = []
@@ -75,7 +76,7 @@ class LampImages:
     def __len__(self) -> int:
         return len(self._images)
 
-    def seen_from(self, point: Any, upwards: Any, active: Any) -> Cones:
+    def seen_from(self, point: Point3, upwards: Vector3, active: Mask) -> Cones:
         """Cones of directions from surface points to the images that can light them.
 
         Parameters
@@ -108,11 +109,11 @@ class Cones:
     cones : axis, 1 - cos of the half angle, and chance of being drawn, of each.
     """
 
-    def __init__(self, mi: Any, cones: list[tuple[Any, Any, Any]]) -> None:
+    def __init__(self, mi: MitsubaModule, cones: list[tuple[Vector3, Float, Float]]) -> None:
         self._mi, self._cones = mi, cones
         self.chance = sum((chance for _, _, chance in cones), mi.Float(0.0))
 
-    def sample(self, choice: Any, place: Any) -> tuple[Any, Any]:
+    def sample(self, choice: Float, place: Point2) -> tuple[Vector3, Mask]:
         """A direction, and whether one is drawn at all.
 
         Parameters
@@ -133,7 +134,7 @@ class Cones:
         y, x = dr.sincos(2 * pi * place.y)
         return mi.Frame3f(axis).to_world(mi.Vector3f(sine * x, sine * y, 1 - below)), drawn
 
-    def density(self, direction: Any) -> Any:
+    def density(self, direction: Vector3) -> Float:
         """Of directions drawn from the images, per steradian; its integral is `chance`."""
         import drjit as dr
 
@@ -144,7 +145,7 @@ class Cones:
         return total
 
 
-def _mirror(mi: Any, shape: Any) -> tuple[NDArray[np.float64], float] | None:
+def _mirror(mi: MitsubaModule, shape: MitsubaObject) -> tuple[NDArray[np.float64], float] | None:
     """Unit normal and offset of the plane of a flat shape whose surface is nothing but a mirror; else None."""
     bsdf = shape.bsdf()
     if bsdf is None or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):

@@ -17,6 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.device_types import (
+    Float,
+    Interaction,
+    LoopState,
+    Mask,
+    MitsubaModule,
+    MitsubaObject,
+    Ray,
+    Vector3,
+)
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.builder import BuiltScene
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
@@ -64,7 +74,7 @@ class Surface:
     met : Dr.Jit Bool, whether the ray came through the box of a moving object.
     """
 
-    def __init__(self, mi: Any, rest: Any, pose: DevicePose | None, met: Any) -> None:
+    def __init__(self, mi: MitsubaModule, rest: Interaction, pose: DevicePose | None, met: Mask) -> None:
         self.rest, self._pose, self.met = rest, pose, met
         point, normal = rest.p, rest.n
         if pose is not None:
@@ -73,17 +83,17 @@ class Surface:
         self.world = mi.Interaction3f(rest.t, rest.time, rest.wavelengths, point, normal)
 
     @property
-    def shading_normal(self) -> Any:
+    def shading_normal(self) -> Vector3:
         """In world space."""
         n = self.rest.sh_frame.n
         return n if self._pose is None else self._pose.turn_to_world(n)
 
-    def to_local(self, direction: Any) -> Any:
+    def to_local(self, direction: Vector3) -> Vector3:
         """From world space into the shading frame."""
         turned = direction if self._pose is None else self._pose.turn_to_rest(direction)
         return self.rest.to_local(turned)
 
-    def to_world(self, direction: Any) -> Any:
+    def to_world(self, direction: Vector3) -> Vector3:
         """From the shading frame into world space."""
         turned = self.rest.to_world(direction)
         return turned if self._pose is None else type(turned)(self._pose.turn_to_world(turned))
@@ -166,7 +176,7 @@ class MovingScene:
             forms = [form for k in together if (form := self.groups[k].part.form) is not None]
             self._fleet = Fleet(self.mi, forms, together, self._tracks)
 
-    def intersect(self, ray: Any, moment: Moment, coherent: Any, active: Any, flags: Any = None) -> Surface:
+    def intersect(self, ray: Ray, moment: Moment, coherent: Mask, active: Mask, flags: MitsubaObject = None) -> Surface:
         """The nearest surface of all parts.
 
         Parameters
@@ -186,26 +196,26 @@ class MovingScene:
             return Surface(mi, rest, None, mi.Bool(False))
         pose = DevicePose.none(mi.Vector3f)
 
-        def take(closer: Any, found: Any, own: DevicePose, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def take(closer: Mask, found: Interaction, own: DevicePose, state: LoopState) -> LoopState:
             rest, *columns, shift = state
             columns = [dr.select(closer, a, b) for a, b in zip(own.columns, columns, strict=True)]
             return dr.select(closer, found, rest), *columns, dr.select(closer, own.shift, shift)
 
-        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             local.maxt = dr.minimum(local.maxt, state[0].t)
             hit, face = group.part.nearest(local, coherent, near)
             closer = near & hit.is_valid()
             return take(closer, group.part.surface(hit, face, local, flags, closer), own, state)
 
         resting = rest.t
-        state: tuple[Any, ...] = rest, *pose.columns, pose.shift
+        state: LoopState = rest, *pose.columns, pose.shift
         state, met = self._visit_groups(ray, moment, active, resting, state, visit)
         if self._fleet is not None:
             fleet = self._fleet
             hit, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
             met |= near
 
-            def describe(*state: Any) -> tuple[Any, ...]:
+            def describe(*state: Any) -> LoopState:
                 own = fleet.pose(number, moment)
                 found = hit.compute_surface_interaction(_at_rest(ray, own), flags, hit.is_valid())
                 return take(hit.is_valid(), found, own, state)
@@ -214,11 +224,11 @@ class MovingScene:
         rest, *columns, shift = state
         return Surface(mi, rest, DevicePose(tuple(columns), shift), met)
 
-    def distance(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+    def distance(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Float, Mask]:
         """To the nearest surface of all parts, m, infinite where there is none; and whether it met a group's box."""
         import drjit as dr
 
-        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             local.maxt = dr.minimum(local.maxt, state[0])
             hit, _ = group.part.nearest(local, False, near)
             return (dr.select(near & hit.is_valid(), hit.t, state[0]),)
@@ -230,14 +240,14 @@ class MovingScene:
             nearest, met = dr.select(hit.is_valid(), hit.t, nearest), met | near
         return nearest, met
 
-    def resting_distance(self, ray: Any) -> Any:
+    def resting_distance(self, ray: Ray) -> Float:
         """To the nearest surface of what rests, m; infinite where there is none."""
         return self._resting.nearest(ray, True, self.mi.Bool(True))[0].t
 
-    def occluded(self, ray: Any, moment: Moment, active: Any) -> tuple[Any, Any]:
+    def occluded(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Mask, Mask]:
         """Whether anything lies on a ray before its `maxt`; and whether it met a group's box."""
 
-        def visit(group: Group, own: DevicePose, local: Any, near: Any, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             return (state[0] | group.part.blocks(local, near & ~state[0]),)
 
         blocked = self._resting.blocks(ray, active)
@@ -250,8 +260,8 @@ class MovingScene:
         return blocked, met
 
     def _visit_groups(
-        self, ray: Any, moment: Moment, active: Any, length: Any, state: tuple[Any, ...], visit: Callable[..., Any]
-    ) -> tuple[tuple[Any, ...], Any]:
+        self, ray: Ray, moment: Moment, active: Mask, length: Float, state: LoopState, visit: Callable[..., LoopState]
+    ) -> tuple[LoopState, Mask]:
         """Let each group of those tried one by one, whose box the first `length` metres of a ray meet, change a state.
 
         Returns
@@ -266,7 +276,7 @@ class MovingScene:
             near = active & meets_box(ray, inverse, length, moment.box(number))
             met |= near
 
-            def turn_to(*state: Any, number: int = number, near: Any = near) -> Any:
+            def turn_to(*state: Any, number: int = number, near: Mask = near) -> LoopState:
                 pose = self._tracks.pose(number, moment.local_us(number))
                 return visit(self.groups[number], pose, _at_rest(ray, pose), near, state)
 
@@ -274,14 +284,14 @@ class MovingScene:
         return state, met
 
 
-def _at_rest(ray: Any, pose: DevicePose) -> Any:
+def _at_rest(ray: Ray, pose: DevicePose) -> Ray:
     """A ray in the frame of what has a pose."""
     local = type(ray)(ray)
     local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
     return local
 
 
-def spare_even_skies(mi: Any, emitters: Sequence[Any]) -> None:
+def spare_even_skies(mi: MitsubaModule, emitters: Sequence[MitsubaObject]) -> None:
     """Ask no surface for the light of a sky that is the same everywhere, where there is other light.
 
     The surface's own directions find it, and rays towards it take from those to the lamps.

@@ -13,6 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.core.device_types import (
+    Bands,
+    Float,
+    Interaction,
+    LoopState,
+    Mask,
+    MitsubaObject,
+    Point2,
+    Ray,
+    UInt32,
+)
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.transport.mirrored_lamps import Cones, LampImages
 from hesim_render.sources.render.transport.moving_scene import MovingScene, Surface
@@ -50,7 +61,9 @@ class PathIntegrator:
         dr.make_opaque(self._lamps)
         self._images = LampImages.of(scene.mi, scene.static)
 
-    def flux(self, sampler: Any, ray: Any, moment: Moment, filter_index: Any) -> tuple[Any, Any, Any, Any]:
+    def flux(
+        self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
+    ) -> tuple[Float, Float, Float, Mask]:
         """One ray a lane; see `MattIntegrator.flux`, of whose estimates there is only one here."""
         import drjit as dr
 
@@ -60,7 +73,7 @@ class PathIntegrator:
         flux = dr.sum(radiance) / len(radiance) * self._wavelengths.total(filter_index)
         return flux, flux, flux, met
 
-    def sample(self, sampler: Any, ray: Any, moment: Moment) -> tuple[Any, Any]:
+    def sample(self, sampler: MitsubaObject, ray: Ray, moment: Moment) -> tuple[Bands, Mask]:
         """One path a lane.
 
         Parameters
@@ -86,7 +99,7 @@ class PathIntegrator:
         ray, active = mi.Ray3f(ray), mi.Bool(True)
         most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
 
-        def shine(si: Any, active: Any, before: Any, pdf: Any, delta: Any) -> Any:
+        def shine(si: Interaction, active: Mask, before: Interaction, pdf: Float, delta: Mask) -> Bands:
             """Light that what a ray runs into gives itself."""
             light = si.emitter(scene.static, active)
             shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
@@ -95,7 +108,7 @@ class PathIntegrator:
             share = dr.select(delta, 1.0, power_heuristic(pdf, light_pdf))
             return dr.select(shines, light.eval(si, shines) * share, 0.0)
 
-        def step(*state: Any) -> tuple[Any, ...]:
+        def step(*state: Any) -> LoopState:
             """One vertex from which the path may go on; its last segment is left for after the loop."""
             sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, _ = state
             surface = scene.intersect(ray, moment, depth == 0, active)
@@ -185,7 +198,7 @@ class PathIntegrator:
         # the throughput of a path that has ended may be anything
         return dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance), met
 
-    def _near_lamps(self, ray: Any) -> Any:
+    def _near_lamps(self, ray: Ray) -> Mask:
         """Whether a ray runs into the box around a light."""
         import drjit as dr
 
@@ -196,8 +209,15 @@ class PathIntegrator:
 
 
 def _redirected(
-    bsdf: Any, context: Any, surface: Surface, cones: Cones, choice: Any, place: Any, chosen: Any, weight: Any
-) -> Any:
+    bsdf: MitsubaObject,
+    context: MitsubaObject,
+    surface: Surface,
+    cones: Cones,
+    choice: Float,
+    place: Point2,
+    chosen: Mask,
+    weight: Bands,
+) -> Bands:
     """Weight of a surface's sample where some are drawn from cones instead; `chosen` becomes what was drawn."""
     import drjit as dr
     import mitsuba as mi
@@ -216,7 +236,7 @@ def _redirected(
     return dr.select(mixed > 0, weight, 0.0)
 
 
-def power_heuristic(a: Any, b: Any) -> Any:
+def power_heuristic(a: Float, b: Float) -> Float:
     """Power heuristic of exponent 2: the weight of the strategy with density `a`."""
     import drjit as dr
 

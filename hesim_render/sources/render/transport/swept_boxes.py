@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hesim_render.core.device_types import Float, Mask, Ray, UInt32, Vector3
 
 
 @dataclass(frozen=True)
@@ -21,22 +22,22 @@ class Moment:
         nothing; `bin`, UInt32, whose boxes hold for the ray's window, and `groups` of a bin.
     """
 
-    instant_us: Any
-    times: Any
+    instant_us: Float
+    times: Float
     tracks: int
-    window: Any
-    boxes: Any
+    window: UInt32
+    boxes: Float
     groups: int
-    bin: Any
+    bin: UInt32
 
-    def local_us(self, track: Any) -> Any:
+    def local_us(self, track: UInt32) -> Float:
         """Time since a track's first keyframe, as `Tracks.pose` takes it."""
         import drjit as dr
 
         kind = type(self.window)
         return dr.gather(type(self.times), self.times, self.window * self.tracks + kind(track)) + self.instant_us
 
-    def box(self, group: Any) -> tuple[Any, Any]:
+    def box(self, group: UInt32) -> tuple[Vector3, Vector3]:
         """Low and high corner, 3-vectors."""
         import drjit as dr
         import mitsuba as mi
@@ -54,14 +55,14 @@ def box_rows(boxes: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.concatenate([low - margin, nothing, high + margin, nothing], axis=-1).astype(np.float32)
 
 
-def inverse_of(direction: Any) -> Any:
+def inverse_of(direction: Vector3) -> Vector3:
     """1 / d of each coordinate for `meets_box`; finite, for 0 · ∞ is nowhere."""
     import drjit as dr
 
     return dr.rcp(dr.select(abs(direction) < 1e-30, 1e-30, direction))
 
 
-def meets_box(ray: Any, inverse: Any, length: Any, box: tuple[Any, Any]) -> Any:
+def meets_box(ray: Ray, inverse: Vector3, length: Float, box: tuple[Vector3, Vector3]) -> Mask:
     """Whether the first `length` metres of a ray meet a box; `inverse` is `inverse_of` its direction."""
     import drjit as dr
 

@@ -1,0 +1,58 @@
+"""Names for the types of values on the device, for annotations.
+
+The types themselves come from `hesim_render.core.backend.jit` at run time: of the LLVM or of the CUDA backend, which is
+known only after a library was probed. So these names are `Any` to a type checker. They say to a reader what Dr.Jit
+would check: the kind of an array's entries. All arrays are flat; a docstring says what the entries go over
+(``[pixel]``, ``[ray]``). An array of one entry stands for a number that all entries share.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+#: Array of 32-bit floats.
+Float: TypeAlias = Any
+#: Array of 64-bit floats.
+Float64: TypeAlias = Any
+#: Array of signed whole numbers of 8 bits: polarities.
+Int8: TypeAlias = Any
+#: Array of signed whole numbers of 32 bits.
+Int32: TypeAlias = Any
+#: Array of unsigned whole numbers of 32 bits: indices, DN, random words, seeds of rays.
+UInt32: TypeAlias = Any
+#: Array of unsigned whole numbers of 64 bits: keys of generators.
+UInt64: TypeAlias = Any
+#: Array of true or false: which entries take part.
+Mask: TypeAlias = Any
+#: Two or three Floats: a place on the sensor; a place, a direction or a normal in space; a colour.
+Point2: TypeAlias = Any
+Point3: TypeAlias = Any
+Vector3: TypeAlias = Any
+#: Three by three or four by four Floats: a turn, or a turn with a shift.
+Matrix: TypeAlias = Any
+#: An array of a kind that the caller chooses.
+DeviceArray: TypeAlias = Any
+#: A counter-based generator of random words, ``Philox4x32``.
+Generator: TypeAlias = Any
+#: The module that has the array types, as `jit` gives it: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+DeviceTypes: TypeAlias = Any
+#: A number, a NumPy array, or an array on the device: what a formula takes.
+Values: TypeAlias = Any
+
+#: Both halves of an estimate, of independent rays: their mean is the value, their difference tells its error.
+Halves: TypeAlias = tuple[Float, Float]
+#: What a symbolic loop or branch carries from step to step.
+LoopState: TypeAlias = tuple[Any, ...]
+
+# Of Mitsuba, which only `sources.render` imports:
+
+#: The module of the variant in use.
+MitsubaModule: TypeAlias = Any
+#: A scene, shape, emitter, surface, integrator, or their parameters.
+MitsubaObject: TypeAlias = Any
+#: ``Ray3f``: origin, direction, ``maxt``, wavelengths; one ray a lane.
+Ray: TypeAlias = Any
+#: ``Interaction3f``, ``SurfaceInteraction3f`` or ``PreliminaryIntersection3f``: where rays have met something.
+Interaction: TypeAlias = Any
+#: One Float for each of the four wavelengths of a ray.
+Bands: TypeAlias = Any

@@ -1,0 +1,165 @@
+"""Noise of frame pixels as formulas: what the simulator samples and the calibration fits.
+
+Physical form, per pixel, I_e light electrons, D dark current in e⁻/s, t exposure in s, K gain in DN/e⁻::
+
+    N_e = min( Poisson( (1 + PRNU)·I_e + D·t ), full well ) + N(0, σ_r²)
+    DN  = clip( round( K·N_e + N_FP + N_tr + N_res ), 0, 2^bits − 1 )
+
+Polynomial form (``aps.beta`` given), I = K·(1 + PRNU)·I_e in DN, per tile position::
+
+    mean = I + t·N_DP + N_FP
+    Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC, without N_tr
+
+Both are one model (`PixelValue`): a count of mean m, Poisson or Gaussian with variance m, is worth a gain in DN each
+and sits on fixed DN; a Gaussian is added to the sum. N_FP = black + N_row + N_BLC. N_tr is one Gaussian number of
+every row of a frame, shared by its pixels (temporal row noise). The ADC rounds once: no uniform noise is added, and
+every variance here leaves out its q²/12.
+
+Arrays are NumPy's or Dr.Jit's (`hesim_render.core.namespace`); nothing here draws a random number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.core.device_types import Values
+from hesim_render.core.namespace import Namespace
+
+#: Error variance of rounding with a step of q = 1 DN, q²/12.
+ADC_VARIANCE_DN2 = 1.0 / 12.0
+
+#: Below this temporal variance (the ADC's taken out) rounding hides the noise and biases the means: Sheppard's
+#: correction q²/12 fails.
+HIDDEN_VARIANCE_DN2 = 0.24
+
+#: The noise term that each of β0 … β5 belongs to; 0 where that is switched off.
+BETA_TERMS = ("read", "shot", "dark_current", "shot", "shot", "dark_current")
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """What the formulas need of each pixel: numbers or arrays.
+
+    Attributes
+    ----------
+    response : 1 + PRNU. dark_e_per_s : D. offset_dn : N_FP.
+    beta : the six of the polynomial form, or None in the physical one.
+    """
+
+    response: Values
+    dark_e_per_s: Values
+    offset_dn: Values
+    beta: tuple[Values, ...] | None
+
+
+@dataclass(frozen=True)
+class PixelValue:
+    """Law of a pixel's value in DN above N_FP, before full well, row noise and ADC.
+
+    Attributes
+    ----------
+    fixed_dn : without noise. count : mean of the count. gain_dn : DN for each of it. gaussian_dn2 : variance of the
+        Gaussian part, DN².
+    """
+
+    fixed_dn: Values
+    gain_dn: Values
+    count: Values
+    gaussian_dn2: Values
+
+    @property
+    def mean_dn(self) -> Values:
+        return self.fixed_dn + self.gain_dn * self.count
+
+    @property
+    def variance_dn2(self) -> Values:
+        """Temporal variance, DN²."""
+        return self.gain_dn * self.gain_dn * self.count + self.gaussian_dn2
+
+
+def light_gain_dn(beta: Sequence[Values] | NDArray, signal_dn: Values, exposure_s: Values) -> Values:
+    """g = β1 + β3 I + β4 t in DN: the part of the variance that goes with the light, over the signal I.
+
+    Parameters
+    ----------
+    beta : β0 … β5 on the first axis.
+    """
+    return beta[1] + beta[3] * signal_dn + beta[4] * exposure_s
+
+
+def dark_variance_dn2(beta: Sequence[Values] | NDArray, exposure_s: Values) -> Values:
+    """β0 + β2 t + β5 t² in DN²: the variance without light; `beta` as in `light_gain_dn`."""
+    return beta[0] + (beta[2] * exposure_s + beta[5] * exposure_s * exposure_s)
+
+
+def polynomial(beta: ArrayLike, signal_dn: Values, exposure_s: Values) -> NDArray[np.float64]:
+    """Temporal variance β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t² in DN², before the ADC.
+
+    Parameters
+    ----------
+    beta : [..., 6]. signal_dn, exposure_s : that fit it without its last axis.
+    """
+    b = np.moveaxis(np.asarray(beta), -1, 0)
+    return dark_variance_dn2(b, exposure_s) + signal_dn * light_gain_dn(b, signal_dn, exposure_s)
+
+
+def physical_beta(system_gain_dn_per_e: float, read_noise_e: float, dark_e_per_s: float) -> list[float]:
+    """β0 … β5 of the physical form, exactly: K²σ_r², K, K²D and 0. PRNU is spatial and never enters β3."""
+    gain = system_gain_dn_per_e
+    return [(gain * read_noise_e) ** 2, gain, gain**2 * dark_e_per_s, 0.0, 0.0, 0.0]
+
+
+def physical_value(
+    electrons: Values, exposure_s: Values, pixels: Pixels, system_gain_dn_per_e: float, read_noise_e: float, shot: bool
+) -> PixelValue:
+    """Value of a pixel in the physical form: light and dark current are one count of K DN each.
+
+    Parameters
+    ----------
+    electrons : I_e, mean photo-electrons of the exposure.
+    shot : whether the light has shot noise; without it that of the dark current remains.
+    """
+    light, dark = pixels.response * electrons, pixels.dark_e_per_s * exposure_s
+    read_dn2 = (system_gain_dn_per_e * read_noise_e) ** 2
+    if shot:
+        return PixelValue(0.0, system_gain_dn_per_e, light + dark, read_dn2)
+    return PixelValue(light * system_gain_dn_per_e, system_gain_dn_per_e, 0.0 * light + dark, read_dn2)
+
+
+def calibrated_value(
+    electrons: Values,
+    exposure_s: Values,
+    pixels: Pixels,
+    system_gain_dn_per_e: float,
+    full_scale_dn: float,
+    xp: Namespace,
+) -> PixelValue:
+    """Value of a pixel in the polynomial form: the light is a count of g = β1 + β3 I + β4 t DN each.
+
+    So its variance is g·I; the rest of the polynomial, below 0 where it cannot be one, counts as Gaussian. In g, I is
+    taken up to full scale, beyond which the polynomial was not measured. Where g is 0 the light has no noise.
+    """
+    assert pixels.beta is not None
+    signal = system_gain_dn_per_e * (pixels.response * electrons)
+    gain = light_gain_dn(pixels.beta, xp.minimum(signal, full_scale_dn), exposure_s)
+    noisy = gain > 0.0
+    count = xp.where(noisy, signal / xp.where(noisy, gain, 1.0), 0.0)
+    fixed = system_gain_dn_per_e * (pixels.dark_e_per_s * exposure_s) + xp.where(noisy, 0.0, signal)
+    return PixelValue(fixed, gain, count, xp.maximum(dark_variance_dn2(pixels.beta, exposure_s), 0.0))
+
+
+def noise_equivalent_e(
+    variance_dn2: Values, system_gain_dn_per_e: float, prnu_rel: float, electrons: Values, xp: Namespace
+) -> Values:
+    """Noise of a pixel in electrons at its input: √(Var/K² + (PRNU·I_e)²)."""
+    fixed_e = prnu_rel * electrons
+    return xp.sqrt(variance_dn2 / system_gain_dn_per_e**2 + fixed_e * fixed_e)
+
+
+def fourth_cumulant_dn4(gain_dn: Values, count_variance_dn2: Values) -> Values:
+    """κ₄ of a Poisson count of `gain_dn` each whose variance is g² m: g⁴ m. It is 0 of a Gaussian."""
+    return gain_dn * gain_dn * count_variance_dn2

@@ -1,0 +1,105 @@
+"""Sampler of frame pixels: values drawn from the law of `hesim_render.pixels.aps.formulas`, on Dr.Jit."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.namespace import device_namespace
+from hesim_render.core.rng import Stream, philox
+from hesim_render.core.units import S_PER_US
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps.fixed_pattern import FixedPattern
+from hesim_render.pixels.aps.formulas import Pixels
+from hesim_render.pixels.aps.poisson import poisson
+from hesim_render.pixels.arrays import take, to_device
+from hesim_render.pixels.normal import normal_pair
+
+if TYPE_CHECKING:
+    from hesim_render.pixels.aps.model import ApsNoise
+
+
+class DeviceMaps:
+    """What the sampler needs of each pixel of a region, on the device.
+
+    Parameters
+    ----------
+    layout : the region.
+    maps : its fixed pattern.
+    beta : [tile_row, tile_col, 6] of the polynomial form, or None.
+    """
+
+    def __init__(self, layout: Layout, maps: FixedPattern, beta: NDArray[np.float64] | None) -> None:
+        self._layout = layout
+        terms = None
+        if beta is not None:
+            uniform = np.all(beta == beta[:1, :1], axis=(0, 1))
+            tiled = layout.tiled(beta)
+            terms = tuple(to_device(beta[0, 0, k] if uniform[k] else tiled[..., k]) for k in range(6))
+        self._pixels = Pixels(
+            to_device(maps.response), to_device(maps.dark_e_per_s), to_device(maps.offset_dn), terms
+        )  # fmt: skip
+
+    def pixels(self, index: UInt32) -> Pixels:
+        """Of the pixels `index` of the region; all of them are in their order where there are so many."""
+        import drjit as dr
+
+        if dr.width(index) == self._layout.rows * self._layout.cols:
+            return self._pixels
+
+        def entries(values: Float) -> Float:
+            return take(values, index)
+
+        own = self._pixels
+        beta = None if own.beta is None else tuple(map(entries, own.beta))
+        return Pixels(entries(own.response), entries(own.dark_e_per_s), entries(own.offset_dn), beta)
+
+    @cached_property
+    def _keys(self) -> UInt32:
+        return jit().UInt32(self._layout.full_index.ravel())
+
+    def keys(self, index: UInt32) -> UInt32:
+        """Full-sensor index of pixels of the region: rows as wide as the sensor's need no table."""
+        import drjit as dr
+
+        types, sensor_cols = jit(), self._layout.spec.geometry.cols
+        if self._layout.cols == sensor_cols:
+            return index + dr.opaque(types.UInt32, self._layout.row0 * sensor_cols)
+        return dr.gather(types.UInt32, self._keys, index)
+
+
+def draw_dn(
+    noise: ApsNoise, maps: DeviceMaps, electrons: Float, exposure_us: float, seed: int, frame: int, first_pixel: int
+) -> UInt32:
+    """`ApsNoise.sample_dn`: values of the pixels `first_pixel` … of a frame."""
+    import drjit as dr
+
+    types, spec = jit(), noise.spec
+    index = dr.arange(types.UInt32, dr.width(electrons)) + dr.opaque(types.UInt32, first_pixel)
+    pixels = maps.pixels(index)
+    value = noise.value(electrons, dr.opaque(types.Float, exposure_us * S_PER_US), pixels, device_namespace())
+
+    key = maps.keys(index)
+    generator = philox(seed, Stream.APS, key, frame)
+    word = generator.next_uint32x4()
+    if spec.law == "poisson":
+        counts = poisson(value.count, generator, (word[0], word[1]))
+        deviate = normal_pair(word[2], word[3])[0]
+    else:
+        shot, deviate = normal_pair(word[0], word[1])
+        counts = dr.fma(dr.sqrt(value.count), shot, value.count)
+    full_well_dn = spec.full_well_e * spec.system_gain_dn_per_e
+    level: Float = dr.minimum(dr.fma(value.gain_dn, counts, value.fixed_dn), full_well_dn) + pixels.offset_dn
+    level = dr.fma(dr.sqrt(types.Float(value.gaussian_dn2)), deviate, level)
+    if noise.row_noise_dn > 0:
+        # of the row on the full sensor: every pixel of it draws the same number
+        row = key // dr.opaque(types.UInt32, noise.layout.spec.geometry.cols)
+        word = philox(seed, Stream.ROW_NOISE, row, frame).next_uint32x4()
+        level = dr.fma(dr.opaque(types.Float, noise.row_noise_dn), normal_pair(word[0], word[1])[0], level)
+    # not clip: of a level that is no number it makes the largest integer, which no ADC of fewer bits gives
+    return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(noise.full_scale_dn)), 0.0))

@@ -1,0 +1,53 @@
+"""Where a ray meets a ball or a face, in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hesim_render.core.device_types import Float, Mask, Point2, Point3, Ray, Vector3
+
+
+def to_ball(ray: Ray, middle: Point3, square: Float) -> Float:
+    """Distance along a ray to a ball; negative or not a number where it lies behind or is missed."""
+    import drjit as dr
+
+    to = middle - ray.o
+    along = dr.dot(to, ray.d)
+    # of the two roots the one without cancellation, and the other by their product
+    root = dr.sqrt(square - dr.squared_norm(dr.fma(-along, ray.d, to)))
+    far = along + dr.mulsign(root, along)
+    other = (dr.squared_norm(to) - square) * dr.rcp(far)
+    first, second = dr.select(far < other, far, other), dr.select(far < other, other, far)
+    return dr.select(first >= 0, first, second)
+
+
+def to_face(ray: Ray, rows: Sequence[tuple[Vector3, Float]]) -> tuple[Float, Point2, Mask]:
+    """Distance along a ray to a face's plane, the place there, and whether it lies on the face.
+
+    Where the ray runs along the plane they are not numbers, and it does not.
+
+    Parameters
+    ----------
+    rows : of the map to u, v and height: three of a vector and a number.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    (u_row, u_0), (v_row, v_0), (normal, height) = rows
+    t = -(dr.dot(normal, ray.o) + height) * dr.rcp(dr.dot(normal, ray.d))
+    point = dr.fma(ray.d, t, ray.o)
+    u, v = dr.dot(u_row, point) + u_0, dr.dot(v_row, point) + v_0
+    # not dr.minimum and dr.maximum: what those do about NaN takes time
+    return t, mi.Point2f(u, v), (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+
+
+def meets_ball(ray: Ray, length: Float, ball: tuple[Point3, Float]) -> Mask:
+    """Whether the first `length` metres of a ray meet a ball, given by its middle and the square of its radius."""
+    import drjit as dr
+
+    middle, square = ball
+    to = middle - ray.o
+    along, far = dr.dot(to, ray.d), dr.squared_norm(to)
+    # from outside it has to lie ahead, and its near side, whatever the radius, no farther than the ray goes
+    ahead = (far <= square) | ((along > 0) & ((along <= length) | (dr.square(along - length) <= square)))
+    return ahead & (dr.fma(-along, along, far) <= square)

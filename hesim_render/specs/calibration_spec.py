@@ -1,0 +1,156 @@
+"""The model of ``calibration.yaml``: a file is checked by it before anything of it is used.
+
+`calibrate` writes the file and a person may change it. What is read of it, by a sensor, the report, the ISP or a later
+calibration, is named here; sections hold more, which is for people.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator, model_validator
+
+from hesim_render.specs.capture import CaptureSpec
+from hesim_render.specs.files import Strict
+
+SCHEMA_VERSION = 1
+SECTIONS = ("aps", "evs")
+
+_Beta = Annotated[list[float | None], Field(min_length=6, max_length=6)]
+
+
+class _Section(Strict):
+    """A part that holds more than what is read of it."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Estimate(_Section):
+    """A parameter: a number with its standard error, or null and the reason why it is not known."""
+
+    value: float | None
+    standard_error: float | None = Field(None, ge=0)
+    interval_95: tuple[float, float] | None = None
+    unit: str = ""
+    reason: str | None = None
+    note: str = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> Estimate:
+        if self.value is None and self.reason is None:
+            raise ValueError("value: null needs a reason beside it")
+        return self
+
+
+class FullWell(Estimate):
+    """Saturation capacity."""
+
+    limited_by: Literal["ADC full scale", "full well"] | None = None
+
+
+class Finding(_Section):
+    """What in the captures is not as the noise model supposes."""
+
+    check: str
+    text: str
+    p_value: float | None
+
+
+class MapsFile(_Section):
+    """Where the maps of a section are: beside the calibration, held to by their hash."""
+
+    file: str = Field(min_length=1)
+    sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
+
+
+class FrameGoodness(_Section):
+    """χ² of the variance polynomials, [tile_row][tile_col]; null for positions without a frame pixel."""
+
+    chi2_per_dof: list[list[float | None]]
+
+
+class FrameSection(_Section):
+    """``aps``: what dark and lit frames told."""
+
+    beta: list[list[_Beta]] = Field(min_length=1)
+    goodness: FrameGoodness
+    black_dn: float
+    n_row_std_dn: float = Field(ge=0)
+    row_noise_dn: Estimate | None = Field(None, description="calibrations of before it was measured lack it")
+    bad_pixels: NonNegativeInt
+    K: Estimate
+    read_noise_e: Estimate
+    dark_current_e_per_s: Estimate
+    full_well_e: FullWell
+    dsnu_e: Estimate
+    prnu_percent: Estimate
+    linearity_error: Estimate
+    findings: list[Finding] = []
+    maps: MapsFile
+
+
+class EventParameters(_Section):
+    """A, B, C and D of all event pixels together, or of a tile position."""
+
+    A: Estimate
+    B: Estimate
+    C: Estimate
+    D: Estimate
+
+
+class PositionParameters(EventParameters):
+    """Of one tile position (row, col)."""
+
+    tile_position: tuple[NonNegativeInt, NonNegativeInt]
+
+
+class EventGoodness(_Section):
+    """χ² of the counts."""
+
+    chi2_per_dof: float | None
+
+
+class EventSection(EventParameters):
+    """``evs``: what counts of events and contrast steps told."""
+
+    theta_hardware_v: PositiveFloat | Estimate
+    shot_law: Literal["linear", "sqrt"]
+    positions: list[PositionParameters] = Field(min_length=1)
+    theta: Estimate
+    theta_on: Estimate
+    theta_off: Estimate
+    threshold_mismatch: Estimate
+    asymmetry: Estimate
+    leak_per_trial: Estimate
+    goodness: EventGoodness
+    trials: PositiveInt
+    bad_pixels: NonNegativeInt
+    findings: list[Finding] = []
+    maps: MapsFile
+
+
+class CalibrationSpec(Strict):
+    """``calibration.yaml``; `capture` is the ``capture.yaml`` of the captures."""
+
+    schema_version: int
+    capture: CaptureSpec
+    aps: FrameSection | None = None
+    evs: EventSection | None = None
+
+    @field_validator("schema_version", mode="before")
+    @classmethod
+    def _version(cls, value: Any) -> Any:
+        if type(value) is not int or value != SCHEMA_VERSION:
+            raise ValueError(f"expected {SCHEMA_VERSION}, a calibration of this version")
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> CalibrationSpec:
+        tile = self.capture.tile_rows, self.capture.tile_cols
+        for name in ("beta", "goodness.chi2_per_dof"):
+            if self.aps is None:
+                break
+            table = self.aps.beta if name == "beta" else self.aps.goodness.chi2_per_dof
+            if len(table) != tile[0] or any(len(row) != tile[1] for row in table):
+                raise ValueError(f"aps.{name}: expected a table of {tile[0]}×{tile[1]}, one entry a tile position")
+        return self

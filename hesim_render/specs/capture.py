@@ -1,0 +1,47 @@
+"""``capture.yaml``: what a person says of the captures of a sensor."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+
+from hesim_render.specs.files import Strict
+from hesim_render.specs.geometry import Region
+
+
+class SignalReference(Strict):
+    """Unit of the EVS signal: I = k · Φ · t_ref, in DN of this exposure seen through `filter`."""
+
+    k: PositiveFloat
+    t_ref_us: PositiveFloat
+    filter: str = "own"
+
+
+class CaptureSpec(Strict):
+    """``capture.yaml``."""
+
+    bit_depth: int = Field(ge=1, le=16)
+    tile_rows: PositiveInt
+    tile_cols: PositiveInt
+    notes: str = ""
+    sensor: str | None = None
+    roi: Region | None = Field(None, description="the whole sensor where it is left out")
+    theta_hardware_v: PositiveFloat | None = None
+    signal_reference: SignalReference | None = None
+    illuminant: str | None = Field(None, description="light on a neutral scene: tells filters that frames lack")
+    contrast_of: Literal["signal", "voltage"] = "signal"
+    evs_tile_rows: PositiveInt | None = Field(
+        None, description="event pixels of a tile, where they are not one a pixel"
+    )
+    evs_tile_cols: PositiveInt | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> CaptureSpec:
+        if (self.evs_tile_rows is None) != (self.evs_tile_cols is None):
+            raise ValueError("evs_tile_rows and evs_tile_cols are given together or not at all")
+        return self
+
+    @property
+    def full_scale_dn(self) -> int:
+        return 2**self.bit_depth - 1
