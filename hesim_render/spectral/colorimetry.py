@@ -13,7 +13,7 @@ from hesim_render.spectral.transfer import encode_exactly
 
 #: XYZ (D65 white, Y = 1) to linear sRGB, IEC 61966-2-1:1999.
 _XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-#: Sharpened cone responses of the Bradford adaptation (Lam 1985, as in ICC.1).
+#: Sharpened cone responses of the Bradford adaptation ([lam1985], as in ICC.1).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
 

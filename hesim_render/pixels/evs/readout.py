@@ -83,7 +83,7 @@ class EventReadout:
 def _running(add: Any, low: Any, high: Any) -> tuple[Any, Any, Any]:
     """Each map w → clip(w + add, low, high) after all before it, as one such map; log₂ n passes.
 
-    Clips of sums are closed under composition, which makes the buffer a prefix scan (Hillis & Steele 1986).
+    Clips of sums are closed under composition, which makes the buffer a prefix scan [hillis1986].
     """
     reach = 1
     while reach < add.size:
