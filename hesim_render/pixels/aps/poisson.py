@@ -16,10 +16,10 @@ _SEARCH_LIMIT = 100
 def poisson(mean: Any, generator: Any, words: tuple[Any, Any] | None = None) -> Any:
     """Poisson deviates, exact to the accuracy of single precision at every mean up to 1e7.
 
-    Below a mean of 10: inversion by sequential search in double precision, from a 64-bit uniform.
-    From 10 on: transformed rejection PTRS [hormann1993], without its quick accept step, which cannot save work in
-    SIMD lanes. The probabilities it compares with are in the saddle-point form of Loader [loader2000], as ln k! in single precision would
-    lose all digits of the result to cancellation.
+    Below a mean of 10: inversion by sequential search in double precision, from a 64-bit uniform. From 10 on:
+    transformed rejection PTRS [hormann1993], without its quick accept step, which cannot save work in SIMD lanes. The
+    probabilities it compares with are in the saddle-point form of Loader [loader2000], as ln k! in single precision
+    would lose all digits of the result to cancellation.
 
     Parameters
     ----------
