@@ -58,7 +58,7 @@ def new_figure(size_px: tuple[int, int]) -> Figure:
 
 
 def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (420, 290)) -> tuple[Figure, Axes]:
-    """A figure with one pair of axes."""
+    """A figure with one pair of axes, size in px of the page."""
     figure = new_figure(size_px)
     axes = figure.subplots()
     axes.set(title=title, xlabel=x_label, ylabel=y_label)
@@ -66,7 +66,7 @@ def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (42
 
 
 def points(axes: Axes, x: NDArray, y: NDArray, colour: str, label: str = "", size: float = 3.4) -> None:
-    """Dots, one for each pair of numbers, that show where many lie on each other."""
+    """Dots, one for each pair of numbers, half transparent where many lie on each other; `size` in px."""
     axes.plot(x, y, linestyle="none", marker="o", markersize=size, color=colour, alpha=0.55, label=label)
 
 
@@ -102,7 +102,10 @@ def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> str:
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an SVG element for an HTML page: no prologue, no metadata, no date, no styles of its own."""
+    """The figure as an SVG element for an HTML page: no prologue, no metadata, no date, no styles of its own.
+
+    It needs nothing but the page. Call it, as everything that draws, within `report_style`.
+    """
     stream = io.BytesIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     figure.savefig(stream, format="svg", metadata=nothing)

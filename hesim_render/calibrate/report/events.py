@@ -20,6 +20,13 @@ _UPPER_OF_NONE = 3.0
 
 
 def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
+    """HTML of the section.
+
+    Parameters
+    ----------
+    section : ``evs`` of a ``calibration.yaml``.
+    maps : its arrays, see `read_maps`; those called ``figure_…`` are drawn.
+    """
     parts = [
         "<h2>Events (EVS)</h2>",
         findings(section),

@@ -14,6 +14,13 @@ from hesim_render.calibrate.report.parts import findings, number, p_text, parame
 
 
 def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
+    """HTML of the section.
+
+    Parameters
+    ----------
+    section : ``aps`` of a ``calibration.yaml``.
+    maps : its arrays, see `read_maps`; those called ``figure_…`` are drawn.
+    """
     n_row = maps["n_row"]
     band = np.repeat(n_row[:, None], max(8, len(n_row) // 3), axis=1)
     step = max(1, len(n_row) // 320)

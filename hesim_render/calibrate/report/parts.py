@@ -40,10 +40,17 @@ def p_text(p_value: float | None) -> str:
 
 
 def row_of(*figures: str) -> str:
+    """Drawings side by side, as many as there is room for; empty ones are left out."""
     return '<div class="row">' + "".join(f"<figure>{f}</figure>" for f in figures if f) + "</div>"
 
 
 def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
+    """Name, value, interval and unit (or why there is no value) of one parameter, as texts for a table.
+
+    Parameters
+    ----------
+    item : a number, or what `estimated` and `not_identifiable` give.
+    """
     if not isinstance(item, dict):
         return name, number(item), "", ""
     if item["value"] is None:
