@@ -1,5 +1,9 @@
 """What a block is rendered of, and what is filled in; numbers of rays."""
 
+import re
+from dataclasses import asdict
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -103,3 +107,9 @@ def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():
     assert not rays_of(Pilot(flux, flux, 0.2 * flux, 0.1 * flux, flux))[1].any()
     # what is hidden for the most part is the sum of what is seen, not the whole less what is hidden
     assert not rays_of(Pilot(flux, flux, 0.1 * flux, 0.2 * flux, 3 * flux))[1].any()
+
+
+def test_the_documented_constants_are_those_of_the_code():
+    page = Path(__file__).parent.parent / "docs" / "change-driven-rendering.md"
+    table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert dict(table) == {name: str(value) for name, value in asdict(TUNING).items()}
