@@ -1,9 +1,15 @@
 """hesim_render: a physically-rendered scene-to-sensor simulator for hybrid event-frame cameras.
 
+Examples
+--------
 >>> import hesim_render as hr
->>> sensor = hr.load_sensor("eiger").crop(512, 384)
->>> scene = hr.load_scene("colorchecker")
->>> rec = hr.simulate(scene, sensor, duration_s=0.1, seed=7)  # doctest: +SKIP
+>>> sensor = hr.load_sensor("gen2").crop(32, 24)
+>>> scene = hr.load_scene("flat-field")
+>>> rec = hr.simulate(scene, sensor, duration_s=0.05, seed=7)
+>>> rec.frames[0].raw.shape, rec.events.dtype.names
+((24, 32), ('t_us', 'x', 'y', 'polarity'))
+>>> hr.__version__.count(".") >= 1 or hr.__version__.startswith("0+")
+True
 """
 
 from __future__ import annotations

@@ -178,3 +178,12 @@ def test_names_of_before_give_the_modules_of_today():
     assert hr.renderer.__name__ == "hesim_render.sources.render"
     assert spectra.__name__ == "hesim_render.spectral.spectrum" and spectra.__spec__.name == spectra.__name__
     assert Recording.__module__ == "hesim_render.recording.recording" and Sensor and load_sensor and WindowReference
+
+
+def test_hooks_need_nothing_but_the_checkouts_own_environment():
+    from ruamel.yaml import YAML
+
+    for repository in YAML(typ="safe").load(ROOT / ".pre-commit-config.yaml")["repos"]:
+        assert repository["repo"] == "local"
+        for hook in repository["hooks"]:
+            assert hook["language"] == "system" and hook["entry"].startswith(".venv/bin/")

@@ -218,6 +218,27 @@ def test_events_within_three_errors_of_the_threshold_are_flips():
         assert (told["extra"], told["flips"]) == (missed, 1 - missed)
 
 
+def test_each_polarity_has_its_own_threshold():
+    """0.3 is a step up over θ₊ = 0.2 and none down over θ₋ = 0.4; of two units each has its own thresholds."""
+    up, flat = np.array([0, 0.3, 0.3, 0.3]), np.zeros(4)
+    reference, run = np.stack([up, -up], axis=1), np.stack([flat, flat], axis=1)
+    error, core = np.full(run.shape, 0.001), np.ones(4, np.bool_)
+    for order in (1, -1):  # units in either order
+        theta = np.array([0.2, 0.4])[::order], np.array([0.4, 0.2])[::order]
+        signal = reference[:, ::order]
+        for told in (
+            compare_ticks(run, signal, error, theta, core),
+            compare_crossings(run, signal, error, theta, core, 8),
+        ):
+            np.testing.assert_array_equal(told.true, [1, 1])
+            np.testing.assert_array_equal(told.missed, [1, 1])
+        for told in (
+            compare_ticks(run, -signal, error, theta, core),
+            compare_crossings(run, -signal, error, theta, core, 8),
+        ):
+            np.testing.assert_array_equal(told.true, [0, 0])
+
+
 def test_crossings_start_anew_at_each_event_of_the_reference():
     theta, core = np.array([0.2]), np.arange(7) < 6  # the last one is there to tell what comes late
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
-from hesim_render.calibrate.report.svg import Plot, number, ticks
+from hesim_render.calibrate.report import drawing
+from hesim_render.calibrate.report.parts import number
 from hesim_render.calibrate.result import plain
 from hesim_render.core.errors import OutputError, SpecError
 
@@ -71,7 +72,8 @@ def test_the_report_is_one_whole_file(both, name, headings):
     checker = _Checker()
     checker.feed(page)
     assert checker.open == []
-    assert all(link.startswith("data:image/png;base64,") for link in checker.links)
+    for link in checker.links:  # a mark is drawn once and used again: a link within the page
+        assert link.startswith("data:image/png;base64,") or (link[0] == "#" and f'id="{link[1:]}"' in page)
     assert "<script" not in page and "nan" not in re.sub(r"base64,[^\"]*", "", page).lower().replace("nance", "")
     for heading in headings:
         assert f"<h2>{heading}</h2>" in page
@@ -90,7 +92,8 @@ def test_the_report_is_one_whole_file(both, name, headings):
         assert "Events (EVS)" not in page
     for text in wanted:
         assert text in page
-    assert checker.images >= 5 + 2 * 4
+    assert checker.images >= 5 + 4  # one for each position, with variances above their residuals
+    assert page.count("residual, %") == 4
     assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", page)
 
 
@@ -102,18 +105,15 @@ def test_notes_cannot_break_the_page(tmp_path):
 
 def test_cells_without_an_event_are_arrows_and_no_cell_is_missing(tmp_path, monkeypatch):
     """Few trials of a bright scene: most cells of it count nothing, and 0 is on no logarithmic axis."""
-    drawn = {"points": [], "arrows_down": []}
-    for name in drawn:
-        monkeypatch.setattr(
-            f"hesim_render.calibrate.report.events.Plot.{name}",
-            lambda self, x, y, *rest, name=name, **more: drawn[name].append((self, x, y)) or self,
-        )
     capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=120.0, c=0.001)
-    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "r.html")
+    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")
+    figures = _figures(tmp_path / "c.yaml", tmp_path / "r.html", monkeypatch)
     maps = read_maps(tmp_path / "c.yaml", "evs")
     signal, on, off, trials = maps["figure_rates"].T
-    first = drawn["points"][0][0]  # the plot of rates against brightness: ON, then OFF
-    points, arrows = ([(x, y) for plot, x, y in drawn[name] if plot is first] for name in drawn)
+    (axes,) = (f.axes[0] for f in figures if f.axes[0].get_title("left") == "Event probability against brightness")
+    drawn = {line.get_label(): line.get_data() for line in axes.lines}
+    points, arrows = ([drawn[label.format(name)] for name in ("ON", "OFF")] for label in ("{}", "_{} none counted"))
+    assert all(y.min() > axes.get_ylim()[0] for _, y in points + arrows)
     for events, (x, y), (at, limit) in zip((on, off), points, arrows, strict=True):
         none = events == 0
         assert none.any() and not none.all()
@@ -153,54 +153,97 @@ def test_numbers_that_are_none_become_null():
     }  # fmt: skip
 
 
-def test_axis_ticks_are_round():
-    assert ticks(0, 1, 5) == [0, 0.2, 0.4, 0.6, 0.8, 1.0]
-    assert ticks(-0.011, 0.011) == [-0.01, -0.005, 0.0, 0.005, 0.01]
+def test_numbers_are_short():
     assert [number(v) for v in (0, 1234567, 0.25, 2e-4)] == ["0", "1.2e6", "0.25", "2.0e-4"]
 
 
-def _texts(svg):
-    """Each text of a drawing: its words, class and box (left, top, right, bottom), turned ones where they stand."""
-    found = []
-    for attributes, words in re.findall(r"<text ([^>]*)>([^<]*)</text>", svg):
-        kind = re.search(r'class="([^"]*)"', attributes).group(1)
-        if words == "":
-            continue
-        turned = re.search(r"translate\(([\d.-]+) ([\d.-]+)\)", attributes)
-        wide = 6.6 * len(words)
-        if turned:
-            x, y = float(turned.group(1)), float(turned.group(2))
-            found.append((words, kind, (x - 10, y - wide / 2, x + 2, y + wide / 2)))
-            continue
-        x, y = (float(re.search(rf'\b{name}="([\d.-]+)"', attributes).group(1)) for name in "xy")
-        left = x - (wide if "end" in kind else 0 if "start" in kind or kind == "title" else wide / 2)
-        found.append((words, kind, (left, y - 9, left + wide, y + 2)))
+def _figures(calibration, report, monkeypatch):
+    """The figures of a report as matplotlib had them when it wrote them."""
+    from matplotlib.figure import Figure
+
+    found, save = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **more: found.append(self) or save(self, *a, **more))
+    write_report(calibration, report, overwrite=True)
     return found
 
 
-def test_no_text_of_a_drawing_lies_on_another_or_beyond_its_edge(both):
-    page = (both[0] / "both.html").read_text(encoding="utf-8")
-    drawings = re.findall(r"<svg .*?</svg>", page, re.S)
-    assert len(drawings) > 12
-    for svg in drawings:
-        width, height = (int(n) for n in re.search(r'width="(\d+)" height="(\d+)"', svg).groups())
-        texts = _texts(svg)
-        for k, (words, kind, (left, top, right, bottom)) in enumerate(texts):
-            assert left > -2 and top > -2 and bottom < height + 2, words
-            assert right < width + (40 if kind == "title" else 6), words
-            for other, _, box in texts[:k]:
-                apart = right <= box[0] or box[2] <= left or bottom <= box[1] or box[3] <= top
+@pytest.fixture(scope="module")
+def again(both, tmp_path_factory):
+    """Figures of the report of both, and the page, drawn a second time."""
+    page = tmp_path_factory.mktemp("again") / "again.html"
+    with pytest.MonkeyPatch.context() as patch:
+        return _figures(both[0] / "c.yaml", page, patch), page
+
+
+def _texts(figure):
+    """Each text of a figure that shows: its words and its box in the figure, px."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.text import Text
+
+    canvas = FigureCanvasAgg(figure).get_renderer()
+    inside = []
+    for axes in [*figure.axes, *(child for a in figure.axes for child in a.child_axes)]:
+        for axis, (low, high) in ((axes.xaxis, sorted(axes.get_xlim())), (axes.yaxis, sorted(axes.get_ylim()))):
+            shown = axis.get_visible() and axes.axison
+            for tick in axis.get_major_ticks() + axis.get_minor_ticks():
+                if not shown or not low <= tick.get_loc() <= high:
+                    inside += [tick.label1, tick.label2]
+            inside += [] if shown else [axis.label]
+    texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and t not in inside]
+    return [(t.get_text(), t.get_window_extent(canvas)) for t in texts]
+
+
+def test_no_text_of_a_drawing_lies_on_another_or_beyond_its_edge(again, tmp_path, monkeypatch):
+    capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=300.0, c=0.001)
+    calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")  # dark pixels on a logarithmic axis
+    figures = again[0] + _figures(tmp_path / "c.yaml", tmp_path / "r.html", monkeypatch)
+    assert len(figures) > 18
+    seen = 0
+    for figure in figures:
+        figure.draw_without_rendering()
+        width, height = figure.bbox.width, figure.bbox.height
+        texts = _texts(figure)
+        seen += len(texts)
+        for k, (words, box) in enumerate(texts):
+            assert box.x0 > -1 and box.y0 > -1 and box.x1 < width + 1 and box.y1 < height + 1, words
+            for other, there in texts[:k]:
+                apart = box.x1 <= there.x0 or there.x1 <= box.x0 or box.y1 <= there.y0 or there.y1 <= box.y0
                 assert apart, (words, other)
+    assert seen > 10 * len(figures)
 
 
 def test_the_legend_stands_below_what_is_drawn():
-    plot = Plot("t", "x", "y", (0, 1), (0, 1), size=(300, 200))
-    for k in range(9):
-        plot.points(np.array([0.5]), np.array([0.5]), "#000", f"{k} milliseconds")
-    svg = plot.svg()
-    boxes = [box for words, _, box in _texts(svg) if "milliseconds" in words]
-    assert len(boxes) == 9 and min(box[1] for box in boxes) > 190 and max(box[2] for box in boxes) < 300
-    assert max(box[3] for box in boxes) < int(re.search(r'height="(\d+)"', svg).group(1))
+    with drawing.report_style():
+        figure, axes = drawing.panel("t", "x", "y", (300, 200))
+        for k in range(9):
+            drawing.points(axes, np.array([0.5]), np.array([0.5]), "#000", f"{k} milliseconds")
+        drawing.legend_below(figure, axes, 2)
+        drawing.svg(figure)
+        boxes = [box for words, box in _texts(figure) if "milliseconds" in words]
+        floor = min(box.y0 for words, box in _texts(figure) if words == "x")  # y counts from the bottom
+    assert len(boxes) == 9 and max(box.y1 for box in boxes) < floor and max(box.x1 for box in boxes) < 300
+    assert min(box.y0 for box in boxes) > 0 and axes.bbox.height > 120
+
+
+def test_names_in_a_drawing_are_text_and_the_same_data_give_the_same_bytes(monkeypatch):
+    import matplotlib
+
+    def drawn():
+        with drawing.report_style():
+            figure, axes = drawing.panel("<script>$\\frac{1}{2}$ & x$", "a $ b", "")
+            drawing.points(axes, np.arange(3.0), np.arange(3.0), "#000", "$\\notmath$")
+            drawing.legend_below(figure, axes, 1)
+            return drawing.svg(figure)
+
+    first = drawn()
+    assert ">&lt;script&gt;$\\frac{1}{2}$ &amp; x$</text>" in first and ">a $ b</text>" in first
+    assert ">$\\notmath$</text>" in first and "<script" not in first
+    assert not re.search(r"<metadata|<style|<!|<\?xml|date", first)
+    with matplotlib.rc_context({"font.size": 30, "svg.fonttype": "path", "svg.hashsalt": "other", "text.usetex": True}):
+        assert drawn() == first  # whatever the user's own settings are
+        assert matplotlib.rcParams["font.size"] == 30
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
+    assert drawn() == first
 
 
 def test_no_dictionary_is_printed(tmp_path):
@@ -213,19 +256,22 @@ def test_no_dictionary_is_printed(tmp_path):
     assert "x 0, y 4, width_px 32, height_px 32" in text and "k 0.25, t_ref_us 1000.0, filter own" in text
 
 
-def test_residuals_beyond_the_usual_are_drawn(both, monkeypatch):
+def test_residuals_beyond_the_usual_are_drawn(again):
     """Every point handed to a panel lies within its axes."""
-    outside = []
-    points = Plot.points
+    drawn = 0
+    for figure in again[0]:
+        for axes in figure.axes:
+            for line in axes.lines:
+                if line.get_marker() == "o":
+                    x, y = line.get_data()
+                    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+                    assert np.all((x >= left) & (x <= right) & (y >= low) & (y <= high)), axes.get_title()
+                    drawn += len(x) > 0
+    assert drawn > 10
 
-    def checked(self, x, y, *rest, **more):
-        outside.append(len(x) - len(self._inside(x, y)))
-        return points(self, x, y, *rest, **more)
 
-    monkeypatch.setattr(Plot, "points", checked)
-    write_report(both[0] / "c.yaml", both[0] / "again.html")
-    (both[0] / "again.html").unlink()
-    assert len(outside) > 10 and not any(outside)
+def test_a_report_is_the_same_bytes_again(both, again):
+    assert again[1].read_bytes() == (both[0] / "both.html").read_bytes()
 
 
 def test_histograms_of_counts_have_bins_of_whole_counts(both):

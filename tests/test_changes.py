@@ -1,8 +1,9 @@
 """What a block is rendered of, and what is filled in; numbers of rays."""
 
-import dataclasses
 import inspect
 import re
+from dataclasses import FrozenInstanceError, asdict, fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,9 +114,15 @@ def test_every_tuning_constant_says_its_unit_its_origin_and_what_it_is_for():
     text = inspect.getdoc(Tuning).partition("Parameters\n----------\n")[2]
     entries = re.findall(r"^(\w[\w, ]*) : ((?:.*)(?:\n    .*)*)", text, re.MULTILINE)
     told = {name: entry for names, entry in entries for name in names.split(", ")}
-    assert set(told) == {field.name for field in dataclasses.fields(Tuning)}
+    assert set(told) == {field.name for field in fields(Tuning)}
     for name, entry in told.items():
         assert re.match(r"[^.]+, [FHC]\. ", entry), name  # unit, origin
         assert re.search("Without|Half as many|Larger", entry), name
-    with pytest.raises(dataclasses.FrozenInstanceError):
+    with pytest.raises(FrozenInstanceError):
         TUNING.change = 1.0
+
+
+def test_the_documented_constants_are_those_of_the_code():
+    page = Path(__file__).parent.parent / "docs" / "change-driven-rendering.md"
+    table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert dict(table) == {name: str(value) for name, value in asdict(TUNING).items()}

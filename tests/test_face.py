@@ -25,6 +25,13 @@ def test_the_package_says_that_it_is_typed():
     assert (Path(hr.__file__).parent / "py.typed").read_bytes() == b""
 
 
+def test_importing_the_package_takes_a_quarter_of_a_second_at_most():
+    """Processor time, the best of three: other work on the machine does not count."""
+    code = "import time; t = time.process_time(); import hesim_render; print(time.process_time() - t)"
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3)]
+    assert min(float(run.stdout) for run in runs) < 0.25
+
+
 def test_descriptions_are_short_and_say_what_is_what():
     sensor = hr.load_sensor("eiger").crop(512, 384, 8, 16)
     assert "512x384+8+16 of 3264x2448 px; events on 256x192 px" in repr(sensor)

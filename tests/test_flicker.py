@@ -351,6 +351,22 @@ def test_motion_within_an_exposure_does_not_lose_the_products_covariance():
         np.testing.assert_allclose(np.array(a), 1.01 * mean, rtol=1e-5)
 
 
+def test_an_instant_on_the_border_of_two_pieces_counts_once():
+    """Φ(t)·w(t) at every cut between pieces, at both ends and between, asked for together and alone."""
+    for kind in (Formula, Windows):
+        flux = FlickerFlux([Mains(50, 0.4, 70)], [kind(1e5, 100.0)])
+        cuts = flux._cuts_us(0.0, 3000.0)
+        assert cuts.size >= 3
+        instants = np.concatenate([[0.0], cuts, [1.0, 1999.0, 3000.0]])
+        t = instants * 1e-6
+        expected = 1e5 * (1 + 100 * t) * (1 + 0.4 * np.cos(200 * np.pi * t + np.radians(70)))
+        pixels = np.arange(instants.size, dtype=np.uint32)
+        together = np.mean(np.array(flux.mean_flux(pixels, instants, instants)), axis=0)
+        np.testing.assert_allclose(together, expected, rtol=1e-5)
+        alone = [np.mean(np.array(flux.mean_flux(pixels[:1], at, at))) for at in instants]
+        np.testing.assert_allclose(alone, expected, rtol=1e-5)
+
+
 def test_windows_are_what_the_mean_over_each_would_be():
     flux = FlickerFlux([Mains(50, 0.4, 70), None], [Windows(1e5, 100.0), Windows(3e4, 100.0)])
     begin = np.arange(12) * 1500.0

@@ -23,7 +23,7 @@ class ErrorMeter:
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS * _DECADES + 2, np.int64)
-        self._square, self._values, self._pictures = 0.0, 0, 0
+        self._square, self._values = 0.0, 0
         self._where: tuple[NDArray[np.int64], UInt32] | None = None
 
     def add(
@@ -58,7 +58,6 @@ class ErrorMeter:
         )
         self._square += float(np.sum(error * error))
         self._values += error.size
-        self._pictures += 1
 
     def as_dict(self, wanted: float | None = None) -> dict[str, float] | None:
         """For the manifest, in units of noise; None where nothing was seen.

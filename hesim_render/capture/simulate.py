@@ -70,6 +70,18 @@ def simulate(
     progress : called with (done, total, what). None shows a bar in notebooks and nothing elsewhere; False nothing.
     on_estimate : called with what the run will take, before it begins; not in the exact mode.
 
+    Examples
+    --------
+    The mean of a clean frame is its electrons times the gain, above black, to half a DN of rounding:
+
+    >>> import hesim_render as hr
+    >>> sensor = hr.load_sensor("reference-mono").crop(32, 24)
+    >>> rec = hr.simulate(hr.load_scene("flat-field"), sensor, duration_s=0.02, samples=4, clean=True)
+    >>> frame, aps = rec.frames[0], sensor.spec.aps
+    >>> signal = frame.electrons_mean.mean() * aps.system_gain_dn_per_e
+    >>> bool(abs(frame.raw.mean() - aps.black_level_dn - signal) < 0.5)
+    True
+
     Returns
     -------
     Recording

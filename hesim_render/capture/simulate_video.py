@@ -94,6 +94,19 @@ def simulate_video(
     options : of `sources.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
         tags, ``mode``, ``white_lux`` or ``white_e_per_s`` with ``white_filter``, ``fit``, ``lens_shading``, …
 
+    Examples
+    --------
+    Four pictures, each brighter than the one before: every pixel sees three steps up.
+
+    >>> import numpy as np
+    >>> import hesim_render as hr
+    >>> clip = np.repeat([60, 90, 120, 150], 48 * 64 * 3).reshape(4, 48, 64, 3).astype(np.uint8)
+    >>> sensor = hr.load_sensor("reference-mono").crop(32, 24)
+    >>> tags = {"transfer": "srgb", "primaries": "bt709"}
+    >>> rec = hr.simulate_video(clip, sensor, fps=200, white_lux=500, clean=True, **tags)
+    >>> len(rec.events) == 3 * 32 * 24, set(rec.events["polarity"].tolist())
+    (True, {1})
+
     Returns
     -------
     Recording

@@ -172,7 +172,7 @@ class _Lines:
 
     def __init__(self, title: str, stream: TextIO) -> None:
         self._title, self._stream = title, stream
-        self._next_s, self._last_s = _FIRST_LINE_S, 0.0
+        self._next_s = _FIRST_LINE_S
 
     def show(self, pace: Pace) -> None:
         now = pace.elapsed_s

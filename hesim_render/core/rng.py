@@ -1,9 +1,8 @@
 """Random numbers as a pure function of (seed, stream, pixel, frame or tick).
 
-Every draw comes from Dr.Jit's counter-based Philox4x32 (Salmon et al. 2011, "Parallel random
-numbers: as easy as 1, 2, 3"; 7 rounds pass BigCrush): the key is made from the seed and the
-stream, the counters are the pixel's index on the *full* sensor, the frame or tick, and a draw
-number. Nothing depends on chunking, threads, crops or the order of calls.
+Every draw comes from Dr.Jit's counter-based Philox4x32 ([salmon2011]; 7 rounds pass BigCrush): the key is made from the
+seed and the stream, the counters are the pixel's index on the *full* sensor, the frame or tick, and a draw number.
+Nothing depends on chunking, threads, crops or the order of calls.
 """
 
 from __future__ import annotations

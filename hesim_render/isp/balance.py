@@ -48,7 +48,7 @@ def white_balance(
 
 
 def grey_world(raw: NDArray[np.float32], tile: ArrayLike) -> list[float]:
-    """Gains that make the mean of all channels equal (Buchsbaum 1980), over tiles that are neither dark nor saturated.
+    """Gains that make the mean of all channels equal [buchsbaum1980], over tiles that are neither dark nor saturated.
 
     Raises
     ------

@@ -2,10 +2,10 @@
 
 A patch is 2×2 neighbouring blocks. In a basis fitted to its tile (the principal axes of pictures under the prior of
 `kriging`), its coefficients are compared with those of the patches around; the mean and the spread of the 16 that are
-nearest say how much of each coefficient is picture. That is the collaborative filtering of Dabov et al. (BM3D, IEEE TIP
-16, 2007; on mosaics Danielyan et al. 2009) with the statistics of Lebrun, Buades and Morel (non-local Bayes, SIAM J.
-Imaging Sci. 6, 2013): a first pass with thresholds, a second as a Wiener filter that knows the first. Patches move by
-whole blocks, so that colours meet their own and the basis serves any tile, with holes.
+nearest say how much of each coefficient is picture. That is the collaborative filtering of BM3D [dabov2007] (on mosaics
+[danielyan2009]) with the statistics of non-local Bayes [lebrun2013]: a first pass with thresholds, a second as a Wiener
+filter that knows the first. Patches move by whole blocks, so that colours meet their own and the basis serves any tile,
+with holes.
 """
 
 from __future__ import annotations

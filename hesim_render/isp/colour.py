@@ -58,7 +58,7 @@ def colour_matrix(image: NDArray[np.float32], matrix: ArrayLike) -> NDArray[np.f
 def fit_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
     """The matrix, with rows that sum to 1 so that white stays white, of least mean ΔE2000.
 
-    Starts from least squares in linear light (Cheung et al. 2004, with the white constraint) and minimises
+    Starts from least squares in linear light ([cheung2004], with the white constraint) and minimises
     the mean ΔE2000 from there; where that does not help the least squares stay.
 
     Parameters

@@ -2,7 +2,7 @@
 
 The guide is the channel with most samples (green, or white), predicted from the samples around under the priors that
 hold there (`guide`). Every other channel is a local linear function of the guide plus a residual interpolated from
-its own samples (residual interpolation, Kiku et al., ICIP 2013), its slope found by ridge regression
+its own samples (residual interpolation, [kiku2013]), its slope found by ridge regression
 towards 1. Work is done on the square root of the signal, in which noise is even and edges overshoot less.
 """
 

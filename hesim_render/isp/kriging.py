@@ -1,7 +1,7 @@
 """Weights of linear demosaicing: the best unbiased prediction of a colour from the samples around it.
 
-Universal co-kriging (Wackernagel, Multivariate Geostatistics, 3rd ed. 2003, ch. 23-24), which is the linear
-minimum-mean-square demosaicing of Trussell and Hartley (IEEE TIP 11, 2002) with the constraint that planes
+Universal co-kriging ([wackernagel2003], ch. 23-24), which is the linear
+minimum-mean-square demosaicing of Trussell and Hartley [trussell2002] with the constraint that planes
 of any colour come out exactly. A prior says two things of pictures: nearby samples are alike,
 cov = exp(-distance / length), and colours go together, cov(colour a, colour b) = cov · (1 + colour · [a = b]).
 `Prior` has others beside that one. No training data is needed, and any tile will do, with holes.
@@ -171,7 +171,7 @@ def stencil(
 def residual_stencil(tile: Block, prior: Prior = ISOTROPIC) -> NDArray[np.float32]:
     """Weights that give how far each sample of the block is from what the others say it should be.
 
-    Leave-one-out residuals of kriging in closed form (Dubrule, Math. Geology 15, 1983): with the inverse B of the
+    Leave-one-out residuals of kriging in closed form [dubrule1983]: with the inverse B of the
     kriging matrix, r_i = Σ_j B_ij y_j / B_ii. One output for each position of the block that has a sample.
     """
     block = np.array(tile)

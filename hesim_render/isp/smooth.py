@@ -12,7 +12,7 @@ from hesim_render.spectral.transfer import ROOT_TOE
 def guided_filter(
     image: NDArray[np.float32], guide: NDArray[np.float32], radius_px: int, epsilon: float
 ) -> NDArray[np.float32]:
-    """An image as a local linear function of a guide (He, Sun and Tang 2013, Eqs. 5-8), boxes of 2·radius + 1.
+    """An image as a local linear function of a guide ([he2013], Eqs. 5-8), boxes of 2·radius + 1.
 
     Parameters
     ----------

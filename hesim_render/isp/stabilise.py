@@ -3,7 +3,7 @@
 With a variance v(I) = a + b I + c I², f(I) = ∫₀ᴵ dI / √(v + 3/8 b²) has a variance of 1 to first order; for a sum of
 Poisson and Gaussian noise it is the generalised Anscombe transform. Below 0 the variance stays that of 0, so that read
 noise around black is not bent. The mean of f over noise is not f of the mean: the way back is the inverse of
-I → E f(I + noise), as Mäkitalo and Foi (IEEE TIP 22, 2013) have it, for a Poisson count of gain b with Gaussian noise.
+I → E f(I + noise), as Mäkitalo and Foi have it [makitalo2013], for a Poisson count of gain b with Gaussian noise.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def auto_gain(image: NDArray[np.float32], percentile: float = 99.5, level: float
 
 
 def tone_global(image: NDArray[np.float32], white: float = 4.0) -> NDArray[np.float32]:
-    """A shoulder for highlights: y (1 + y / white²) / (1 + y), which maps `white` to 1 (Reinhard et al. 2002, Eq. 4).
+    """A shoulder for highlights: y (1 + y / white²) / (1 + y), which maps `white` to 1 ([reinhard2002], Eq. 4).
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def tone_global(image: NDArray[np.float32], white: float = 4.0) -> NDArray[np.fl
 def tone_local(
     image: NDArray[np.float32], compression: float = 0.6, detail: float = 1.0, radius_px: int = 16
 ) -> NDArray[np.float32]:
-    """Large-scale contrast reduced, detail kept (Durand and Dorsey 2002, with the guided filter for the base).
+    """Large-scale contrast reduced, detail kept ([durand2002], with the guided filter for the base).
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from hesim_render.core.device_types import Float, UInt32
 
 
 def normal_pair(radius_word: UInt32, angle_word: UInt32) -> tuple[Float, Float]:
-    """Two independent N(0, 1) deviates of two UInt32 words (Box & Muller 1958).
+    """Two independent N(0, 1) deviates of two UInt32 words [box1958].
 
     Dr.Jit's own normal generator uses 23 bits for the radius, which makes its tail coarse beyond
     5 standard deviations: event thresholds sit there. All 32 bits are used here, and the radius word

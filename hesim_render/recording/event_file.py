@@ -1,4 +1,4 @@
-"""Events in HDF5, in the layout of the DSEC data set (Gehrig et al. 2021), Blosc LZ4.
+"""Events in HDF5, in the layout of the DSEC data set [gehrig2021], Blosc LZ4.
 
 ``events/t`` uint32 µs after ``t_offset``, ``events/x``, ``events/y`` uint16, ``events/p`` uint8 (1 ON,
 0 OFF); ``ms_to_idx[k]`` is the index of the first event at or after k ms, ``t_offset`` int64 µs.

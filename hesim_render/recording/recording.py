@@ -86,6 +86,17 @@ class Recording:
     events : structured array; None reads those of `path` on first use.
     event_truth : None reads those of `path`.
     path : the folder, None for a recording in memory.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import hesim_render as hr
+    >>> rec = hr.simulate(hr.load_scene("dark"), hr.load_sensor("reference-mono").crop(32, 24), duration_s=0.02)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = rec.save(f"{folder}/dark")
+    ...     again = hr.Recording.load(f"{folder}/dark")
+    ...     again.frames[0], bool((again.events == rec.events).all())
+    (<Frame 0: 32x24 px, t_us=10000, exposure_us=10000>, True)
     """
 
     def __init__(

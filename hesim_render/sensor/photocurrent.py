@@ -91,6 +91,18 @@ def photocurrent(
         the leading shape is free.
     quadrature : see `band_weights`.
 
+    Examples
+    --------
+    Light that is the same at all wavelengths, against the integral of the response (e⁻/s per W m⁻² sr⁻¹ nm⁻¹):
+
+    >>> import numpy as np
+    >>> import hesim_render as hr
+    >>> sensor, wavelength_nm = hr.load_sensor("reference-mono"), np.arange(360.0, 831.0)
+    >>> (name, response), = sensor.spectral_response(wavelength_nm).items()
+    >>> electrons = hr.photocurrent(np.full(471, 1e-3), wavelength_nm, sensor, 10_000, filter=name)
+    >>> round(float(electrons / (0.01 * 1e-3 * np.trapezoid(response, wavelength_nm))), 2)
+    1.0
+
     Returns
     -------
     Electrons, with the shape of the radiance less its last axis; NumPy float64 for NumPy input, a

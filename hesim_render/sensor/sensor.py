@@ -33,6 +33,19 @@ class Sensor(PlainState):
     ----------
     layout : region, tile and event grid; `layout.spec` is the file.
     lens : the lens in use (a scene may replace f-number, focal length and focus).
+
+    Examples
+    --------
+    A crop sees what those pixels of the full sensor see. Noise formulas are at hand:
+
+    >>> import hesim_render as hr
+    >>> sensor = hr.load_sensor("reference-mono").crop(64, 48)
+    >>> sensor
+    <Sensor 'reference-mono': 64x48+480+488 of 1024x1024 px; events on 64x48 px; f/4, 16 mm>
+    >>> gain, read = sensor.spec.aps.system_gain_dn_per_e, sensor.spec.aps.read_noise_e
+    >>> dark_e = sensor.spec.aps.dark_current_now_e_per_s * 0.01
+    >>> round(float(sensor.aps.variance_dn2(1000.0, exposure_us=10_000)) / (gain**2 * (1000 + read**2 + dark_e)), 9)
+    1.0
     """
 
     layout: Layout
@@ -150,6 +163,12 @@ class Sensor(PlainState):
 
 def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Sensor:
     """A sensor by shipped name (``hesim-render list sensors``) or path of a YAML file.
+
+    Examples
+    --------
+    >>> import hesim_render as hr
+    >>> hr.load_sensor("eiger", {"aps.exposure_us": 2000}).spec.aps.exposure_us
+    2000
 
     Raises
     ------

@@ -24,6 +24,12 @@ class Scene:
     Parameters
     ----------
     spec : the validated scene file.
+
+    Examples
+    --------
+    >>> import hesim_render as hr
+    >>> hr.load_scene("rotating-star")
+    <Scene 'rotating-star': target siemens-star; object wall; light uniform; moving: target>
     """
 
     spec: SceneSpec
@@ -129,6 +135,12 @@ def load_scene(
     ----------
     overrides : dotted keys and their values, applied before validation (``camera.f_number``).
     allow_outside : let the scene name files (spectra, meshes, textures, includes) outside of its folder.
+
+    Examples
+    --------
+    >>> import hesim_render as hr
+    >>> hr.load_scene("flat-field", {"light.illuminance_lux": 50}).spec.lights[0].illuminance_lux
+    50.0
 
     Raises
     ------

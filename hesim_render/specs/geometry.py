@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
 
 from hesim_render.core.guard import MOST_PIXELS
@@ -75,8 +75,9 @@ def rotation_vector(matrix: tuple[Row, Row, Row, Row]) -> NDArray[np.float64]:
     return Rotation.from_matrix(np.array(matrix)[:3, :3]).as_rotvec()
 
 
-def rotation_matrix_about(axis: Vector, angle_deg: float) -> NDArray[np.float64]:
-    """Matrix [3, 3] of a right-handed turn about a unit axis."""
+def rotation_about(axis: ArrayLike, angle_deg: float) -> NDArray[np.float64]:
+    """Matrix [3, 3] of a right-handed turn by `angle_deg` about `axis` (any length but zero)."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_rotvec(np.radians(angle_deg) * np.array(axis)).as_matrix()
+    direction = np.asarray(axis, dtype=np.float64)
+    return Rotation.from_rotvec(np.radians(angle_deg) * direction / np.linalg.norm(direction)).as_matrix()

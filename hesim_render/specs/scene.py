@@ -25,7 +25,7 @@ from pydantic import (
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
-from hesim_render.specs.geometry import Direction, RigidMatrix, Size, Vector, rotation_matrix_about, rotation_vector
+from hesim_render.specs.geometry import Direction, RigidMatrix, Size, Vector, rotation_about, rotation_vector
 from hesim_render.specs.light import LightSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.spectrum import SpectrumSpec
@@ -116,7 +116,7 @@ class KeyframeSpec(Strict):
             return self
         axis, angle_deg = _turn(rotation_vector(self.matrix), before)
         values, pivot = np.array(self.matrix, dtype=np.float64), np.array(pivot_m, dtype=np.float64)
-        shift = values[:3, 3] - pivot + rotation_matrix_about(axis, angle_deg) @ pivot
+        shift = values[:3, 3] - pivot + rotation_about(axis, angle_deg) @ pivot
         return KeyframeSpec(
             t_us=self.t_us, translation_m=tuple(shift.tolist()), rotation_axis=axis, rotation_deg=angle_deg
         )

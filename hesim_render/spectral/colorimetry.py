@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.spectral.spectrum import Spectrum, colour_matching_functions
+from hesim_render.spectral.transfer import encode_exactly
 
 #: XYZ (D65 white, Y = 1) to linear sRGB, IEC 61966-2-1:1999.
 _XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-#: Sharpened cone responses of the Bradford adaptation (Lam 1985, as in ICC.1).
+#: Sharpened cone responses of the Bradford adaptation ([lam1985], as in ICC.1).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
 
-#: Grid of the sums below: pictures need no finer one (radiometry integrates in `spectra`).
+#: Grid of the sums below: pictures need no finer one (radiometry integrates in `spectrum`).
 _GRID_NM = np.arange(360.0, 831.0, 1.0)
 
 
@@ -57,9 +58,7 @@ def encode_srgb(linear: ArrayLike) -> NDArray[np.uint8]:
 
 
 def _srgb_table() -> NDArray[np.uint8]:
-    x = np.linspace(0.0, 1.0, 4096) ** 2
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
+    return np.rint(255 * encode_exactly(np.linspace(0.0, 1.0, 4096) ** 2, "srgb")).astype(np.uint8)
 
 
 _SRGB_TABLE = _srgb_table()

@@ -220,7 +220,7 @@ def camera_sensitivity(camera: str, channel: str) -> Spectrum:
 
 
 def srgb_reflectances() -> tuple[Spectrum, Spectrum, Spectrum]:
-    """Reflectances of linear sRGB red, green and blue, Mallett and Yuksel (2019), 380-780 nm at 5 nm.
+    """Reflectances of linear sRGB red, green and blue, [mallett2019], 380-780 nm at 5 nm.
 
     Each lies between 0 and 1, they sum to 1, and under D65 a mixture has the tristimulus values of its colour.
     """

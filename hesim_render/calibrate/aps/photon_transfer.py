@@ -1,4 +1,4 @@
-"""Photon transfer in the terms of EMVA 1288 (Release 4.0), beside the polynomial of the paper."""
+"""Photon transfer in the terms of EMVA 1288 [emva2021], beside the polynomial of the paper."""
 
 from __future__ import annotations
 

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, span_of
-from hesim_render.calibrate.report.svg import COLOURS, Plot, picture, table
+from hesim_render.calibrate.report.drawing import COLOURS, legend_below, panel, picture, points, svg
+from hesim_render.calibrate.report.parts import findings, number, p_text, parameter_row, row_of, table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Mean number of events of which a chance of 5 % is left that none is counted: −ln 0.05.
 _UPPER_OF_NONE = 3.0
 
 
 def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
+    """HTML of the section.
+
+    Parameters
+    ----------
+    section : ``evs`` of a ``calibration.yaml``.
+    maps : its arrays, see `read_maps`; those called ``figure_…`` are drawn.
+    """
     parts = [
         "<h2>Events (EVS)</h2>",
         findings(section),
@@ -24,7 +35,7 @@ def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
             _rates(maps),
             _position_rates(maps),
         ),
-        "<p>Arrows: no event was counted; they start at the 95 % limit.</p>",
+        "<p>Triangles: no event was counted; their upper edge is the 95 % limit.</p>",
         row_of(*(_on_off(name, maps) for name in ("lit", "dark"))),
         row_of(_steps(maps), _starts(section, maps)),
         "<h2>Parameters (EVS)</h2>",
@@ -35,69 +46,89 @@ def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     return "\n".join(parts)
 
 
-def _brightness_axis(signal: NDArray) -> tuple[str, tuple[float, float], bool]:
-    """Label, range and whether it is logarithmic: where the brightness spans more than a factor of 100."""
-    top, lowest = float(signal.max()), float(signal[signal > 0].min(initial=np.inf))
-    if not top > 100 * lowest:
-        return "light signal, DN", span_of(signal), False
-    dark = " (dark at the left edge)" if np.any(signal == 0) else ""
-    return f"light signal, DN{dark}", (lowest / 1.5, 1.1 * top), True
+def _rate_panel(title: str, signal: NDArray) -> tuple[Figure, Axes]:
+    """Axes of event probabilities; the light is logarithmic, with 0 on it, where it spans more than a factor of 100."""
+    figure, axes = panel(title, "light signal, DN", "P per trial")
+    darkest_lit = float(signal[signal > 0].min(initial=np.inf))
+    if float(signal.max()) > 100 * darkest_lit:
+        axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest_lit)), linscale=0.5)
+        axes.xaxis.set_major_formatter(_number)
+    axes.set_yscale("log", subs=range(2, 10))
+    axes.yaxis.set_major_formatter(_number)
+    axes.yaxis.set_minor_formatter("")
+    return figure, axes
+
+
+def _number(value: float, _: float) -> str:
+    return number(value).replace(".0e", "e")
+
+
+def _end_of_axis(axes: Axes, counted: float, fitted: float) -> None:
+    """All that was counted is seen, and fits to a hundredth of it; a short axis has more numbers."""
+    from matplotlib.ticker import LogLocator
+
+    axes.set_ylim(bottom=max(0.8 * min(counted, fitted), 0.01 * counted))
+    low, high = axes.get_ylim()
+    if high < 300 * low:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
 
 
 def _rates(maps: dict[str, NDArray]) -> str:
     signal, on, off, trials = maps["figure_rates"].T
     line, fit_on, fit_off = maps["figure_rates_fit"].T
-    lowest, highest = _probability_span(np.concatenate([on, off]), np.concatenate([trials, trials]))
-    label, reach, log_x = _brightness_axis(signal)
-    range_ = 0.8 * min(lowest, fit_on.min(), fit_off.min()), 1.2 * highest
-    title = "Event probability against brightness"
-    plot = Plot(title, label, "P per trial", reach, range_, log_y=True, log_x=log_x)
-    _counted(plot, signal, on, trials, COLOURS[1], "ON")
-    _counted(plot, signal, off, trials, COLOURS[0], "OFF")
-    return plot.line(line, fit_on, COLOURS[1]).line(line, fit_off, COLOURS[0], dashed=True).svg()
+    figure, axes = _rate_panel("Event probability against brightness", signal)
+    _counted(axes, signal, on, trials, COLOURS[1], "ON")
+    _counted(axes, signal, off, trials, COLOURS[0], "OFF")
+    axes.plot(line, fit_on, color=COLOURS[1])
+    axes.plot(line, fit_off, color=COLOURS[0], linestyle="--")
+    counted = _lowest(np.concatenate([on, off]), np.concatenate([trials, trials]))
+    _end_of_axis(axes, counted, min(fit_on.min(), fit_off.min()))
+    legend_below(figure, axes, 2)
+    return svg(figure)
 
 
 def _position_rates(maps: dict[str, NDArray]) -> str:
     fits = maps["figure_position_fits"]
     position, signal, on, off, trials = maps["figure_position_rates"].T
-    lowest, highest = _probability_span(on + off, 2 * trials)
-    label, reach, log_x = _brightness_axis(signal)
-    range_ = 0.8 * min(lowest, fits.min()), 1.2 * highest
-    plot = Plot("By tile position", label, "P per trial", reach, range_, log_y=True, log_x=log_x)
+    figure, axes = _rate_panel("By tile position", signal)
     line = maps["figure_rates_fit"][:, 0]
     for k, fit in enumerate(fits):
         colour, some = COLOURS[k % len(COLOURS)], np.flatnonzero(position == k)[::3]
-        _counted(plot, signal[some], (on + off)[some], 2 * trials[some], colour, radius=1.2)
-        plot.line(line, fit, colour)
-    return plot.svg()
+        _counted(axes, signal[some], (on + off)[some], 2 * trials[some], colour, size=2.4)
+        axes.plot(line, fit, color=colour)
+    _end_of_axis(axes, _lowest(on + off, 2 * trials), fits.min())
+    return svg(figure)
 
 
 def _counted(
-    plot: Plot, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", radius: float = 1.7
+    axes: Axes, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", size: float = 3.4
 ) -> None:
-    """Rates as points; where nothing was counted, an arrow down from the 95 % limit, as 0 is on no logarithmic axis."""
+    """Rates as points; where nothing was counted, a triangle down from the 95 % limit: no logarithmic axis has 0."""
     some = events > 0
-    plot.points(x[some], events[some] / trials[some], colour, label, radius)
-    plot.arrows_down(x[~some], _UPPER_OF_NONE / trials[~some], colour)
+    points(axes, x[some], events[some] / trials[some], colour, label, size)
+    axes.plot(
+        x[~some], _UPPER_OF_NONE / trials[~some], color=colour, linestyle="none", marker=11, alpha=0.7,
+        label=f"_{label} none counted",
+    )  # fmt: skip
 
 
-def _probability_span(events: NDArray, trials: NDArray) -> tuple[float, float]:
-    """Lowest and highest of what `_counted` draws."""
-    shown = np.where(events > 0, events, _UPPER_OF_NONE) / trials
-    return float(shown.min()), float(shown.max())
+def _lowest(events: NDArray, trials: NDArray) -> float:
+    """Lowest of what `_counted` draws."""
+    return float((np.where(events > 0, events, _UPPER_OF_NONE) / trials).min())
 
 
 def _on_off(name: str, maps: dict[str, NDArray]) -> str:
     if f"figure_on_off_{name}" not in maps:
         return ""
-    top = float(maps[f"figure_on_off_{name}_top"])
-    plot = Plot(f"Counts per pixel, {name}", "ON events", "OFF events", (-0.5, top), (-0.5, top), size=(360, 330))
-    ends = np.array([0.0, top])
-    return (
-        plot.image(maps[f"figure_on_off_{name}"], (-0.5, top), (-0.5, top), log=True)
-        .line(ends, ends, "#ffffff", dashed=True)
-        .svg()
-    )
+    from matplotlib.colors import FuncNorm
+
+    counts, top = maps[f"figure_on_off_{name}"], float(maps[f"figure_on_off_{name}_top"])
+    figure, axes = panel(f"Counts per pixel, {name}", "ON events", "OFF events", (360, 330))
+    norm = FuncNorm((np.log1p, np.expm1), vmin=0, vmax=max(1.0, float(counts.max())))
+    axes.imshow(counts, origin="lower", extent=(-0.5, top, -0.5, top), norm=norm)
+    axes.plot([0.0, top], [0.0, top], color="#ffffff", linestyle="--")
+    axes.grid(False)
+    return svg(figure)
 
 
 def _steps(maps: dict[str, NDArray]) -> str:
@@ -105,10 +136,15 @@ def _steps(maps: dict[str, NDArray]) -> str:
         return ""
     step, on, off = maps["figure_steps"].T
     line, fit_on, fit_off = maps["figure_steps_fit"].T
-    plot = Plot("S-curve", "S = ln x₁/x₀", "P per trial", span_of(step), (0, 1))
+    figure, axes = panel("S-curve", "S = ln x₁/x₀", "P per trial")
     n = float(maps["figure_steps_trials"])
-    plot.points(step, on / n, COLOURS[1], "ON", 2.5).points(step, off / n, COLOURS[0], "OFF", 2.5)
-    return plot.line(line, fit_on, COLOURS[1]).line(line, fit_off, COLOURS[0]).svg()
+    points(axes, step, on / n, COLOURS[1], "ON", 5.0)
+    points(axes, step, off / n, COLOURS[0], "OFF", 5.0)
+    axes.plot(line, fit_on, color=COLOURS[1])
+    axes.plot(line, fit_off, color=COLOURS[0])
+    axes.set_ylim(-0.03, 1.03)
+    legend_below(figure, axes, 2)
+    return svg(figure)
 
 
 def _starts(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
@@ -116,19 +152,13 @@ def _starts(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     known = [k for k in range(4) if np.isfinite(error[k]) and error[k] > 0]
     if not known:
         return ""
-    scaled = (starts - np.median(starts, axis=0)) / np.where(np.isfinite(error) & (error > 0), error, 1)
-    reach = max(1e-4, 1.2 * float(np.abs(scaled[:, known]).max()))
-    plot = Plot(
-        f"{len(starts)} starts, spread by e² either way",
-        "",
-        "end − median, standard errors",
-        (0.3, 4.7),
-        (-reach, reach),
-        ticks_x=False,
-    )
-    for k in known:
-        plot.box(k + 1.0, scaled[:, k], COLOURS[k], "ABCD"[k])
-    return plot.svg()
+    scaled = (starts[:, known] - np.median(starts[:, known], axis=0)) / error[known]
+    reach = max(1e-4, 1.2 * float(np.abs(scaled).max()))
+    figure, axes = panel(f"{len(starts)} starts, spread by e² either way", "", "end − median, standard errors")
+    axes.boxplot(scaled, whis=(0, 100), widths=0.3)
+    axes.set_xticks(np.arange(1, len(known) + 1), ["ABCD"[k] for k in known])
+    axes.set_ylim(-reach, reach)
+    return svg(figure)
 
 
 def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:

@@ -8,24 +8,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, span_of
-from hesim_render.calibrate.report.svg import COLOURS, Plot, number, picture, table
+from hesim_render.calibrate.report.drawing import COLOURS, legend_below, new_figure, panel, picture, points, svg
+from hesim_render.calibrate.report.parts import findings, number, p_text, parameter_row, row_of, table
 from hesim_render.pixels.aps.formulas import polynomial
 
 
 def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
-    rows = np.arange(len(maps["n_row"]))
+    """HTML of the section.
+
+    Parameters
+    ----------
+    section : ``aps`` of a ``calibration.yaml``.
+    maps : its arrays, see `read_maps`; those called ``figure_…`` are drawn.
+    """
     n_row = maps["n_row"]
     band = np.repeat(n_row[:, None], max(8, len(n_row) // 3), axis=1)
     step = max(1, len(n_row) // 320)
-    profile = Plot("Row bias N_row", "row", "DN", (0, len(rows)), span_of(n_row)).line(rows, n_row, COLOURS[0])
     exposure = float(maps["figure_variance_exposure_us"]) / 1000
     parts = [
         "<h2>Frames (APS)</h2>",
         findings(section),
         row_of(
             picture("Row bias", band[::step, ::step], "DN", 390),
-            profile.svg(),
+            _profile(n_row),
             picture(f"Temporal variance per pixel, lit, {exposure:g} ms", maps["figure_variance_map"], "DN²", 330),
         ),
         row_of(*(_histogram(name, maps[f"figure_noise_{name}"]) for name in ("dark", "lit"))),
@@ -41,46 +46,54 @@ def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     return "\n".join(parts)
 
 
+def _profile(n_row: NDArray) -> str:
+    figure, axes = panel("Row bias N_row", "row", "DN")
+    axes.plot(np.arange(len(n_row)), n_row, color=COLOURS[0])
+    axes.set_xlim(0, len(n_row))
+    return svg(figure)
+
+
 def _histogram(name: str, values: NDArray) -> str:
     x, measured, predicted = values.T
-    plot = Plot(
-        f"Noise of single values, {name}, longest exposure",
-        "deviation from the mean, DN",
-        "density, 1/DN",
-        (x[0], x[-1]),
-        (0, 1.08 * measured.max()),
+    figure, axes = panel(
+        f"Noise of single values, {name}, longest exposure", "deviation from the mean, DN", "density, 1/DN"
     )
-    return plot.bars(x, measured, COLOURS[0], "measured").line(x, predicted, COLOURS[1], "predicted").svg()
+    half = (x[1] - x[0]) / 2 if len(x) > 1 else 0.5
+    axes.stairs(measured, np.append(x - half, x[-1] + half), fill=True, color=COLOURS[0], alpha=0.35, label="measured")
+    axes.plot(x, predicted, color=COLOURS[1], label="predicted")
+    legend_below(figure, axes, 2)
+    return svg(figure)
 
 
-def _variance_panels(section: dict[str, Any], points: NDArray) -> str:
+def _variance_panels(section: dict[str, Any], pooled: NDArray) -> str:
     figures = []
     for i, row in enumerate(section["beta"]):
         for j, cell in enumerate(row):
-            here = points[(points[:, 0] == i) & (points[:, 1] == j)]
-            if len(here) == 0 or all(b is None for b in cell):
-                continue
-            beta = np.array([0.0 if b is None else b for b in cell])
-            x, y = here[:, 4], here[:, 5]
-            upper = Plot(
-                f"({i}, {j})",
-                "light signal, DN",
-                "variance, DN²",
-                span_of(x),
-                (0, 1.05 * y.max()),
-                size=(300, 210),
-            )
-            relative = 100 * (y / polynomial(beta, x, here[:, 2]) - 1)
-            reach = max(3.0, 1.05 * float(np.abs(relative).max()))
-            lower = Plot("", "light signal, DN", "residual, %", span_of(x), (-reach, reach), size=(300, 130))
-            for k, t in enumerate(np.unique(here[:, 2])):
-                colour, use = COLOURS[k % len(COLOURS)], here[:, 2] == t
-                upper.points(x[use], y[use], colour, f"{1e3 * t:g} ms", 1.5)
-                line = np.linspace(x[use].min(), x[use].max(), 60)
-                upper.line(line, polynomial(beta, line, t), colour)
-                lower.points(x[use], relative[use], colour, "", 1.3)
-            figures.append(upper.svg() + "<br>" + lower.svg())
+            here = pooled[(pooled[:, 0] == i) & (pooled[:, 1] == j)]
+            if len(here) and any(b is not None for b in cell):
+                beta = np.array([0.0 if b is None else b for b in cell])
+                figures.append(_variance_panel(f"({i}, {j})", beta, here))
     return row_of(*figures)
+
+
+def _variance_panel(title: str, beta: NDArray, here: NDArray) -> str:
+    """Variances of one tile position against light, and what the polynomial `beta` leaves of them."""
+    exposure_s, x, y = here[:, 2], here[:, 4], here[:, 5]
+    relative = 100 * (y / polynomial(beta, x, exposure_s) - 1)
+    reach = max(3.0, 1.08 * float(np.abs(relative).max()))
+    figure = new_figure((300, 340))
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    upper.set(title=title, ylabel="variance, DN²")
+    lower.set(xlabel="light signal, DN", ylabel="residual, %", ylim=(-reach, reach))
+    for k, t in enumerate(np.unique(exposure_s)):
+        colour, use = COLOURS[k % len(COLOURS)], exposure_s == t
+        points(upper, x[use], y[use], colour, f"{1e3 * t:g} ms", 3.0)
+        line = np.linspace(x[use].min(), x[use].max(), 60)
+        upper.plot(line, polynomial(beta, line, t), color=colour)
+        points(lower, x[use], relative[use], colour, size=2.6)
+    upper.set_ylim(bottom=min(0.0, float(y.min())))
+    legend_below(figure, upper, 4)
+    return svg(figure)
 
 
 def _transfer_table(section: dict[str, Any]) -> str:

@@ -6,10 +6,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from hesim_render.calibrate.report.drawing import report_style
 from hesim_render.calibrate.report.events import evs_section
 from hesim_render.calibrate.report.frames import aps_section
-from hesim_render.calibrate.report.parts import plain_text
-from hesim_render.calibrate.report.svg import table
+from hesim_render.calibrate.report.parts import plain_text, table
 from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning
 from hesim_render.core.output import replacing
 from hesim_render.specs.calibration import as_written
@@ -21,10 +21,8 @@ h1{font-size:1.6rem}h2{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px sol
 figcaption{font-size:.85rem;color:#555;max-width:52rem}
 table{border-collapse:collapse;font-size:.85rem;margin:.6rem 0}
 td,th{padding:.15rem .6rem;border-bottom:1px solid #ddd;text-align:left;font-variant-numeric:tabular-nums}
-svg text{font:11px system-ui,sans-serif;fill:#333}svg .title{font-weight:600;font-size:12px}
-svg .label,svg .tick{text-anchor:middle}svg .end{text-anchor:end}svg .start{text-anchor:start}
+svg{stroke-linejoin:round;stroke-linecap:butt}
 .findings{border-left:4px solid #d55e00;background:#fdf3ec;padding:.3rem .9rem;margin:.8rem 0}
-svg .grid{stroke:#e4e4e4;fill:none}svg .axis{stroke:#555;fill:none}
 """
 
 
@@ -44,7 +42,7 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
     """
     path = check_report(calibration, report, overwrite)
     data = read_calibration(calibration)
-    with as_written(calibration):
+    with as_written(calibration), report_style():
         parts = [_introduction(data)]
         if "aps" in data:
             parts.append(aps_section(data["aps"], read_maps(calibration, "aps", data)))

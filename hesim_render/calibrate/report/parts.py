@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
-from hesim_render.calibrate.report.svg import number
 
 
 def findings(section: Mapping[str, Any]) -> str:
@@ -45,10 +40,17 @@ def p_text(p_value: float | None) -> str:
 
 
 def row_of(*figures: str) -> str:
+    """Drawings side by side, as many as there is room for; empty ones are left out."""
     return '<div class="row">' + "".join(f"<figure>{f}</figure>" for f in figures if f) + "</div>"
 
 
 def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
+    """Name, value, interval and unit (or why there is no value) of one parameter, as texts for a table.
+
+    Parameters
+    ----------
+    item : a number, or what `estimated` and `not_identifiable` give.
+    """
     if not isinstance(item, dict):
         return name, number(item), "", ""
     if item["value"] is None:
@@ -59,5 +61,17 @@ def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
     return name, f"{item['value']:.5g}", between, " ".join(t for t in (item.get("unit", ""), note) if t)
 
 
-def span_of(values: NDArray) -> tuple[float, float]:
-    return float(np.nanmin(values)), float(np.nanmax(values))
+def number(value: float) -> str:
+    """A number in few digits."""
+    if value == 0:
+        return "0"
+    if 1e3 <= abs(value) < 1e5:
+        return f"{value:.0f}"
+    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e5 else f"{value:.1e}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """An HTML table; text is escaped."""
+    header = "".join(f"<th>{escape(h)}</th>" for h in head)
+    body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table>"

@@ -16,12 +16,10 @@ _SEARCH_LIMIT = 100
 def poisson(mean: Float, generator: Generator, words: tuple[UInt32, UInt32] | None = None) -> Float:
     """Poisson deviates, exact to the accuracy of single precision at every mean up to 1e7.
 
-    Below a mean of 10: inversion by sequential search in double precision, from a 64-bit uniform.
-    From 10 on: transformed rejection PTRS (Hörmann 1993, "The transformed rejection method for
-    generating Poisson random variables"), without its quick accept step, which cannot save work in
-    SIMD lanes. The probabilities it compares with are in the saddle-point form of Loader (2000,
-    "Fast and accurate computation of binomial probabilities"), as ln k! in single precision would
-    lose all digits of the result to cancellation.
+    Below a mean of 10: inversion by sequential search in double precision, from a 64-bit uniform. From 10 on:
+    transformed rejection PTRS [hormann1993], without its quick accept step, which cannot save work in SIMD lanes. The
+    probabilities it compares with are in the saddle-point form of Loader [loader2000], as ln k! in single precision
+    would lose all digits of the result to cancellation.
 
     Parameters
     ----------
@@ -121,7 +119,7 @@ def _propose(mean: Float, u_word: UInt32, v_word: UInt32) -> tuple[Float, Mask]:
 
 
 def _log_probability(count: Float, mean: Float) -> tuple[Float, Float]:
-    """Poisson probability as exp(−deviance) / scale (Loader 2000): bd0 + Stirling error, and √(2πk)."""
+    """Poisson probability as exp(−deviance) / scale [loader2000]: bd0 + Stirling error, and √(2πk)."""
     import drjit as dr
 
     empty = count == 0.0

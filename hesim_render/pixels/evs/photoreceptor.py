@@ -6,9 +6,8 @@ comparator sees. For u on a straight line from u₀ to u₁ in a time h, with E 
     z₁ = u₁ + E (z₀ − u₀) − p (u₁ − u₀)
     y₁ = u₁ + E (y₀ − u₀ + ah (z₀ − u₀)) − (2p − E)(u₁ − u₀)
 
-which is exact whatever h is. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A
-photoreceptor is a second-order system whose corner rises with the photocurrent (Graça et al. 2021,
-"Unraveling the paradox of intensity-dependent DVS pixel noise") until its bias current limits it.
+which is exact whatever h is. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A photoreceptor is a
+second-order system whose corner rises with the photocurrent [graca2021] until its bias current limits it.
 """
 
 from __future__ import annotations

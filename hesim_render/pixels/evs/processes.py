@@ -28,7 +28,7 @@ class BandNoise:
 
     White noise through two equal poles, −3 dB at the cut-off together. With a = 2π f_c/√(√2 − 1) its
     correlation is (1 + a|τ|)·exp(−a|τ|), and its slope is finite, so that it crosses a level at a finite
-    rate (Rice 1945): zero upwards a/2π times a second. Behind a single pole that rate has no limit, and
+    rate [rice1945]: zero upwards a/2π times a second. Behind a single pole that rate has no limit, and
     event rates would follow the spacing of the nodes.
 
     The state (u, u'/a) steps from node to node with its exact transition matrix. Between nodes the

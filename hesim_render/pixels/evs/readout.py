@@ -83,7 +83,7 @@ def _running(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Each map w → clip(w + add, low, high) after all before it, as one such map; log₂ n passes.
 
-    Clips of sums are closed under composition, which makes the buffer a prefix scan (Hillis & Steele 1986).
+    Clips of sums are closed under composition, which makes the buffer a prefix scan [hillis1986].
     """
     reach = 1
     while reach < add.size:

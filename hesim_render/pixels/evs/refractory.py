@@ -2,7 +2,7 @@
 
 No event of a pixel comes within the period after its last one, leak events included. At the end of the
 period the change amplifier is released, and the reference is the level of that instant, as in a DVS pixel
-(Lichtsteiner et al. 2008). On a steady slope a pixel therefore fires every period + θ/slope.
+[lichtsteiner2008]. On a steady slope a pixel therefore fires every period + θ/slope.
 """
 
 from __future__ import annotations

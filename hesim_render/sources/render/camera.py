@@ -20,7 +20,7 @@ from hesim_render.core.units import MM_PER_M
 from hesim_render.sensor.lens import pixel_centres_mm
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
-from hesim_render.sources.render.scene.trajectory import rotation_about
+from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector
 
 _FWHM_PER_SIGMA = 2.3548200450309493  # 2 √(2 ln 2)

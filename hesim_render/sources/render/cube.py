@@ -1,8 +1,8 @@
 """Spectral radiance cubes L(row, col, λ) of one instant, and spectral EXR files.
 
-The files follow Fichet, Pacanowski and Wilkie, "An OpenEXR Layout for Spectral Images" (JCGT 10(3),
-2021): one channel per band named ``S0.550,000000nm`` (Stokes component 0, decimal comma), and the
-attributes ``spectralLayoutVersion`` and ``emissiveUnits``. Compression is PIZ, which Mitsuba can read.
+The files follow the OpenEXR layout of Fichet, Pacanowski and Wilkie [fichet2021]: one channel per band named
+``S0.550,000000nm`` (Stokes component 0, decimal comma), and the attributes ``spectralLayoutVersion`` and
+``emissiveUnits``. Compression is PIZ, which Mitsuba can read.
 """
 
 from __future__ import annotations

@@ -120,11 +120,6 @@ class RenderedFlux(WindowByWindow):
         illumination = self.sensor.relative_illumination.ravel() * np.float32(self._tracer.radiance_scale)
         self._illumination = types.Float(illumination)
 
-    @property
-    def rays_per_pixel(self) -> int:
-        """Rays that one call traces for each listed pixel (for progress bars)."""
-        return 0 if self._tracer.built.is_dark else self.samples
-
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval at which moving objects take their next pose, µs."""
         return self._timeline.edges_us(begin_us, end_us)

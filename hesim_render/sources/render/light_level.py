@@ -1,8 +1,8 @@
 """Mitsuba scenes in absolute light: the factor to their radiance that makes a level on a plane what was asked for.
 
 The irradiance of all light together, what surfaces throw back included, is measured by paths from a point of the plane:
-with light sampled there and directions of a Lambertian surface, weighted against each other (Veach and Guibas 1995,
-"Optimally combining sampling techniques for Monte Carlo rendering"), and the scene's own integrator beyond.
+with light sampled there and directions of a Lambertian surface, weighted against each other [veach1995], and the
+scene's own integrator beyond.
 """
 
 from __future__ import annotations

@@ -128,45 +128,6 @@ class Timeline:
             fastest_px = max(fastest_px, float(np.linalg.norm(moved, axis=-1).max()))
         return fastest_px * (times.size - 1)
 
-    def object_motion_px(self, name: str, begin_us: float, end_us: float) -> float:
-        """Length of the longest way a corner of one moving object goes in the image during an interval, pixels."""
-        trajectory = self._trajectories[name]
-        times = np.linspace(begin_us, end_us, _LEAST_STEPS + 1)
-        poses = trajectory.matrix(times)
-        points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-        camera = self._view.camera_to_world
-        if self._camera is not None:
-            camera = self._camera.matrix(np.array(0.5 * (begin_us + end_us))) @ camera
-        places = self._view.project(points, np.broadcast_to(camera, poses.shape))
-        return float(np.linalg.norm(np.diff(places, axis=0), axis=-1).sum(axis=0).max())
-
-    def outlines_px(self, name: str, begin_us: float, end_us: float, parts: int = 6) -> list[NDArray[np.float64]]:
-        """Where a moving object's box is seen during an interval: points whose convex hulls hold it, in some parts.
-
-        Returns
-        -------
-        For each part of the interval, column and row of all corners at its begin, middle and end, [k, 2] pixels.
-        """
-        times = np.linspace(begin_us, end_us, 2 * parts + 1)
-        poses = self._trajectories[name].matrix(times)
-        points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
-        camera = np.broadcast_to(self._view.camera_to_world, poses.shape)
-        if self._camera is not None:
-            camera = self._camera.matrix(times) @ camera
-        places = self._view.project(points, camera)
-        return [places[2 * k : 2 * k + 3].reshape(-1, 2) for k in range(parts)]
-
-    def extent_px(self, name: str, t_us: float) -> float:
-        """Least extent of one moving object's box in the image, of its two, pixels."""
-        pose = self._trajectories[name].matrix(t_us)
-        camera = (
-            self._view.camera_to_world
-            if self._camera is None
-            else self._camera.matrix(t_us) @ self._view.camera_to_world
-        )
-        places = self._view.project(self._corners[name] @ pose[:3, :3].T + pose[:3, 3], camera)
-        return float(np.ptp(places, axis=0).min())
-
     def edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """All slice edges strictly inside an interval, increasing."""
         if not self._trajectories:

@@ -5,9 +5,9 @@ camera RGB; its scale comes from the filter with the strongest white. Filters th
 (white event pixels) see a luma, or the spectral route, at the scale of their own white.
 
 ``spectral``: a colour becomes the reflectance r·ρ_r(λ) + g·ρ_g(λ) + b·ρ_b(λ) with the basis of Mallett and Yuksel
-(2019), which lies between 0 and 1, sums to 1 for white and has the colour's own tristimulus values under D65. Under the
-light it goes through Eq. 1 with the sensor's own curves. Any filter has a defined answer: that of one smooth surface
-of this colour, of the many that share it. The basis ends at 380 and 780 nm and is held constant beyond.
+[mallett2019], which lies between 0 and 1, sums to 1 for white and has the colour's own tristimulus values under D65.
+Under the light it goes through Eq. 1 with the sensor's own curves. Any filter has a defined answer: that of one smooth
+surface of this colour, of the many that share it. The basis ends at 380 and 780 nm and is held constant beyond.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Bounds for means of bounded variables that hold at any number of draws and for any distribution: by betting.
 
-Who bets on every draw x in [0, 1] that the mean is below m, with a stake λ in [0, 1), has after n draws the capital
-Π (1 − λ (x − m)). If the mean is m or more, that capital has no drift upwards, and by Ville's inequality it ever
-reaches 1/α with a chance of at most α: all m for which it has are ruled out with confidence 1 − α, no matter when one
-looks or why one stops (Waudby-Smith and Ramdas 2024, "Estimating means of bounded random variables by betting",
-J. R. Stat. Soc. B 86). A portfolio of stakes is a bet as well.
+Who bets on every draw x in [0, 1] that the mean is below m, with a stake λ in [0, 1), has after n draws the capital Π
+(1 − λ (x − m)). If the mean is m or more, that capital has no drift upwards, and by Ville's inequality [ville1939] it
+ever reaches 1/α with a chance of at most α: all m for which it has are ruled out with confidence 1 − α, no matter when
+one looks or why one stops [waudby2024]. A portfolio of stakes is a bet as well.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The pilot pass: a few rays of each pixel in each window, which decide how the picture is rendered.
 
 Its rays have random numbers of their own, so that what they show may decide about the picture without favouring what
-the picture's rays happen to miss (Kirk and Arvo 1991, "Unbiased sampling techniques for image synthesis"). They are the
+the picture's rays happen to miss [kirk1991]. They are the
 same at all times: differences between two windows are changes of the scene, not of the rays.
 """
 

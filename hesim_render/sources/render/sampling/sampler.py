@@ -13,9 +13,7 @@ Place in the pixel and instant are one draw: an edge that moves is a surface in 
 and where it passes over a pixel or two within the window, 128 rays of a half have 0.6 times the error
 that they have with the instant drawn apart (0.37 against 0.6 of that of independent rays).
 
-Padding of low-dimensional sequences: Kollig and Keller 2002, "Efficient multidimensional sampling";
-permutation: Kensler 2013, "Correlated multi-jittered sampling"; hash: Wellons 2018, "Prospecting for hash functions"
-(lowbias32).
+Padding of low-dimensional sequences: [kollig2002]; permutation: [kensler2013]; hash: lowbias32 of [wellons2018].
 """
 
 from __future__ import annotations
@@ -82,8 +80,7 @@ def zero_two_point(index: UInt32) -> tuple[UInt32, UInt32]:
 def third_coordinates(first_bit: int, bits: int) -> NDArray[np.uint32]:
     """Sobol's third coordinate of the indices 0 … 2^bits - 1, shifted left by `first_bit`, as binary fractions.
 
-    Direction numbers of the primitive polynomial x² + x + 1 with m = 1, 3: Joe and Kuo 2008, "Constructing Sobol
-    sequences with better two-dimensional projections".
+    Direction numbers of the primitive polynomial x² + x + 1 with m = 1, 3: [joe2008].
     """
     m = [1, 3]
     while len(m) < first_bit + bits:

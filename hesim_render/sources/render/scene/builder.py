@@ -25,7 +25,8 @@ from hesim_render.sources.render.scene.mitsuba_version import (
 )
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.targets import build_target
-from hesim_render.sources.render.scene.trajectory import Trajectory, rotation_about
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.spectral.spectrum import Spectrum, require_coverage
 

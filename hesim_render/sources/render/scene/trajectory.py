@@ -8,43 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from hesim_render.core.device_types import Float
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.specs.scene import KeyframeSpec, TrackSpec
 
-Quaternion = NDArray[np.float64]  # w, x, y, z
 _EPSILON = 1e-12
-
-
-def _axis_angle(axis: NDArray[np.float64], angle_rad: NDArray[np.float64]) -> Quaternion:
-    """Quaternions [..., 4] of rotations about unit axes [..., 3]."""
-    half = np.asarray(angle_rad, dtype=np.float64)[..., None] / 2
-    return np.concatenate([np.cos(half), np.sin(half) * axis], axis=-1)
-
-
-def _multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """p · q: rotate by q, then by p."""
-    w = p[..., :1] * q[..., :1] - np.sum(p[..., 1:] * q[..., 1:], axis=-1, keepdims=True)
-    v = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
-    return np.concatenate([w, v], axis=-1)
-
-
-def rotation_matrix(q: Quaternion) -> NDArray[np.float64]:
-    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def rotation_about(axis: ArrayLike, angle_deg: float) -> NDArray[np.float64]:
-    """Matrix [3, 3] of a right-handed turn by `angle_deg` about `axis` (any length but zero)."""
-    direction = np.asarray(axis, dtype=np.float64)
-    return rotation_matrix(_axis_angle(direction / np.linalg.norm(direction), np.array(radians(angle_deg))))
 
 
 def _unit(axis: ArrayLike) -> NDArray[np.float64]:
@@ -61,14 +31,11 @@ def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], f
     a, b = _unit(start.rotation_axis), _unit(end.rotation_axis)
     if abs(abs(a @ b) - 1) < 1e-9:
         return a, radians(end.rotation_deg * np.sign(a @ b) - start.rotation_deg)
-    first = _axis_angle(a, np.array(radians(start.rotation_deg)))
-    second = _axis_angle(b, np.array(radians(end.rotation_deg)))
-    step = _multiply(second, first * np.array([1, -1, -1, -1]))
-    step = -step if step[0] < 0 else step  # the shorter of the two arcs
-    sine = float(np.linalg.norm(step[1:]))
-    if sine < _EPSILON:
-        return a, 0.0
-    return step[1:] / sine, 2 * float(np.arctan2(sine, step[0]))
+    first = Rotation.from_rotvec(radians(start.rotation_deg) * a)
+    second = Rotation.from_rotvec(radians(end.rotation_deg) * b)
+    turn = (second * first.inv()).as_rotvec()  # the shorter of the two arcs
+    angle = float(np.linalg.norm(turn))
+    return (a, 0.0) if angle < _EPSILON else (turn / angle, angle)
 
 
 class Piece(NamedTuple):
@@ -109,9 +76,10 @@ class Trajectory:
         arcs = [_arc(start, end) for start, end in zip(frames[:-1], frames[1:], strict=True)]
         self.arc_axis = np.array([axis for axis, _ in arcs])
         self.arc_rad = np.array([angle for _, angle in arcs])
-        self.start_rotation = np.array(
-            [_axis_angle(_unit(f.rotation_axis), np.array(radians(f.rotation_deg))) for f in frames[:-1]]
-        )
+        turns = [radians(frame.rotation_deg) * _unit(frame.rotation_axis) for frame in frames[:-1]]
+        self._starts = Rotation.from_rotvec(np.array(turns))
+        #: Quaternions [segment, 4], scalar first.
+        self.start_rotation = self._starts.as_quat(scalar_first=True)
 
     @property
     def period_us(self) -> float:
@@ -150,8 +118,9 @@ class Trajectory:
 
     def within(self, segment: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pose in the segments between two keyframes at a share of each, 0 to 1 with both ends; [..., 4, 4]."""
-        turn = _axis_angle(self.arc_axis[segment], share * self.arc_rad[segment])
-        rotation = rotation_matrix(_multiply(turn, self.start_rotation[segment]))
+        each = np.ravel(segment)
+        turn = Rotation.from_rotvec((np.ravel(share) * self.arc_rad[each])[:, None] * self.arc_axis[each])
+        rotation = (turn * self._starts[each]).as_matrix().reshape(*share.shape, 3, 3)
         start = self.translation_m[segment]
         translation = start + share[..., None] * (self.translation_m[segment + 1] - start)
         pose = np.zeros((*share.shape, 4, 4))

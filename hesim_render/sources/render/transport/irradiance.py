@@ -38,7 +38,7 @@ class RectangleLight:
         """∫ cos θ dω over the rectangle, what lies below the horizon cut off; sr.
 
         Lambert's formula, ½ |Σ γ_i (Γ_i · n)| with γ_i the angle that edge i subtends and Γ_i the unit normal of the
-        plane through the point and that edge (Lambert 1760; Baum, Rushmeier and Winget 1989 have it for polygons).
+        plane through the point and that edge ([lambert1760]; for polygons [baum1989]).
         Clipping a convex polygon at a plane leaves its edges shortened, and one more along the horizon.
 
         Parameters

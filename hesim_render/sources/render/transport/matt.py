@@ -14,7 +14,7 @@ irradiance (E[r] = e_k) and is seen or not (v = 1 or 0), which gives two unbiase
 
 Each pair of a pixel and a window takes the one that its pilot found less noisy.
 
-One path of the common estimator (Veach 1997) multiplies all of these; at the dark side of a penumbra its error was
+One path of the common estimator [veach1997] multiplies all of these; at the dark side of a penumbra its error was
 three times as large with more rays.
 """
 

@@ -3,7 +3,7 @@
 A matt surface that a mirror shows a lamp is lit by its image. A shadow ray ends at the mirror, and of the surface's
 own directions few go to the image. So some of them are drawn from the cones around the images instead, and the
 density of the mixture is the density of all: one-sample multiple importance sampling with the balance heuristic
-(Veach 1997, section 9.2.4). Whatever such a ray runs into, the estimate stays unbiased.
+([veach1997], section 9.2.4). Whatever such a ray runs into, the estimate stays unbiased.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A path tracer whose rays have times of their own, and which knows whether a path has come near what moves.
 
-The estimator is the common one (Veach 1997): light sampled at every vertex, combined with the
+The estimator is the common one [veach1997]: light sampled at every vertex, combined with the
 surface's own sampling by the power heuristic; Russian roulette where a path has gone on for long. It is
 written here because Mitsuba's own follows a path through one scene at one time. What it has besides: matt
 surfaces send some paths to the images of lamps in flat mirrors (`LampImages`), and an even sky is not sampled

@@ -1,0 +1,125 @@
+"""Figures of the calibration report: drawn by matplotlib, written as SVG that stands inside an HTML page.
+
+Matplotlib is imported when a report is drawn, not before. Figures are built without ``pyplot``, so that no state of
+the process changes and no display is needed.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Colours told apart with any colour vision (Okabe and Ito).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6b6b", "#000000")
+_SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+#: One unit of the drawing is one pixel of the page, and one point of matplotlib.
+_PER_INCH = 72
+#: Height of a line of the legend, px.
+_LEGEND_LINE = 16
+#: What every figure looks like, whatever the user's own ``matplotlibrc`` says. Text stays text, is never read as
+#: mathematics (a name may hold a $), and identifiers follow from the content alone: the same data give the same bytes.
+_SETTINGS: dict[Any, Any] = {
+    "svg.fonttype": "none", "svg.hashsalt": "hesim_render", "text.parse_math": False, "figure.dpi": _PER_INCH,
+    "font.sans-serif": ["DejaVu Sans"], "font.size": 9.5, "axes.titlesize": 11, "axes.titleweight": "bold",
+    "axes.titlelocation": "left", "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
+    "axes.axisbelow": True, "grid.color": "#e4e4e4", "axes.edgecolor": "#555555", "lines.linewidth": 1.4,
+    "lines.markeredgewidth": 0, "image.cmap": "cividis", "image.interpolation": "none",
+    "image.composite_image": False, "axes.formatter.limits": (-3, 5), "axes.formatter.useoffset": False,
+    "axes.unicode_minus": True,
+}  # fmt: skip
+
+
+@contextmanager
+def report_style() -> Iterator[None]:
+    """Settings under which the figures of a report are built and written; those of before come back."""
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_SETTINGS)
+        yield
+
+
+def new_figure(size_px: tuple[int, int]) -> Figure:
+    """An empty figure whose parts are laid out so that no text lies on another."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(size_px[0] / _PER_INCH, size_px[1] / _PER_INCH), layout="constrained")
+
+
+def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (420, 290)) -> tuple[Figure, Axes]:
+    """A figure with one pair of axes, size in px of the page."""
+    figure = new_figure(size_px)
+    axes = figure.subplots()
+    axes.set(title=title, xlabel=x_label, ylabel=y_label)
+    return figure, axes
+
+
+def points(axes: Axes, x: NDArray, y: NDArray, colour: str, label: str = "", size: float = 3.4) -> None:
+    """Dots, one for each pair of numbers, half transparent where many lie on each other; `size` in px."""
+    axes.plot(x, y, linestyle="none", marker="o", markersize=size, color=colour, alpha=0.55, label=label)
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """The labelled artists of the axes, below them, where they hide nothing; the figure grows by their height."""
+    handles, labels = axes.get_legend_handles_labels()
+    lines = -(-len(labels) // columns)
+    figure.set_figheight(figure.get_figheight() + lines * _LEGEND_LINE / _PER_INCH)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, handlelength=1.2,
+                  columnspacing=1.2, handletextpad=0.4, borderpad=0.2, labelspacing=0.2, markerscale=1.8)  # fmt: skip
+
+
+def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> str:
+    """A map with a colour bar, its longer side `size_px`; colours span the 1st to the 99th percentile.
+
+    Values that are not finite are grey.
+    """
+    from matplotlib import colormaps
+
+    finite = values[np.isfinite(values)]
+    low, high = (float(v) for v in np.quantile(finite, [0.01, 0.99])) if finite.size else (0.0, 1.0)
+    rows, columns = values.shape
+    scale = size_px / max(rows, columns)
+    width, height = max(24, round(scale * columns)), max(24, round(scale * rows))
+    figure = new_figure((width + 84, height + 26))
+    axes = figure.subplots()
+    shades = colormaps["cividis"].with_extremes(bad="#c8c8c8")
+    image = axes.imshow(np.ma.masked_invalid(values), cmap=shades, vmin=low, vmax=high)
+    axes.set_axis_off()
+    axes.set_title(title)
+    figure.colorbar(image, cax=axes.inset_axes((1 + 8 / width, 0, 12 / width, 1)), label=unit)
+    return svg(figure)
+
+
+def svg(figure: Figure) -> str:
+    """The figure as an SVG element for an HTML page: no prologue, no metadata, no date, no styles of its own.
+
+    It needs nothing but the page. Call it, as everything that draws, within `report_style`.
+    """
+    stream = io.BytesIO()
+    nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.savefig(stream, format="svg", metadata=nothing)
+    root = ElementTree.fromstring(stream.getvalue())
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag in (f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"):
+                parent.remove(child)
+        if parent.tag == f"{{{_SVG}}}g":  # named by their order, so that two figures of a page share the names
+            parent.attrib.pop("id", None)
+        if (link := parent.attrib.pop(f"{{{_XLINK}}}href", None)) is not None:
+            parent.set("href", link)
+    for name in ("width", "height"):
+        root.set(name, root.get(name, "").removesuffix("pt"))
+    root.set("role", "img")
+    ElementTree.register_namespace("", _SVG)
+    return ElementTree.tostring(root, encoding="unicode")

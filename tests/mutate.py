@@ -1,0 +1,340 @@
+"""Mutation testing: change one operator or number of a statistical module, and see whether a test fails.
+
+    python -m tests.mutate                    twenty random mutations of the targets below
+    python -m tests.mutate --count 200 --seed 3 --only aps
+    python -m tests.mutate --fixed            the mutations that once survived; all must be killed
+    python -m tests.mutate --list             every mutation, not run
+
+A mutation that no test notices is printed with its line; the command then ends with status 1. Some survivors are
+equivalent to the original (a starting value of a search, a bound that is never reached): read the line before a test
+is written. The working tree is not touched: pytest gets the changed module through an import hook, which this file
+installs when pytest loads it as a plugin.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import importlib.abc
+import importlib.util
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Where the hook finds the changed module: its name, and the file with its source.
+_NAME, _SOURCE = "HESIM_RENDER_MUTANT_NAME", "HESIM_RENDER_MUTANT_SOURCE"
+#: A run of tests that takes so many times as long as the unchanged one hangs, and so many seconds more.
+_PATIENCE, _GRACE_S = 4.0, 30.0
+
+#: Functions that are mutated, "module:function" or "module" for all of it, and the tests that should notice.
+TARGETS: dict[str, tuple[str, ...]] = {
+    "calibrate.aps.variance": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_aps.py"),
+    "calibrate.aps.photon_transfer": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_aps.py"),
+    "calibrate.moments": ("tests/test_calibrate_aps.py",),
+    "calibrate.evs.model": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
+    "calibrate.evs.fitted": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
+    "calibrate.evs.thresholds": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
+    "calibrate.evs.defects": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
+    "sources.flicker": ("tests/test_flicker.py",),
+    "sources.render.audit.confidence": ("tests/test_audit.py",),
+    "sources.render.audit.compare": ("tests/test_audit.py",),
+    "sources.render.change_driven.plan": ("tests/test_changes.py",),
+    "sources.render.change_driven.tuning:Gain": ("tests/test_changes.py",),
+    "sources.render.sampling.sampler:third_coordinates": ("tests/test_renderer_sampling.py",),
+    "pixels.normal": ("tests/test_noise_aps.py", "tests/test_noise_evs.py"),
+}
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A mutation of a line, wherever in the package that stands.
+
+    Parameters
+    ----------
+    why : what it breaks.
+    before, after : the text, which one module has once.
+    tests : that must notice.
+    """
+
+    why: str
+    before: str
+    after: str
+    tests: tuple[str, ...]
+
+
+_FORMS = "tests/test_calibration_closed_forms.py"
+#: Mutations that no test noticed once.
+FIXED = (
+    Fixed(
+        "variance polynomial: no correction for the noise of the signals",
+        "found[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]",
+        "found[:, n] += 0 * sums[:, n - 2 * j]",
+        (_FORMS,),
+    ),
+    Fixed(
+        "system gain: no correction for the noise of the signals",
+        "x2 = bins.powers[lit, 2] - bins.noise[lit] * bins.pixels[lit]",
+        "x2 = bins.powers[lit, 2] + 0 * bins.noise[lit] * bins.pixels[lit]",
+        (_FORMS,),
+    ),
+    Fixed(
+        "error of θ: the covariance of both thresholds with the wrong sign",
+        "return float(np.sqrt(self.covariance[:2, :2].sum())) / 2",
+        "return float(np.sqrt(2 * np.trace(self.covariance[:2, :2]) - self.covariance[:2, :2].sum())) / 2",
+        (_FORMS,),
+    ),
+    Fixed(
+        "error of θ from the conversion to voltage: the covariance of A and B with the wrong sign",
+        "variance = relative[0, 0] + relative[1, 1] - 2 * relative[0, 1]",
+        "variance = relative[0, 0] + relative[1, 1] + 2 * relative[0, 1]",
+        (_FORMS,),
+    ),
+    Fixed(
+        "pixels that fire too little: the tail of the wrong threshold",
+        "found[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE",
+        "found[under] = binom.cdf(counts[under], trials, high[group[under]]) < _CHANCE",
+        (_FORMS,),
+    ),
+    Fixed(
+        "pixels that fire too little over contrast steps: no tail",
+        "poisson.cdf(total, least) < _CHANCE",
+        "poisson.cdf(total, least) < 0",
+        (_FORMS,),
+    ),
+    Fixed(
+        "asymmetry: kept from a likelihood ratio of 1e-2 on",
+        "enough = float(chi2_law.isf(1e-3, 1))",
+        "enough = float(chi2_law.isf(1e-2, 1))",
+        (_FORMS,),
+    ),
+    Fixed(
+        "asymmetry: kept from a likelihood ratio of 1e-4 on",
+        "enough = float(chi2_law.isf(1e-3, 1))",
+        "enough = float(chi2_law.isf(1e-4, 1))",
+        (_FORMS,),
+    ),
+    Fixed(
+        "flicker: an instant on the border of two pieces counts twice",
+        "(begin >= low) & ((begin < high) | (number == bounds.size - 2))",
+        "(begin >= low) & ((begin <= high) | (number == bounds.size - 2))",
+        ("tests/test_flicker.py",),
+    ),
+    Fixed(
+        "the renderer's own error: half as large",
+        "error = np.abs(one - other) / 2 / noise((one + other) / 2, place)",
+        "error = np.abs(one - other) / 4 / noise((one + other) / 2, place)",
+        ("tests/test_hidden_scenes.py::test_the_stated_error_of_event_samples_is_the_true_one",),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A module with one change.
+
+    Parameters
+    ----------
+    module : dotted name within the package.
+    line : of the change; `change`, what it is, in words of code.
+    make : gives the source of the whole module.
+    """
+
+    module: str
+    line: int
+    change: str
+    make: Callable[[], str]
+
+
+# ---- mutations ----------------------------------------------------------------------------------
+
+_SWAPPED = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.MatMult: ast.Sub,
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.And: ast.Or, ast.Or: ast.And, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+_NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "cdf": "sf", "sf": "cdf"}
+
+
+def _changed(node: ast.AST) -> Iterator[ast.AST]:
+    """What may stand in place of one node."""
+    other = copy.copy(node)
+    if isinstance(other, ast.BinOp | ast.BoolOp) and type(other.op) in _SWAPPED:
+        other.op = _SWAPPED[type(other.op)]()
+        yield other
+    elif isinstance(other, ast.Compare) and type(other.ops[0]) in _SWAPPED:
+        other.ops = [_SWAPPED[type(other.ops[0])](), *other.ops[1:]]
+        yield other
+    elif isinstance(other, ast.UnaryOp) and isinstance(other.op, ast.USub | ast.Not | ast.Invert):
+        yield other.operand
+    elif isinstance(other, ast.Constant) and isinstance(other.value, bool):
+        yield ast.Constant(not other.value)
+    elif isinstance(other, ast.Constant) and isinstance(other.value, int | float):
+        yield ast.Constant(other.value + 1 if isinstance(other.value, int) else 2 * other.value if other.value else 1.0)
+    elif isinstance(other, ast.Attribute) and other.attr in _NAMES:
+        other.attr = _NAMES[other.attr]
+        yield other
+    elif isinstance(other, ast.Name) and other.id in _NAMES:
+        other.id = _NAMES[other.id]
+        yield other
+
+
+def _places(tree: ast.AST, parent: ast.AST | None = None) -> Iterator[tuple[ast.AST, str, int | None, ast.AST]]:
+    """Nodes that compute something: (parent, field, place in a list, node); no annotations, texts or decorators."""
+    for name, value in ast.iter_fields(tree):
+        if name in ("annotation", "returns", "decorator_list", "type_params", "exc", "msg"):
+            continue
+        for place, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
+            if isinstance(node, ast.AST):
+                yield tree, name, place, node
+                if not isinstance(node, ast.JoinedStr):
+                    yield from _places(node, tree)
+
+
+def path_of(module: str) -> Path:
+    return ROOT / "hesim_render" / Path(*module.split(".")).with_suffix(".py")
+
+
+def mutants(target: str) -> list[Mutant]:
+    """All of a target, in the order of the source."""
+    module, _, function = target.partition(":")
+    tree = ast.parse(path_of(module).read_text(encoding="utf-8"))
+    part: ast.AST = tree
+    if function:
+        part = next(n for n in ast.walk(tree) if getattr(n, "name", None) == function)
+
+    def source(parent: ast.AST, name: str, place: int | None, node: ast.AST, other: ast.AST) -> str:
+        _put(parent, name, place, other)
+        changed = ast.unparse(ast.fix_missing_locations(tree))
+        _put(parent, name, place, node)
+        return changed
+
+    return [
+        Mutant(
+            module, getattr(node, "lineno", 0), f"{ast.unparse(node)}  ->  {ast.unparse(other)}",
+            partial(source, parent, name, place, node, other),
+        )
+        for parent, name, place, node in list(_places(part))
+        for other in _changed(node)
+    ]  # fmt: skip
+
+
+def _put(parent: ast.AST, name: str, place: int | None, node: ast.AST) -> None:
+    if place is None:
+        setattr(parent, name, node)
+    else:
+        getattr(parent, name)[place] = node
+
+
+def of_fixed(one: Fixed) -> Mutant:
+    """The module that has the text, changed.
+
+    Raises
+    ------
+    ValueError
+        If no module has it, or it stands in more than one place.
+    """
+    found = []
+    for path in sorted((ROOT / "hesim_render").rglob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        found += [(path, source)] * source.count(one.before)
+    if len(found) != 1:
+        raise ValueError(f"{one.why}: {len(found)} places have {one.before!r}; write the line anew in tests/mutate.py")
+    path, source = found[0]
+    module = ".".join(path.relative_to(ROOT / "hesim_render").with_suffix("").parts)
+    line = source[: source.index(one.before)].count("\n") + 1
+    return Mutant(module, line, one.why, lambda: source.replace(one.before, one.after))
+
+
+# ---- running ------------------------------------------------------------------------------------
+
+
+def run_tests(tests: tuple[str, ...], mutant: Mutant | None, timeout_s: float | None = None) -> str:
+    """``passed``, ``failed``, ``late``, or what else pytest said, with a module changed or not."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        if mutant is not None:
+            source = Path(folder) / "mutant.py"
+            source.write_text(mutant.make(), encoding="utf-8")
+            environment |= {_NAME: f"hesim_render.{mutant.module}", _SOURCE: str(source)}
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "tests.mutate", "-p", "no:cacheprovider", *tests]
+        try:
+            child = subprocess.run(
+                command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout_s
+            )
+        except subprocess.TimeoutExpired:
+            return "late"
+    # a module that cannot even be imported ends with status 2 or 4
+    return {0: "passed", 1: "failed"}.get(child.returncode, "failed" if mutant is not None else child.stdout[-2000:])
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Gives one module another source."""
+
+    def __init__(self, name: str, source: str) -> None:
+        self._name, self._source = name, source
+
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname == self._name:
+            return importlib.util.spec_from_file_location(fullname, self._source)
+        return None
+
+
+if _NAME in os.environ and __name__ != "__main__":  # loaded by pytest as a plugin
+    sys.meta_path.insert(0, _Finder(os.environ[_NAME], os.environ[_SOURCE]))
+
+
+def survivors(chosen: list[tuple[Mutant, tuple[str, ...]]]) -> list[Mutant]:
+    """Those that no test notices; one line each is printed."""
+    usual: dict[tuple[str, ...], float] = {}
+    found = []
+    for mutant, tests in chosen:
+        if tests not in usual:
+            begin = time.perf_counter()
+            told = run_tests(tests, None)
+            if told != "passed":
+                raise SystemExit(f"{' '.join(tests)} do not pass on the unchanged code: {told}")
+            usual[tests] = time.perf_counter() - begin
+        told = run_tests(tests, mutant, _PATIENCE * usual[tests] + _GRACE_S)
+        print(
+            f"{'SURVIVED' if told == 'passed' else 'killed':8} {mutant.module}:{mutant.line}  {mutant.change}",
+            flush=True,
+        )
+        if told == "passed":
+            found.append(mutant)
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=20, help="random mutations to run")
+    parser.add_argument("--seed", type=int, default=0, help="of the choice")
+    parser.add_argument("--only", default="", help="targets whose name has this text")
+    parser.add_argument("--fixed", action="store_true", help="the fixed list instead")
+    parser.add_argument("--list", action="store_true", help="print all, run none")
+    given = parser.parse_args()
+    if given.fixed:
+        chosen = [(of_fixed(one), one.tests) for one in FIXED]
+    else:
+        every = [(m, tests) for target, tests in TARGETS.items() if given.only in target for m in mutants(target)]
+        if given.list:
+            for mutant, _ in every:
+                print(f"{mutant.module}:{mutant.line}  {mutant.change}")
+            return 0
+        chosen = random.Random(given.seed).sample(every, min(given.count, len(every)))
+        chosen.sort(key=lambda pair: (pair[0].module, pair[0].line))
+    left = survivors(chosen)
+    print(f"{len(left)} of {len(chosen)} survived")
+    return 1 if left else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

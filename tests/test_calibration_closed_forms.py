@@ -1,0 +1,304 @@
+"""Lines of the calibration against closed forms of their own, without captures: each fails if its line is changed.
+
+Inputs are exact expectations, so that answers are exact as well; nothing here is random.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import betainc, gammaincc, ndtr
+
+from hesim_render.calibrate.aps.photon_transfer import system_gain
+from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
+from hesim_render.calibrate.estimate import Spread
+from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
+from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
+from hesim_render.calibrate.evs.counts import StaticCapture
+from hesim_render.calibrate.evs.defects import bad_event_pixels, bad_in_steps
+from hesim_render.calibrate.evs.fitted import fit_events
+from hesim_render.calibrate.evs.model import from_natural, natural
+from hesim_render.calibrate.evs.output import _gauge
+from hesim_render.calibrate.evs.steps import Steps
+from hesim_render.calibrate.evs.thresholds import Thresholds
+
+BETA = np.array([4.0, 0.3, 20.0, 2e-5, 0.05, 30.0])  # 1, I, t, I², I t, t²
+FRAMES, TAU = 16, 6.0
+
+
+def variance_of(signal, seconds):
+    terms = np.array(
+        [np.ones_like(signal), signal, 0 * signal + seconds, signal**2, signal * seconds, 0 * signal + seconds**2]
+    )
+    return BETA @ terms
+
+
+def pooled(seconds, tau, lit=True, pixels=1000.0, signals=None):
+    """Bins as very many pixels would fill them, whose signals are estimated with Gaussian errors of std `tau`.
+
+    The mean of Îᵏ over the errors is a quadrature that is exact up to k = 19.
+    """
+    signal = np.linspace(10, 600, 40) if signals is None else np.asarray(signals, float)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(10)
+    seen = signal[:, None] + tau * nodes
+    weights = weights / weights.sum()
+    powers = np.stack([pixels * (seen**k @ weights) for k in range(7)], axis=1)
+    y = variance_of(signal, seconds)
+    full = np.ones(signal.size)
+    return Pooled(
+        seconds * full, tau**2 * full, powers, y[:, None] * powers[:, :4], pixels * y**2, 0 * full, (FRAMES - 1) * full,
+        np.full(signal.size, lit),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("tau", [0.0, TAU, 40.0])
+def test_variance_polynomial_is_exact_however_noisy_the_signals_are(tau):
+    """Errors in variables: noise of the signals inflates Σ I² by τ², and Σ I³ and Σ I⁴ accordingly."""
+    found = fit_variance(join([pooled(seconds, tau) for seconds in (0.01, 0.05, 0.2)]))
+    np.testing.assert_allclose(found.beta, BETA, rtol=1e-6, atol=1e-12)
+    assert found.identified.all() and found.hidden_pixels == 0
+
+
+def test_error_of_a_signal_is_that_of_a_mean_over_the_frames():
+    """τ² = (V + V_row)/n + variance of the dark line, V with the ADC's 1/12 in it."""
+    signal = np.full(500, 100.0)
+    for lit in (True, False):
+        bins = pool(signal, np.full(500, 8.0), 0.01, 0.25, FRAMES, lit, row_variance=0.5)
+        np.testing.assert_allclose(bins.noise, (8.0 + 0.5) / FRAMES + 0.25 if lit else 0.0)
+        np.testing.assert_allclose(bins.variance_dn2, 8.0 - 1 / 12)
+    # the sample variance of n values scatters by 2 V²/(n − 1); row noise taken out leaves 4 V R/(n − 1) more
+    np.testing.assert_allclose(1 / bins.weight(np.array([8.0])), 2 * (64 + 2 * 8.0 * 0.5) / (FRAMES - 1))
+
+
+@pytest.mark.parametrize("tau", [0.0, 20.0])
+def test_system_gain_is_exact_however_noisy_the_signals_are(tau, monkeypatch):
+    """K of a sensor with lit − dark variance K·I exactly; without the correction K is 0.3 % too small at τ = 20."""
+    monkeypatch.setitem(globals(), "BETA", np.array([4.0, 0.3, 20.0, 0, 0, 0]))
+    times = (0.01, 0.05)
+    bins = join([pooled(t, tau) for t in times] + [pooled(t, 0.0, lit=False, signals=[0.0]) for t in times])
+    gain, _ = system_gain(bins, top_dn=700.0)
+    assert gain == pytest.approx(0.3, rel=1e-9)
+    assert system_gain(bins, top_dn=300.0)[0] == pytest.approx(0.3, rel=1e-9)
+    assert np.isnan(system_gain(bins, top_dn=-1.0)[0])
+    # lit variances, each with 2 V²/(n − 1) of its own, and that of the dark, which all lit bins of a time share
+    lit, dark = (bins.lit == which for which in (True, False))
+    signal = bins.powers[lit, 1] / bins.powers[lit, 0]
+    shared = bins.variance_dn2[dark]
+    expected = np.repeat(shared, lit.sum() // 2) + 0.3 * signal
+    weight = (FRAMES - 1) / (2 * expected**2)
+    x2 = bins.powers[lit, 2] - tau**2 * bins.powers[lit, 0]
+    bottom = np.sum(weight * x2)
+    of_dark = [np.sum((weight * bins.powers[lit, 1])[bins.exposure_s[lit] == t]) for t in times]
+    dark_variance = 2 * shared**2 / ((FRAMES - 1) * bins.pixels[dark])
+    error = np.sqrt(bottom + np.sum(np.square(of_dark) * dark_variance)) / bottom
+    assert system_gain(bins, top_dn=700.0)[1] == pytest.approx(error, rel=1e-9)
+
+
+# ---- thresholds ---------------------------------------------------------------------------------
+
+
+def thresholds(covariance=None, mismatch=0.0, size=(20, 20)):
+    one = np.ones(size, np.float32)
+    return Thresholds(
+        theta_on=0.2, theta_off=0.25, width=0.05, slope=0.0,
+        covariance=np.zeros((4, 4)) if covariance is None else covariance,
+        spread=Spread(mismatch, 0.0, 0.0), mismatch_on=mismatch, mismatch_off=mismatch, noise=(0.05, 0.0),
+        pixel_on=one, pixel_off=one, noise_on=0 * one, noise_off=0 * one, step=np.linspace(-0.5, 0.5, 11),
+    )  # fmt: skip
+
+
+def test_error_of_the_mean_threshold_has_the_covariance_of_both():
+    """var((θ₊ + θ₋)/2) = (var θ₊ + var θ₋ + 2 cov)/4; with the covariance's other sign it would be half as large."""
+    covariance = np.diag([4e-6, 9e-6, 1.0, 1.0])
+    covariance[0, 1] = covariance[1, 0] = 3e-6
+    found = thresholds(covariance)
+    assert found.theta == pytest.approx(0.225) and found.theta_error == pytest.approx(np.sqrt(19e-6) / 2)
+
+
+def test_error_of_the_conversion_to_voltage_is_that_of_finite_differences():
+    """Contrasts of the signal become S = ln x₁/x₀ by A/B: its error moves θ₊ and θ₋ together, as both steps shrink."""
+    a, b, signal = 0.7, 12.0, 40.0
+    covariance = np.zeros((6, 6))
+    covariance[:2, :2] = [[0.02**2, 0.6 * 0.02 * 0.5], [0.6 * 0.02 * 0.5, 0.5**2]]
+    captures = SimpleNamespace(spec=SimpleNamespace(contrast_of="signal"))
+
+    def steps(a, b, contrast):
+        fit = SimpleNamespace(values=np.array([a, b, 0, 0, 0, 0]), identified=lambda name: True)
+        return step_in_ln(captures, SimpleNamespace(contrast=contrast, signal_dn=signal), fit)
+
+    # contrasts at which S is θ₊ and −θ₋
+    goals = np.array([0.2, -0.25])
+    contrast = np.log((np.exp(goals) * (a * signal + b) - b) / (a * signal))
+    np.testing.assert_allclose(steps(a, b, contrast), goals, rtol=1e-12)
+    h = 1e-6
+    jacobian = np.stack(
+        [
+            (steps(a * (1 + h), b, contrast) - steps(a * (1 - h), b, contrast)) / (2 * h * a),
+            (steps(a, b * (1 + h), contrast) - steps(a, b * (1 - h), contrast)) / (2 * h * b),
+        ],
+        axis=1,
+    )
+    jacobian[1] *= -1  # θ₋ is −S
+    fit = SimpleNamespace(values=np.array([a, b, 0, 0, 0, 0]), covariance=covariance)
+    found = _with_conversion_error(thresholds(), signal, fit).covariance
+    np.testing.assert_allclose(found[:2, :2], jacobian @ covariance[:2, :2] @ jacobian.T, rtol=1e-6)
+    assert found[0, 1] > 0 and not found[2:].any()
+
+
+def test_errors_of_the_gauge_are_those_of_finite_differences():
+    """β0 … β5 from (A, B, C, D, θ) and their errors, all correlated but θ's."""
+    values = np.array([0.7, 12.0, 0.03, -0.2, 0.0, 0.0])
+    root = np.array([[0.02, 0, 0, 0], [0.3, 0.4, 0, 0], [0.001, -0.002, 0.003, 0], [0.02, 0.03, -0.01, 0.05]])
+    covariance = np.zeros((6, 6))
+    covariance[:4, :4] = root @ root.T
+    both = np.diag([4e-6, 9e-6, 0, 0])
+    both[0, 1] = both[1, 0] = 3e-6
+    theta_v, found = 0.75e-3, thresholds(both)
+    fit = SimpleNamespace(values=values, covariance=covariance, identified=lambda name: True)
+    told = _gauge(SimpleNamespace(thresholds=found, theta_v=theta_v, fits=[fit]))
+
+    def beta(p):
+        a, b, c, d, t0 = p
+        return np.array([t0, a / b, 1.0, c * t0 / b, t0 / b, d])
+
+    at = np.array([*values[:4], found.theta / theta_v])
+    steps = 1e-6 * np.abs(at)
+    jacobian = np.stack([(beta(at + h) - beta(at - h)) / (2 * h.sum()) for h in np.diag(steps)], axis=1)
+    whole = np.zeros((5, 5))
+    whole[:4, :4], whole[4, 4] = covariance[:4, :4], (4e-6 + 9e-6 + 6e-6) / 4 / theta_v**2
+    np.testing.assert_allclose(told["beta"][0], beta(at), rtol=1e-12)
+    expected = np.sqrt(np.diag(jacobian @ whole @ jacobian.T))
+    (errors,) = (value for name, value in told.items() if name != "beta" and isinstance(value, list))
+    np.testing.assert_allclose(errors[0], expected, rtol=1e-5, atol=1e-12)
+
+
+def test_natural_parameters_and_their_covariance():
+    parameters = np.array([0.7, np.log(12.0), 8e-4, -6e-3, 0.02, 1e-4])
+    root = np.tril(0.1 * np.abs(parameters)[:, None] * np.cos(np.arange(36).reshape(6, 6)))
+    covariance = root @ root.T
+    values, found = natural(parameters, covariance)
+    c = np.sqrt(8e-4 + 36e-6)
+    np.testing.assert_allclose(values, [0.7, 12.0, c, -6e-3 / c, 0.02, 1e-4], rtol=1e-12)
+    np.testing.assert_allclose(from_natural(values), parameters, rtol=1e-12)
+    steps = np.diag(1e-6 * np.abs(parameters))
+    jacobian = np.stack(
+        [
+            (natural(parameters + h, covariance)[0] - natural(parameters - h, covariance)[0]) / (2 * h.sum())
+            for h in np.abs(steps)
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(found, jacobian @ covariance @ jacobian.T, rtol=1e-5, atol=1e-16)
+
+
+# ---- bad event pixels ---------------------------------------------------------------------------
+
+TRIALS = 200_000
+
+
+def lone_pixel(count, usual, shape=(24, 24)):
+    """A capture whose pixels all have the same counts, but one."""
+    on = np.full(shape, usual)
+    on[5, 7] = count
+    return StaticCapture(np.full(shape, 50.0), on, on.copy(), None, None, TRIALS, (1, 1))
+
+
+@pytest.mark.parametrize("fires", ["too little", "too often"])
+def test_a_pixel_is_bad_beyond_a_tail_of_1e_7_about_thresholds_six_per_cent_away(fires):
+    """The binomial tail by the incomplete beta function: P(X ≤ k) = I_{1−p}(n − k, k + 1).
+
+    All pixels are alike, so the reach is its least, 6 %. The median count is known to half of one: counts 3 % on either
+    side of the limit are decided.
+    """
+    usual = 4000
+    u = -_quantile(usual / TRIALS)
+    if fires == "too little":
+        p = ndtr(-1.06 * u)
+        limit = brentq(lambda k: np.log(betainc(TRIALS - k, k + 1, 1 - p)) - np.log(1e-7), 2000, TRIALS * p)
+        bad, good = 0.97 * limit, 1.03 * limit
+        assert good < usual
+    else:
+        p = ndtr(-0.94 * u)
+        limit = brentq(lambda k: np.log(betainc(k, TRIALS - k + 1, p)) - np.log(1e-7), TRIALS * p, 8000)
+        bad, good = 1.03 * limit, 0.97 * limit
+        assert good > usual
+    found = bad_event_pixels(lone_pixel(round(bad), usual))
+    assert found[5, 7] and found.sum() == 1
+    assert not bad_event_pixels(lone_pixel(round(good), usual)).any()
+
+
+def _quantile(p):
+    return brentq(lambda x: ndtr(x) - p, -9, 9, xtol=1e-14)
+
+
+@pytest.mark.parametrize("polarity", ["on", "off"])
+@pytest.mark.parametrize("fires", ["too little", "too often"])
+def test_a_pixel_is_bad_in_steps_beyond_a_poisson_tail_of_1e_7(polarity, fires):
+    """P(X ≤ k) = Γ(k + 1, λ)/Γ(k + 1), exact to the count; λ is the mean of a threshold 6 % away over all steps."""
+    found, trials, size = thresholds(), 300, (20, 20)
+    theta = found.theta_on if polarity == "on" else found.theta_off
+    signed = found.step if polarity == "on" else -found.step
+
+    def mean(relative):
+        return trials * ndtr(-(theta * relative - signed) / found.width).sum()
+
+    k = np.arange(5000)
+    if fires == "too little":
+        limit = int(k[gammaincc(k + 1, mean(1.06)) < 1e-7].max())  # the largest count that is bad
+        counts = limit, limit + 1
+    else:
+        limit = int(k[1:][1 - gammaincc(k[1:], mean(0.94)) < 1e-7].min())  # the smallest count that is bad
+        counts = limit, limit - 1
+    for count, is_bad in zip(counts, (True, False), strict=True):
+        totals = {"on": np.full(size, round(mean(1.0))), "off": np.full(size, 1000)}
+        totals["off" if polarity == "on" else "on"][:] = round(_total(found, polarity != "on", trials))
+        totals[polarity][:] = round(mean(1.0))
+        totals[polarity][3, 4] = count
+        steps = Steps(
+            found.step, 50.0, np.zeros((11, 100)), np.zeros((11, 100)), np.zeros(100), trials,
+            totals["on"], totals["off"], np.zeros(size, np.intp),
+        )  # fmt: skip
+        bad = bad_in_steps(steps, found, np.ones(size, bool))
+        assert bad[3, 4] == is_bad and bad.sum() == is_bad
+
+
+def _total(found, on, trials):
+    theta, sign = (found.theta_on, 1) if on else (found.theta_off, -1)
+    return trials * ndtr(-(theta - sign * found.step) / found.width).sum()
+
+
+# ---- asymmetry ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(10.3, False), (11.4, True)])
+def test_asymmetry_is_kept_from_a_likelihood_ratio_of_1e_3_on(gain, kept):
+    """χ² of one degree of freedom exceeds 10.83 with a chance of 1e-3.
+
+    Counts are exact expectations of thresholds θ(1 ∓ ρ). The best model without ρ has the mean of both probabilities to
+    first order in ρ, so that 2 Δ ln L is 2 n Σ KL(p, p̄) over brightness and polarity, in closed form.
+    """
+    a, b, c, d = 0.02, 3.0, 0.004, 0.0
+    signal = np.repeat(np.linspace(0, 200, 32), 32).reshape(32, 32)
+    trials = 10**8
+
+    def u(x):
+        y = c * x
+        return (a * x + b) / np.sqrt(2 * (1 + 2 * d * y + y * y))
+
+    def ratio(rho):
+        both = [ndtr(-u(signal) * (1 - sign * rho)) for sign in (1, -1)]
+        mean = sum(both) / 2
+        return sum(
+            float(np.sum(2 * trials * (p * np.log(p / mean) + (1 - p) * np.log((1 - p) / (1 - mean))))) for p in both
+        )
+
+    rho = brentq(lambda r: ratio(r) - gain, 1e-9, 1e-2)
+    on, off = (np.rint(trials * ndtr(-u(signal) * (1 - sign * rho))).astype(np.int64) for sign in (1, -1))
+    static = StaticCapture(signal, on, off, None, None, trials, (1, 1))
+    good = np.ones(signal.shape, bool)
+    pixels = pool_events(static, good, PixelThresholds.unknown(good.shape, 0.0))
+    fit = fit_events(pixels, 1.0, "linear", from_natural(np.array([a, b, c, d, 0.0, 0.0])))
+    assert fit.free[4] == kept and not fit.free[5]
+    if kept:
+        assert fit.values[4] == pytest.approx(rho, rel=0.02)
