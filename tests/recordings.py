@@ -6,7 +6,8 @@ import numpy as np
 
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.events import EVENT_DTYPE
-from hesim_render.recording.recording import Frame, RecordingWriter
+from hesim_render.recording.frame import Frame
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.lens import Lens, response
 from hesim_render.specs import read_sensor
 

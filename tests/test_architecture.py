@@ -187,3 +187,15 @@ def test_hooks_need_nothing_but_the_checkouts_own_environment():
         assert repository["repo"] == "local"
         for hook in repository["hooks"]:
             assert hook["language"] == "system" and hook["entry"].startswith(".venv/bin/")
+
+
+def test_a_recording_does_not_know_its_previews():
+    """Pictures are drawn by those who know recordings, not the other way round."""
+    reached, waiting = set(), ["hesim_render.recording.recording", "hesim_render.recording.writer"]
+    while waiting:
+        name = waiting.pop()
+        if name in MODULES and name not in reached:
+            reached.add(name)
+            waiting += modules_imported(name)
+    assert "hesim_render.recording.folder" in reached
+    assert not reached & {"hesim_render.recording.preview", "hesim_render.recording.showcase"}

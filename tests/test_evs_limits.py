@@ -16,7 +16,8 @@ from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.pixels.evs.processes import BandNoise
 from hesim_render.pixels.evs.readout import EventReadout, scan_start_row
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.recording.recording import Recording
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.specs.sensor import read_sensor
 

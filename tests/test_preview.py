@@ -7,6 +7,7 @@ from PIL import Image
 
 from hesim_render.mosaic import description as mosaic
 from hesim_render.recording import preview, showcase
+from hesim_render.recording.colour_view import colour_picture, thumbnail
 from hesim_render.recording.recording import Recording
 from hesim_render.spectral import colorimetry
 from hesim_render.spectral import spectrum as spectra
@@ -39,7 +40,7 @@ def bars(picture, count):
 @pytest.mark.parametrize("light", ["D65", "A", "FL11"])
 def test_neutral_is_neutral_under_any_light(name, light):
     raw, described = frame_under(name, spectra.illuminant(light), [spectra.constant(v) for v in (0.9, 0.4, 0.1)])
-    for picture in (preview.colour_picture(raw, described), preview.thumbnail(raw, described)):
+    for picture in (colour_picture(raw, described), thumbnail(raw, described)):
         found = bars(picture, 3)
         assert np.ptp(found, axis=1).max() <= 3  # of 255; rounding to whole DN
         assert found[0].mean() > 230 and np.all(np.diff(found.mean(axis=1)) < -20)
@@ -53,7 +54,7 @@ def test_colorchecker_patches_come_out_in_their_colours():
     light = spectra.illuminant("D65")
     patches = [chart[k] for k in (18, 14, 13, 12, 15, 2, 8)]  # white, red, green, blue, yellow, blue sky, moderate red
     raw, described = frame_under("eiger", light, patches, width=448)
-    found = bars(preview.colour_picture(raw, described), len(patches)) / 255
+    found = bars(colour_picture(raw, described), len(patches)) / 255
     white = colorimetry.tristimulus(light, [spectra.constant(1.0)])[0]
     linear = colorimetry.xyz_to_linear_srgb(colorimetry.tristimulus(light, patches), white)
     # the picture sets its own exposure: compare at the exposure of the white patch
@@ -88,21 +89,21 @@ def test_event_pixels_do_not_leak_into_the_picture(width):
     sensor = recordings.sensor_like("eiger", width, 192)
     frame, described = recordings.frame_of(sensor), mosaic.describe(sensor)
     poisoned = np.where(frame.valid, frame.raw, 1023).astype(np.uint16)
-    for draw in (preview.colour_picture, preview.thumbnail):
+    for draw in (colour_picture, thumbnail):
         np.testing.assert_array_equal(draw(frame.raw, described, 300), draw(poisoned, described, 300))
 
 
 def test_saturated_highlights_are_white_not_magenta():
     sensor = recordings.sensor_like("eiger", 64, 64)
     described = mosaic.describe(sensor)
-    picture = preview.colour_picture(np.full((64, 64), 1023, dtype=np.uint16), described)
+    picture = colour_picture(np.full((64, 64), 1023, dtype=np.uint16), described)
     assert np.ptp(picture.astype(int), axis=2).max() <= 1 and picture.min() > 220
 
 
 def test_a_dark_frame_stays_dark():
     sensor = recordings.sensor_like("eiger", 64, 64)
     noise = np.random.default_rng(1).normal(64, 1.0, (64, 64))
-    picture = preview.colour_picture(np.rint(noise).astype(np.uint16), mosaic.describe(sensor))
+    picture = colour_picture(np.rint(noise).astype(np.uint16), mosaic.describe(sensor))
     assert picture.mean() < 60
 
 

@@ -22,7 +22,8 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.dng import binned
-from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.recording.recording import Recording
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.specs import SensorSpec, read_scene
 
 HERE = Path(__file__).parent

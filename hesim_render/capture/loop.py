@@ -29,7 +29,7 @@ from hesim_render.sources.protocol import FluxSource, Sample
 from hesim_render.sources.still import StillFlux
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import RecordingWriter
+    from hesim_render.recording.writer import RecordingWriter
 
 #: Names of all noise terms that can be switched off.
 NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))

@@ -14,7 +14,8 @@ from hesim_render.core.errors import ConflictError, RangeError, TooLongError
 from hesim_render.core.progress import Progress, ProgressReport, shown
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.schedule import require_countable
-from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.recording.recording import Recording
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.audit.audit import STRETCHES, Audit

@@ -17,7 +17,8 @@ from hesim_render.core.progress import Progress, ProgressReport, in_words, shown
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.description import Mosaic, describe
 from hesim_render.mosaic.schedule import require_countable
-from hesim_render.recording.recording import Recording, RecordingWriter
+from hesim_render.recording.recording import Recording
+from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.video import VideoFlux, VideoOptions
 from hesim_render.sources.video.flux import Source

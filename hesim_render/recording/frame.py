@@ -50,3 +50,11 @@ class Frame:
             "exposure_us": self.exposure_us,
             "line_time_us": self.line_time_us,
         }
+
+
+@dataclass(frozen=True, eq=False)
+class EventTruth:
+    """Noise-free flux of the event pixels, mean over the recording, float32 [y, x], e⁻/s."""
+
+    flux_mean_e_per_s: NDArray[np.float32]
+    flux_stderr_e_per_s: NDArray[np.float32]

@@ -1,8 +1,4 @@
-"""Pictures of a recording: the RAW mosaic, a simple colour view, events over a frame.
-
-They are for people. The colour view averages each channel over its neighbourhood, balances white,
-applies one matrix and the sRGB curve; it is no demosaicing to measure with.
-"""
+"""Pictures of a recording, for people: the RAW mosaic, events over a frame, and sheets of them."""
 
 from __future__ import annotations
 
@@ -14,9 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from hesim_render.mosaic.description import Mosaic
+from hesim_render.recording.colour_view import Picture
 from hesim_render.spectral.colorimetry import encode_srgb
-
-Picture = NDArray[np.uint8]  # [row, col, 3], sRGB
 
 ON_COLOUR = np.array([255, 150, 20], dtype=np.float32)
 OFF_COLOUR = np.array([30, 160, 255], dtype=np.float32)
@@ -27,69 +22,6 @@ _TINT = np.array(
     [[1, 0.08, 0.06], [0.1, 0.9, 0.12], [0.1, 0.2, 1], [0.1, 0.9, 1], [1, 0.2, 1], [1, 0.9, 0.1], [0.9, 0.9, 0.9]],
     dtype=np.float32,
 )
-
-
-def colour_picture(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 1024) -> Picture:
-    """A colour view of one frame from its valid pixels, at full size or binned by whole tiles.
-
-    Parameters
-    ----------
-    raw : [row, col] DN.
-    max_width : wider frames are binned until they fit.
-    """
-    tile_cols = mosaic.tile_shape[1]
-    if raw.shape[1] <= max_width:
-        channels = _smoothed(raw, mosaic)
-    else:
-        channels = _binned(raw, mosaic, -(-raw.shape[1] // (tile_cols * max_width)))
-    return encode_srgb(_developed(channels, mosaic))
-
-
-def thumbnail(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 256) -> Picture:
-    """A small colour view, binned by whole tiles."""
-    tiles = max(1, -(-raw.shape[1] // (mosaic.tile_shape[1] * max_width)))
-    return encode_srgb(_developed(_binned(raw, mosaic, tiles), mosaic))
-
-
-def _binned(raw: NDArray[np.uint16], mosaic: Mosaic, tiles: int) -> NDArray[np.float32]:
-    """Mean DN above black of each channel over blocks of tiles, [row, col, channel]."""
-    tile = mosaic.tile_channel
-    block_rows, block_cols = tile.shape[0] * tiles, tile.shape[1] * tiles
-    rows, cols = raw.shape[0] // block_rows, raw.shape[1] // block_cols
-    if rows == 0 or cols == 0:
-        return _smoothed(raw, mosaic)
-    blocks = raw[: rows * block_rows, : cols * block_cols].reshape(rows, block_rows, cols, block_cols)
-    pixels = blocks.transpose(0, 2, 1, 3).reshape(rows, cols, block_rows * block_cols)
-    channel = np.tile(tile, (tiles, tiles)).ravel()
-    means = [pixels[..., channel == number].mean(axis=-1, dtype=np.float32) for number in range(len(mosaic.channels))]
-    return np.stack(means, axis=-1) - np.float32(mosaic.black_level_dn)
-
-
-def _smoothed(raw: NDArray[np.uint16], mosaic: Mosaic) -> NDArray[np.float32]:
-    """DN above black of each channel at every pixel: Gaussian-weighted mean of its valid neighbours."""
-    from scipy.ndimage import gaussian_filter
-
-    channel = mosaic.tiled(mosaic.tile_channel, raw.shape)
-    signal = raw.astype(np.float32) - np.float32(mosaic.black_level_dn)
-    sigma = 0.35 * max(mosaic.tile_shape)
-    if sigma < 0.5:
-        return signal[..., None]
-    planes = []
-    for number in range(len(mosaic.channels)):
-        mask = (channel == number).astype(np.float32)
-        weight = gaussian_filter(mask, sigma, mode="nearest", truncate=3.5)
-        planes.append(gaussian_filter(signal * mask, sigma, mode="nearest", truncate=3.5) / weight)
-    return np.stack(planes, axis=-1)
-
-
-def _developed(channels: NDArray[np.float32], mosaic: Mosaic) -> NDArray[np.float32]:
-    """Linear sRGB, exposed so that the brightest half percent reaches white; dark frames stay dark."""
-    span = float(mosaic.white_level_dn - mosaic.black_level_dn)
-    # saturated channels are held at one level, or highlights would turn magenta
-    balanced = np.minimum(channels / np.array(mosaic.neutral, dtype=np.float32), span)
-    linear = balanced @ np.array(mosaic.camera_to_srgb, dtype=np.float32).T
-    white = max(float(np.percentile(linear.max(axis=-1)[::2, ::2], 99.5)), 0.02 * span)
-    return linear * (0.95 / white)
 
 
 def mosaic_picture(raw: NDArray[np.uint16], mosaic: Mosaic, scale: int = 1) -> Picture:

@@ -12,10 +12,12 @@ from hesim_render.core.guard import printable
 from hesim_render.core.output import replacing
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import dng, preview
-from hesim_render.recording.preview import Panel, Picture
+from hesim_render.recording.colour_view import Picture, colour_picture, thumbnail
+from hesim_render.recording.preview import Panel
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Frame, Recording
+    from hesim_render.recording.frame import Frame
+    from hesim_render.recording.recording import Recording
 
 #: Events of a moving scene are shown over a window of this length, µs.
 WINDOW_US = 10_000
@@ -41,7 +43,7 @@ def write_previews(recording: Recording, folder: Path) -> list[Path]:
             with replacing(written[-1]) as temporary:
                 dng.write_dng(
                     temporary, raw, mosaic, exposure_us=frame.exposure_us, description=frame.times,
-                    thumbnail=preview.thumbnail(raw, mosaic),
+                    thumbnail=thumbnail(raw, mosaic),
                 )  # fmt: skip
     pictures = animation(recording) if moves(recording) else []
     if len(pictures) > 1:
@@ -71,7 +73,7 @@ def contact_sheet(recording: Recording) -> Image.Image:
     middle_us = (begin_us + end_us) // 2
     if len(recording.frames):
         frame = _middle(recording)
-        colour = preview.colour_picture(frame.raw, mosaic)
+        colour = colour_picture(frame.raw, mosaic)
         middle_us = frame.exposure_start_us + frame.exposure_us // 2
         label = "Grey view" if len(mosaic.channels) == 1 else "Colour view"
         panels.append(Panel(colour, f"{label} of frame {frame.index}, {_ms(frame.exposure_us)} exposure"))
@@ -127,7 +129,7 @@ def _mosaic_panels(frame: Frame, recording: Recording, colour: Picture, width_px
 def animation(recording: Recording) -> list[Picture]:
     """Events over the latest frame, step by step through the recording."""
     if min(recording.event_shape) == 0:
-        frames = [preview.colour_picture(f.raw, recording.mosaic, _ANIMATION_WIDTH_PX) for f in recording.frames]
+        frames = [colour_picture(f.raw, recording.mosaic, _ANIMATION_WIDTH_PX) for f in recording.frames]
         return frames[:_ANIMATION_STEPS]
     begin_us, end_us = recording.manifest["time"]["begin_us"], recording.manifest["time"]["end_us"]
     edges = np.linspace(begin_us, end_us + 1, _ANIMATION_STEPS + 1).astype(int)
@@ -138,7 +140,7 @@ def animation(recording: Recording) -> list[Picture]:
         latest = max(0, int(np.searchsorted(shown_at, last, side="right")) - 1)
         if shown_at and latest != shown:
             raw = recording.frames[latest].raw
-            background, shown = preview.colour_picture(raw, recording.mosaic, _ANIMATION_WIDTH_PX), latest
+            background, shown = colour_picture(raw, recording.mosaic, _ANIMATION_WIDTH_PX), latest
         events = recording.event_slice(int(first), int(last)) if last > first else no_events()
         pictures.append(preview.events_picture(background, events, recording.event_shape))
     return pictures
