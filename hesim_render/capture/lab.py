@@ -136,6 +136,7 @@ class _Session:
     total: float = 0.0
     done: float = 0.0
     frame: int = 0
+    trial: int = 0
     t_us: int = 0
 
     def _advance(self, work: float, what: str) -> None:
@@ -206,10 +207,10 @@ class _Session:
         for name, plan in plans.items():
             bench = TrialBench(
                 self.bench.evs, self.bench.event_dn_per_e_per_s, self.seed,
-                lambda seconds, name=name: self._advance(self.work_of(seconds), name), self.t_us,
+                lambda seconds, name=name: self._advance(self.work_of(seconds), name), self.t_us, self.trial,
             )  # fmt: skip
             bench.write(folder / f"{name}.npz", plan)
-            self.t_us = bench.t_us
+            self.t_us, self.trial = bench.t_us, bench.count
 
     def _electrons(self, signal_dn: NDArray[np.float64]) -> Any:
         """Electrons of one event window, flat on the device."""

@@ -28,6 +28,8 @@ _LIGHTS = ((80.0, 22), (8.0, 10), (1.6, 10))
 _REACH = (0.25, 1.9)
 #: Settling, and the ends of the time bins after a step and in steady light, in periods of the cut-off.
 _SETTLE, _STEP_BINS, _STEADY_BINS = 0.75, (0.03, 1.25), (20.0,)
+#: From the seed of one trial to that of the next: odd, so that none comes twice (2⁶⁴ over the golden section).
+_SEEDS_APART = 0x9E3779B97F4A7C15
 #: Time from one level of light to the next.
 _STEP_US = 1
 
@@ -89,6 +91,7 @@ class TrialBench:
     Parameters
     ----------
     dn_per_e_per_s : [y, x], I/Φ of every event pixel.
+    count : trials so far; each has its own noise and leak.
     advance : called with seconds of a sensor's time that were simulated.
     """
 
@@ -97,6 +100,7 @@ class TrialBench:
     seed: int
     advance: Callable[[float], None]
     t_us: int = 0
+    count: int = 0
 
     def write(self, file: Path, plan: TrialPlan) -> None:
         """All kinds of trials of a plan, as the arrays of one file."""
@@ -132,7 +136,9 @@ class TrialBench:
         self, before, after, plan: TrialPlan  # noqa: ANN001
     ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int8]]:
         """Which pixels were calm while settling, the time bin of each one's first event (−1: none), its polarity."""
-        stage, start_us = EvsStage(self.noise, self.seed), self.t_us
+        # waits for leak events begin with the stage: each needs its own seed
+        stage, start_us = EvsStage(self.noise, (self.seed + _SEEDS_APART * self.count) % 2**64), self.t_us
+        self.count += 1
         step_us = start_us + plan.settle_us
         end_us = step_us + int(plan.edges_us[-1])
         stage.step(before, start_us)

@@ -21,7 +21,7 @@ from hesim_render.core.errors import SpecError
 
 #: Most pixels the parameters are fitted to, drawn at random; maps have all of them.
 MOST_PIXELS = 16384
-_ROUNDS, _TRIES, _ENOUGH = 40, 8, 1e-3
+_ROUNDS, _TRIES, _ENOUGH = 40, 8, 0.02
 #: Pixels that a rough start is found on.
 _FEW = 300
 #: Steps of numerical derivatives, of ln of a parameter; largest change of it in a round.
@@ -108,7 +108,7 @@ def _climb(likelihood: Likelihood, start: NDArray) -> tuple[NDArray, NDArray, ND
             break
         if (better := _along(likelihood, values, np.clip(change, -_LARGEST, _LARGEST), least, best)) is None:
             break
-        values = better; __import__("os").environ.get("DBG") and print(best, expected, values.round(5).tolist())
+        values = better
     each, scores = _scores(likelihood, values)
     return values, scores, free, float(each.sum())
 

@@ -41,8 +41,8 @@ def threshold_grid(theta: float, mismatch: float) -> NDArray[np.float64]:
 def noise_of(values: NDArray, signal_dn: NDArray, law: Law) -> NDArray[np.float64]:
     """σ of ln x in a light."""
     power = signal_dn if law == "sqrt" else signal_dn**2
-    least = _LEAST_NOISE * values[0]
-    return np.sqrt(values[SHOT] * power + values[DARK]) / (1 + values[RESPONSE] * signal_dn) + least
+    own = (values[SHOT] * power + values[DARK]) / (1 + values[RESPONSE] * signal_dn) ** 2
+    return np.sqrt(own + (_LEAST_NOISE * values[0]) ** 2)
 
 
 def step_of(values: NDArray, trials: Trials) -> NDArray[np.float64]:
