@@ -205,10 +205,12 @@ class _Session:
         """Trials after a reset, of asynchronous pixels."""
         assert self.bench.evs is not None
         for name, plan in plans.items():
-            bench = TrialBench(
-                self.bench.evs, self.bench.event_dn_per_e_per_s, self.seed,
-                lambda seconds, name=name: self._advance(self.work_of(seconds), name), self.t_us, self.trial,
-            )  # fmt: skip
+
+            def advance(seconds: float, name: str = name) -> None:
+                self._advance(self.work_of(seconds), name)
+
+            scale = self.bench.event_dn_per_e_per_s
+            bench = TrialBench(self.bench.evs, scale, self.seed, advance, self.t_us, self.trial)
             bench.write(folder / f"{name}.npz", plan)
             self.t_us, self.trial = bench.t_us, bench.count
 

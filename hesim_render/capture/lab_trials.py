@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +81,10 @@ def plan_trials(noise: EvsNoise, trials: int) -> dict[str, TrialPlan]:
         "evs_noise_rate": TrialPlan(
             np.array(_STEADY) * dn, np.zeros(len(_STEADY)), settle_us, edges(_STEADY_BINS), trials
         ),
-        "evs_s_curve": TrialPlan(np.concatenate(signal), np.concatenate(contrast), settle_us, edges(_STEP_BINS), trials),
-    }  # fmt: skip
+        "evs_s_curve": TrialPlan(
+            np.concatenate(signal), np.concatenate(contrast), settle_us, edges(_STEP_BINS), trials
+        ),
+    }
 
 
 @dataclass
@@ -128,12 +131,12 @@ class TrialBench:
             archive.add("n_on", on)
             archive.add("n_off", off)
 
-    def _electrons(self, signal_dn: float):  # noqa: ANN202
+    def _electrons(self, signal_dn: float) -> Any:
         seconds = self.noise.spec.window_us * S_PER_US
         return jit().Float((signal_dn / self.dn_per_e_per_s * seconds).astype(np.float32).ravel())
 
     def _trial(
-        self, before, after, plan: TrialPlan  # noqa: ANN001
+        self, before: Any, after: Any, plan: TrialPlan
     ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int8]]:
         """Which pixels were calm while settling, the time bin of each one's first event (−1: none), its polarity."""
         # waits for leak events begin with the stage: each needs its own seed

@@ -51,9 +51,7 @@ class Columns:
 def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], dict[str, Goodness]]:
     """Every check, on the pixels of the fit: `sets` are their trials, steady and with steps."""
     columns = _columns(fit)
-    goodness = {
-        name: _judge(columns, np.flatnonzero(columns.family == k), fit) for k, name in enumerate(_FAMILIES)
-    }
+    goodness = {name: _judge(columns, np.flatnonzero(columns.family == k), fit) for k, name in enumerate(_FAMILIES)}
     goodness["all"] = _judge(columns, np.arange(columns.family.size), fit)
     found = [_family(name, goodness[name]) for name in _FAMILIES]
     found += [_ceiling(fit, sets[1]), _floor(fit, sets[1])]
@@ -66,7 +64,7 @@ def _columns(fit: Fit) -> Columns:
         weight = np.exp(log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], fit.likelihood.grids[k]))
         at = at_kind = 0
         for trials in counts.sets:
-            mean = chances(fit.values, trials, counts.polarity, fit.likelihood.grids[k], fit.law) @ weight  # [kind, bin]
+            mean = chances(fit.values, trials, counts.polarity, fit.likelihood.grids[k], fit.law) @ weight
             kinds, bins = mean.shape
             events = counts.events[:, at : at + kinds * bins].reshape(-1, kinds, bins)
             total = events.sum(axis=2) + counts.silent[:, at_kind : at_kind + kinds]
@@ -119,15 +117,15 @@ _LOOK_AT = {
     "steps": (
         "S-curve",
         "events right after a step are not those of one normal law of noise with normally spread thresholds: "
-        "thresholds, mismatch and noise may be off. Look at the plot of the S-curves: contrasts that are not as stated, a "
+        "thresholds, mismatch and noise may be off. Look at the plot of the S-curves: contrasts not as stated, a "
         "step that takes longer than the first time bin, noise with long tails, events that are lost, or light that "
         "is not uniform.",
     ),
     "times": (
         "event times",
         "events in the later time bins after a step do not come as noise of one bandwidth brings them: "
-        "photoreceptor_cutoff_hz is off. Look for steps that end late in the pixel (its signal bandwidth), latency of the "
-        "read-out, or light that flickers.",
+        "photoreceptor_cutoff_hz is off. Look for steps that end late in the pixel (its signal bandwidth), latency of "
+        "the read-out, or light that flickers.",
     ),
     "steady": (
         "noise rate",
@@ -169,9 +167,9 @@ def _ceiling(fit: Fit, steps: Trials) -> Finding | None:
         return None
     return Finding(
         "S-curve ceiling",
-        f"steps far beyond the threshold give no event in {loss:.2g} of the trials: thresholds and noise are off. Events "
-        "are lost (look at the read-out's bandwidth when all pixels step at once: step fewer of them), or trials are "
-        "counted that had no step.",
+        f"steps far beyond the threshold give no event in {loss:.2g} of the trials: thresholds and noise are off. "
+        "Events are lost (look at the read-out's bandwidth when all pixels step at once: step fewer of them), or "
+        "trials are counted that had no step.",
         p_value,
     )
 
@@ -192,10 +190,10 @@ def _floor(fit: Fit, steps: Trials) -> Finding | None:
             found.append((name, events / trials, p_value))
     if not found:
         return None
+    rates = " and ".join(f"{r:.2g} ({n})" for n, r, _ in found)
     return Finding(
         "S-curve floor",
-        "steps away from the threshold give events, in " + " and ".join(f"{r:.2g} ({n})" for n, r, _ in found) + " of the "
-        "trials, beyond leak. Noise and leak are off. Look for events that come by themselves, or a reset that is not "
-        "over when the trial begins.",
+        f"steps away from the threshold give events, in {rates} of the trials, beyond leak. Noise and leak are off. "
+        "Look for events that come by themselves, or a reset that is not over when the trial begins.",
         min(2 * p for _, _, p in found),
     )

@@ -88,7 +88,9 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
         (counts.silent @ sure, trials @ (sure * (1 - chance))),
         (events @ never, trials @ (never * chance)),
     )
-    return np.array([np.sum(weight * poisson.sf(n - 1, np.maximum(mean, 1e-12)), axis=1) < _CHANCE for n, mean in tests])
+    return np.array(
+        [np.sum(weight * poisson.sf(n - 1, np.maximum(mean, 1e-12)), axis=1) < _CHANCE for n, mean in tests]
+    )
 
 
 def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefects:
@@ -99,10 +101,11 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
     if some.size == 0:
         return TrialDefects(bad, kind, on_hz, off_hz)
     ours, light = steady.of(some), int(np.argmax(steady.signal_dn))
+    seconds = max(float(steady.calm[light].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
     duration = np.maximum(ours.calm[light] * steady.edges_s[-1], 1e-12)
     never_calm = ours.calm[light] < _CALM * steady.calm[light].max()
     rates = [np.where(never_calm, 0, n[light].sum(axis=0, dtype=np.float64)) / duration for n in (ours.on, ours.off)]
-    usual = [float(n[light].sum() / max((steady.calm[light] * steady.edges_s[-1]).sum(), 1e-12)) for n in (steady.on, steady.off)]
+    usual = [float(n[light].sum(dtype=np.float64)) / seconds for n in (steady.on, steady.off)]
     excess = [poisson.sf(r * duration - 1, max(u, 1e-9) * duration) < 1e-3 for r, u in zip(rates, usual, strict=True)]
     hot = never_calm | excess[0] | excess[1]
     silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm

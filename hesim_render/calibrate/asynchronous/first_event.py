@@ -1,8 +1,8 @@
 """When the first event of an asynchronous pixel after a reset comes, and of which polarity.
 
 A reset makes the pixel's reference the level of that instant, its noise σ₀ z included. After the settling time the
-light steps by S (0 in steady light). From then on the first event is ON where S + σ₁ ν − σ₀ z passes θ₊ before it passes
-−θ₋. What the pixel does after that event, and in what state it was before the reset, does not matter.
+light steps by S (0 in steady light). From then on the first event is ON where S + σ₁ ν − σ₀ z passes θ₊ before it
+passes −θ₋. What the pixel does after that event, and in what state it was before the reset, does not matter.
 
 ν is white noise through two equal poles, −3 dB together at the cut-off f_c: correlation (1 + a τ) exp(−a τ),
 a = 2π f_c/√(√2 − 1). It is above h at the step with the chance Q(h), and stays below h for a time w after it with the
@@ -10,11 +10,12 @@ chance
 
     Φ(h) exp(−λ(h) w),   λ(h) = (a/2π) exp(−h²/2) · κ(h)
 
-(a/2π) exp(−h²/2) is the rate of its crossings (Rice 1945). κ makes up for their coming in clumps, for high chances, and
-for what the event stage makes of the noise: 16 nodes in a period of the cut-off with straight lines between them, of the
-same variance on the average. So a simulated sensor has the rates that were measured. κ was counted on 1.2 million such
-paths of 1.25/f_c up to h = 3.5; above, it is the closed form of such a line's crossings, a bivariate normal chance. Noise
-without nodes passes h = 0 to 2 5 % more often, h = 4 10 % less: f_c of a real sensor comes out by up to so much higher.
+(a/2π) exp(−h²/2) is the rate of its crossings (Rice 1945). κ makes up for their coming in clumps, for high chances,
+and for what the event stage makes of the noise: 16 nodes in a period of the cut-off with straight lines between them,
+of the same variance on the average. So a simulated sensor has the rates that were measured. κ was counted on
+1.2 million such paths of 1.25/f_c up to h = 3.5; above, it is the closed form of such a line's crossings, a bivariate
+normal chance. Noise without nodes passes h = 0 to 2 by 5 % more often and h = 4 by 10 % less: by so much the f_c of a
+sensor with such noise is the one that gives its rates in a simulation, not its own.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-#: ln κ against the level h in standard deviations, highest power first, between two ends of h; within 0.4 % of the counts.
+#: ln κ against the level h in standard deviations, highest power first, between two ends of h; 0.4 % off the counts.
 _LOG_KAPPA = (-3.1165e-05, 3.6215e-04, -4.6413e-04, -4.4709e-03, -0.027395, 0.34284, -0.92856, 0.61716)
 _LOWEST, _HIGHEST, _SLOPE = -1.5, 6.0, -2.112  # below, ln κ goes on along its slope there
 #: (a/2π)/f_c.

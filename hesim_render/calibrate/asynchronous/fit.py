@@ -1,7 +1,7 @@
 """Maximum likelihood of thresholds, mismatch, noise, bandwidth and leak, and the covariance of what it gives.
 
-Scoring with the outer product of the pixels' own scores (Berndt, Hall, Hall and Hausman 1974), which is at the same time
-the information: each pixel, with thresholds of its own, is one independent draw.
+Scoring with the outer product of the pixels' own scores (Berndt, Hall, Hall and Hausman 1974), which is at the same
+time the information: each pixel, with thresholds of its own, is one independent draw.
 """
 
 from __future__ import annotations
@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from hesim_render.calibrate.asynchronous.likelihood import (
-    CUTOFF, DARK, LEAK, MISMATCH, NAMES, RESPONSE, SHOT, THETA, Law, Likelihood, threshold_grid,
+    CUTOFF,
+    DARK,
+    LEAK,
+    MISMATCH,
+    NAMES,
+    RESPONSE,
+    SHOT,
+    THETA,
+    Law,
+    Likelihood,
+    threshold_grid,
 )  # fmt: skip
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.core.errors import SpecError
@@ -24,8 +34,8 @@ MOST_PIXELS = 16384
 _ROUNDS, _TRIES, _ENOUGH = 40, 8, 0.02
 #: Pixels that a rough start is found on.
 _FEW = 300
-#: Steps of numerical derivatives, of ln of a parameter; largest change of it in a round.
-_H, _LARGEST = 4e-3, 0.7
+#: Step of numerical derivatives, of ln of a parameter; largest change of it in a round.
+_H, _LARGEST = 1e-5, 0.7
 #: Parameters that may be 0, and what they may be 0 below, of the start's.
 _MAY_VANISH = (SHOT, DARK, LEAK)
 _FLOOR = 1e-6
@@ -60,13 +70,18 @@ class Fit:
         return float(np.sqrt(max(self.covariance[k, k], 0.0))) if self.free[k] else float("nan")
 
 
-def fit_trials(sets: Sequence[Trials], law: Law, start: NDArray) -> Fit:
-    """Fit from a start; the grids of thresholds follow the fit."""
+def fit_trials(sets: Sequence[Trials], law: Law, start: NDArray, rounds: int = _ROUNDS) -> Fit:
+    """Fit from a start; the grids of thresholds follow the fit.
+
+    Parameters
+    ----------
+    rounds : most that are made on either grid.
+    """
     values = start.copy()
     for _ in range(2):
-        grids = tuple(threshold_grid(values[t], values[m]) for t, m in zip(THETA, MISMATCH, strict=True))
-        likelihood = Likelihood.of(sets, law, grids)
-        values, scores, free, best = _climb(likelihood, values)
+        on, off = (threshold_grid(values[t], values[m]) for t, m in zip(THETA, MISMATCH, strict=True))
+        likelihood = Likelihood.of(sets, law, (on, off))
+        values, scores, free, best = _climb(likelihood, values, rounds)
     information = scores[:, free].T @ scores[:, free]
     covariance = np.full((len(NAMES), len(NAMES)), np.nan)
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
@@ -77,21 +92,19 @@ def fit_trials(sets: Sequence[Trials], law: Law, start: NDArray) -> Fit:
 def _scores(likelihood: Likelihood, values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """ln L [pixel] and its derivatives [pixel, parameter] by the ln of each."""
     given = likelihood.given_thresholds(values)
-    scores = np.empty((given[0].shape[0], len(NAMES)))
+    each = likelihood.of_pixels(values, given)
+    scores = np.empty((each.size, len(NAMES)))
     for k in range(len(NAMES)):
-        ends = []
-        for sign in (1, -1):
-            there = values.copy()
-            there[k] *= np.exp(sign * _H)
-            # the other polarity's mean threshold enters chances only by competition: left out of the derivative
-            ends.append(likelihood.of_pixels(there, given if k < RESPONSE else None))
-        scores[:, k] = (ends[0] - ends[1]) / (2 * _H)
-    return likelihood.of_pixels(values, given), scores
+        there = values.copy()
+        there[k] *= np.exp(_H)
+        # the other polarity's mean threshold enters chances only by competition: left out of the derivative
+        scores[:, k] = (likelihood.of_pixels(there, given if k < RESPONSE else None) - each) / _H
+    return each, scores
 
 
-def _climb(likelihood: Likelihood, start: NDArray) -> tuple[NDArray, NDArray, NDArray[np.bool_], float]:
+def _climb(likelihood: Likelihood, start: NDArray, rounds: int) -> tuple[NDArray, NDArray, NDArray[np.bool_], float]:
     values, least = start.copy(), _FLOOR * start
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         each, scores = _scores(likelihood, values)
         best, gradient = float(each.sum()), scores.sum(axis=0)
         free = np.ones(len(NAMES), bool)
@@ -137,8 +150,8 @@ def _along(
 def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law) -> NDArray[np.float64]:
     """A start from closed forms: centres and widths of the pooled S-curves of each light, then the bandwidth by trial.
 
-    Right after a step P = Q((θ − S)/w) over all pixels, w² = σ₀² + σ₁² + m² θ². r is the one with which θ is the same in
-    all lights, and m, β3² and β4² are the least squares of w².
+    Right after a step P = Q((θ − S)/w) over all pixels, w² = σ₀² + σ₁² + m² θ². r is the one with which θ is the same
+    in all lights, and m, β3² and β4² are the least squares of w².
     """
     good_steps = steps.of(good)
     spread = [middle_and_spread(pixel_thresholds(good_steps, p))[1] for p in (1, -1)]

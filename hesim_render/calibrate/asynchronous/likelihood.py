@@ -51,11 +51,9 @@ def step_of(values: NDArray, trials: Trials) -> NDArray[np.float64]:
     return np.log1p(r * trials.signal_dn * np.exp(trials.contrast)) - np.log1p(r * trials.signal_dn)
 
 
-def chances(
-    values: NDArray, trials: Trials, polarity: int, thresholds: NDArray, law: Law
-) -> NDArray[np.float64]:
+def chances(values: NDArray, trials: Trials, polarity: int, thresholds: NDArray, law: Law) -> NDArray[np.float64]:
     """Chance [kind, bin, threshold] of a first event of one polarity, among trials the other has not ended."""
-    own, other = (0, 1) if polarity > 0 else (1, 0)
+    other = THETA[1] if polarity > 0 else THETA[0]
     step = polarity * step_of(values, trials)[:, None]
     after_dn = trials.signal_dn * np.exp(trials.contrast)
     noise = noise_of(values, trials.signal_dn, law)[:, None], noise_of(values, after_dn, law)[:, None]
@@ -88,7 +86,9 @@ class Counts:
         sets = [t.towards(polarity) for t in sets]
         own = [t.events(polarity).reshape(-1, t.calm.shape[1]) for t in sets]
         silent = [t.calm - t.on.sum(axis=1, dtype=np.int64) - t.off.sum(axis=1, dtype=np.int64) for t in sets]
-        return cls(polarity, sets, np.concatenate(own).T.astype(np.float64), np.concatenate(silent).T.astype(np.float64))
+        return cls(
+            polarity, sets, np.concatenate(own).T.astype(np.float64), np.concatenate(silent).T.astype(np.float64)
+        )
 
     def log_likelihood(self, values: NDArray, grid: NDArray, law: Law) -> NDArray[np.float64]:
         """ln L [pixel, threshold]."""
@@ -119,8 +119,7 @@ class Likelihood:
     def given_thresholds(self, values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """ln L [pixel, threshold] of ON and of OFF."""
         on, off = (
-            counts.log_likelihood(values, grid, self.law)
-            for counts, grid in zip(self.counts, self.grids, strict=True)
+            counts.log_likelihood(values, grid, self.law) for counts, grid in zip(self.counts, self.grids, strict=True)
         )
         return on, off
 

@@ -10,7 +10,17 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.asynchronous.analysis import DECISIVE, AsynchronousCalibration
 from hesim_render.calibrate.asynchronous.fit import Fit
 from hesim_render.calibrate.asynchronous.likelihood import (
-    DARK, LEAK, MISMATCH, NAMES, RESPONSE, SHOT, THETA, chances, log_prior, noise_of, step_of,
+    DARK,
+    LEAK,
+    MISMATCH,
+    NAMES,
+    RESPONSE,
+    SHOT,
+    THETA,
+    chances,
+    log_prior,
+    noise_of,
+    step_of,
 )  # fmt: skip
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.defect import Defect
@@ -74,7 +84,14 @@ def _beta(fit: Fit) -> tuple[list[float | None], list[float | None]]:
     error = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     theta = (fit.value("theta_on") + fit.value("theta_off")) / 2
     values: list[float | None] = [theta, fit.values[RESPONSE], 1.0, 0.0, 0.0, 0.0]
-    errors: list[float | None] = [float(np.sqrt(fit.covariance[:2, :2].sum())) / 2, error[RESPONSE], 0.0, None, None, None]
+    errors: list[float | None] = [
+        float(np.sqrt(fit.covariance[:2, :2].sum())) / 2,
+        error[RESPONSE],
+        0.0,
+        None,
+        None,
+        None,
+    ]
     for place, k in ((3, SHOT), (4, DARK)):
         if fit.free[k]:
             root = float(np.sqrt(fit.values[k]))
@@ -102,7 +119,8 @@ def maps(result: AsynchronousCalibration) -> dict[str, NDArray]:
     """Map files of the section, and small arrays for the report (their names start with ``figure_``)."""
     shape, defects = result.steps.shape, result.defects
     arrays: dict[str, NDArray] = {
-        "bad_pixels": defects.bad, "defect": defects.kind, "defect_on_hz": defects.on_hz, "defect_off_hz": defects.off_hz,
+        "bad_pixels": defects.bad, "defect": defects.kind, "defect_on_hz": defects.on_hz,
+        "defect_off_hz": defects.off_hz,
         "threshold_on_relative": result.relative[0], "threshold_off_relative": result.relative[1],
         "threshold_on_noise": result.noise[0], "threshold_off_noise": result.noise[1],
     }  # fmt: skip

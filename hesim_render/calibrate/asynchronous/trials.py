@@ -1,8 +1,9 @@
 """Captures of an asynchronous sensor: the first event of each pixel after a reset, in steady light and after steps.
 
-``evs_noise_rate.npz`` (steady light) and ``evs_s_curve.npz`` (steps of contrast) hold the same arrays, of uniform light. A
-trial begins with a reset of the pixels; ``settle_us`` later comes the step of light, and then the time bins bounded by
-``edges_us``. A pixel without an event while settling was calm; its first event after that falls into one of the bins.
+``evs_noise_rate.npz`` (steady light) and ``evs_s_curve.npz`` (steps of contrast) hold the same arrays, of uniform
+light. A trial begins with a reset of the pixels; ``settle_us`` later comes the step of light, and then the time bins
+bounded by ``edges_us``. A pixel without an event while settling was calm; its first event after that falls into one of
+the bins.
 """
 
 from __future__ import annotations
@@ -129,13 +130,17 @@ def _read(file: Path, has_steps: bool) -> Trials:
     if has_steps and not (np.any(contrast > 0) and np.any(contrast < 0)):
         raise SpecError("contrast must hold steps up, which tell θ₊, and down, which tell θ₋", file=file)
     if has_steps and (np.any(contrast == 0) or np.any(signal == 0)):
-        raise SpecError(f"a step needs light before it and a contrast; steady light goes into {NOISE_RATE}.npz", file=file)
+        raise SpecError(
+            f"a step needs light before it and a contrast; steady light goes into {NOISE_RATE}.npz", file=file
+        )
     if not has_steps and np.any(contrast != 0):
         raise SpecError(f"contrast must be 0 in steady light; steps go into {S_CURVE}.npz", file=file)
     settle_s = number(arrays["settle_us"], "settle_us", file) * S_PER_US
     edges = _list(arrays["edges_us"], "edges_us", file)
     if edges.size < 2 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
-        raise SpecError("edges_us must begin with 0, the time of the step, and rise: bounds of the time bins", file=file)
+        raise SpecError(
+            "edges_us must begin with 0, the time of the step, and rise: bounds of the time bins", file=file
+        )
     calm, on, off = (arrays[name] for name in ("n_calm", "n_on", "n_off"))
     if calm.ndim != 3 or calm.size == 0 or len(calm) != signal.size:
         raise SpecError(f"n_calm has shape {calm.shape}; expected [{signal.size} kinds of trials, row, col]", file=file)
@@ -144,7 +149,9 @@ def _read(file: Path, has_steps: bool) -> Trials:
         if values.dtype.kind not in "ui":
             raise SpecError(f"{name} holds {values.dtype.name}; save whole numbers of trials", file=file)
         if values is not calm and values.shape != wanted:
-            raise SpecError(f"{name} has shape {values.shape}; expected {wanted}: [kind, time bin, row, col]", file=file)
+            raise SpecError(
+                f"{name} has shape {values.shape}; expected {wanted}: [kind, time bin, row, col]", file=file
+            )
         if values.min() < 0 or values.max() >= 2**31:
             raise SpecError(f"{name} holds numbers below 0, or beyond 2^31", file=file)
     events = on.sum(axis=1, dtype=np.int64) + off.sum(axis=1, dtype=np.int64)
@@ -152,8 +159,8 @@ def _read(file: Path, has_steps: bool) -> Trials:
         raise SpecError("n_on and n_off hold more trials together than n_calm: count first events only", file=file)
     if calm.sum(dtype=np.float64) < _LEAST_CALM * calm.max(axis=(1, 2)).sum(dtype=np.float64) * calm[0].size:
         raise SpecError(
-            "fewer than a fifth of the trials are calm while settling; shorten settle_us, raise the thresholds, or take "
-            "brighter light",
+            "fewer than a fifth of the trials are calm while settling; shorten settle_us, raise the thresholds, or "
+            "take brighter light",
             file=file,
         )
     if has_steps and not (on.any() and off.any()):

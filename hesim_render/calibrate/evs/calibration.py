@@ -64,7 +64,9 @@ def calibrate_evs(
     tell("reading event counts", 0.0)
     if is_asynchronous(captures):
         if bootstrap:
-            raise RangeError("bootstrap", bootstrap, "0 for an asynchronous sensor: its errors are the pixels' own scatter")
+            raise RangeError(
+                "bootstrap", bootstrap, "0 for an asynchronous sensor: its errors are the pixels' own scatter"
+            )
         section, maps = _asynchronous(captures, seed, tell)
     else:
         section, maps = _fixed_ticks(captures, out, tell, bootstrap, seed)

@@ -21,8 +21,8 @@ def asynchronous_section(section: dict[str, Any], maps: dict[str, NDArray]) -> s
         "<h2>Events (EVS, asynchronous)</h2>",
         findings(section),
         row_of(*(_s_curves(maps, polarity) for polarity in (1, -1)), _noise_rate(maps)),
-        "<p>Points: counted. Lines: the fit. In the S-curves the lower branch is of events right after the step (the first "
-        "time bin), the upper one of all bins. Arrows: no event was counted; they start at the 95 % limit.</p>",
+        "<p>Points: counted. Lines: the fit. In the S-curves the lower branch is of events right after the step (the "
+        "first time bin), the upper one of all bins. Arrows: no event was counted; they start at the 95 % limit.</p>",
         row_of(_pixels(maps), *(_map(maps, name, sign) for name, sign in (("on", "θ₊"), ("off", "θ₋")))),
         "<h2>Parameters (EVS)</h2>",
         table(("parameter", "value", "95 % interval", "unit, or why not"), _rows(section)),
@@ -80,7 +80,11 @@ def _pixels(maps: dict[str, NDArray]) -> str:
     counts = [np.histogram(v, edges)[0] for v in values]
     middle = (edges[1:] + edges[:-1]) / 2
     plot = Plot(
-        "Thresholds over their mean", "θ of a pixel / mean", "pixels", (edges[0], edges[-1]), (0, 1.1 * float(np.max(counts)))
+        "Thresholds over their mean",
+        "θ of a pixel / mean",
+        "pixels",
+        (edges[0], edges[-1]),
+        (0, 1.1 * float(np.max(counts))),
     )
     return plot.bars(middle, counts[0], COLOURS[1], "θ₊").bars(middle, counts[1], COLOURS[0], "θ₋").svg()
 
@@ -101,10 +105,17 @@ def _rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     for k, (value, error) in enumerate(zip(section["beta"][0], section["beta_standard_error"][0], strict=True)):
         rows.append((f"β{k}", f"{value:.5g}", "" if not error else f"± {1.96 * error:.2g}", ""))
     decisive = "" if section["shot_law_decisive"] else ", not decisive"
-    rows.append(("shot law", section["shot_law"], "", f"ln L above the other: {section['shot_law_advantage']:.1f}{decisive}"))
+    rows.append(
+        ("shot law", section["shot_law"], "", f"ln L above the other: {section['shot_law_advantage']:.1f}{decisive}")
+    )
     goodness = section["goodness"]
     rows.append(
-        ("χ²/dof", f"{goodness['chi2_per_dof']:.3f}", "", f"{goodness['dof']} degrees of freedom, p = {p_text(goodness['p_value'])}")
+        (
+            "χ²/dof",
+            f"{goodness['chi2_per_dof']:.3f}",
+            "",
+            f"{goodness['dof']} degrees of freedom, p = {p_text(goodness['p_value'])}",
+        )
     )
     for name, text in (("steps", "right after steps"), ("times", "later after steps"), ("steady", "in steady light")):
         rows.append((f"p of events {text}", p_text(goodness[f"{name}_p_value"]), "", ""))
