@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_law
 from scipy.stats import norm, poisson
 
-from hesim_render.calibrate.asynchronous.fit import Fit
+from hesim_render.calibrate.asynchronous.fit import Fit, middle_and_spread, pixel_thresholds
 from hesim_render.calibrate.asynchronous.likelihood import LEAK, MISMATCH, THETA, chances, log_prior, step_of
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.finding import ALARM, Finding
@@ -26,6 +26,8 @@ _LAW_ERROR = 0.03
 _STEP_ERROR = 0.002
 #: Loss of events and events the wrong way, per trial, from which they are told.
 _LEAST_LOSS, _LEAST_FLOOR = 1e-3, 1e-4
+#: Spreads of the pixels' thresholds beyond which a step surely gives an event.
+_FAR = 4.0
 _FAMILIES = ("steps", "times", "steady")
 
 
@@ -54,7 +56,7 @@ def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], 
     goodness = {name: _judge(columns, np.flatnonzero(columns.family == k), fit) for k, name in enumerate(_FAMILIES)}
     goodness["all"] = _judge(columns, np.arange(columns.family.size), fit)
     found = [_family(name, goodness[name]) for name in _FAMILIES]
-    found += [_ceiling(fit, sets[1]), _floor(fit, sets[1])]
+    found += [_ceiling(sets[1]), _floor(fit, sets[1])]
     return [f for f in found if f is not None], goodness
 
 
@@ -143,26 +145,22 @@ def _family(name: str, goodness: Goodness) -> Finding | None:
     return Finding(check, f"χ²/dof {goodness.chi2 / max(goodness.dof, 1):.3g}: {text}", goodness.p_value)
 
 
-def _ceiling(fit: Fit, steps: Trials) -> Finding | None:
-    """Steps that surely give an event, and do not."""
-    missing = expected = total = 0.0
-    squares = np.zeros(steps.calm.shape[1])
-    for k, polarity in enumerate((1, -1)):
-        grid = fit.likelihood.grids[k]
-        weight = np.exp(log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid))
+def _ceiling(steps: Trials) -> Finding | None:
+    """Steps that surely give an event, and do not: those beyond four spreads of the pixels' own middle contrasts."""
+    lost, total = np.zeros(steps.calm.shape[1]), 0.0
+    for polarity in (1, -1):
+        middle, spread = middle_and_spread(pixel_thresholds(steps, polarity))
         there = steps.towards(polarity)
-        mean = chances(fit.values, there, polarity, grid, fit.law).sum(axis=1) @ weight
-        sure = mean > 1 - _LEAST_LOSS / 2
-        trials = there.calm[sure].sum(axis=0, dtype=np.float64)
+        sure = np.abs(there.contrast) > middle * (1 + _FAR * spread)
+        sure &= there.signal_dn >= 0.999 * there.signal_dn.max()
         events = (there.on + there.off)[sure].sum(axis=(0, 1), dtype=np.float64)
-        lost = trials - events - ((1 - mean[sure])[:, None] * there.calm[sure]).sum(axis=0)
-        squares += lost
-        missing, total = missing + float((trials - events).sum()), total + float(trials.sum())
-        expected += float(((1 - mean[sure])[:, None] * there.calm[sure]).sum())
+        trials = there.calm[sure].sum(axis=0, dtype=np.float64)
+        lost += trials - events
+        total += float(trials.sum())
     if total == 0:
         return None
-    error = np.sqrt(squares.size * squares.var() + expected + 1.0)
-    loss, p_value = (missing - expected) / total, float(norm.sf((missing - expected) / error))
+    loss, error = lost.sum() / total, np.sqrt(lost.size * lost.var() + 1.0) / total
+    p_value = float(norm.sf((loss - _LEAST_LOSS / 2) / error))
     if p_value > ALARM or loss < _LEAST_LOSS:
         return None
     return Finding(

@@ -158,7 +158,7 @@ def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law
     curves = [curve for p in (1, -1) for curve in _pooled_curves(good_steps, p)]
     light = np.array([c[1] for c in curves])
     if light.size == 0:
-        raise SpecError("no S-curve rises from below ½ to nearly 1; take steps of up to twice the threshold")
+        raise SpecError("no S-curve rises from below ½ to above it; take steps of up to twice the threshold")
     tried = np.geomspace(0.3, 3000.0, 200) / light.max()
     response = float(tried[np.argmin([_disagreement(curves, r) for r in tried])])
     polarity, _, centre, variance = np.array(curves).T
@@ -192,9 +192,10 @@ def _pooled_curves(steps: Trials, polarity: int) -> list[tuple[int, float, float
         kinds = np.flatnonzero((np.sign(steps.contrast) == polarity) & (steps.signal_dn == light))
         kinds = kinds[np.argsort(np.abs(steps.contrast[kinds]))]
         rate = steps.events(polarity)[kinds, 0].sum(axis=1) / np.maximum(steps.calm[kinds].sum(axis=1), 1)
-        if kinds.size < 3 or rate[0] > 0.4 or rate[-1] < 0.9:
+        if kinds.size < 3 or rate[0] > 0.4 or rate[-1] < 0.6:
             continue
-        contrast, missing = np.abs(steps.contrast[kinds]), 1 - rate
+        # where even the last step lacks events, a start is had from those that come; the checks tell it
+        contrast, missing = np.abs(steps.contrast[kinds]), 1 - rate / rate[-1]
         first = np.trapezoid(missing, contrast)
         second = 2 * np.trapezoid(missing * (contrast - contrast[0]), contrast)
         found.append((polarity, float(light), float(contrast[0] + first), float(max(second - first**2, 1e-8))))
