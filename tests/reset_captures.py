@@ -95,7 +95,7 @@ def trials(pixels, on, off, light, contrast, settle_s, edges_s, count, rng, nois
 
 
 def write(folder, pixels, rng, shape=(32, 32), count=12, steps=8, change=None, noise=unit_noise, contrast_scale=1.0):
-    """A capture set; returns the thresholds of the pixels. `change(name, kind, calm, on, off)` spoils counts in place."""
+    """A capture set; returns the thresholds of the pixels. `change(name, calm, on, off)` spoils counts in place."""
     number = shape[0] * shape[1]
     on, off = (
         theta * (1 + pixels.mismatch * rng.standard_normal(number)) for theta in (pixels.theta_on, pixels.theta_off)

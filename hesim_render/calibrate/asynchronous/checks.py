@@ -20,6 +20,8 @@ from hesim_render.calibrate.finding import ALARM, Finding
 
 #: Events, and trials without one, that a column needs to be judged; and pixels it needs of its own.
 _FEWEST, _PIXELS_PER_COLUMN = 25.0, 10
+#: Directions of less variance than this part of a column's are those the fit took out.
+_LEAST_VARIANCE = 1e-4
 #: Relative error that the law of times after a step, and of steady light, is allowed: its rates are approximations.
 _LAW_ERROR = 0.03
 #: The same right after a step.
@@ -103,13 +105,15 @@ def _judge(columns: Columns, some: NDArray[np.intp], fit: Fit) -> Goodness:
     error = np.where(columns.family[some] == 0, _STEP_ERROR, _LAW_ERROR) * columns.expected[some]
     error *= columns.silent[some] / (columns.expected[some] + columns.silent[some])
     scores = fit.scores[:, fit.free]
+    # the pixels' scores take out what the fit fitted, and what it left undone where it stopped short of its end
     left = residual - scores @ np.linalg.lstsq(scores, residual, rcond=None)[0]
-    left -= left.mean(axis=0)
+    total = left.sum(axis=0)
+    left = left - left.mean(axis=0)
     covariance = left.T @ left * (1 + 1 / count) + np.diag((error @ gather) ** 2)
     scale = np.sqrt(np.maximum(np.diag(residual.T @ residual), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 1e-6
-    along = vectors[:, kept].T @ (residual.sum(axis=0) / scale)
+    kept = values > _LEAST_VARIANCE
+    along = vectors[:, kept].T @ (total / scale)
     chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
     ratio = chi2 * (count - dof) / (dof * (count - 1))
     return Goodness(chi2, dof, float(f_law.sf(ratio, dof, count - dof)))
