@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 from scipy.stats import f as f_law
 from scipy.stats import norm, poisson
 
@@ -65,11 +66,16 @@ def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], 
 def _columns(fit: Fit) -> Columns:
     parts: list[tuple[NDArray, NDArray, NDArray, NDArray]] = []
     for k, counts in enumerate(fit.likelihood.counts):
-        weight = np.exp(log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], fit.likelihood.grids[k]))
+        grid = fit.likelihood.grids[k]
+        log = counts.log_likelihood(fit.values, grid, fit.law)
+        log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
+        # over what each pixel's threshold may be: pixels of low thresholds are calm less often, and count less
+        weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
         at = at_kind = 0
         for trials in counts.sets:
-            mean = chances(fit.values, trials, counts.polarity, fit.likelihood.grids[k], fit.law) @ weight
-            kinds, bins = mean.shape
+            chance = chances(fit.values, trials, counts.polarity, grid, fit.law)
+            mean = np.tensordot(weight, chance, (1, 2))  # [pixel, kind, bin]
+            kinds, bins = mean.shape[1:]
             events = counts.events[:, at : at + kinds * bins].reshape(-1, kinds, bins)
             total = events.sum(axis=2) + counts.silent[:, at_kind : at_kind + kinds]
             expected = total[:, :, None] * mean

@@ -5,8 +5,8 @@ light steps by S (0 in steady light). From then on the first event is ON where S
 passes −θ₋. What the pixel does after that event, and in what state it was before the reset, does not matter.
 
 ν is white noise through two equal poles, −3 dB together at the cut-off f_c: correlation (1 + a τ) exp(−a τ),
-a = 2π f_c/√(√2 − 1). It is above h at the step with the chance Q(h), and stays below h for a time w after it with the
-chance
+a = 2π f_c/√(√2 − 1). At the step it is above h with the chance Q(h), of a calm pixel less that of noise which
+passes the threshold before; it stays below h for a time w after it with the chance
 
     Φ(h) exp(−λ(h) w),   λ(h) = (a/2π) exp(−h²/2) · κ(h)
 
@@ -89,14 +89,17 @@ def first_event(
     rho = correlation(cutoff_hz, settle_s)
     fresh = math.sqrt(max(1.0 - rho * rho, 1e-12))
     settling = max(settle_s - _REMEMBERED / cutoff_hz, 0.0)
-    jumps = np.broadcast_to(np.asarray(step) != 0, shape)
     for z, weight in zip(_Z, _Z_WEIGHTS, strict=True):
-        lost = cutoff_hz * (passage_rate(theta / before + z) + passage_rate(theta_other / before - z)) + sum(leak_hz)
+        high, low = theta / before + z, theta_other / before - z
+        lost = cutoff_hz * (passage_rate(high) + passage_rate(low)) + sum(leak_hz)
         kept = weight * np.exp(-np.minimum(lost * settling, 500.0))
         up, down = theta - step + before * z, theta_other + step - before * z
-        # what noise was at the reset is not quite forgotten at the step
-        at_once = np.where(jumps, ndtr((rho * z - up / after) / fresh), 0.0)
-        at_once_other = np.where(jumps, ndtr((-rho * z - down / after) / fresh), 0.0)
+        # at the step a calm pixel's noise lies within both thresholds, and has not quite forgotten the reset
+        within, below = ndtr((high - rho * z) / fresh), ndtr((low + rho * z) / fresh)
+        calm = np.maximum(within + below - 1.0, 1e-12)
+        at_once = np.maximum(within - ndtr((up / after - rho * z) / fresh), 0.0) / calm
+        at_once_other = np.maximum(below - ndtr((down / after + rho * z) / fresh), 0.0) / calm
+        at_once, at_once_other = np.minimum(at_once, 1.0), np.minimum(at_once_other, 1.0 - np.minimum(at_once, 1.0))
         rate = cutoff_hz * passage_rate(up / after) + leak_hz[0]
         rate_other = cutoff_hz * passage_rate(down / after) + leak_hz[1]
         both = np.maximum(rate + rate_other, 1e-300)
