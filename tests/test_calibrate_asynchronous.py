@@ -359,8 +359,8 @@ def test_calibrations_of_the_two_kinds_of_sensor_are_not_mixed_up(session):
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth(tmp_path):
-    """24 sets of trials in NumPy: 95 % intervals of each parameter cover in 19 or more (at a coverage of 95 % each fails
-    with a chance of 0.1 %), and of 24,576 pixels 2 at most are called bad."""
+    """24 sets of trials in NumPy: 95 % intervals of each parameter cover in 19 or more (at a coverage of 95 % each
+    fails with a chance of 0.1 %), and of 24,576 pixels 2 at most are called bad."""
     inside, bad = [], 0
     for seed in range(1, 25):
         folder = tmp_path / str(seed)

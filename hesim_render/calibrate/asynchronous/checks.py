@@ -94,7 +94,9 @@ def _columns(fit: Fit) -> Columns:
             )  # fmt: skip
             at, at_kind = at + kinds * bins, at_kind + kinds
     residual, expected, silent, family = (np.concatenate(v, axis=-1) for v in zip(*parts, strict=True))
-    enough = (expected >= _FEWEST) & (silent >= _FEWEST)
+    # what comes though it is not expected counts as well
+    seen = residual.sum(axis=0)
+    enough = (np.maximum(expected, expected + seen) >= _FEWEST) & (np.maximum(silent, silent - seen) >= _FEWEST)
     return Columns(residual[:, enough], expected[enough], silent[enough], family[enough])
 
 

@@ -36,8 +36,9 @@ _ROUNDS, _TRIES, _ENOUGH = 40, 8, 0.02
 _FEW = 300
 #: Step of numerical derivatives, of ln of a parameter; largest change of it in a round.
 _H, _LARGEST = 1e-5, 0.7
-#: Relative error of the law itself, in the order of `NAMES`: what sessions of davis346 with seeds 1 to 3 were off on the
-#: average (r 0.3 %, β4² 1.5 %, f_c 1.5 %), with a margin. Judged on other seeds, and on trials written out in the tests.
+#: Relative error of the law itself, in the order of `NAMES`: what sessions of davis346 with seeds 1 to 3 were off on
+#: the average (r 0.3 %, β4² 1.5 %, f_c 1.5 %), with a margin. Judged on other seeds, and on trials written out in the
+#: tests.
 _LAW_ERROR = np.array([0.0, 0.0, 0.0, 0.0, 0.004, 0.01, 0.015, 0.02, 0.0])
 #: Parameters that may be 0, and what they may be 0 below, of the start's.
 _MAY_VANISH = (SHOT, DARK, LEAK)
