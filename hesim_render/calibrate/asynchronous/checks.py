@@ -31,6 +31,8 @@ _STEP_ERROR = 0.002
 _LEAST_LOSS, _LEAST_FLOOR = 1e-3, 1e-4
 #: Spreads of the pixels' thresholds beyond which a step surely gives an event.
 _FAR = 4.0
+#: Squared standard errors from the best fit beyond which the search is told to have failed.
+_UNDONE = 16.0
 _FAMILIES = ("steps", "times", "steady")
 
 
@@ -59,7 +61,7 @@ def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], 
     goodness = {name: _judge(columns, np.flatnonzero(columns.family == k), fit) for k, name in enumerate(_FAMILIES)}
     goodness["all"] = _judge(columns, np.arange(columns.family.size), fit)
     found = [_family(name, goodness[name]) for name in _FAMILIES]
-    found += [_ceiling(sets[1]), _floor(fit, sets[1])]
+    found += [_ended(fit), _ceiling(sets[1]), _floor(fit, sets[1])]
     return [f for f in found if f is not None], goodness
 
 
@@ -155,6 +157,23 @@ def _family(name: str, goodness: Goodness) -> Finding | None:
         return None
     check, text = _LOOK_AT[name]
     return Finding(check, f"χ²/dof {goodness.chi2 / max(goodness.dof, 1):.3g}: {text}", goodness.p_value)
+
+
+def _ended(fit: Fit) -> Finding | None:
+    """A search that stopped far from its end: the other tests have taken out what is left undone."""
+    scores = fit.scores[:, fit.free]
+    total = scores.sum(axis=0)
+    left = float(total @ np.linalg.pinv(scores.T @ scores, hermitian=True) @ total)
+    if left < _UNDONE:
+        return None
+    return Finding(
+        "fit",
+        f"the search for the parameters ended {np.sqrt(left):.2g} standard errors from the best there is: no "
+        "parameters of this law describe the trials, and none of the figures below hold. Look at the S-curves of both time bins: "
+        "events that come late (latency of the read-out, a step that is slower than the first time bin) or are lost, "
+        "contrasts or lights that are not as stated.",
+        None,
+    )
 
 
 def _ceiling(steps: Trials) -> Finding | None:
