@@ -123,6 +123,8 @@ def _mismatch(fit: Fit) -> Spread:
     """Of both polarities, each with the weight of how well it is known."""
     k = [NAMES.index(name) for name in ("mismatch_on", "mismatch_off")]
     values, covariance = fit.values[k], fit.covariance[np.ix_(k, k)]
+    if not (np.all(np.isfinite(covariance)) and np.linalg.det(covariance) > 0):
+        return Spread(0.0, float("nan"), float(values.max()))
     weight = np.linalg.solve(covariance, np.ones(2))
     weight /= weight.sum()
     value, error = float(weight @ values), float(np.sqrt(weight @ covariance @ weight))

@@ -168,9 +168,9 @@ def _ended(fit: Fit) -> Finding | None:
         return None
     return Finding(
         "fit",
-        f"the search for the parameters ended {np.sqrt(left):.2g} standard errors from the best there is: no "
-        "parameters of this law describe the trials, and none of the figures below hold. Look at the S-curves of both time bins: "
-        "events that come late (latency of the read-out, a step that is slower than the first time bin) or are lost, "
+        f"the search for the parameters ended {np.sqrt(left):.2g} standard errors from the best: no parameters of "
+        "this law describe the trials, and no figure below holds. Look at the S-curves of both time bins: events "
+        "that come late (latency of the read-out, a step that is slower than the first time bin) or are lost, "
         "contrasts or lights that are not as stated.",
         None,
     )

@@ -100,7 +100,9 @@ class Counts:
 
 def log_prior(theta: float, mismatch: float, grid: NDArray) -> NDArray[np.float64]:
     """ln of how common each threshold of the grid is."""
-    weight = -0.5 * ((grid / theta - 1) / max(mismatch, 1e-4)) ** 2
+    # never narrower than the grid, so that the mean is told where thresholds hardly spread
+    spread = np.hypot(mismatch, (grid[1] - grid[0]) / theta)
+    weight = -0.5 * ((grid / theta - 1) / spread) ** 2
     return weight - logsumexp(weight)
 
 
