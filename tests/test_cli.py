@@ -457,13 +457,13 @@ def test_bad_input_of_lab_and_calibrate_is_one_line_and_writes_nothing(arguments
     assert list(tmp_path.iterdir()) == []
 
 
-def test_lab_says_what_it_leaves_out_and_keeps_what_is_there(capsys, tmp_path):
-    command = ["lab", "davis346", "--out", tmp_path / "o", "--roi", "16x16", "--frames", "8"]
+def test_lab_of_an_asynchronous_sensor_and_keeps_what_is_there(capsys, tmp_path):
+    command = ["lab", "davis346", "--out", tmp_path / "o", "--roi", "8x8", "--frames", "8", "--trials", "4"]
     status, out, _ = call(capsys, *command)
-    assert status == 0 and out.startswith("frames only: events of reference 'last_event'")
-    assert out.count("\n") == 4 and "evs_" not in out
+    assert status == 0 and "evs_noise_rate.npz" in out and "evs_s_curve.npz" in out
+    assert out.count("\n") == 5 and "evs_static" not in out
     assert "exists; give another name" in fails(capsys, *command)
-    assert call(capsys, *command, "--overwrite")[0] == 0
+    assert "trials is 3; expected 4 to 65535" in fails(capsys, *command[:-1], "3", "--overwrite")
 
 
 def test_isp_develops_a_recording(capsys, tmp_path):

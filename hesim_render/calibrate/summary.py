@@ -21,6 +21,8 @@ _EVS = {
     "theta_off": "θ₋",
     "threshold_mismatch": "threshold mismatch",
     "leak_per_trial": "leak per trial",
+    "leak_rate_hz": "leak",
+    "photoreceptor_cutoff_hz": "noise bandwidth",
 }
 
 
@@ -35,6 +37,7 @@ def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
     content = calibration[section]
     names = _APS if section == "aps" else _EVS
     lines = [_line(text, content[key]) for key, text in names.items() if key in content]
+    lines += [_line(f"noise at {item['signal_dn']:.4g} DN", item) for item in content.get("noise", [])]
     if section == "aps":
         values = [c for row in content["goodness"]["chi2_per_dof"] for c in row if c is not None]
         lines.append(f"{'β, χ²/dof':<20} {min(values):.3f} to {max(values):.3f} over {len(values)} tile positions")

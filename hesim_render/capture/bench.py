@@ -101,10 +101,8 @@ def set_up(
         If the illuminant is unknown or does not cover the response.
     """
     aps, evs = noise_models(sensor, without=without)
-    if evs is not None and evs.spec.reference == "last_event":
-        evs = None
     if aps is None and evs is None:
-        raise RangeError("sensor", sensor.name, "frame pixels, or event pixels with reference 'previous_sample'")
+        raise RangeError("sensor", sensor.name, "a sensor with frame or event pixels")
     one_lux = spectra.scale_to_lux(spectra.illuminant(illuminant), 1.0)
     per_lux = {
         name: float(photocurrent(one_lux.values / pi, one_lux.wavelength_nm, sensor, US_PER_S, filter=name))

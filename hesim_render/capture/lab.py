@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from hesim_render.capture.bench import Bench, set_up
+from hesim_render.capture.lab_trials import TrialBench, TrialPlan, plan_trials
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
@@ -38,7 +39,9 @@ LIT_EXPOSURES_US = (1000, 2000, 5000, 10000, 20000, 40000, 50000, 80000)
 _CONTRASTS, _REACH = 21, 2.0
 _LEAST_TRIALS = 50
 _FEWEST_FRAMES = 8
+_FEWEST_TRIALS = 4
 _FRAME_WORK = 8  # a frame takes about as long as so many ticks
+_NODES_PER_CUTOFF_PERIOD = 16  # of the noise of asynchronous pixels, each of which costs about as much as a tick
 
 
 def write_captures(
@@ -47,6 +50,7 @@ def write_captures(
     *,
     frames: int = 64,
     ticks: int = 20000,
+    trials: int = 20,
     seed: int = 7,
     without: Sequence[str] = (),
     dark_exposures_us: Sequence[int] = DARK_EXPOSURES_US,
@@ -60,11 +64,11 @@ def write_captures(
     Parameters
     ----------
     sensor : from `load_sensor`; crop it to capture a part. Frames are streamed to disk: memory does not grow with
-        their number. Of a sensor with reference ``last_event`` only frames are captured: it makes no comparisons at
-        fixed times, so its counts have no probability per trial.
+        their number.
     frames : per exposure, dark and lit.
     ticks : comparisons counted on the static target, and as many in the dark; the S-curve takes a
-        hundredth of them, 50 at least, at each of 21 contrasts.
+        hundredth of them, 50 at least, at each of 21 contrasts. Of sensors with fixed comparisons.
+    trials : after a reset, at each level of light and each step of contrast. Of sensors with reference ``last_event``.
     seed : of the temporal noise; every frame and tick of a session has its own number, so none repeats.
     without : noise terms to switch off, as in `simulate`.
     overwrite : replace a capture set that is there.
@@ -90,24 +94,32 @@ def write_captures(
         raise RangeError("frames", frames, f"{_FEWEST_FRAMES} or more, to get a variance")
     if not 1 <= ticks < 2**31:
         raise RangeError("ticks", ticks, "1 to 2^31 - 1")
+    if not _FEWEST_TRIALS <= trials < 2**16:
+        raise RangeError("trials", trials, f"{_FEWEST_TRIALS} to 65535")
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
     bench = set_up(sensor, lit_exposures_us, illuminant, without)
     session = _Session(bench, seed, progress)
     if bench.aps is not None:
         session.total += _FRAME_WORK * frames * (len(dark_exposures_us) + len(lit_exposures_us))
-    trials = max(_LEAST_TRIALS, ticks // 100)
-    if bench.evs is not None:
-        session.total += 2 * ticks + 2 * trials * _CONTRASTS
+    step_trials = max(_LEAST_TRIALS, ticks // 100)
+    plans: dict[str, TrialPlan] = {}
+    if bench.evs is not None and bench.evs.spec.reference == "last_event":
+        plans = plan_trials(bench.evs, trials)
+        session.total += sum(session.work_of(plan.duration_s) for plan in plans.values())
+    elif bench.evs is not None:
+        session.total += 2 * ticks + 2 * step_trials * _CONTRASTS
     folder = OutputFolder(out, CAPTURE_NAME, overwrite)
     try:
         with output_errors(folder.target):
             if bench.aps is not None:
                 session.write_frames(folder.path / "aps_dark.npz", dark_exposures_us, frames, 0.0)
                 session.write_frames(folder.path / "aps_lit.npz", lit_exposures_us, frames, 1.0)
-            if bench.evs is not None:
+            if plans:
+                session.write_trials(folder.path, plans)
+            elif bench.evs is not None:
                 session.write_static(folder.path / "evs_static.npz", ticks)
-                session.write_steps(folder.path / "evs_steps.npz", trials)
+                session.write_steps(folder.path / "evs_steps.npz", step_trials)
             _describe(bench, folder.path, illuminant, seed)
         return folder.commit()
     except BaseException:
@@ -125,6 +137,7 @@ class _Session:
     total: float = 0.0
     done: float = 0.0
     frame: int = 0
+    trial: int = 0
     t_us: int = 0
 
     def _advance(self, work: float, what: str) -> None:
@@ -183,6 +196,24 @@ class _Session:
             archive.add("n_trials", np.array(trials))
             for k, name in enumerate(("n_on", "n_off")):
                 archive.add_pieces(name, (len(counts), *level.shape), counts[0][k].dtype, (pair[k] for pair in counts))
+
+    def work_of(self, duration_s: float) -> float:
+        """What trials of asynchronous pixels cost, in ticks."""
+        assert self.bench.evs is not None and self.bench.evs.spec.photoreceptor_cutoff_hz is not None
+        return duration_s * _NODES_PER_CUTOFF_PERIOD * self.bench.evs.spec.photoreceptor_cutoff_hz
+
+    def write_trials(self, folder: Path, plans: dict[str, TrialPlan]) -> None:
+        """Trials after a reset, of asynchronous pixels."""
+        assert self.bench.evs is not None
+        for name, plan in plans.items():
+
+            def advance(seconds: float, name: str = name) -> None:
+                self._advance(self.work_of(seconds), name)
+
+            scale = self.bench.event_dn_per_e_per_s
+            bench = TrialBench(self.bench.evs, scale, self.seed, advance, self.t_us, self.trial)
+            bench.write(folder / f"{name}.npz", plan)
+            self.t_us, self.trial = bench.t_us, bench.count
 
     def _electrons(self, signal_dn: NDArray[np.float64]) -> Float:
         """Electrons of one event window, flat on the device."""

@@ -29,6 +29,9 @@ def lab(
     ] = "256x256",
     frames: Annotated[int, typer.Option(help="frames per exposure, dark and lit")] = 64,
     ticks: Annotated[int, typer.Option(help="event comparisons on the static target, and in the dark")] = 20000,
+    trials: Annotated[
+        int, typer.Option(help="trials after a reset, per light and contrast (asynchronous events)")
+    ] = 20,
     dark_ms: Annotated[str, typer.Option(help="dark exposures, ms")] = "1,5,20,50,80",
     lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
     illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
@@ -46,15 +49,10 @@ def lab(
     from hesim_render.sensor.sensor import load_sensor
 
     loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
-    if loaded.spec.evs is not None and loaded.spec.evs.reference == "last_event":
-        say(
-            "frames only: events of reference 'last_event' have no fixed comparisons to count, and their "
-            "calibration is not covered"
-        )
     with progress_report(f"lab {sensor}") as progress:
         folder = write_captures(
-            loaded, out, frames=frames, ticks=ticks, seed=seed, without=without or (), illuminant=illuminant,
-            overwrite=overwrite, progress=progress, **exposures,
+            loaded, out, frames=frames, ticks=ticks, trials=trials, seed=seed, without=without or (),
+            illuminant=illuminant, overwrite=overwrite, progress=progress, **exposures,
         )  # fmt: skip
     for file in sorted(folder.iterdir()):
         say(f"{file.stat().st_size / 1e6:10.1f} MB  {out / file.name}")

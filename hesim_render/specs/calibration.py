@@ -285,6 +285,8 @@ def _aps_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) 
 def _evs_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) -> dict[str, Any]:
     """In the gauge of the calibration, β2 = 1 V; θ is the file's own where the calibration could not tell it."""
     evs, own, capture = data["evs"], sensor["evs"], data["capture"]
+    if evs.get("reference") == "last_event":
+        return _asynchronous_values(sensor, data, file)
     if own.get("reference") != "previous_sample":
         raise SpecError("its events are of fixed comparisons; the sensor needs reference 'previous_sample'", file=file)
     theta_v = evs["theta_hardware_v"]
@@ -312,12 +314,35 @@ def _evs_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) 
     }
     if not isinstance(evs["theta_hardware_v"], Mapping):
         values["threshold_hardware_v"] = theta_v
-    if "signal_reference" in capture:
-        reference = capture["signal_reference"]
-        values["signal_reference"] = {
+    return values | _signal_reference(capture)
+
+
+def _asynchronous_values(sensor: Mapping[str, Any], data: Mapping[str, Any], file: Path) -> dict[str, Any]:
+    """Of a sensor without fixed comparisons: one set of coefficients for all positions, in the gauge β2 = 1 V."""
+    evs = data["evs"]
+    if sensor["evs"].get("reference") != "last_event":
+        raise SpecError("its events are of an asynchronous sensor; the sensor needs reference 'last_event'", file=file)
+    names = ("beta1", "beta2", "beta3", "beta4", "beta5")
+    return {
+        "contrast_threshold_on": _needed(evs["theta_on"], "evs.theta_on", file),
+        "contrast_threshold_off": _needed(evs["theta_off"], "evs.theta_off", file),
+        "threshold_mismatch_std": _needed(evs["threshold_mismatch"], "evs.threshold_mismatch", file),
+        "coefficients": [dict(zip(names, map(float, evs["beta"][0][1:]), strict=True))],
+        "shot_law": evs["shot_law"],
+        "leak_rate_hz": max(0.0, _needed(evs["leak_rate_hz"], "evs.leak_rate_hz", file)),
+        "photoreceptor_cutoff_hz": _needed(evs["photoreceptor_cutoff_hz"], "evs.photoreceptor_cutoff_hz", file),
+    } | _signal_reference(data["capture"])
+
+
+def _signal_reference(capture: Mapping[str, Any]) -> dict[str, Any]:
+    if "signal_reference" not in capture:
+        return {}
+    reference = capture["signal_reference"]
+    return {
+        "signal_reference": {
             "k_dn_per_e": reference["k"], "t_ref_us": reference["t_ref_us"], "filter": reference["filter"]
-        }  # fmt: skip
-    return values
+        }
+    }  # fmt: skip
 
 
 def _asymmetry(evs: Mapping[str, Any]) -> float:

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from hesim_render.calibrate.aps.calibration import describe
+from hesim_render.calibrate.asynchronous.analysis import analyse_trials
+from hesim_render.calibrate.asynchronous.trials import is_asynchronous
 from hesim_render.calibrate.evs.analysis import analyse, bootstrap_errors
-from hesim_render.calibrate.evs.counts import read_static
+from hesim_render.calibrate.evs.counts import event_tile, read_static
 from hesim_render.calibrate.moments import Progress
-from hesim_render.recording.capture_set import read_captures
+from hesim_render.core.errors import RangeError
+from hesim_render.recording.capture_set import CaptureSet, read_captures
 
 
 def calibrate_evs(
@@ -24,12 +30,14 @@ def calibrate_evs(
 
     Parameters
     ----------
-    folder : capture set with ``capture.yaml``, ``evs_static.npz`` and, for θ, ``evs_steps.npz``.
+    folder : capture set with ``capture.yaml``, ``evs_static.npz`` and, for θ, ``evs_steps.npz``; of an asynchronous
+        sensor ``evs_noise_rate.npz`` and ``evs_s_curve.npz``.
     out : the calibration; its section ``evs`` is written, others are kept. Where ``evs_static.npz`` has no
         ``signal_dn``, the composite in its section ``aps`` is the signal: frames of the same scene.
     report : HTML file, if one is wanted; it covers every section of `out`, and a report of `out` is replaced.
     progress : called with what is being done and the fraction done.
-    bootstrap : number of resamplings of the pixels for a second opinion on the standard errors.
+    bootstrap : number of resamplings of the pixels for a second opinion on the standard errors; of sensors with fixed
+        comparisons only.
     seed : of the multi-start study and the bootstrap.
     overwrite : replace a report of another calibration.
 
@@ -39,12 +47,13 @@ def calibrate_evs(
 
     Raises
     ------
+    RangeError
+        For a bootstrap of an asynchronous sensor.
     SpecError
         If the captures cannot be used; the message says what to capture instead.
     OutputError
         If a result cannot be written.
     """
-    from hesim_render.calibrate.evs.output import content, maps
     from hesim_render.calibrate.result import check_calibration, check_report, write_section
 
     captures = read_captures(folder)
@@ -53,14 +62,40 @@ def calibrate_evs(
         check_report(out, report, overwrite)
     tell = progress or (lambda what, fraction: None)
     tell("reading event counts", 0.0)
-    static = read_static(captures, out)
-    result = analyse(captures, static, seed, tell)
-    errors = bootstrap_errors(result, bootstrap, seed) if bootstrap else None
+    if is_asynchronous(captures):
+        if bootstrap:
+            raise RangeError(
+                "bootstrap", bootstrap, "0 for an asynchronous sensor: its errors are the pixels' own scatter"
+            )
+        section, maps = _asynchronous(captures, seed, tell)
+    else:
+        section, maps = _fixed_ticks(captures, out, tell, bootstrap, seed)
     tell("writing", 0.95)
-    write_section(out, "evs", describe(captures), content(captures, result, errors), maps(result))
+    write_section(out, "evs", describe(captures), section, maps)
     if report is not None:
         from hesim_render.calibrate.report.page import write_report
 
         write_report(out, report, overwrite)
     tell("done", 1.0)
     return Path(out)
+
+
+def _fixed_ticks(
+    captures: CaptureSet, out: str | Path, tell: Progress, bootstrap: int, seed: int
+) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Section and maps of a sensor of fixed comparisons."""
+    from hesim_render.calibrate.evs.output import content, maps
+
+    static = read_static(captures, out)
+    result = analyse(captures, static, seed, tell)
+    errors = bootstrap_errors(result, bootstrap, seed) if bootstrap else None
+    return content(captures, result, errors), maps(result)
+
+
+def _asynchronous(captures: CaptureSet, seed: int, tell: Progress) -> tuple[dict[str, Any], dict[str, NDArray]]:
+    """Section and maps of a sensor without fixed comparisons."""
+    from hesim_render.calibrate.asynchronous.output import content, maps
+
+    result = analyse_trials(captures, seed, tell)
+    event_tile(captures, result.steps.shape)
+    return content(result), maps(result)

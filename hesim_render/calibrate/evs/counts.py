@@ -60,14 +60,6 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
         If arrays are missing or do not fit each other, or the counts hold nothing to fit.
     """
     file = captures.folder / "evs_static.npz"
-    evs = captures.sensor.evs if captures.sensor is not None else None
-    if evs is not None and evs.reference == "last_event":
-        raise SpecError(
-            "sensors with reference 'last_event' make no comparisons at fixed times: their counts have no probability "
-            "per trial, and their events cannot be calibrated",
-            file=captures.folder / "capture.yaml",
-            key="sensor",
-        )
     data = captures.arrays("evs_static", ("n_on", "n_off", "n_trials"))
     signal = np.asarray(data["signal_dn"]) if "signal_dn" in data else _composite_signal(captures, calibration, file)
     if signal.ndim != 2 or signal.dtype.kind not in "uif" or signal.size == 0:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import binom, poisson
 
+from hesim_render.calibrate.defect import Defect
 from hesim_render.calibrate.evs.counts import StaticCapture
 from hesim_render.calibrate.evs.medians import (
     LEAST_EVENTS,
@@ -28,16 +28,6 @@ _CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06
 _FEWEST = 200
 #: Standard errors by which counts of one pixel differ where it does not stay as it is.
 _SIGMAS = 6.0
-
-
-class Defect(IntEnum):
-    """What a pixel does; values are those of the map ``defect``."""
-
-    NONE = 0
-    STUCK = 1  # gives no event at all
-    HOT = 2  # gives events at a steady rate of its own
-    FLICKERING = 3  # gives events at a rate that comes and goes
-    OTHER = 4  # its counts are unlike those of any threshold; nothing more is known
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from hesim_render.calibrate.report.asynchronous import asynchronous_section
 from hesim_render.calibrate.report.drawing import report_style
 from hesim_render.calibrate.report.events import evs_section
 from hesim_render.calibrate.report.frames import aps_section
@@ -47,7 +48,8 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
         if "aps" in data:
             parts.append(aps_section(data["aps"], read_maps(calibration, "aps", data)))
         if "evs" in data:
-            parts.append(evs_section(data["evs"], read_maps(calibration, "evs", data)))
+            draw = asynchronous_section if data["evs"].get("reference") == "last_event" else evs_section
+            parts.append(draw(data["evs"], read_maps(calibration, "evs", data)))
     body = "\n".join(parts)
     page = (
         f'{report_beginning(calibration)}"><title>Noise calibration</title>'

@@ -119,7 +119,8 @@ class LeakProcess:
         import drjit as dr
 
         self._count = dr.zeros(jit().UInt32, dr.width(self._key))
-        self._due_us = self._wait_us(self._key, self._count) + float(t_us)
+        # opaque: a time written into the kernel would have it compiled again at every one
+        self._due_us = self._wait_us(self._key, self._count) + dr.opaque(jit().Float64, float(t_us))
         dr.eval(self._due_us)
 
     def until(self, t_us: float) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint32]]]:
@@ -127,7 +128,8 @@ class LeakProcess:
         import drjit as dr
 
         types = jit()
-        pixel: UInt32 = dr.compress(self._due_us <= float(t_us))
+        end_us = dr.opaque(types.Float64, float(t_us))
+        pixel: UInt32 = dr.compress(self._due_us <= end_us)
         while dr.width(pixel):
             due_us = dr.gather(types.Float64, self._due_us, pixel)
             count = dr.gather(types.UInt32, self._count, pixel) + 1
@@ -136,5 +138,5 @@ class LeakProcess:
             dr.scatter(self._due_us, following, pixel)
             dr.scatter(self._count, count, pixel)
             yield np.array(due_us), np.array(pixel)
-            again: UInt32 = dr.compress(following <= float(t_us))
+            again: UInt32 = dr.compress(following <= end_us)
             pixel = dr.gather(types.UInt32, pixel, again)

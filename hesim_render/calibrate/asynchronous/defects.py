@@ -1,0 +1,114 @@
+"""Asynchronous event pixels unlike the others: found by what no threshold they may have could give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import poisson
+
+from hesim_render.calibrate.asynchronous.fit import Fit
+from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
+from hesim_render.calibrate.asynchronous.trials import Trials
+from hesim_render.calibrate.defect import Defect
+
+#: Chance with which a good pixel's counts may be called bad.
+_CHANCE = 1e-7
+#: Where more pixels than this part fail one test, the model is wrong and not the pixels: the checks tell it.
+_MOST_BAD = 0.02
+#: Part of the trials in the brightest light in which a good pixel is calm while settling.
+_CALM = 0.5
+#: Chances beyond which an event is surely there, or surely not.
+_SURE = 0.02
+#: Pixels looked at together.
+_CHUNK = 8192
+
+
+@dataclass(frozen=True)
+class TrialDefects:
+    """Bad pixels, flat arrays: all of them, `Defect` of each, and events per second of hot ones, 0 elsewhere."""
+
+    bad: NDArray[np.bool_]
+    kind: NDArray[np.uint8]
+    on_hz: NDArray[np.float32]
+    off_hz: NDArray[np.float32]
+
+
+def plainly_bad(steady: Trials, steps: Trials) -> NDArray[np.bool_]:
+    """Pixels [pixel] that lack a polarity, are never calm, or have events of their own in the brightest light."""
+    bad = (steps.on.sum(axis=(0, 1)) == 0) | (steps.off.sum(axis=(0, 1)) == 0)
+    for trials in (steady, steps):
+        bright = trials.signal_dn == trials.signal_dn.max()
+        most = trials.calm[bright].max(axis=1).sum()
+        bad |= trials.calm[bright].sum(axis=0) < _CALM * most
+    k = int(np.argmax(steady.signal_dn))
+    for events in (n[k].sum(axis=0, dtype=np.float64) for n in (steady.on, steady.off)):
+        usual = np.minimum(events, np.quantile(events, 0.99) + 1).mean()
+        bad |= poisson.sf(events - 1, max(usual, 1.0 / events.size)) < _CHANCE
+    return bad
+
+
+def unlike(fit: Fit, steady: Trials, steps: Trials, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Good pixels [pixel] whose counts no threshold that their S-curve allows could give.
+
+    Three tests of each polarity: too many events in steady light, events lost of steps that surely give one, and
+    events of steps that surely give none.
+    """
+    found = np.zeros((6, good.size), bool)
+    pixels = np.flatnonzero(good)
+    for begin in range(0, pixels.size, _CHUNK):
+        some = pixels[begin : begin + _CHUNK]
+        for k, polarity in enumerate((1, -1)):
+            found[3 * k : 3 * k + 3, some] = _tests(fit, steady.of(some), steps.of(some), polarity)
+    wrong = found[found.sum(axis=1) <= _MOST_BAD * pixels.size]
+    return np.any(wrong, axis=0) if wrong.size else np.zeros(good.size, bool)
+
+
+def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np.bool_]:
+    """[test, pixel]."""
+    k = 0 if polarity > 0 else 1
+    grid = fit.likelihood.grids[k]
+    counts = Counts.of([steps], polarity)
+    log = counts.log_likelihood(fit.values, grid, fit.law)
+    log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
+    weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    chance = chances(fit.values, counts.sets[0], polarity, grid, fit.law).sum(axis=1)  # [kind, threshold]
+    events = counts.events.reshape(log.shape[0], chance.shape[0], -1).sum(axis=2)
+    trials = events + counts.silent
+    sure, never = chance > 1 - _SURE, chance < _SURE
+    quiet = Counts.of([steady], polarity)
+    seen = quiet.events.sum(axis=1, keepdims=True)
+    usual = chances(fit.values, quiet.sets[0], polarity, grid, fit.law).sum(axis=1)
+    bins = len(steady.edges_s) - 1
+    own = quiet.events.reshape(log.shape[0], -1, bins).sum(axis=2) + quiet.silent
+    tests = (
+        (np.broadcast_to(seen, log.shape), own @ usual),
+        (counts.silent @ sure, trials @ (sure * (1 - chance))),
+        (events @ never, trials @ (never * chance)),
+    )
+    return np.array(
+        [np.sum(weight * poisson.sf(n - 1, np.maximum(mean, 1e-12)), axis=1) < _CHANCE for n, mean in tests]
+    )
+
+
+def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefects:
+    """Name what bad pixels do."""
+    kind = np.zeros(bad.size, np.uint8)
+    on_hz, off_hz = np.zeros((2, bad.size), np.float32)
+    some = np.flatnonzero(bad)
+    if some.size == 0:
+        return TrialDefects(bad, kind, on_hz, off_hz)
+    ours, light = steady.of(some), int(np.argmax(steady.signal_dn))
+    seconds = max(float(steady.calm[light].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
+    duration = np.maximum(ours.calm[light] * steady.edges_s[-1], 1e-12)
+    never_calm = ours.calm[light] < _CALM * steady.calm[light].max()
+    rates = [np.where(never_calm, 0, n[light].sum(axis=0, dtype=np.float64)) / duration for n in (ours.on, ours.off)]
+    usual = [float(n[light].sum(dtype=np.float64)) / seconds for n in (steady.on, steady.off)]
+    excess = [poisson.sf(r * duration - 1, max(u, 1e-9) * duration) < 1e-3 for r, u in zip(rates, usual, strict=True)]
+    hot = never_calm | excess[0] | excess[1]
+    silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm
+    kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
+    on_hz[some], off_hz[some] = (np.where(hot & e, r, 0) for e, r in zip(excess, rates, strict=True))
+    return TrialDefects(bad, kind, on_hz, off_hz)

@@ -1,0 +1,179 @@
+"""Captures of an asynchronous sensor: the first event of each pixel after a reset, in steady light and after steps.
+
+``evs_noise_rate.npz`` (steady light) and ``evs_s_curve.npz`` (steps of contrast) hold the same arrays, of uniform
+light. A trial begins with a reset of the pixels; ``settle_us`` later comes the step of light, and then the time bins
+bounded by ``edges_us``. A pixel without an event while settling was calm; its first event after that falls into one of
+the bins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.core.npz import read_arrays
+from hesim_render.core.units import S_PER_US
+from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, number
+
+NOISE_RATE, S_CURVE = "evs_noise_rate", "evs_s_curve"
+_ARRAYS = ("signal_dn", "settle_us", "edges_us", "n_calm", "n_on", "n_off")
+#: Largest |ln I₁/I₀| of a step.
+_LARGEST_CONTRAST = 20.0
+#: Part of all trials that must be calm.
+_LEAST_CALM = 0.2
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Trials of one file; kinds differ in light and step, pixels are in row-major order.
+
+    Attributes
+    ----------
+    signal_dn, contrast : [kind], light before the step and ln I₁/I₀; 0 in steady light.
+    settle_s : from reset to step. edges_s : [bin + 1], bounds of the time bins after the step, the first 0.
+    calm : [kind, pixel], trials without an event while settling.
+    on, off : [kind, bin, pixel], those of them whose first event after it is of this polarity and in this bin.
+    shape : (rows, cols) of the event grid.
+    """
+
+    signal_dn: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    settle_s: float
+    edges_s: NDArray[np.float64]
+    calm: NDArray[np.integer]
+    on: NDArray[np.integer]
+    off: NDArray[np.integer]
+    shape: tuple[int, int]
+
+    def of(self, pixels: NDArray) -> Trials:
+        """Of some pixels: indices or a mask."""
+        return Trials(
+            self.signal_dn, self.contrast, self.settle_s, self.edges_s, self.calm[:, pixels], self.on[..., pixels],
+            self.off[..., pixels], self.shape,
+        )  # fmt: skip
+
+    def towards(self, polarity: int) -> Trials:
+        """Without steps towards the other polarity."""
+        kinds = np.flatnonzero(np.sign(self.contrast) != -polarity)
+        return Trials(
+            self.signal_dn[kinds], self.contrast[kinds], self.settle_s, self.edges_s, self.calm[kinds], self.on[kinds],
+            self.off[kinds], self.shape,
+        )  # fmt: skip
+
+    def events(self, polarity: int) -> NDArray[np.integer]:
+        return self.on if polarity > 0 else self.off
+
+
+def is_asynchronous(captures: CaptureSet) -> bool:
+    """Whether the event captures are trials after a reset.
+
+    Raises
+    ------
+    SpecError
+        If they are not what the sensor needs.
+    """
+    found = captures.has(S_CURVE) or captures.has(NOISE_RATE)
+    evs = captures.sensor.evs if captures.sensor is not None else None
+    if evs is not None and evs.reference == "previous_sample" and found:
+        raise SpecError(
+            "its sensor compares at fixed ticks: capture evs_static.npz and evs_steps.npz, not trials after a reset",
+            file=captures.folder / "capture.yaml",
+            key="sensor",
+        )
+    if evs is not None and evs.reference == "last_event" and not found and captures.has("evs_static"):
+        raise SpecError(
+            "its sensor has reference 'last_event', without comparisons at fixed ticks: capture trials after a reset, "
+            f"{NOISE_RATE}.npz and {S_CURVE}.npz",
+            file=captures.folder / "capture.yaml",
+            key="sensor",
+        )
+    return found or (evs is not None and evs.reference == "last_event")
+
+
+def read_trials(captures: CaptureSet) -> tuple[Trials, Trials]:
+    """Trials in steady light, and with steps.
+
+    Raises
+    ------
+    SpecError
+        If a file is missing, damaged or not as it must be; the message says what to capture instead.
+    """
+    for name, what in (
+        (NOISE_RATE, "trials after a reset in steady light, from dark to bright"),
+        (S_CURVE, "trials after a reset with steps of contrast up and down"),
+    ):
+        if not captures.has(name):
+            raise SpecError(f"no such file; capture {what}", file=captures.folder / f"{name}.npz")
+    steady, steps = (_read(captures.folder / f"{name}.npz", name == S_CURVE) for name in (NOISE_RATE, S_CURVE))
+    if steady.shape != steps.shape:
+        raise SpecError(
+            f"is of {steps.shape[0]}×{steps.shape[1]} pixels, {NOISE_RATE}.npz of {steady.shape[0]}×{steady.shape[1]}",
+            file=captures.folder / f"{S_CURVE}.npz",
+        )
+    return steady, steps
+
+
+def _read(file: Path, has_steps: bool) -> Trials:
+    arrays = read_arrays(file, (*_ARRAYS, *(("contrast",) if has_steps else ())), kinds="uif")
+    signal = _list(arrays["signal_dn"], "signal_dn", file)
+    if not np.all((signal >= 0) & (signal <= BRIGHTEST_DN)):
+        raise SpecError(SIGNAL_RANGE, file=file)
+    contrast = _list(arrays.get("contrast", np.zeros(signal.size)), "contrast", file)
+    if contrast.shape != signal.shape:
+        raise SpecError(f"contrast has {contrast.size} values, signal_dn {signal.size}; each kind needs one", file=file)
+    if np.abs(contrast).max() > _LARGEST_CONTRAST:
+        raise SpecError(f"contrast, ln I₁/I₀, must lie within ±{_LARGEST_CONTRAST:g}", file=file)
+    if has_steps and not (np.any(contrast > 0) and np.any(contrast < 0)):
+        raise SpecError("contrast must hold steps up, which tell θ₊, and down, which tell θ₋", file=file)
+    if has_steps and (np.any(contrast == 0) or np.any(signal == 0)):
+        raise SpecError(
+            f"a step needs light before it and a contrast; steady light goes into {NOISE_RATE}.npz", file=file
+        )
+    if not has_steps and np.any(contrast != 0):
+        raise SpecError(f"contrast must be 0 in steady light; steps go into {S_CURVE}.npz", file=file)
+    settle_s = number(arrays["settle_us"], "settle_us", file) * S_PER_US
+    edges = _list(arrays["edges_us"], "edges_us", file)
+    if edges.size < 2 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
+        raise SpecError(
+            "edges_us must begin with 0, the time of the step, and rise: bounds of the time bins", file=file
+        )
+    calm, on, off = (arrays[name] for name in ("n_calm", "n_on", "n_off"))
+    if calm.ndim != 3 or calm.size == 0 or len(calm) != signal.size:
+        raise SpecError(f"n_calm has shape {calm.shape}; expected [{signal.size} kinds of trials, row, col]", file=file)
+    wanted = (signal.size, edges.size - 1, *calm.shape[1:])
+    for name, values in (("n_calm", calm), ("n_on", on), ("n_off", off)):
+        if values.dtype.kind not in "ui":
+            raise SpecError(f"{name} holds {values.dtype.name}; save whole numbers of trials", file=file)
+        if values is not calm and values.shape != wanted:
+            raise SpecError(
+                f"{name} has shape {values.shape}; expected {wanted}: [kind, time bin, row, col]", file=file
+            )
+        if values.min() < 0 or values.max() >= 2**31:
+            raise SpecError(f"{name} holds numbers below 0, or beyond 2^31", file=file)
+    events = on.sum(axis=1, dtype=np.int64) + off.sum(axis=1, dtype=np.int64)
+    if np.any(events > calm):
+        raise SpecError("n_on and n_off hold more trials together than n_calm: count first events only", file=file)
+    if calm.sum(dtype=np.float64) < _LEAST_CALM * calm.max(axis=(1, 2)).sum(dtype=np.float64) * calm[0].size:
+        raise SpecError(
+            "fewer than a fifth of the trials are calm while settling; shorten settle_us, raise the thresholds, or "
+            "take brighter light",
+            file=file,
+        )
+    if has_steps and not (on.any() and off.any()):
+        raise SpecError("holds no event of one polarity; take steps of up to twice the threshold", file=file)
+    count = len(calm)
+    return Trials(
+        signal, contrast, settle_s, edges * S_PER_US, calm.reshape(count, -1), on.reshape(*wanted[:2], -1),
+        off.reshape(*wanted[:2], -1), (calm.shape[1], calm.shape[2]),
+    )  # fmt: skip
+
+
+def _list(values: NDArray, name: str, file: Path) -> NDArray[np.float64]:
+    found = values.astype(np.float64)
+    if found.ndim != 1 or found.size == 0 or not np.all(np.isfinite(found)):
+        raise SpecError(f"{name} must be a list of finite numbers", file=file)
+    return found

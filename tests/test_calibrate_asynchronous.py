@@ -1,0 +1,374 @@
+"""Calibration of asynchronous event pixels, against trials written out in NumPy, closed forms and the event stage."""
+
+import numpy as np
+import pytest
+import reset_captures
+from reset_captures import Pixels
+from scipy.special import ndtr
+from scipy.stats import binom
+
+import hesim_render as hr
+from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate.asynchronous.first_event import first_event
+from hesim_render.calibrate.defect import Defect
+from hesim_render.capture.lab import write_captures
+from hesim_render.core.errors import RangeError, SpecError
+
+TRUTH = Pixels()
+
+
+def scores(section, pixels):
+    """Deviation in standard errors of every parameter."""
+    found = {
+        name: (section[name]["value"], section[name]["standard_error"], truth)
+        for name, truth in (
+            ("theta_on", pixels.theta_on), ("theta_off", pixels.theta_off), ("threshold_mismatch", pixels.mismatch),
+            ("photoreceptor_cutoff_hz", pixels.cutoff_hz), ("leak_rate_hz", pixels.leak_hz),
+        )
+    }  # fmt: skip
+    beta, error = section["beta"][0], section["beta_standard_error"][0]
+    for name, k, truth in (("response", 1, pixels.r), ("shot", 3, pixels.shot), ("dark", 4, pixels.dark)):
+        found[name] = beta[k], error[k], truth
+    return {name: (value - truth) / error for name, (value, error, truth) in found.items()}
+
+
+# ---- the law of the first event ----------------------------------------------------------------------
+
+
+def test_right_after_a_step_the_s_curve_is_a_probit():
+    """Φ((S − θ)/√(σ₀² + σ₁²)), once noise has forgotten the reset; nothing is lost while settling at θ = 10 σ."""
+    step = np.linspace(0.1, 0.3, 21)
+    before, after = 0.02, 0.015
+    own, other = first_event(0.2, 0.25, step, (before, after), 300.0, 0.02, np.array([0, 1e-9]), (0.0, 0.0))
+    assert own[0] == pytest.approx(ndtr((step - 0.2) / np.hypot(before, after)), abs=2e-5)
+    assert other.max() < 1e-12
+
+
+def test_leak_alone_is_a_poisson_process():
+    own, other = first_event(
+        1.0, 1.0, np.zeros(1), (np.full(1, 0.01),) * 2, 300.0, 0.01, np.array([0, 0.5, 2.0]), (0.7, 0.0)
+    )
+    assert own[:, 0] == pytest.approx([1 - np.exp(-0.35), np.exp(-0.35) - np.exp(-1.4)], rel=1e-9)
+    assert other.max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("light", "contrast", "theta_on", "theta_off"),
+    [(400.0, 0.2, 0.2, 0.2), (15.0, -0.25, 0.2, 0.2), (0.0, 0.0, 0.15, 0.17), (0.0, 0.0, 0.2, 0.13)],
+)
+def test_chances_are_those_of_trials_written_out(light, contrast, theta_on, theta_off):
+    """40,000 trials in NumPy; ON and OFF in each bin within 4.5 binomial standard errors and 4 % (rates of the law).
+
+    16 numbers: a false alarm in 9,000 runs.
+    """
+    pixels, count = Pixels(leak_hz=0.0), 40_000
+    period = 1 / pixels.cutoff_hz
+    edges = np.array([0, 0.03, 1.25, 4.0]) * period
+    calm, on, off = reset_captures.trials(
+        pixels, np.array([theta_on]), np.array([theta_off]), light, contrast, 0.75 * period, edges, count,
+        np.random.default_rng(11),
+    )  # fmt: skip
+    step = np.array([pixels.step(light, contrast)])
+    noise = np.array([pixels.sigma(light)]), np.array([pixels.sigma(light * np.exp(contrast))])
+    own, other = first_event(theta_on, theta_off, step, noise, pixels.cutoff_hz, 0.75 * period, edges, (0.0, 0.0))
+    for counted, chance in ((on, own), (off, other)):
+        expected = calm[0] * chance[:, 0]
+        error = np.sqrt(expected * (1 - chance[:, 0]) + 1)
+        law = 0.04 * expected * (1 - chance[:, 0])
+        assert np.all(np.abs(counted[:, 0] - expected) < 4.5 * error + law)
+
+
+# ---- the fit -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plain")
+    on, off = reset_captures.write(folder, TRUTH, np.random.default_rng(1))
+    calibrate_evs(folder, folder / "calibration.yaml", folder / "report.html")
+    return (
+        folder,
+        read_calibration(folder / "calibration.yaml")["evs"],
+        read_maps(folder / "calibration.yaml", "evs"),
+        on,
+        off,
+    )
+
+
+def test_every_parameter_is_recovered(plain):
+    """15 % mismatch; eight parameters within 3.5 standard errors: a false alarm in 270 seeds, and the seed is fixed."""
+    _, section, _, _, _ = plain
+    assert max(abs(z) for z in scores(section, TRUTH).values()) < 3.5
+    assert section["shot_law"] == "sqrt" and section["shot_law_decisive"]
+    assert section["threshold_mismatch"]["standard_error"] < 0.02 * TRUTH.mismatch
+    assert section["photoreceptor_cutoff_hz"]["standard_error"] < 0.03 * TRUTH.cutoff_hz
+    for item in section["noise"]:
+        assert item["value"] == pytest.approx(TRUTH.sigma(item["signal_dn"]), rel=0.02)
+
+
+def test_the_fit_describes_the_trials_and_calls_no_pixel_bad(plain):
+    _, section, maps, _, _ = plain
+    assert section["findings"] == [] and section["goodness"]["p_value"] > 1e-3
+    assert 0.4 < section["goodness"]["chi2_per_dof"] < 1.6
+    assert section["bad_pixels"] == 0 and not maps["bad_pixels"].any() and not maps["defect"].any()
+
+
+def test_each_pixel_has_its_own_threshold_and_error(plain):
+    """z of 1024 pixels: mean and standard deviation as of a normal law (5 σ: 0.16 and 0.11)."""
+    _, section, maps, on, off = plain
+    for name, truth in (("on", on), ("off", off)):
+        found = maps[f"threshold_{name}_relative"].ravel() * section[f"theta_{name}"]["value"]
+        error = maps[f"threshold_{name}_noise"].ravel() * section[f"theta_{name}"]["value"]
+        z = (found - truth) / error
+        assert abs(z.mean()) < 0.3 and z.std() == pytest.approx(1.0, abs=0.12)
+        assert np.median(error) < 0.05 * truth.mean()
+
+
+def test_report_shows_curves_rates_and_maps(plain):
+    folder, section, maps, _, _ = plain
+    page = (folder / "report.html").read_text()
+    for text in ("S-curves, ON", "S-curves, OFF", "Events in steady light", "noise bandwidth", "mismatch of θ₊"):
+        assert text in page
+    assert "{&#x27;" not in page and "nan" not in page
+    rows = maps["figure_s_curves"]
+    assert set(rows[:, 0]) == {1.0, -1.0} and np.all(rows[:, 4] <= rows[:, 5])
+    first = rows[rows[:, 3] == 0]
+    z = (first[:, 4] - first[:, 5] * first[:, 6]) / np.sqrt(first[:, 5] * 0.25)
+    assert np.abs(z).max() < 12  # pixels share their thresholds: wider than binomial
+    assert np.all(maps["figure_noise_rate"][:, 3] > 0) and section["fitted_pixels"] == 1024
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mismatch", "law"), [(0.0, "linear"), (0.25, "sqrt")])
+def test_other_mismatches_and_the_other_shot_law(tmp_path, mismatch, law):
+    """None and 25 %; the linear law's shot noise is large against dark noise at the step's light."""
+    pixels = Pixels(mismatch=mismatch, law=law, shot=0.03 if law == "sqrt" else 0.008)
+    reset_captures.write(tmp_path, pixels, np.random.default_rng(3), count=8)
+    calibrate_evs(tmp_path, tmp_path / "c.yaml")
+    section = read_calibration(tmp_path / "c.yaml")["evs"]
+    assert section["shot_law"] == law and section["bad_pixels"] == 0
+    if mismatch:
+        item = section["threshold_mismatch"]
+        assert abs(item["value"] - mismatch) < 3.5 * item["standard_error"]
+    else:
+        assert section["threshold_mismatch"]["value"] < 0.01
+    for name, truth in (("theta_on", pixels.theta_on), ("theta_off", pixels.theta_off)):
+        assert abs(section[name]["value"] - truth) < 3.5 * section[name]["standard_error"]
+
+
+# ---- captures that are not as the model supposes -----------------------------------------------------
+
+
+@pytest.mark.slow
+def test_stuck_hot_and_odd_pixels_are_found_and_no_other(tmp_path):
+    def change(name, calm, on, off):
+        on[..., 5] = off[..., 5] = 0  # stuck
+        if name == "evs_noise_rate":
+            on[:, 0, 77] = calm[:, 77] // 2  # hot: 7 events a second
+            off[:, 0, 77] = 0
+        else:
+            lost = on[..., 300] // 2  # half of its events are lost
+            on[..., 300] -= lost
+
+    reset_captures.write(tmp_path, TRUTH, np.random.default_rng(4), change=change)
+    calibrate_evs(tmp_path, tmp_path / "c.yaml")
+    maps = read_maps(tmp_path / "c.yaml", "evs")
+    section = read_calibration(tmp_path / "c.yaml")["evs"]
+    assert np.flatnonzero(maps["bad_pixels"]).tolist() == [5, 77, 300]
+    kinds = maps["defect"].ravel()
+    assert (kinds[5], kinds[77], kinds[300]) == (Defect.STUCK, Defect.HOT, Defect.OTHER)
+    assert maps["defect_on_hz"].ravel()[77] == pytest.approx(0.5 / (20 / 300), rel=0.2)
+    assert max(abs(z) for z in scores(section, TRUTH).values()) < 4
+
+
+def ceiling(name, calm, on, off, rng=np.random.default_rng(8)):  # noqa: B008
+    if name == "evs_s_curve":
+        on[:], off[:] = binom.rvs(on, 0.9, random_state=rng), binom.rvs(off, 0.9, random_state=rng)
+
+
+def floor(name, calm, on, off, rng=np.random.default_rng(9)):  # noqa: B008
+    if name == "evs_s_curve":
+        more = binom.rvs(calm - on.sum(axis=1) - off.sum(axis=1), 0.004, random_state=rng)
+        off[:, 1] += more
+
+
+def flicker(name, calm, on, off, rng=np.random.default_rng(10)):  # noqa: B008
+    if name == "evs_noise_rate":
+        off[:, 0] += binom.rvs(calm - on.sum(axis=1) - off.sum(axis=1), 0.02, random_state=rng)
+
+
+def late(name, calm, on, off, rng=np.random.default_rng(12)):  # noqa: B008
+    if name == "evs_s_curve":  # the read-out's latency takes a fifth of the first events into the later bin
+        for events in (on, off):
+            moved = binom.rvs(events[:, 0], 0.2, random_state=rng)
+            events[:, 0] -= moved
+            events[:, 1] += moved
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        pytest.param(ceiling, "S-curve ceiling", marks=pytest.mark.slow),
+        pytest.param(floor, "S-curve floor", marks=pytest.mark.slow),
+        pytest.param(flicker, "noise rate", marks=pytest.mark.slow),
+        (late, "fit"),
+    ],
+)  # fmt: skip
+def test_what_breaks_the_model_is_named(tmp_path, change, wanted):
+    reset_captures.write(tmp_path, TRUTH, np.random.default_rng(6), change=change, count=8)
+    calibrate_evs(tmp_path, tmp_path / "c.yaml")
+    found = {f["check"]: f for f in read_calibration(tmp_path / "c.yaml")["evs"]["findings"]}
+    assert wanted in found
+    assert wanted == "fit" or found[wanted]["p_value"] < 1e-6
+
+
+# ---- files -------------------------------------------------------------------------------------------
+
+
+def spoiled(folder, target, name, **arrays):
+    target.mkdir()
+    for file in folder.glob("evs_*.npz"):
+        data = dict(np.load(file))
+        if file.stem == name:
+            data = {k: v for k, v in (data | arrays).items() if v is not None}
+        np.savez(target / file.name, **data)
+    (target / "capture.yaml").write_text((folder / "capture.yaml").read_text())
+    return target
+
+
+@pytest.mark.parametrize(
+    ("name", "arrays", "text"),
+    [
+        ("evs_s_curve", {"n_on": None}, "holds no array 'n_on'"),
+        ("evs_s_curve", {"contrast": None}, "holds no array 'contrast'"),
+        ("evs_s_curve", {"contrast": np.full(32, np.nan)}, "contrast must be a list of finite numbers"),
+        ("evs_s_curve", {"contrast": np.full(32, 0.1)}, "steps up, which tell"),
+        ("evs_s_curve", {"contrast": np.ones(3)}, "contrast has 3 values, signal_dn 32"),
+        ("evs_s_curve", {"signal_dn": np.full(32, -1.0)}, "signal_dn must be 0 or above"),
+        ("evs_s_curve", {"edges_us": np.array([5.0, 2.0, 9.0])}, "edges_us must begin with 0"),
+        ("evs_s_curve", {"settle_us": np.array("soon")}, "settle_us holds"),
+        ("evs_s_curve", {"n_calm": np.zeros((32, 4), int)}, r"n_calm has shape \(32, 4\)"),
+        ("evs_s_curve", {"n_on": np.zeros((32, 1, 32, 32), int)}, "n_on has shape"),
+        ("evs_s_curve", {"n_on": np.full((32, 2, 32, 32), 9000)}, "more trials together than n_calm"),
+        ("evs_s_curve", {"n_on": np.full((32, 2, 32, 32), -1)}, "numbers below 0"),
+        ("evs_s_curve", {"n_calm": np.zeros((32, 32, 32)) + 0.5}, "save whole numbers"),
+        ("evs_noise_rate", {"contrast": np.array([0, 0.1, 0])}, "contrast must be 0 in steady light"),
+        ("evs_noise_rate", {"signal_dn": np.array([np.inf, 1, 2])}, "signal_dn must be a list of finite"),
+    ],
+)
+def test_files_that_are_not_as_they_must_be_are_refused(plain, tmp_path, name, arrays, text):
+    folder = spoiled(plain[0], tmp_path / "set", name, **arrays)
+    with pytest.raises(SpecError, match=text) as error:
+        calibrate_evs(folder, tmp_path / "c.yaml")
+    assert str(error.value).startswith(str(folder / f"{name}.npz"))
+    assert not (tmp_path / "c.yaml").exists()
+
+
+def test_sets_that_lack_a_file_or_belong_to_another_sensor(plain, tmp_path):
+    folder = spoiled(plain[0], tmp_path / "a", "")
+    (folder / "evs_noise_rate.npz").unlink()
+    with pytest.raises(SpecError, match="capture trials after a reset in steady light"):
+        calibrate_evs(folder, tmp_path / "c.yaml")
+    folder = spoiled(plain[0], tmp_path / "b", "")
+    text = (folder / "capture.yaml").read_text()
+    (folder / "capture.yaml").write_text(text + "sensor: reference-mono\n")
+    with pytest.raises(SpecError, match=r"capture evs_static\.npz and evs_steps\.npz"):
+        calibrate_evs(folder, tmp_path / "c.yaml")
+    for file in folder.glob("evs_*.npz"):
+        file.unlink()
+    (folder / "capture.yaml").write_text(text + "sensor: davis346\n")
+    np.savez(folder / "evs_static.npz", n_on=np.zeros((2, 2), int))
+    with pytest.raises(SpecError, match=r"capture trials after a reset, evs_noise_rate\.npz and evs_s_curve\.npz"):
+        calibrate_evs(folder, tmp_path / "c.yaml")
+    with pytest.raises(RangeError, match="bootstrap"):
+        calibrate_evs(plain[0], tmp_path / "d.yaml", bootstrap=10)
+    damaged = spoiled(plain[0], tmp_path / "e", "")
+    data = (damaged / "evs_s_curve.npz").read_bytes()
+    (damaged / "evs_s_curve.npz").write_bytes(data[: len(data) // 2])
+    with pytest.raises(SpecError, match="cannot be read"):
+        calibrate_evs(damaged, tmp_path / "c.yaml")
+
+
+# ---- the virtual laboratory, and back ----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session of davis346, and its calibration."""
+    folder = tmp_path_factory.mktemp("session")
+    sensor = hr.load_sensor("davis346").crop(32, 32)
+    write_captures(
+        sensor, folder / "captures", frames=8, trials=6, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)
+    )
+    calibrate_evs(folder / "captures", folder / "calibration.yaml")
+    return sensor, folder
+
+
+DAVIS = Pixels(theta_on=0.2, theta_off=0.2, mismatch=0.15, r=0.2, shot=0.03, dark=0.04, cutoff_hz=300.0, leak_hz=0.01)
+
+
+def test_a_session_of_davis346_gives_its_own_parameters_back(session):
+    sensor, folder = session
+    section = read_calibration(folder / "calibration.yaml")["evs"]
+    assert max(abs(z) for z in scores(section, DAVIS).values()) < 4
+    assert section["bad_pixels"] == 0 and section["findings"] == [] and section["shot_law"] == "sqrt"
+    maps = read_maps(folder / "calibration.yaml", "evs")
+    for name, truth in (("on", sensor.evs.threshold_on_map), ("off", sensor.evs.threshold_off_map)):
+        assert np.corrcoef(maps[f"threshold_{name}_relative"].ravel(), truth.ravel())[0, 1] > 0.95
+
+
+@pytest.mark.slow
+def test_a_calibrated_sensor_behaves_like_the_captured_one(session, tmp_path):
+    """Its thresholds, noise and leak from the file; a second session with it has the first one's event counts.
+
+    Counts of a kind of trials scatter with other noise on nearly the same pixels: within 6 binomial standard errors
+    and 6 % of what is neither sure nor impossible.
+    """
+    sensor, folder = session
+    again = hr.load_sensor("davis346", {"noise": str(folder / "calibration.yaml")}).crop(32, 32)
+    spec = again.spec.evs
+    assert spec.contrast_threshold_on == pytest.approx(0.2, rel=0.03)
+    assert spec.threshold_mismatch_std == pytest.approx(0.15, rel=0.12)
+    assert spec.photoreceptor_cutoff_hz == pytest.approx(300, rel=0.06)
+    assert again.evs.threshold_on_map.std() == pytest.approx(sensor.evs.threshold_on_map.std(), rel=0.1)
+    write_captures(
+        again, tmp_path / "c", frames=8, trials=6, seed=8, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)
+    )
+    for name in ("evs_noise_rate", "evs_s_curve"):
+        one, two = (dict(np.load(place / f"{name}.npz")) for place in (folder / "captures", tmp_path / "c"))
+        # contrasts of the plan follow the file's thresholds: compare by interpolation in contrast, light by light
+        for light_1, light_2 in zip(np.unique(one["signal_dn"]), np.unique(two["signal_dn"]), strict=True):
+            assert light_1 == pytest.approx(light_2, rel=0.02)
+            for key in ("n_on", "n_off"):
+                rates = []
+                for data, light in ((one, light_1), (two, light_2)):
+                    kinds = np.flatnonzero(data["signal_dn"] == light)
+                    kinds = kinds[np.argsort(data["contrast"][kinds])]
+                    calm = data["n_calm"][kinds].sum(axis=(1, 2))
+                    rates.append((data["contrast"][kinds], data[key][kinds].sum(axis=(1, 2, 3)) / calm, calm.min()))
+                (c1, p1, n), (c2, p2, _) = rates
+                there = np.interp(c1, c2, p2) if c1.size > 1 else p2
+                error = np.sqrt(2 * np.maximum(p1 * (1 - p1), 1 / n) / n)
+                assert np.all(np.abs(p1 - there) < 6 * error + 0.06 * p1 * (1 - p1) + 0.02 * (name == "evs_s_curve"))
+
+
+def test_calibrations_of_the_two_kinds_of_sensor_are_not_mixed_up(session):
+    _, folder = session
+    with pytest.raises(SpecError, match="the sensor needs reference 'last_event'"):
+        hr.load_sensor("reference-mono", {"noise": str(folder / "calibration.yaml")})
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth(tmp_path):
+    """24 sets of trials in NumPy: 95 % intervals of each parameter cover in 19 or more (at a coverage of 95 % each
+    fails with a chance of 0.1 %), and of 24,576 pixels 2 at most are called bad."""
+    inside, bad = [], 0
+    for seed in range(1, 25):
+        folder = tmp_path / str(seed)
+        reset_captures.write(folder, TRUTH, np.random.default_rng(seed))
+        calibrate_evs(folder, folder / "c.yaml")
+        section = read_calibration(folder / "c.yaml")["evs"]
+        inside.append([abs(z) < 1.96 for z in scores(section, TRUTH).values()])
+        bad += section["bad_pixels"]
+    assert np.sum(inside, axis=0).min() >= 19
+    assert bad <= 2
