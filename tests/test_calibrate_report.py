@@ -142,7 +142,7 @@ def test_what_cannot_be_written_or_read(both, tmp_path):
     (tmp_path / "lone.yaml").write_text((folder / "c.yaml").read_text())
     with pytest.raises(SpecError, match=r"c_aps_maps-[0-9a-f]{12}\.npz: no such file; it belongs to lone\.yaml"):
         read_maps(tmp_path / "lone.yaml", "aps")
-    (tmp_path / "none.yaml").write_text("schema_version: 1\ncapture: {}\n")
+    (tmp_path / "none.yaml").write_text("schema_version: 1\ncapture: {bit_depth: 10, tile_rows: 1, tile_cols: 1}\n")
     with pytest.raises(SpecError, match="no section 'evs'"):
         read_maps(tmp_path / "none.yaml", "evs")
 
