@@ -129,6 +129,42 @@ FIXED = (
         ("tests/test_flicker.py",),
     ),
     Fixed(
+        "variance polynomial: its goodness of fit centred elsewhere",
+        "return float(ndtr(-(chi2 - 1) * np.sqrt(dof / each)))",
+        "return float(ndtr(-(chi2 + 1) * np.sqrt(dof / each)))",
+        (_FORMS,),
+    ),
+    Fixed(
+        "error of the read noise: a third instead of half",
+        "noise_error = float(np.sqrt(np.sum(error**2)) / len(known) / (2 * noise))",
+        "noise_error = float(np.sqrt(np.sum(error**2)) / len(known) / (3 * noise))",
+        (_FORMS,),
+    ),
+    Fixed(
+        "audit: events of one polarity are judged by the other's threshold",
+        "for sign, theta in ((1.0, thresholds[0]), (-1.0, thresholds[1])):",
+        "for sign, theta in ((1.0, thresholds[1]), (-1.0, thresholds[1])):",
+        ("tests/test_audit.py::test_each_polarity_has_its_own_threshold",),
+    ),
+    Fixed(
+        "plan: a change is measured in the inverse of the noise",
+        "np.float32(tuning.change * tuning.tolerance * quality) * units",
+        "np.float32(tuning.change * tuning.tolerance * quality) / units",
+        ("tests/test_changes.py",),
+    ),
+    Fixed(
+        "plan: great changes next to a pixel do not count by themselves",
+        "near = sites.most(great[window], 1) | sites.most(huge[window], 2)",
+        "near = sites.most(great[window], 1) & sites.most(huge[window], 2)",
+        ("tests/test_changes.py",),
+    ),
+    Fixed(
+        "plan: half of what counts, in units that do not fit",
+        "np.float32(0.5) * bound)",
+        "np.float32(0.5) / bound)",
+        ("tests/test_changes.py",),
+    ),
+    Fixed(
         "the renderer's own error: half as large",
         "error = np.abs(one - other) / 2 / noise((one + other) / 2, place)",
         "error = np.abs(one - other) / 4 / noise((one + other) / 2, place)",

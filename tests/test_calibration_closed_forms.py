@@ -3,6 +3,7 @@
 Inputs are exact expectations, so that answers are exact as well; nothing here is random.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import betainc, gammaincc, ndtr
 
-from hesim_render.calibrate.aps.photon_transfer import system_gain
+from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
 from hesim_render.calibrate.estimate import Spread
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
@@ -58,6 +59,51 @@ def test_variance_polynomial_is_exact_however_noisy_the_signals_are(tau):
     found = fit_variance(join([pooled(seconds, tau) for seconds in (0.01, 0.05, 0.2)]))
     np.testing.assert_allclose(found.beta, BETA, rtol=1e-6, atol=1e-12)
     assert found.identified.all() and found.hidden_pixels == 0
+
+
+@pytest.mark.parametrize("more", [0.99, 1.0, 1.01])
+def test_goodness_of_the_variance_fit(more):
+    """Sample variances that scatter `more` times as much as 2 V²/(n − 1): χ² and its chance, written out.
+
+    χ² of N squares of variance 2 + 12/(n − 1) each is normal; a Poisson count of gain K has the fourth cumulant K²
+    times its variance, which adds that over n to each square.
+    """
+    parts = []
+    for seconds in (0.01, 0.05, 0.2):
+        bins = pooled(seconds, 0.0)
+        y = bins.variance_dn2
+        parts.append(replace(bins, squares=bins.pixels * (y**2 + more * 2 * (y + 1 / 12) ** 2 / (FRAMES - 1))))
+    bins = join(parts)
+    found = fit_variance(bins)
+    y, count = bins.variance_dn2, bins.pixels.sum()
+    assert found.dof == count - 6
+    assert found.chi2_per_dof == pytest.approx(more * count / (count - 6), rel=1e-9)
+    cumulant = BETA[1] ** 2 * (y - BETA[0]) / FRAMES
+    expected = 1 + np.mean(cumulant * (FRAMES - 1) / (2 * (y + 1 / 12) ** 2))
+    assert found.expected_chi2 == pytest.approx(expected, rel=1e-6)
+    deviation = (found.chi2_per_dof / expected - 1) * np.sqrt((count - 6) / (2 + 12 / (FRAMES - 1)))
+    assert found.p_value == pytest.approx(ndtr(-deviation), rel=1e-4)
+
+
+def test_read_noise_is_the_root_of_the_mean_variance_with_its_error():
+    """σ = √β0: an error e of β0 is e/2σ of σ; of two positions the mean has half the root of the sum."""
+    fits = {
+        (0, k): SimpleNamespace(beta=np.array([value, 0]), covariance=np.diag([error**2, 0]), identified=[True])
+        for k, (value, error) in enumerate([(8.0, 0.4), (10.0, 0.3)])
+    }
+    told = _read_noise(fits, 0.5, 0.02)
+    assert told["value_dn"] == 3.0 and told["value"] == 6.0
+    assert told["standard_error"] == pytest.approx(6.0 * np.hypot(0.5 / 2 / (2 * 3.0) / 3.0, 0.02))
+
+
+def test_linearity_is_the_deviation_of_each_exposure_from_proportionality():
+    rate = np.full((10, 10), 1000.0)
+    exposures = np.array([0.01, 0.1, 0.5, 0.8, 2.0])  # 1 % and 200 % of the range do not count
+    signals = rate * exposures[:, None, None] * np.array([3, 1.01, 0.98, 1.0, 0.5])[:, None, None]
+    lit = SimpleNamespace(exposures_s=exposures, exposures_us=np.rint(1e6 * exposures))
+    told = linearity(lit, signals, np.ones(signals.shape, bool), SimpleNamespace(rate_dn_per_s=rate), 1000.0)
+    assert told["largest"] == pytest.approx(2.0) and told["value"] == pytest.approx((1 + 2 + 0) / 3)
+    assert told["per_exposure"] == pytest.approx({100_000: 1.0, 500_000: -2.0, 800_000: 0.0}, abs=1e-9)
 
 
 def test_error_of_a_signal_is_that_of_a_mean_over_the_frames():

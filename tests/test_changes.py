@@ -10,7 +10,7 @@ import pytest
 
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Closer, Pilot, allocate
-from hesim_render.sources.render.change_driven.plan import changes, fill_in, longer
+from hesim_render.sources.render.change_driven.plan import changes, fill_in, longer, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
 
 
@@ -27,6 +27,36 @@ def test_windows_are_marked_where_the_flux_leaves_the_last_mark():
     assert marks([0, 0, 5, 5, 5]) == [0, 1, 1, 0, 0]
     # for one window only
     assert marks([0, 0, 5, 0, 0]) == [0, 1, 1, 1, 0]
+
+
+def test_the_window_before_a_change_is_marked_where_most_of_it_came_in_one_step():
+    """More than half of the change that counts, 4 here: steps of 2.5 and of 1.9 after it."""
+    assert marks([0, 0, 2.5, 5, 5], 4.0) == [0, 0, 1, 1, 0]
+    assert marks([0, 1.5, 3.0, 4.9, 4.9], 4.0) == [0, 0, 0, 1, 0]
+
+
+@pytest.mark.parametrize(("step", "reach"), [(0.9, -1), (1.1, 0), (15.0, 0), (17.0, 1), (120.0, 1), (136.0, 2)])
+def test_what_is_rendered_around_a_change(step, reach):
+    """A change of `step` times what counts, 0.7 · 3 · quality · unit, is rendered so many pixels away; -1 is nowhere.
+
+    Of a change in window 4 that stays, the windows 3 and 4 are rendered; beyond a pixel away one more on either side.
+    """
+    quality, unit, windows = 0.5, 10.0, 9
+    sites = Sites.around(np.arange(9 * 9, dtype=np.uint32), 9, 9)
+    flux = np.full((windows, 81), 1e5, np.float32)
+    flux[4:, 4 * 9 + 4] += step * 0.7 * 3 * quality * unit
+    nothing = np.zeros_like(flux)
+    found = plan(
+        Pilot(flux, flux, nothing, nothing, flux), sites, lambda told: np.full_like(told, unit), quality,
+        Gain(*TUNING.matt_gain), TUNING, True,
+    ).rendered.reshape(windows, 9, 9)  # fmt: skip
+    row, col = np.indices((9, 9))
+    away = np.maximum(abs(row - 4), abs(col - 4))
+    assert found[0].all() and found[-1].all()
+    for window in range(1, windows - 1):
+        beyond = 2 if window in (2, 3, 4, 5) and reach == 2 else -1
+        near = max(reach if reach < 2 else 1, 0) if window in (3, 4) and reach >= 0 else -1
+        np.testing.assert_array_equal(found[window], away <= max(near, beyond))
 
 
 def test_longer_marks_reach_no_further():

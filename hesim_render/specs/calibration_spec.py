@@ -8,7 +8,17 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator, model_validator
+from pydantic import (
+    ConfigDict,
+    Discriminator,
+    Field,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import Strict
@@ -129,13 +139,61 @@ class EventSection(EventParameters):
     maps: MapsFile
 
 
+class NoiseInLight(Estimate):
+    """σ of ln x in one light."""
+
+    signal_dn: float = Field(ge=0)
+
+
+class AsynchronousGoodness(EventGoodness):
+    """χ² of first events after a reset, together and by kind."""
+
+    dof: int
+    p_value: float | None
+    steps_p_value: float | None
+    times_p_value: float | None
+    steady_p_value: float | None
+
+
+class AsynchronousSection(_Section):
+    """``evs`` of a sensor without fixed comparisons: what trials after a reset told."""
+
+    reference: Literal["last_event"]
+    shot_law: Literal["linear", "sqrt"]
+    beta: list[_Beta] = Field(min_length=1)
+    theta: Estimate
+    theta_on: Estimate
+    theta_off: Estimate
+    threshold_mismatch: Estimate
+    threshold_mismatch_on: Estimate
+    threshold_mismatch_off: Estimate
+    photoreceptor_cutoff_hz: Estimate
+    leak_rate_hz: Estimate
+    noise: list[NoiseInLight] = []
+    goodness: AsynchronousGoodness
+    bad_pixels: NonNegativeInt
+    findings: list[Finding] = []
+    maps: MapsFile
+
+
+def _kind_of_events(section: Any) -> str:
+    is_asynchronous = isinstance(section, dict) and section.get("reference") == "last_event"
+    return "asynchronous" if is_asynchronous else "fixed comparisons"
+
+
 class CalibrationSpec(Strict):
     """``calibration.yaml``; `capture` is the ``capture.yaml`` of the captures."""
 
     schema_version: int
     capture: CaptureSpec
     aps: FrameSection | None = None
-    evs: EventSection | None = None
+    evs: (
+        Annotated[
+            Annotated[EventSection, Tag("fixed comparisons")] | Annotated[AsynchronousSection, Tag("asynchronous")],
+            Discriminator(_kind_of_events),
+        ]
+        | None
+    ) = None
 
     @field_validator("schema_version", mode="before")
     @classmethod

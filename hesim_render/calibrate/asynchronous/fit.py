@@ -1,6 +1,6 @@
 """Maximum likelihood of thresholds, mismatch, noise, bandwidth and leak, and the covariance of what it gives.
 
-Scoring with the outer product of the pixels' own scores (Berndt, Hall, Hall and Hausman 1974), which is at the same
+Scoring with the outer product of the pixels' own scores [berndt1974], which is at the same
 time the information: each pixel, with thresholds of its own, is one independent draw.
 """
 

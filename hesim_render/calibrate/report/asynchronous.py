@@ -82,7 +82,7 @@ def _pixels(maps: dict[str, NDArray]) -> str:
     good = ~maps["bad_pixels"]
     values = [maps[f"threshold_{name}_relative"][good] for name in ("on", "off")]
     low, high = (float(v) for v in np.quantile(np.concatenate(values), [0.001, 0.999]))
-    edges = np.linspace(low - 0.02, high + 0.02, 50)
+    edges = np.linspace(low - 0.02, high + 0.02, 50).tolist()
     figure, axes = panel("Thresholds over their mean", "θ of a pixel / mean", "pixels")
     for each, colour, label in zip(values, (COLOURS[1], COLOURS[0]), ("θ₊", "θ₋"), strict=True):
         axes.hist(each, edges, color=colour, alpha=0.5, label=label)
