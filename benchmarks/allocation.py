@@ -4,7 +4,7 @@
 
 `renderer.options.Tuning` has factor · n^-power of the fit, `matt_gain` of star and sweep, `path_gain` of glass; the
 factor is larger than the fit, for a pilot of 16 rays knows scatter less well than the 64 of this script. The scenes of
-`tests/test_hidden_scenes.py` and `tests/random_scenes.py` judge it.
+`tests/sources/render/test_hidden_scenes.py` and `tests/support/random_scenes.py` judge it.
 
 Of random pixels that scatter, in windows of 1 ms (events) and 10 ms (exposures): the truth is the mean of six traces of
 4096 rays, errors are pooled over pixels before they are divided.

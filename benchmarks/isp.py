@@ -2,9 +2,9 @@
 
     python benchmarks/isp.py [speed] [clean] [patterns] [noisy] [--bits 8 10] [--repeat 5]
 
-`clean`: sRGB pictures go through the inverse pipeline of `tests/isp_images.py` (white balance of the H-ESIM paper;
-identity and the paper's matrix) into a RAW frame without noise and through the default pipeline back. The ceiling is
-the same quantisation without a mosaic. With colour-demosaicing installed, its Menon (2007) stands beside the Bayer
+`clean`: sRGB pictures go through the inverse pipeline of `tests/support/isp_images.py` (white balance of the H-ESIM
+paper; identity and the paper's matrix) into a RAW frame without noise and through the default
+pipeline back. The ceiling is the same quantisation without a mosaic. With colour-demosaicing installed, its Menon (2007) stands beside the Bayer
 figures; with scikit-image, four photographs of its package are reported too. `patterns` are pictures that are hard for
 a mosaic: a zone plate, diagonals, text, slanted edges, beside a linear oracle fitted to the very picture.
 
@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "support"))
 import isp_images as pictures  # the generator of the tests
 
 import hesim_render as hr

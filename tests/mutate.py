@@ -37,20 +37,38 @@ _PATIENCE, _GRACE_S = 4.0, 30.0
 
 #: Functions that are mutated, "module:function" or "module" for all of it, and the tests that should notice.
 TARGETS: dict[str, tuple[str, ...]] = {
-    "calibrate.aps.variance": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_aps.py"),
-    "calibrate.aps.photon_transfer": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_aps.py"),
-    "calibrate.moments": ("tests/test_calibrate_aps.py",),
-    "calibrate.evs.model": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
-    "calibrate.evs.fitted": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
-    "calibrate.evs.thresholds": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
-    "calibrate.evs.defects": ("tests/test_calibration_closed_forms.py", "tests/test_calibrate_evs.py"),
-    "sources.flicker": ("tests/test_flicker.py",),
-    "sources.render.audit.confidence": ("tests/test_audit.py",),
-    "sources.render.audit.compare": ("tests/test_audit.py",),
-    "sources.render.change_driven.plan": ("tests/test_changes.py",),
-    "sources.render.change_driven.tuning:Gain": ("tests/test_changes.py",),
-    "sources.render.sampling.sampler:third_coordinates": ("tests/test_renderer_sampling.py",),
-    "pixels.normal": ("tests/test_noise_aps.py", "tests/test_noise_evs.py"),
+    "calibrate.aps.variance": (
+        "tests/calibrate/test_calibration_closed_forms.py",
+        "tests/calibrate/test_calibrate_aps.py",
+    ),
+    "calibrate.aps.photon_transfer": (
+        "tests/calibrate/test_calibration_closed_forms.py",
+        "tests/calibrate/test_calibrate_aps.py",
+    ),
+    "calibrate.moments": ("tests/calibrate/test_calibrate_aps.py",),
+    "calibrate.evs.model": (
+        "tests/calibrate/test_calibration_closed_forms.py",
+        "tests/calibrate/test_calibrate_evs.py",
+    ),
+    "calibrate.evs.fitted": (
+        "tests/calibrate/test_calibration_closed_forms.py",
+        "tests/calibrate/test_calibrate_evs.py",
+    ),
+    "calibrate.evs.thresholds": (
+        "tests/calibrate/test_calibration_closed_forms.py",
+        "tests/calibrate/test_calibrate_evs.py",
+    ),
+    "calibrate.evs.defects": (
+        "tests/calibrate/test_calibration_closed_forms.py",
+        "tests/calibrate/test_calibrate_evs.py",
+    ),
+    "sources.flicker": ("tests/sources/test_flicker.py",),
+    "sources.render.audit.confidence": ("tests/sources/render/test_audit.py",),
+    "sources.render.audit.compare": ("tests/sources/render/test_audit.py",),
+    "sources.render.change_driven.plan": ("tests/sources/render/test_changes.py",),
+    "sources.render.change_driven.tuning:Gain": ("tests/sources/render/test_changes.py",),
+    "sources.render.sampling.sampler:third_coordinates": ("tests/sources/render/test_renderer_sampling.py",),
+    "pixels.normal": ("tests/pixels/test_noise_aps.py", "tests/pixels/test_noise_evs.py"),
 }
 
 
@@ -71,7 +89,7 @@ class Fixed:
     tests: tuple[str, ...]
 
 
-_FORMS = "tests/test_calibration_closed_forms.py"
+_FORMS = "tests/calibrate/test_calibration_closed_forms.py"
 #: Mutations that no test noticed once.
 FIXED = (
     Fixed(
@@ -126,7 +144,7 @@ FIXED = (
         "flicker: an instant on the border of two pieces counts twice",
         "(begin >= low) & ((begin < high) | (number == bounds.size - 2))",
         "(begin >= low) & ((begin <= high) | (number == bounds.size - 2))",
-        ("tests/test_flicker.py",),
+        ("tests/sources/test_flicker.py",),
     ),
     Fixed(
         "variance polynomial: its goodness of fit centred elsewhere",
@@ -144,31 +162,31 @@ FIXED = (
         "audit: events of one polarity are judged by the other's threshold",
         "for sign, theta in ((1.0, thresholds[0]), (-1.0, thresholds[1])):",
         "for sign, theta in ((1.0, thresholds[1]), (-1.0, thresholds[1])):",
-        ("tests/test_audit.py::test_each_polarity_has_its_own_threshold",),
+        ("tests/sources/render/test_audit.py::test_each_polarity_has_its_own_threshold",),
     ),
     Fixed(
         "plan: a change is measured in the inverse of the noise",
         "np.float32(tuning.change * tuning.tolerance * quality) * units",
         "np.float32(tuning.change * tuning.tolerance * quality) / units",
-        ("tests/test_changes.py",),
+        ("tests/sources/render/test_changes.py",),
     ),
     Fixed(
         "plan: great changes next to a pixel do not count by themselves",
         "near = sites.most(great[window], 1) | sites.most(huge[window], 2)",
         "near = sites.most(great[window], 1) & sites.most(huge[window], 2)",
-        ("tests/test_changes.py",),
+        ("tests/sources/render/test_changes.py",),
     ),
     Fixed(
         "plan: half of what counts, in units that do not fit",
         "np.float32(0.5) * bound)",
         "np.float32(0.5) / bound)",
-        ("tests/test_changes.py",),
+        ("tests/sources/render/test_changes.py",),
     ),
     Fixed(
         "the renderer's own error: half as large",
         "error = np.abs(one - other) / 2 / noise((one + other) / 2, place)",
         "error = np.abs(one - other) / 4 / noise((one + other) / 2, place)",
-        ("tests/test_hidden_scenes.py::test_the_stated_error_of_event_samples_is_the_true_one",),
+        ("tests/sources/render/test_hidden_scenes.py::test_the_stated_error_of_event_samples_is_the_true_one",),
     ),
 )
 

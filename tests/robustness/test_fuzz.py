@@ -27,7 +27,7 @@ def lines_of(*parts):
     """What fuzz.py prints; its end, of itself or by us, is the last line."""
     child = subprocess.Popen(
         [sys.executable, HERE / "fuzz.py", *parts], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": f"{HERE.parents[1]}:{HERE.parent}"},
+        env={**os.environ, "PYTHONPATH": f"{HERE.parents[1]}:{HERE.parent / 'support'}"},
     )  # fmt: skip
     try:
         with selectors.DefaultSelector() as ready:

@@ -4,11 +4,12 @@ Each says where it comes from by a letter:
 
 - F: fitted on the scenes `star`, `sweep` and `glass` of `benchmarks/change_driven.py` (the gains by
   `benchmarks/allocation.py`).
-- H: the scenes of `tests/test_hidden_scenes.py`, on which nothing was fitted, showed that it is needed and how large.
+- H: the scenes of `tests/support/hidden_scenes.py`, on which nothing was fitted, showed that it is needed and how
+  large.
 - C: chosen, not fitted: a bound on work, or a size that follows from the others.
 
-All were judged on the scenes of `tests/random_scenes.py` and of `tests/test_hidden_scenes.py`; none was chosen on the
-former.
+All were judged on the scenes of `tests/support/random_scenes.py` and of `tests/support/hidden_scenes.py`; none was
+chosen on the former.
 """
 
 from __future__ import annotations

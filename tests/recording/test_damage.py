@@ -23,7 +23,7 @@ from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.recording.recording import Recording
 from hesim_render.specs.files import load_yaml
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import TrackSpec
 
 COLS, ROWS = 16, 12
-DOCS = Path(__file__).parent.parent / "docs" / "scenes.md"
+DOCS = Path(__file__).parents[3] / "docs" / "scenes.md"
 
 
 def even(value):

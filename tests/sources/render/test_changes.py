@@ -153,6 +153,6 @@ def test_every_tuning_constant_says_its_unit_its_origin_and_what_it_is_for():
 
 
 def test_the_documented_constants_are_those_of_the_code():
-    page = Path(__file__).parent.parent / "docs" / "change-driven-rendering.md"
+    page = Path(__file__).parents[3] / "docs" / "change-driven-rendering.md"
     table = re.findall(r"^\| `(\w+)` \| ([^|]+) \|", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert dict(table) == {name: str(value) for name, value in asdict(TUNING).items()}

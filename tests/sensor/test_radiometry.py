@@ -11,7 +11,7 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 
 
 def isetcam_sensor(tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "hesim_render"
 
 MAP = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")

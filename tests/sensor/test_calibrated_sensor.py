@@ -17,7 +17,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.stage import EvsStage
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SIZE = 32
 
 

@@ -18,7 +18,7 @@ from hesim_render.core import output
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.output import OutputFolder, check_target, discard_unfinished, output_errors, replacing
 
-KILLED = Path(__file__).parent / "robustness" / "killed.py"
+KILLED = Path(__file__).parents[1] / "robustness" / "killed.py"
 
 
 def write(folder, text, overwrite=True):

@@ -1,7 +1,7 @@
 """Five recordings, to the bit: what moves code from place to place must change none of them.
 
 Bits are those of one backend and one kind of processor; elsewhere the last digits may differ, and the test is skipped.
-Where arithmetic is changed on purpose, the hashes are made anew: ``python tests/test_same_bits.py``.
+Where arithmetic is changed on purpose, the hashes are made anew: ``python tests/capture/test_same_bits.py``.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ import pytest
 import hesim_render as hr
 from hesim_render.core import backend
 
-HASHES = Path(__file__).parent / "data" / "same_bits.json"
+HASHES = Path(__file__).parents[1] / "data" / "same_bits.json"
 SIZE = 32, 24
 
 

@@ -26,7 +26,7 @@ from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.specs import SensorSpec, read_scene
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parents[2]
 SENSORS = ("eiger", "gen2", "mipi-hybridevs", "davis346", "reference-mono", "reference-bayer")
 LINEAR_RAW, CFA = 34892, 32803
 
@@ -216,7 +216,7 @@ def test_manifest_says_what_made_the_recording(tmp_path):
 def test_manifest_spec_alone_gives_the_sensor_back(tmp_path):
     """A CSV filter is written out, so the dump (and the hash) hold its numbers."""
     (tmp_path / "sensors").mkdir()
-    text = (HERE.parent / "sensors" / "reference-mono.yaml").read_text()
+    text = (ROOT / "sensors" / "reference-mono.yaml").read_text()
     text = text.replace("clear: {flat: 1.0, band_nm: [400, 700]}", "clear: curve.csv")
     (tmp_path / "sensors" / "a.yaml").write_text(text)
     hashes = []
@@ -268,7 +268,7 @@ def test_an_error_on_the_way_leaves_nothing(tmp_path):
 
 
 def run(code, *arguments):
-    environment = {**os.environ, "PYTHONPATH": str(HERE)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests" / "support")}
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
