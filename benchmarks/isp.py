@@ -3,16 +3,15 @@
     python benchmarks/isp.py [speed] [clean] [patterns] [noisy] [--bits 8 10] [--repeat 5]
 
 `clean`: sRGB pictures go through the inverse pipeline of `tests/support/isp_images.py` (white balance of the H-ESIM
-paper; identity and the paper's matrix) into a RAW frame without noise and through the default
-pipeline back. The ceiling is the same quantisation without a mosaic. With colour-demosaicing installed, its Menon (2007) stands beside the Bayer
-figures; with scikit-image, four photographs of its package are reported too. `patterns` are pictures that are hard for
-a mosaic: a zone plate, diagonals, text, slanted edges, beside a linear oracle fitted to the very picture.
-
-`noisy`: a photograph, still for 60 ms, goes as a video of 20 and 100 lux (white) into `eiger` and through the ISP. The
-reference is the frame without noise (`clean=True`) through the same pipeline, at the same exposure gain; PSNR of 8-bit
-sRGB. Judged on astronaut, cat, coffee and rocket of scikit-image; the constants of `denoise` were fitted on its
-motorcycle and on matplotlib's portrait of Grace Hopper. The filters beside it have the best figures of a grid for each
-picture and light, which a person at the picture could at best find by hand.
+paper; identity and the paper's matrix) into a RAW frame without noise and through the default pipeline back. The
+ceiling is the same quantisation without a mosaic. With colour-demosaicing installed, its Menon (2007) stands beside
+the Bayer figures; with scikit-image, four photographs of its package are reported too. `patterns` are pictures that
+are hard for a mosaic: a zone plate, diagonals, text, slanted edges, beside a linear oracle fitted to the very
+picture. `noisy`: a photograph, still for 60 ms, goes as a video of 20 and 100 lux (white) into `eiger` and through
+the ISP. The reference is the frame without noise (`clean=True`) through the same pipeline, at the same exposure gain;
+PSNR of 8-bit sRGB. Judged on astronaut, cat, coffee and rocket of scikit-image; the constants of `denoise` were
+fitted on its motorcycle and on matplotlib's portrait of Grace Hopper. The filters beside it have the best figures of
+a grid for each picture and light, which a person at the picture could at best find by hand.
 """
 
 import argparse
