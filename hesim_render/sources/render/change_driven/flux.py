@@ -1,9 +1,9 @@
-"""The renderer as a source of flux whose cost follows what changes, and whose error follows the sensor's noise.
+"""Change-driven rendering as a source of flux: its cost follows the changes, its error follows the sensor's noise.
 
-Every decision is a pure function of scene, sensor, seed, quality, the pixel's place on the full sensor and the window:
-a pilot pass with random numbers of its own (`pilot`) says how many rays a pair of a pixel and a window gets, and where
-a pixel may be filled in between two windows (`plan`). Nothing that was rendered before decides about anything. What
-is kept because it would come out the same again is kept for speed only.
+Every decision is a pure function of scene, sensor, seed, quality, window and the pixel's place on the full sensor. A
+pilot pass with random numbers of its own (`pilot`) decides how many rays a pair of a pixel and a window gets, and
+which windows of a pixel are interpolated (`plan`). Values that were rendered before decide nothing. Cached values save
+time only: they would come out the same again.
 """
 
 from __future__ import annotations
@@ -35,36 +35,36 @@ from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import require_finite, used_responses
 from hesim_render.sources.scene import Scene
 
-#: Error of the render over the sensor's noise, unless asked for otherwise.
+#: Default error of the render, as a fraction of the sensor's noise.
 QUALITY = 0.5
-#: Pixels that are worked on at a time, for bounded memory.
+#: Pixels that are processed at a time, to bound memory.
 _BAND_PIXELS = 1 << 17
 _ALWAYS_US = (-np.inf, np.inf)
 
 
 class ChangeDrivenFlux:
-    """Φ in e⁻/s where only what changes is rendered; implements `FluxSource`.
+    """Φ in e⁻/s, where only changes are rendered; implements `FluxSource`.
 
-    The same integral as `RenderedFlux`, with two differences: objects and camera move through every window,
-    ray by ray, and each pixel gets as many rays as its own noise asks for. Random numbers are a pure function of
-    (seed, pixel on the full sensor, ray), so a pixel near which nothing moves is exactly constant.
+    It computes the same integral as `RenderedFlux`, with two differences. Objects and camera move within every window,
+    with a time of its own for each ray. Each pixel gets as many rays as its own noise requires. Random numbers are a
+    pure function of (seed, pixel on the full sensor, ray), so a pixel near which nothing moves is exactly constant.
 
     Parameters
     ----------
-    scene, sensor : what and through what.
-    quality : wanted error of the render over the sensor's noise (temporal; PRNU included for frames; at least
+    scene, sensor : the scene and the sensor that sees it.
+    quality : wanted error of the render over the sensor's noise (temporal; with PRNU for frames; at least
         θ/20 for events).
-    seed : of the run.
-    most_power : largest factor by which the flux is multiplied afterwards (a flickering light's power over its mean).
+    seed : seed of the run.
+    most_power : largest factor by which the flux is multiplied later (largest over mean power of a flickering light).
     progress : called with the number of rays traced so far, after each block.
-    tuning : constants.
+    tuning : constants of the method.
 
     Attributes
     ----------
-    sensor : with the lens in use.
+    sensor : the sensor, with the lens in use.
     view : the placed camera.
     is_static : True where nothing moves.
-    counts : of what was done so far.
+    counts : work done so far.
 
     Raises
     ------
@@ -111,6 +111,7 @@ class ChangeDrivenFlux:
 
     @property
     def rays_traced(self) -> int:
+        """Number of rays traced so far, pilot passes included."""
         return self._tracer.rays_done
 
     @property
@@ -118,7 +119,7 @@ class ChangeDrivenFlux:
         return self._tracer.built.is_dark
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """None: motion is followed ray by ray."""
+        """No edges: each ray follows the motion at its own time."""
         return np.empty(0)
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
@@ -126,7 +127,7 @@ class ChangeDrivenFlux:
         return blocks_of_run(self._clock.instants_us, window_us, begin_us, end_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly inside the interval that follow all motion, the camera's too, µs."""
+        """Times strictly inside the interval that follow all motion, including that of the camera, µs."""
         times = self._clock.instants_us(begin_us, end_us).astype(np.float64)
         return times[(times > begin_us) & (times < end_us)]
 
@@ -152,7 +153,9 @@ class ChangeDrivenFlux:
     def _alone(
         self, pixel: NDArray[np.uint32], begin: NDArray[np.float64], end: NDArray[np.float64], role: Role, out: Flux
     ) -> None:
-        """Each listed pixel in a window of its own, into `out` [1, n]; what never changes is rendered once."""
+        """Put the flux of listed pixels, each in its own window, into `out` [1, n]. Constant pixels are rendered
+        once.
+        """
         self.counts.values += pixel.size
         still = self._still_pixels(role)
         known = still.known[pixel]
@@ -160,7 +163,7 @@ class ChangeDrivenFlux:
         waiting = np.flatnonzero(~known)
         span, number = np.unique(np.stack([begin[waiting], end[waiting]]), axis=1, return_inverse=True)
         windows, number = Windows(span[0], span[1]), number.ravel()
-        # a pixel's neighbours have the window of their own row: where a row has several, one after the other
+        # neighbours use the window of their own row; a row with several windows is rendered once for each
         turn = turns(pixel[waiting] // self.sensor.cols, number)
         for k in range(int(turn.max(initial=-1)) + 1):
             listed, window = waiting[turn == k], number[turn == k]
@@ -183,7 +186,7 @@ class ChangeDrivenFlux:
     def foretell(
         self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], role: Role
     ) -> float:
-        """Rays that each listed pixel takes in a block of windows, the first one apart, or in a single window."""
+        """Rays per listed pixel for a block of windows without its first one, or for a single window."""
         if self._is_dark or pixel.size == 0:
             return 0.0
         counts, done, windows, rays = replace(self.counts), self._tracer.rays_done, Windows(begin_us, end_us), 0
@@ -199,13 +202,13 @@ class ChangeDrivenFlux:
         return rays / pixel.size
 
     def rays_per_second(self) -> float:
-        """Speed of the tracer here and now, on pixels from all over the region."""
+        """Measured speed of the tracer on this machine, over pixels from the whole region, rays/s."""
         if self._is_dark:
             return float("inf")
         done = self._tracer.rays_done
         index = self._index[np.linspace(0, self._index.size - 1, min(self._index.size, 8192)).astype(np.int64)]
         window, seconds = Windows(np.zeros(1), np.full(1, 1000.0)), np.inf
-        for _ in range(2):  # the first time compiles
+        for _ in range(2):  # the first pass compiles the kernel
             start = time.perf_counter()
             where = np.zeros(index.size, np.int64)
             self._tracer.trace(index, where, window, np.full(index.size, 64), np.ones(index.size, np.bool_))
@@ -216,11 +219,11 @@ class ChangeDrivenFlux:
     # ---- for the audit ----------------------------------------------------------------------------
 
     def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
-        """Which event pixels nothing that moves can come near at any time, [n], as far as that is known."""
+        """Event pixels [n] that are known to be constant: no moving object can come near them at any time."""
         return self._still_pixels("events").known[pixel]
 
     def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
-        """What one standard deviation of each pixel's noise is worth at a flux [..., n], e⁻/s."""
+        """Change of flux equal to one standard deviation of each pixel's noise, at a flux [..., n], e⁻/s."""
         unit = Noise(self.sensor).of("events" if events else "any", self._index[pixel])
         return unit(flux.astype(np.float32)).astype(np.float64)
 
@@ -232,11 +235,18 @@ class ChangeDrivenFlux:
         quality: float,
         events: bool,
     ) -> NDArray[np.float64]:
-        """Mean Φ of each listed pixel in its own window, e⁻/s, by random numbers that nothing else has.
+        """Mean Φ of each listed pixel in its own window, e⁻/s, with a stream of random numbers of its own.
 
         Parameters
         ----------
-        quality : wanted error over the sensor's noise, that of events or of exposures.
+        pixel : [n], mosaic indices.
+        begin_us, end_us : [n], the windows, µs.
+        quality : wanted error over the sensor's noise.
+        events : True for the noise of events, False for that of exposures.
+
+        Returns
+        -------
+        [n], e⁻/s.
         """
         if self._is_dark or pixel.size == 0:
             return np.zeros(pixel.size)
@@ -257,7 +267,7 @@ class ChangeDrivenFlux:
         return self._kept[role]
 
     def _bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
-        """The listed pixels, some rows at a time."""
+        """The listed pixels in bands of successive rows."""
         index, geometry = self._index[pixel], self.sensor.spec.geometry
         order, apart, tuning = np.argsort(index, kind="stable"), self._noise.is_apart(role), self._tuning
         rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
@@ -293,17 +303,17 @@ class ChangeDrivenFlux:
         span_us: tuple[float, float] | None = None,
         first: Flux | None = None,
     ) -> tuple[Flux, NDArray[np.bool_]]:
-        """The pairs that a plan names.
+        """Render the pairs that a plan names.
 
         Parameters
         ----------
-        numbers : of each pair's window, [w, n].
-        first : flux in the first window, [1, n], where that is known.
+        numbers : [w, n], window number of each pair.
+        first : [1, n], flux in the first window, if it is already known.
 
         Returns
         -------
         flux : [w, n], 0 where nothing was rendered.
-        met : [w, n], whether a path came near what moves in `span_us`; False where nothing was rendered.
+        met : [w, n], True if a path came near a moving object in `span_us`; False where nothing was rendered.
         """
         out, met = Flux.zeros(*what.rendered.shape), np.zeros(what.rendered.shape, np.bool_)
         todo = what.rendered.copy()
@@ -349,17 +359,18 @@ class ChangeDrivenFlux:
 
 
 class _Blocks:
-    """One list of event pixels through successive blocks.
+    """A list of event pixels over successive blocks.
 
     Parameters
     ----------
-    source : whose pixels they are.
-    pixel : mosaic indices.
+    source : source of their flux.
+    pixel : [n], mosaic indices.
     first : the first block.
 
     Attributes
     ----------
-    alive : places of the pixels that may change; `base`, [1, n], flux of all in the first window.
+    alive : places of the pixels that may change.
+    base : [1, n], flux of all pixels in the first window.
     """
 
     def __init__(self, source: ChangeDrivenFlux, pixel: NDArray[np.uint32], first: Block) -> None:
