@@ -1,4 +1,4 @@
-"""Takes what a run makes, as it comes, into a folder or into memory."""
+"""Writer of a run's frames and events, into a folder or into memory."""
 
 from __future__ import annotations
 

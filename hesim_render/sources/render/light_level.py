@@ -119,7 +119,7 @@ def _measured(spec: SceneSpec, source: MitsubaSpec) -> LightLevel:
 
 
 def _error(values: np.ndarray) -> float:
-    """Relative standard error of the mean of independent estimates; 1 if the mean is 0."""
+    """Relative standard error of the mean of independent estimates; 1 if the mean is not above 0."""
     mean = values.mean()
     return float(values.std(ddof=1) / np.sqrt(values.size) / mean) if mean > 0 else 1.0
 

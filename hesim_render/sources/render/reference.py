@@ -199,8 +199,8 @@ class WindowReference:
         return Work(max(1, min(1 << ceil(log2(wanted)), self._most_rays // self._samples)), self._samples)
 
     def _ladder(self, work: Work, is_static: bool) -> list[Work]:
-        """Steps from the least to the most work. With motion, the number of instants grows first, then the rays at
-        each.
+        """Steps from the least to the most work. With motion, the number of instants and the rays at each grow in
+        turn.
         """
         found = [work]
         while 4 * work.rays <= self._most_rays:
