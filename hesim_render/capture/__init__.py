@@ -1,4 +1,4 @@
-"""One run: a source of flux and a sensor in, frames and events out."""
+"""The capture: from a source of flux and a sensor to frames and events."""
 
 from hesim_render.capture.loop import Capture, noise_models
 

@@ -1,7 +1,7 @@
-"""The bench of a virtual calibration session: a sensor, a target of many brightnesses, and its light.
+"""The bench of a virtual calibration session: a sensor, a test target of many brightness levels, and its light.
 
-Light is in closed form, without a render: a neutral target in front of a Lambertian source of a named
-illuminant, so that the flux of each pixel is Eq. 1 through its own filter times the target's
+The light is a closed form, without a render: a neutral target in front of a Lambertian source of a named
+illuminant. The flux of each pixel is Eq. 1 through its own filter times the target's
 transmittance.
 """
 
@@ -27,17 +27,17 @@ from hesim_render.spectral import spectrum as spectra
 #: Density from one patch of the wedge to the next, and the number of patches (4 rows of 6).
 _DENSITY_STEP, _PATCHES = 0.15, 24
 _DARKEST = 10 ** (-_DENSITY_STEP * _PATCHES)
-#: Signal of the brightest patch as a part of saturation, at the geometric mean of the shortest and longest exposure.
+#: Signal of the brightest patch over saturation, at the geometric mean of the shortest and longest exposure.
 _BRIGHTEST = 0.9
-#: Where there are no frames to saturate: brightest event signal in DN of the signal reference.
+#: Brightest event signal of a sensor without frames, in DN of the signal reference.
 _BRIGHTEST_EVENT_DN = 1000.0
 
 
 def step_target(rows: int, cols: int) -> NDArray[np.float64]:
     """Transmittance [row, col] of the target: a step wedge above a linear and a logarithmic ramp.
 
-    The upper half holds 24 neutral patches, 0.15 in density apart, in four rows that run to and fro; the third
-    quarter goes linearly from almost 0 at the left to 1 at the right, the last one evenly in density over 3.6.
+    The upper half holds 24 neutral patches at density steps of 0.15, in four rows of alternating direction. The third
+    quarter rises linearly from almost 0 at the left to 1 at the right, the last one uniformly in density over 3.6.
     """
     y, x = np.ogrid[:rows, :cols]
     band, along = np.minimum(y * 8 // rows, 3), x * 6 // cols
@@ -53,9 +53,10 @@ class Bench:
 
     Parameters
     ----------
-    flux_e_per_s : [row, col], noise-free, of the lit scene through each pixel's own filter, before crosstalk.
-    lux : illuminance that gives the brightest patch its radiance, E = π·L over the source's spectrum.
-    aps, evs : noise models of what is captured, None where it is not.
+    sensor : the sensor.
+    flux_e_per_s : [row, col], noise-free flux of the lit scene through each pixel's own filter, before crosstalk, e⁻/s.
+    lux : illuminance that gives the brightest patch its radiance, E = π·L over the source's spectrum, lx.
+    aps, evs : noise models of the captured pixels, None for a kind that is not captured.
     """
 
     sensor: Sensor
@@ -66,13 +67,14 @@ class Bench:
 
     @property
     def frame_flux_e_per_s(self) -> NDArray[np.float64]:
-        """The flux as frame pixels get it, [row, col]."""
+        """Flux of the frame pixels with their crosstalk, [row, col], e⁻/s."""
         return mixed(self.flux_e_per_s, self.aps.crosstalk if self.aps is not None else 0.0)
 
     @property
     def event_dn_per_e_per_s(self) -> NDArray[np.float64]:
-        """I / Φ of every event pixel, [y, x]: the signal reference's k · t_ref, times its filter's response over
-        the pixel's own."""
+        """I / Φ of every event pixel, [y, x]: k · t_ref of the signal reference, times the ratio of its filter's
+        response to the pixel's own.
+        """
         assert self.evs is not None
         reference = self.evs.spec.signal_reference
         scale = np.asarray(self.evs.signal_scale)[self.sensor.layout.evs_position]
@@ -88,15 +90,26 @@ class Bench:
 def set_up(
     sensor: Sensor, lit_exposures_us: Sequence[int], illuminant: str = "D65", without: Sequence[str] = ()
 ) -> Bench:
-    """Put the target in front of the sensor, as bright as its frames can use.
+    """Set up the target in front of the sensor, as bright as its frames can use.
 
     The brightest frame position reaches 90 % of saturation at the geometric mean of the shortest and the longest
-    exposure: longer ones saturate it and bring up the dark patches.
+    exposure. Longer exposures saturate it and raise the signal of the dark patches.
+
+    Parameters
+    ----------
+    sensor : the sensor.
+    lit_exposures_us : exposures of the lit frames, µs.
+    illuminant : name of the light's spectrum.
+    without : noise terms to switch off, as in `simulate`.
+
+    Returns
+    -------
+    The bench.
 
     Raises
     ------
     RangeError
-        For a noise term that does not exist, or a sensor of which nothing can be captured.
+        If a noise term does not exist, or the sensor has nothing that can be captured.
     SpecError
         If the illuminant is unknown or does not cover the response.
     """

@@ -1,4 +1,4 @@
-"""How exact a render was, from its two independent halves, in units of the sensor's own noise."""
+"""Error of a render in units of the sensor's own noise, from its two independent halves."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
 
-#: Values looked at of each picture, and bins of a decade of the histogram from the first bin's end on.
+#: Number of values sampled per picture, and bins per decade of the histogram after its first bin.
 _VALUES, _BINS, _FIRST, _DECADES = 1 << 15, 50, 1e-5, 10
 
 
 class ErrorMeter:
-    """Errors of the values of a run.
+    """Measures the error of the values of a run.
 
-    Half the difference of a value's two halves has the variance of the value's own error and, where rays are many, its
-    distribution. Of large pictures some values are looked at, the same in every picture.
+    Half the difference of a value's two halves has the variance of the value's own error and, with many rays, its
+    distribution. In large pictures a sample of the values is used, the same in every picture.
     """
 
     def __init__(self) -> None:
@@ -32,12 +32,12 @@ class ErrorMeter:
         half_b: Float,
         noise: Callable[[NDArray[np.float64], NDArray[np.int64]], NDArray[np.float64]],
     ) -> None:
-        """One picture.
+        """Add one picture.
 
         Parameters
         ----------
-        half_a, half_b : Dr.Jit Float [n], electrons; the same array where a source has no error of this kind.
-        noise : electrons [k] and places in the picture [k] → one standard deviation of the noise there, electrons.
+        half_a, half_b : Dr.Jit Float [n], electrons; the same array if a source has no error of this kind.
+        noise : maps electrons [k] and places in the picture [k] to one standard deviation of the noise, electrons.
         """
         import drjit as dr
 
@@ -60,11 +60,11 @@ class ErrorMeter:
         self._values += error.size
 
     def as_dict(self, wanted: float | None = None) -> dict[str, float] | None:
-        """For the manifest, in units of noise; None where nothing was seen.
+        """Statistics for the manifest, in units of noise; None without values.
 
         Parameters
         ----------
-        wanted : error that was asked for.
+        wanted : error that was asked for, in units of noise.
         """
         if not self._values:
             return None
@@ -72,7 +72,7 @@ class ErrorMeter:
         cumulated = np.cumsum(self._counts)
         found = {"rms": float(np.sqrt(self._square / self._values))}
         for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
-            # the middle of the bin, which is 4.7 % wide
+            # centre of the bin, which is 4.7 % wide
             found[name] = float(lower[np.searchsorted(cumulated, part * cumulated[-1])] * 10 ** (0.5 / _BINS))
         if wanted is not None:
             found["share_above_wanted"] = float(self._counts[lower >= wanted * (1 - 1e-9)].sum() / self._values)

@@ -1,6 +1,6 @@
-"""A virtual calibration session: the captures a person with the sensor on a bench would make.
+"""A virtual calibration session: the captures that a person would make with the sensor on a bench.
 
-Frames and events come from the same noise models and the same event stage as in a simulation; the light
+Frames and events come from the same noise models and the same event stage as in a simulation. The light
 is that of `hesim_render.capture.bench`.
 """
 
@@ -31,16 +31,16 @@ from hesim_render.specs.files import content_hash, list_names
 from hesim_render.specs.sensor import read_sensor
 
 CAPTURE_NAME = "capture.yaml"
-#: Exposure sets of the paper, µs. The longest dark set of its two sensors is taken for every sensor.
+#: Exposure sets of the paper, µs. The longer dark set of its two sensors is used for every sensor.
 DARK_EXPOSURES_US = (1000, 5000, 20000, 50000, 80000)
 LIT_EXPOSURES_US = (1000, 2000, 5000, 10000, 20000, 40000, 50000, 80000)
 
-#: S-curve: contrasts from −2 θ to 2 θ, the brightest of which is the target's brightest patch.
+#: S-curve: contrasts from −2 θ to 2 θ; the brightest level is that of the target's brightest patch.
 _CONTRASTS, _REACH = 21, 2.0
 _LEAST_TRIALS = 50
 _FEWEST_FRAMES = 8
 _FEWEST_TRIALS = 4
-_FRAME_WORK = 8  # a frame takes about as long as so many ticks
+_FRAME_WORK = 8  # a frame takes about as long as this many ticks
 _NODES_PER_CUTOFF_PERIOD = 16  # of the noise of asynchronous pixels, each of which costs about as much as a tick
 
 
@@ -59,19 +59,24 @@ def write_captures(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Hold a calibration session and write its capture set; it appears whole or not at all.
+    """Run a calibration session and write its capture set, which appears whole or not at all.
 
     Parameters
     ----------
-    sensor : from `load_sensor`; crop it to capture a part. Frames are streamed to disk: memory does not grow with
+    sensor : from `load_sensor`; crop it to capture a part. Frames are streamed to disk, so memory does not grow with
         their number.
-    frames : per exposure, dark and lit.
-    ticks : comparisons counted on the static target, and as many in the dark; the S-curve takes a
-        hundredth of them, 50 at least, at each of 21 contrasts. Of sensors with fixed comparisons.
-    trials : after a reset, at each level of light and each step of contrast. Of sensors with reference ``last_event``.
-    seed : of the temporal noise; every frame and tick of a session has its own number, so none repeats.
+    out : folder to write.
+    frames : number of frames per exposure, dark and lit.
+    ticks : number of comparisons on the static target, and again in the dark; the S-curve takes a
+        hundredth of them, at least 50, at each of 21 contrasts. For sensors with fixed comparisons.
+    trials : number of trials after a reset, at each level of light and each step of contrast. For sensors with
+        reference ``last_event``.
+    seed : seed of the temporal noise. Every frame, tick and trial of a session has its own number, so noise never
+        repeats.
     without : noise terms to switch off, as in `simulate`.
-    overwrite : replace a capture set that is there.
+    dark_exposures_us, lit_exposures_us : exposures of the dark and of the lit frames, µs.
+    illuminant : name of the light's spectrum.
+    overwrite : replace an existing capture set.
     progress : called with (done, total, what).
 
     Returns
@@ -81,7 +86,7 @@ def write_captures(
     Raises
     ------
     RangeError
-        For a number out of range, or a noise term that does not exist.
+        If a number is out of range, or a noise term does not exist.
     SpecError
         If the illuminant is unknown or does not cover the response.
     OutputError
@@ -129,7 +134,7 @@ def write_captures(
 
 @dataclass
 class _Session:
-    """Numbers frames and ticks through the session, and tells how far it is."""
+    """Numbers the frames and ticks of a session, and reports its progress."""
 
     bench: Bench
     seed: int
@@ -177,9 +182,9 @@ class _Session:
                 archive.add(name, array)
 
     def write_steps(self, file: Path, trials: int) -> None:
-        """Steps from one level to others and back; of each pair only the step away is counted.
+        """Steps from one level to others and back. Only the step away from the first level is counted.
 
-        The light is set filter by filter, so that every event pixel starts from the same signal.
+        The light is set per filter, so that every event pixel starts from the same signal.
         """
         evs = self.bench.evs
         assert evs is not None
@@ -222,18 +227,18 @@ class _Session:
         return jit().Float((signal_dn / self.bench.event_dn_per_e_per_s * seconds).astype(np.float32).ravel())
 
     def _counts(self, levels: Sequence[Float], trials: int, what: str) -> tuple[NDArray, NDArray]:
-        """ON and OFF events [y, x] of `trials` arrivals at the last level, the levels being shown in turn."""
+        """ON and OFF events [y, x] of `trials` steps to the last level; the levels are shown in turn."""
         evs = self.bench.evs
         assert evs is not None and evs.spec.tick_us is not None
         shape = self.bench.sensor.layout.evs_shape
         on, off = np.zeros((2, shape[0] * shape[1]), dtype=np.min_scalar_type(trials))
         stage, period = EvsStage(evs, self.seed), len(levels)
-        # the first sample of all is only a reference
+        # the very first sample is only a reference
         for k in range(trials * period + (period == 1)):
             self.t_us += evs.spec.tick_us
             events = stage.step(levels[k % period], self.t_us)
             if k % period == period - 1:
-                # a pixel has at most one event at a tick
+                # a pixel has at most one event per tick
                 pixel = events["y"].astype(np.int64) * shape[1] + events["x"]
                 on[pixel[events["polarity"] > 0]] += 1
                 off[pixel[events["polarity"] < 0]] += 1
@@ -243,7 +248,7 @@ class _Session:
 
 
 def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
-    """``capture.yaml``, and the sensor's file where it is not one that ships."""
+    """Write ``capture.yaml``, and the sensor's file if it is not a shipped one."""
     spec, layout = bench.sensor.spec, bench.sensor.layout
     shipped = bench.sensor.file in list_names("sensors") and content_hash(
         read_sensor(bench.sensor.file)

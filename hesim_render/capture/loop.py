@@ -1,4 +1,4 @@
-"""One run: a source of flux, a sensor, a stretch of time; out come frames, events and their truth."""
+"""The capture loop: from a source of flux and a sensor to frames, events and their truth."""
 
 from __future__ import annotations
 
@@ -38,12 +38,17 @@ NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term 
 def noise_models(
     sensor: Sensor, clean: bool = False, without: Sequence[str] = ()
 ) -> tuple[ApsNoise | None, EvsNoise | None]:
-    """Both noise models with terms switched off.
+    """Both noise models of a sensor, with terms switched off.
 
     Parameters
     ----------
-    clean : all terms off.
-    without : names such as ``aps.read`` or ``evs.leak``; see `NOISE_TERMS`.
+    sensor : the sensor; the model of a pixel kind that it lacks is None.
+    clean : switch all terms off.
+    without : names of terms to switch off, such as ``aps.read`` or ``evs.leak``; see `NOISE_TERMS`.
+
+    Returns
+    -------
+    aps, evs : models of frame pixels and of event pixels.
 
     Raises
     ------
@@ -64,7 +69,7 @@ def noise_models(
 
 @dataclass
 class _OpenFrame:
-    """A frame being exposed: both halves of its electrons, one entry per frame pixel; None before the first piece."""
+    """A frame during its exposure: both halves of its electrons, per frame pixel; None before the first piece."""
 
     exposure: Exposure
     half_a: Float = None
@@ -73,7 +78,7 @@ class _OpenFrame:
 
 @dataclass(frozen=True)
 class _Piece:
-    """Part of an exposure in which the source does not change its state."""
+    """Part of an exposure during which the source is in one state."""
 
     frame: _OpenFrame
     begin_us: float
@@ -81,22 +86,23 @@ class _Piece:
 
 
 class Capture:
-    """Drives the stages over time, holding one slice of flux and the frames in exposure.
+    """Runs the sensor over time. It holds one slice of flux and the frames in exposure.
 
     Parameters
     ----------
-    flux : where Φ comes from.
-    sensor : region and lens as `flux` uses them.
+    flux : source of Φ, e⁻/s.
+    sensor : with the region and lens that `flux` uses.
     aps, evs : noise models, from `noise_models`.
-    duration_us : end of the run.
-    seed : of all temporal noise.
-    begin_us : begin of the run. Frames and comparisons are at the same times whenever it begins; frames belong to the
-        run in which they end.
-    pixels : what the event pixels remember of the run before, its `pixel_state`: together both are one run.
+    duration_us : end of the run, µs.
+    seed : seed of all temporal noise.
+    begin_us : begin of the run, µs. The times of frames and comparisons do not depend on it; a frame belongs to the
+        run in which it ends.
+    pixels : state of the event pixels at the end of the previous run (its `pixel_state`). Both runs together
+        then equal one run.
 
     Attributes
     ----------
-    errors : of the render, for frames and for events.
+    errors : error of the render, for frames and for events.
     """
 
     def __init__(
@@ -113,7 +119,7 @@ class Capture:
         self._sensor, self._aps, self._seed = sensor, aps, seed
         self._begin_us, self._duration_us = begin_us, duration_us
         layout = sensor.layout
-        # the source as frame and as event pixels see it: one, but where crosstalk is off for one of them
+        # frame pixels and event pixels share one source, unless crosstalk is switched off for one of the two
         sources = {n.crosstalk: with_crosstalk(flux, layout.shape, n.crosstalk) for n in (aps, evs) if n is not None}
         self._frame_source, self._event_source = (
             sources[noise.crosstalk] if noise is not None else next(iter(sources.values()), flux)
@@ -135,7 +141,7 @@ class Capture:
         self.errors = {"frames": ErrorMeter(), "events": ErrorMeter()}
 
     def _still_sources(self) -> tuple[FluxSource, FluxSource]:
-        """Both sources, each rendered once, with all the pixels that it is asked for."""
+        """Both sources of a static scene, each rendered once for all the pixels that it is asked for."""
         frame_pixel = self._aps_pixel if self._exposures else self._aps_pixel[:0]
         if self._frame_source is self._event_source:
             still = StillFlux(self._frame_source, np.concatenate([frame_pixel, self._evs_pixel]))
@@ -144,16 +150,16 @@ class Capture:
 
     @property
     def event_pixels(self) -> NDArray[np.uint32]:
-        """Mosaic indices in the order of the event grid."""
+        """Mosaic indices of the event pixels, [n], in the order of the event grid."""
         return self._evs_pixel
 
     @property
     def pixel_state(self) -> dict[str, Any]:
-        """What the event pixels remember at the end of the run, for one that goes on; plain values, NumPy arrays."""
+        """State of the event pixels at the end of the run, for a run that continues it; plain values, NumPy arrays."""
         return self._pixel_state
 
     def event_blocks(self) -> Iterator[Block]:
-        """Windows in which the source is asked for event pixels."""
+        """Blocks of windows for which the source is asked for the flux of event pixels."""
         if self._stage is None:
             return
         spec = self._stage.noise.spec
@@ -164,34 +170,43 @@ class Capture:
         if known_us is None:
             yield from self._event_source.sample_blocks(spec.window_us, self._begin_us, self._duration_us)
             return
-        # the last sample of the run before is known
+        # the state of the previous run holds its last sample
         blocks = self._event_source.sample_blocks(spec.window_us, known_us - spec.window_us, self._duration_us)
         next(blocks)
         yield from blocks
 
     @property
     def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:
-        """Frame pixels and all exposures of the run."""
+        """Mosaic indices of the frame pixels, [n], and all exposures of the run."""
         return self._aps_pixel, list(self._exposures)
 
     @property
     def event_flux(self) -> EventFlux:
-        """Mean noise-free flux of the event pixels over all samples taken so far."""
+        """Mean noise-free flux of the event pixels over all samples so far, e⁻/s."""
         return self._event_flux
 
     @property
     def events_dropped(self) -> int:
-        """Events lost in the sensor's read-out so far."""
+        """Number of events that the sensor's read-out has lost so far."""
         return self._stage.dropped if self._stage is not None else 0
 
     def run(self, progress: Progress | None = None) -> Iterator[Frame | NDArray]:
-        """Frames and blocks of events (`EVENT_DTYPE`), each kind in order of time."""
+        """Run the capture.
+
+        Parameters
+        ----------
+        progress : called with (done, total, what).
+
+        Yields
+        ------
+        Frames, and blocks of events (structured arrays of `EVENT_DTYPE`); each kind in order of time.
+        """
         pieces = self._pieces()
         piece = next(pieces, None)
         blocks, asked = tee(self.event_blocks())
         samples = self._event_source.flux_of_blocks(self._evs_pixel, asked)
         for begin_us, end_us in _wanted(blocks):
-            # what ends before a window comes first: a source may forget what lies behind
+            # expose whatever ends before a window first: a source may drop its data of the past
             while piece is not None and piece.end_us <= begin_us:
                 yield from self._expose(piece)
                 piece = next(pieces, None)
@@ -207,7 +222,13 @@ class Capture:
             piece = next(pieces, None)
 
     def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
-        """Run, and write frames, events and the truth of the event pixels as they come."""
+        """Run the capture, and write frames, events and the truth of the event pixels as they come.
+
+        Parameters
+        ----------
+        writer : takes frames and events.
+        progress : called with (done, total, what).
+        """
         for item in self.run(progress):
             if isinstance(item, np.ndarray):
                 writer.add_events(item)
@@ -219,7 +240,7 @@ class Capture:
             writer.set_events_dropped(self.events_dropped)
 
     def _compare(self, sample: Sample, t_us: int) -> NDArray:
-        """Events of the run up to a sample."""
+        """Events up to a sample."""
         assert self._stage is not None
         if t_us > self._duration_us:
             self._pixel_state = self._stage.state()
@@ -229,10 +250,10 @@ class Capture:
         return events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
 
     def _pieces(self) -> Iterator[_Piece]:
-        """Exposures, cut where the source moves to its next state, in order of their ends."""
+        """Exposures, cut where the source changes its state, in order of their ends."""
         waiting: list[tuple[float, int, _Piece]] = []
         for exposure in self._exposures:
-            # nothing of this exposure ends before it begins
+            # no piece of this exposure ends before the exposure begins
             while waiting and waiting[0][0] <= exposure.start_us:
                 yield heappop(waiting)[2]
             frame = _OpenFrame(exposure)
@@ -243,7 +264,7 @@ class Capture:
             yield heappop(waiting)[2]
 
     def _expose(self, piece: _Piece) -> Iterator[Frame]:
-        """Add the part of each row's exposure that lies in a piece; the frame, if this is its last."""
+        """Add to each row the part of its exposure that lies in a piece. Yield the frame after its last piece."""
         frame = piece.frame
         if frame.half_a is None:
             import drjit as dr
@@ -284,7 +305,7 @@ class Capture:
         return self._stage.step((half_a + half_b) * (0.5 * seconds), t_us)
 
     def _read_out(self, frame: _OpenFrame) -> Frame:
-        """Noise once per frame, then everything back on the mosaic."""
+        """Draw the noise of a frame once, then put all values back on the mosaic."""
         import drjit as dr
 
         assert self._aps is not None

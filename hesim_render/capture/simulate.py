@@ -1,4 +1,4 @@
-"""The main job: render a scene, expose a sensor to it, and record what comes out."""
+"""Render a scene, expose a sensor to it, and record frames and events."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
 from hesim_render.sources.scene import Scene
 
-#: Rays per pixel in the exact mode where the user names none. A static scene is rendered once for the whole run,
+#: Default rays per pixel in the exact mode. A static scene is rendered once for the whole run,
 #: a moving one once per slice.
 STATIC_SAMPLES = 64
 MOVING_SAMPLES = 16
@@ -50,30 +50,31 @@ def simulate(
     progress: Progress | Literal[False] | None = None,
     on_estimate: Callable[[Estimate], None] | None = None,
 ) -> Recording:
-    """RAW frames and events of a scene, with the electrons behind them.
+    """Simulate a sensor in front of a scene: RAW frames, events, and their noise-free truth.
 
     Parameters
     ----------
     scene, sensor : from `load_scene` and `load_sensor` (crop the sensor for a region of interest).
     duration_s : simulated time from 0, s.
-    seed : of the temporal noise and of the render's samples; the device's own maps come from the
-        sensor file's device seed.
+    seed : seed of the temporal noise and of the render's samples. The fixed maps of the device come from the
+        device seed of the sensor file.
     clean : switch every noise term off.
-    without : noise terms to switch off by name, such as ``aps.read`` or ``evs.leak``.
-    quality : error of the render as a part of the sensor's own noise, default 0.5: each pixel gets as many
-        rays as that takes, and only what changes is rendered again. An audit states what that has missed.
-    samples : rays per pixel and slice, even, in place of `quality`; asks for the exact mode.
-    exact : render every pixel of every slice with the same number of rays, default 64 for a static scene, 16
+    without : names of noise terms to switch off, such as ``aps.read`` or ``evs.leak``.
+    quality : wanted error of the render, as a fraction of the sensor's own noise; default 0.5. Each pixel gets as
+        many rays as this error needs, and only pixels that change are rendered again. An audit measures what this
+        misses.
+    samples : rays per pixel and slice, even. Selects the exact mode, in place of `quality`.
+    exact : render every pixel of every slice with the same number of rays; default 64 for a static scene, 16
         for a moving one.
-    max_minutes : refuse a run whose estimate is longer; None does not.
+    max_minutes : refuse a run whose estimated time is longer, min; None sets no limit.
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
-    progress : called with (done, total, what). None shows a bar in notebooks and nothing elsewhere; False nothing.
-    on_estimate : called with what the run will take, before it begins; not in the exact mode.
+    progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
+    on_estimate : called with the estimate of time and memory before the run begins; not in the exact mode.
 
     Examples
     --------
-    The mean of a clean frame is its electrons times the gain, above black, to half a DN of rounding:
+    The mean of a clean frame is its electrons times the gain, above the black level, to half a DN of rounding:
 
     >>> import hesim_render as hr
     >>> sensor = hr.load_sensor("reference-mono").crop(32, 24)
@@ -87,13 +88,13 @@ def simulate(
     -------
     Recording
         Frames whose last row is exposed within the run, events, and their truth with standard
-        errors from two independent halves of the render. ``settings.render`` of its manifest tells what
-        was reached.
+        errors from two independent halves of the render. ``settings.render`` of its manifest states the
+        error that was reached.
 
     Raises
     ------
     RangeError
-        For a duration, seed, quality, sample count or noise term out of range.
+        If duration, seed, quality, sample count or noise term is out of range.
     ConflictError
         If `quality` comes with `exact` or `samples`.
     TooLongError
@@ -101,7 +102,7 @@ def simulate(
     SpecError
         If scene and sensor do not fit together (a spectrum that does not cover the response).
     OutputError
-        If `out` exists or cannot be written; nothing half-written is left.
+        If `out` exists or cannot be written. No partial output is left.
     """
     duration_us = _duration_us(duration_s)
     if not 0 <= seed < 2**64:
@@ -165,7 +166,7 @@ def simulate(
 
 
 def _camera_used(flux: Any) -> dict[str, Any]:
-    """Where the camera stands at rest and how wide it sees, whatever of it was said by whom; plain values."""
+    """Pose at rest and field of view of the camera in use, as plain values, whether scene or sensor set them."""
     view = flux.view
     left, right, _, _ = view.region_mm
     axis, image_mm = view.sensor.lens.axis_mm[0], view.sensor.lens.image_distance_mm
@@ -189,7 +190,7 @@ def _source(
     exact: bool,
     progress: Progress | None,
 ) -> tuple[Any, dict[str, Any]]:
-    """The renderer that was asked for, or that the scene needs, and what the manifest says of it."""
+    """The renderer that was asked for, or that the scene needs, and its settings for the manifest."""
     settings: dict[str, Any] = {}
     window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
     if not exact and samples is None:
@@ -214,12 +215,12 @@ def _source(
 
 
 def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
-    """The change-driven renderers of a source: one for each waveform of its lights; none in the exact mode."""
+    """The change-driven renderers of a source, one per waveform of its lights; none in the exact mode."""
     return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
 
 
 def _noted(flux: Any, capture: Capture, seed: int) -> NotedFlux:
-    """The source, with units of an audit noted on the way."""
+    """The source, wrapped so that units of the audit are noted during the run."""
     spec = flux.sensor.spec.evs
     stretch = STRETCHES[spec.reference] if spec is not None else (0, 1, 0)
     windows = 0 if flux.is_static else sum(int(block.wanted.sum()) for block in capture.event_blocks())
@@ -228,13 +229,13 @@ def _noted(flux: Any, capture: Capture, seed: int) -> NotedFlux:
 
 
 def _work_done(parts: list[ChangeDrivenFlux]) -> dict[str, Any]:
-    """Rays and pairs of all parts, plain values."""
+    """Total rays and pairs of all parts, as plain values."""
     total = {name: sum(getattr(part.counts, name) for part in parts) for name in vars(parts[0].counts)}
     return {"quality": parts[0].quality, "renders": len(parts), **total}
 
 
 def _share_progress(total: float, progress: Progress | None) -> Callable[[int], None] | None:
-    """A static scene is one long render: tell how much of what was expected is done."""
+    """Progress of a static scene, which is one long render: rays done out of the forecast number."""
     if progress is None or total <= 0:
         return None
     return lambda rays: progress(min(rays, total), total, "rays")
@@ -243,7 +244,7 @@ def _share_progress(total: float, progress: Progress | None) -> Callable[[int], 
 def _ray_progress(
     scene: Scene, sensor: Sensor, samples: int, progress: Progress | None
 ) -> Callable[[int], None] | None:
-    """A static scene is one long render: tell how many of its rays are done."""
+    """Progress of a static scene, which is one long render: rays done out of all rays."""
     if progress is None or scene.spec.motion:
         return None
     wanted = sensor.layout.aps_mask.copy()

@@ -1,4 +1,4 @@
-"""A video in front of a sensor: RAW frames and events from pictures instead of a rendered scene."""
+"""Simulate a sensor in front of a video: RAW frames and events from pictures instead of a rendered scene."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hesim_render.sources.video import VideoFlux, VideoOptions
 from hesim_render.sources.video.flux import Source
 from hesim_render.spectral import spectrum as spectra
 
-#: Slack of a duration given in decimals of the video's length, µs.
+#: Tolerance of a duration that is given as the rounded length of the video, µs.
 _SLACK_US = 1.0
 #: Processor seconds for a pixel of a picture, of an event sample and of a frame that is read out and stored; seconds
 #: for each of these besides its pixels, and in all. From `benchmarks/video.py`, for one core of an AVX-512 server.
@@ -33,12 +33,12 @@ _PER_PIXEL_S, _PER_ITEM_S, _IN_ALL_S = np.array([8e-9, 17e-9, 60e-9]), np.array(
 
 @dataclass(frozen=True)
 class VideoEstimate:
-    """What a run will take, right to about a factor of two; decoding of hard codecs comes on top.
+    """Estimated work of a run, right to about a factor of two. The time to decode slow codecs comes on top.
 
     Parameters
     ----------
-    seconds : in all.
-    pictures, event_samples, frames : how many of each.
+    seconds : total time, s.
+    pictures, event_samples, frames : number of each.
     """
 
     seconds: float
@@ -54,7 +54,7 @@ class VideoEstimate:
 
 
 def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimate:
-    """From counts alone: nothing is read, and nothing is held in memory however long the run."""
+    """Estimate from counts alone. Nothing is read, and memory does not depend on the length of the run."""
     aps, evs, shape = sensor.spec.aps, sensor.spec.evs, sensor.layout.shape
     pictures = min(flux.clock.count, int(np.searchsorted(flux.clock.middle_us, duration_us)) + 1)
     samples = 0
@@ -83,21 +83,21 @@ def simulate_video(
     on_estimate: Callable[[VideoEstimate], None] | None = None,
     **options: Any,
 ) -> Recording:
-    """RAW frames and events of a video, with the electrons behind them.
+    """Simulate a sensor in front of a video: RAW frames, events, and their noise-free truth.
 
     Parameters
     ----------
     source : path of a video file, of a folder of numbered pictures or of a ``.npy`` file, or an array
         [time, row, col] or [time, row, col, channel].
     sensor : from `load_sensor` (crop it for a region of interest).
-    duration_s : simulated time from the video's first picture, s; default all of it.
-    seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as in `simulate`.
-    options : of `sources.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
+    duration_s : simulated time from the video's first picture, s; default: the whole video.
+    seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as for `simulate`.
+    options : options of `sources.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
         tags, ``mode``, ``white_lux`` or ``white_e_per_s`` with ``white_filter``, ``fit``, ``lens_shading``, …
 
     Examples
     --------
-    Four pictures, each brighter than the one before: every pixel sees three steps up.
+    Each of these four pictures is brighter than the one before, so every pixel sees three steps up.
 
     >>> import numpy as np
     >>> import hesim_render as hr
@@ -111,19 +111,19 @@ def simulate_video(
     Returns
     -------
     Recording
-        As of `simulate`; the standard errors of the truth are 0. ``settings.video`` of its manifest holds the
-        input's hash and all that was done with it.
+        As from `simulate`; the standard errors of the truth are 0. ``settings.video`` of its manifest holds the
+        hash of the input and all processing options.
 
     Raises
     ------
     SpecError
-        If the video cannot be read, is damaged or lacks colour tags or a clock.
+        If the video cannot be read, is damaged, or lacks colour tags or a clock.
     RangeError
-        For a value out of range, or a duration longer than the video.
+        If a value is out of range, or the duration is longer than the video.
     TooLongError
         If the run would take longer than `max_minutes`.
     OutputError
-        If `out` exists or cannot be written; nothing half-written is left.
+        If `out` exists or cannot be written. No partial output is left.
     """
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
@@ -193,7 +193,7 @@ def _duration_us(duration_s: float | None, flux: VideoFlux, name: str) -> int:
 
 
 def _mosaic(sensor: Sensor, options: VideoOptions) -> Mosaic:
-    """The sensor's mosaic under the video's light, with the balance and matrix of a camera that was given."""
+    """The sensor's mosaic under the light of the video, with the balance and matrix of the camera, if one was given."""
     mosaic = describe(sensor, spectra.illuminant(options.illuminant))
     camera = options.camera
     if camera is None or sorted(camera.channels) != sorted(mosaic.channels):

@@ -1,9 +1,9 @@
-"""All colours at every pixel, from any tile: Bayer, Quad-Bayer, RGBW, with or without holes.
+"""Demosaicing of any tile: Bayer, Quad-Bayer, RGBW, with or without holes.
 
-The guide is the channel with most samples (green, or white), predicted from the samples around under the priors that
-hold there (`guide`). Every other channel is a local linear function of the guide plus a residual interpolated from
-its own samples (residual interpolation, [kiku2013]), its slope found by ridge regression
-towards 1. Work is done on the square root of the signal, in which noise is even and edges overshoot less.
+The guide is the channel with most samples (green or white). It is predicted from the samples around a pixel, with the
+local priors of `guide`. Every other channel is a local linear function of the guide plus a residual, which is
+interpolated from the channel's own samples (residual interpolation, [kiku2013]). Ridge regression towards 1 gives the
+slope. All steps work on the square root of the signal, where the noise is uniform and edges overshoot less.
 """
 
 from __future__ import annotations
@@ -76,8 +76,17 @@ def remosaic(raw: NDArray[np.float32], tile: ArrayLike, target: ArrayLike = ((0,
 
     Parameters
     ----------
-    raw, tile : as `demosaic`.
-    target : tile wanted, by default RGGB.
+    raw, tile : as for `demosaic`.
+    target : [tile_row, tile_col], channel numbers of the wanted tile, by default RGGB.
+
+    Returns
+    -------
+    float32 [row, col], in the unit of `raw`.
+
+    Raises
+    ------
+    RangeError
+        As for `demosaic`, or if `target` has a channel number that `tile` lacks.
     """
     wanted = np.asarray(target)
     colours = demosaic(raw, tile)
@@ -136,7 +145,7 @@ def _linear(planes: NDArray[np.float32], block: NDArray, channel: int) -> NDArra
 def _guided(
     planes: NDArray[np.float32], guide: NDArray[np.float32], block: NDArray, channel: int
 ) -> NDArray[np.float32]:
-    """A channel as a local linear function of the guide plus what its own samples have beyond that."""
+    """A channel as a local linear function of the guide, plus the interpolated residual of its own samples."""
     known, wanted = _targets(block, channel)
     bh, bw = block.shape
     samples = [planes[row * bw + col, 1:-1, 1:-1] for row, col in known]

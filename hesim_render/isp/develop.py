@@ -18,7 +18,7 @@ from hesim_render.recording import manifest as manifests
 from hesim_render.recording.recording import Recording
 from hesim_render.sensor.lens import Lens, relative_illumination
 
-#: File that tells a folder of pictures.
+#: File by which a folder of pictures is recognised.
 MARKER = "isp.json"
 
 
@@ -30,20 +30,21 @@ def develop_recording(
     overwrite: bool = False,
     calibration: str | Path | None = None,
 ) -> Path:
-    """Write a picture of every frame of a recording, and ``isp.json`` with how they were made.
+    """Write a picture of every frame of a recording, and ``isp.json`` with the settings used.
 
-    Depth 8 gives PNG; depth 16, and float32 where there is no encode step or it says ``float``, give TIFF. An
-    automatic exposure is measured on the middle frame and kept for all, so that a sequence does not flicker. Noise is
-    reduced by the model and the maps of the sensor that made the recording; what was switched off there is not looked
-    for, so that frames without noise stay as they are.
+    Depth 8 gives PNG. Depth 16 gives TIFF, as does float32 (without an encode step, or where that step says ``float``).
+    Automatic exposure is measured on the middle frame and kept for all frames, so that a sequence does not flicker.
+    Noise reduction uses the noise model and the maps of the sensor that made the recording. Noise terms that were
+    switched off in the recording are not reduced, so frames without noise stay unchanged.
 
     Parameters
     ----------
-    out : folder to write; default beside the recording, its name with ``-pictures``.
+    folder : the recording.
+    out : folder to write; default: beside the recording, with its name and ``-pictures``.
     pipeline : default `DENOISED_PICTURE`; `PICTURE` is the same without noise reduction.
     progress : called with (done, total, what).
     overwrite : replace an earlier folder of pictures.
-    calibration : the ``calibration.yaml`` of a calibrated sensor, whose maps the recording does not hold; without it
+    calibration : ``calibration.yaml`` of a calibrated sensor, whose maps the recording does not hold. Without it,
         row offsets are estimated from the frames.
 
     Returns
@@ -53,7 +54,9 @@ def develop_recording(
     Raises
     ------
     SpecError
-        If it is no recording, or has no frames, or the calibration is not that of its sensor.
+        If the folder is not a recording, or has no frames, or the calibration belongs to another sensor.
+    RangeError
+        If a calibration is given, but no step of the pipeline reduces noise.
     OutputError
         If the pictures cannot be written.
     """
@@ -101,12 +104,17 @@ def develop_recording(
 
 
 def write_picture(path: Path, picture: NDArray) -> None:
-    """Write [row, col, 3]: uint8 as PNG or TIFF, uint16 and float32 as TIFF.
+    """Write a picture: uint8 as PNG or TIFF, uint16 and float32 as TIFF.
+
+    Parameters
+    ----------
+    path : file to write; its ending selects the format.
+    picture : [row, col, 3].
 
     Raises
     ------
     RangeError
-        If the file name's ending does not go with the depth.
+        If the ending of the file name does not suit the depth.
     """
     if path.suffix == ".png":
         from PIL import Image
@@ -123,10 +131,10 @@ def write_picture(path: Path, picture: NDArray) -> None:
 
 
 def _illumination(recording: Recording) -> NDArray[np.float32]:
-    """Relative illumination of the recording's own lens over its region, as the manifest describes them."""
+    """Relative illumination of the recording's own lens over its region, computed from the manifest."""
     spec = manifests.sensor_spec(recording.manifest, recording.path)
     roi, used = recording.manifest["roi"], recording.manifest["lens"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
-    axis_x, axis_y = used.get("axis_mm", (0.0, 0.0))  # recordings of before it was told have theirs in the middle
+    axis_x, axis_y = used.get("axis_mm", (0.0, 0.0))  # older recordings do not state the axis: it is in the middle
     lens = Lens(used["f_number"], used["focal_length_mm"], used["magnification"], (axis_x, axis_y))
     return relative_illumination(layout, lens)

@@ -1,4 +1,4 @@
-"""What is known of the noise of a sensor's frames: its variance against the signal, and its fixed maps."""
+"""Noise model of a sensor's frames for the ISP: variance against signal, and fixed maps."""
 
 from __future__ import annotations
 
@@ -25,19 +25,24 @@ Map = float | NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FrameNoise:
-    """Noise of frames over the region read out, in the calibrated form (`hesim_render.pixels.aps.formulas`).
+    """Noise of frames over the read-out region, in the calibrated form (`hesim_render.pixels.aps.formulas`).
 
     Parameters
     ----------
     beta : [tile_row, tile_col, 6], temporal variance before the ADC over 1, I, t, I², I t, t²; DN and s.
     exposure_us : exposure of the frame, µs.
-    residual_dn2 : variance beside it, DN²: what no term of `beta` has, and pixel offsets of which there is no map.
-    response_std : relative spread of responses of which there is no map.
-    row_std_dn : standard deviation over rows of fixed offsets of which there is no map, DN.
-    row_noise_dn : standard deviation of offsets that rows have in this frame alone (temporal row noise), DN.
+    residual_dn2 : further variance, DN²: noise that `beta` does not describe, and pixel offsets without a map.
+    response_std : relative spread of pixel responses without a map.
+    row_std_dn : standard deviation over rows of fixed offsets without a map, DN.
+    row_noise_dn : standard deviation of row offsets that change from frame to frame (temporal row noise), DN.
     offset_dn : N_FP less the black level, [row, col], DN; 0 where it is not known.
     dark_dn_per_s : N_DP, mean signal of the dark current, [row, col] or a number, DN/s.
     response : relative response of each pixel, [row, col] or 1.
+
+    Raises
+    ------
+    RangeError
+        If `beta` has another shape, or a value that is not finite.
     """
 
     beta: NDArray[np.float64]
@@ -58,12 +63,18 @@ class FrameNoise:
     def of_sensor(
         cls, spec: SensorSpec, layout: Layout, off: frozenset[str] = frozenset(), maps: bool = True
     ) -> FrameNoise:
-        """Of a sensor file's frame pixels.
+        """Noise of a sensor file's frame pixels.
 
         Parameters
         ----------
+        spec : content of the sensor file.
+        layout : read-out region.
         off : noise terms that are switched off (`APS_TERMS`).
-        maps : take the device's maps as known; else what they would tell counts as noise.
+        maps : take the device's maps as known; otherwise their spread counts as noise.
+
+        Returns
+        -------
+        The noise, at the exposure of the file.
 
         Raises
         ------
@@ -101,19 +112,23 @@ class FrameNoise:
     def of_recording(
         cls, manifest: Mapping[str, Any], calibration: str | Path | None = None, folder: Path | None = None
     ) -> FrameNoise:
-        """Of the sensor that made a recording, less the terms that were switched off.
+        """Noise of the sensor that made a recording, without the terms that were switched off there.
 
         Parameters
         ----------
-        manifest : of the recording.
-        calibration : the ``calibration.yaml`` of a calibrated sensor, whose maps a recording does not hold; without
-            it the maps are taken as unknown.
-        folder : of the recording, for errors.
+        manifest : manifest of the recording.
+        calibration : ``calibration.yaml`` of a calibrated sensor, whose maps a recording does not hold; without
+            it the maps are unknown.
+        folder : folder of the recording, for error messages.
+
+        Returns
+        -------
+        The noise, at the exposure of the recording's sensor.
 
         Raises
         ------
         SpecError
-            If the manifest holds no sensor that this version knows, or the calibration is not the one it had.
+            If the manifest holds no sensor that this version knows, or the calibration is not the one that was used.
         """
         spec = sensor_spec(manifest, folder)
         settings, roi = manifest.get("settings", {}), manifest["roi"]
@@ -126,12 +141,21 @@ class FrameNoise:
 
     @classmethod
     def of_calibration(cls, file: str | Path, exposure_us: float) -> FrameNoise:
-        """Of frames of a real sensor, as ``calibrate aps`` found it; for the region that was captured.
+        """Noise of frames of a real sensor, from ``calibrate aps``, for the captured region.
+
+        Parameters
+        ----------
+        file : the calibration.
+        exposure_us : exposure of the frames, µs.
+
+        Returns
+        -------
+        The noise.
 
         Raises
         ------
         SpecError
-            If the file is no calibration of frames.
+            If the file has no calibration of frames.
         """
         path = Path(file)
         data = read_calibration(path)
@@ -148,11 +172,29 @@ class FrameNoise:
         )  # fmt: skip
 
     def at(self, exposure_us: float) -> FrameNoise:
-        """The same sensor at another exposure."""
+        """The noise of the same sensor at another exposure.
+
+        Parameters
+        ----------
+        exposure_us : exposure, µs.
+
+        Returns
+        -------
+        The noise at that exposure.
+        """
         return replace(self, exposure_us=float(exposure_us))
 
     def times(self, factor: float) -> FrameNoise:
-        """With standard deviations multiplied by a factor; the maps stay."""
+        """The same noise with all standard deviations multiplied by a factor; the maps are unchanged.
+
+        Parameters
+        ----------
+        factor : 0 or more.
+
+        Returns
+        -------
+        The scaled noise.
+        """
         return replace(
             self,
             beta=self.beta * factor**2,
@@ -162,16 +204,16 @@ class FrameNoise:
 
     @property
     def unknown_rows_dn(self) -> float:
-        """Standard deviation over rows of all offsets that only the picture itself can tell."""
+        """Standard deviation over rows of all offsets that only the picture itself can show, DN."""
         return float(np.hypot(self.row_std_dn, self.row_noise_dn))
 
     @property
     def is_clean(self) -> bool:
-        """Whether there is nothing to smooth: no temporal noise, no pixel pattern without a map."""
+        """True if there is nothing to smooth: no temporal noise, and no pixel pattern without a map."""
         return not (self.beta.any() or self.residual_dn2 or self.response_std)
 
     def describe(self) -> dict[str, Any]:
-        """What is known, as plain values."""
+        """The parameters of the noise as plain values, maps summarised."""
         known = any(isinstance(values, np.ndarray) for values in (self.offset_dn, self.dark_dn_per_s, self.response))
         unknown = self.row_std_dn > 0 or self.response_std > 0
         return {
@@ -181,22 +223,35 @@ class FrameNoise:
         }
 
     def variance(self, position: tuple[int, int]) -> tuple[float, float, float]:
-        """a, b, c of the variance a + b I + c I² at a position of the tile, DN²; rounding to whole DN included."""
+        """Coefficients of the variance a + b I + c I² at a tile position, rounding to whole DN included.
+
+        Parameters
+        ----------
+        position : (tile_row, tile_col).
+
+        Returns
+        -------
+        a, b, c : DN², DN and 1, for a signal I in DN.
+        """
         beta, t = self.beta[position], self.exposure_us * S_PER_US
         constant = dark_variance_dn2(beta, t) + self.residual_dn2 + ADC_VARIANCE_DN2
         return float(constant), float(light_gain_dn(beta, 0.0, t)), float(beta[3] + self.response_std**2)
 
     def corrected(self, signal_dn: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A frame without what its sensor's maps say, DN.
+        """Remove the fixed pattern of the sensor's maps from a frame.
 
         Parameters
         ----------
         signal_dn : [row, col], DN above the black level.
 
+        Returns
+        -------
+        float32 [row, col], DN.
+
         Raises
         ------
         RangeError
-            If the maps are of another size.
+            If the maps have another size.
         """
         t = np.float32(self.exposure_us * S_PER_US)
         maps = [_fitting(name, getattr(self, name), signal_dn.shape) for name in
@@ -214,7 +269,7 @@ class FrameNoise:
 
 
 def _map(values: Map, factor: float, shift: float) -> Map:
-    """values · factor + shift, in float32 where it is a map."""
+    """values · factor + shift; float32 if `values` is a map."""
     if isinstance(values, np.ndarray):
         return values * np.float32(factor) + np.float32(shift)
     return values * factor + shift
@@ -228,7 +283,7 @@ def _fitting(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np
 
 
 def _with_calibration(spec: SensorSpec, path: Path) -> SensorSpec:
-    """A recording's sensor with the place of its calibration, which its manifest does not hold."""
+    """The sensor of a recording with the path of its calibration, which the manifest does not hold."""
     if spec.noise is None:
         raise SpecError("the recording's sensor has no calibration: its maps follow from its device seed", file=path)
     here = NoiseFile(file=path.name, sha256=spec.noise.sha256, folder=path.parent)

@@ -1,4 +1,4 @@
-"""A pipeline: a list of steps that a YAML file can change, and what runs it."""
+"""A pipeline: a list of steps that a YAML file can change, and the functions that run it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,20 @@ from hesim_render.specs.files import Strict, load_yaml, validate
 
 
 class Pipeline(Strict):
-    """Steps in the order in which they are done; a step may be left out, and some may stand more than once.
+    """A list of steps, in the order in which they are done. A step may be left out, and some may occur more than once.
 
-    Steps on the mosaic (black_level, fill, denoise, lens_shading, white_balance) come before the one demosaic, the
-    others after it; encode, if there is one, comes last. Before denoise stand black_level and, if need be, fill.
+    Steps on the mosaic (black_level, fill, denoise, lens_shading, white_balance) come before the single demosaic step,
+    all others after it. An encode step comes last. Only black_level and fill may come before denoise.
+
+    Parameters
+    ----------
+    schema_version : version of the file format, 1.
+    steps : steps as in a pipeline file, see docs/isp.md.
+
+    Raises
+    ------
+    ValidationError
+        If a step is unknown or the order is wrong (from pydantic; `load_pipeline` makes a `SpecError` of it).
     """
 
     schema_version: Literal[1] = 1
@@ -51,11 +61,29 @@ class Pipeline(Strict):
 
     @classmethod
     def of(cls, *steps: str | dict[str, Any]) -> Pipeline:
-        """A pipeline of step names, or of dictionaries as in a file."""
+        """A pipeline of given steps.
+
+        Parameters
+        ----------
+        steps : step names, or dictionaries as in a file.
+
+        Returns
+        -------
+        The pipeline.
+        """
         return cls.model_validate({"steps": [{"step": item} if isinstance(item, str) else item for item in steps]})
 
     def without(self, step: str) -> Pipeline:
-        """The same without steps of a name."""
+        """The same pipeline without some of its steps.
+
+        Parameters
+        ----------
+        step : name of the steps to leave out.
+
+        Returns
+        -------
+        A new pipeline.
+        """
         return self.model_copy(update={"steps": [item for item in self.steps if item.step != step]})
 
 
@@ -71,12 +99,20 @@ DENOISED_PICTURE = Pipeline.of("black_level", "denoise", *PICTURE.model_dump()["
 
 
 def load_pipeline(file: str | Path) -> Pipeline:
-    """A pipeline from a YAML file.
+    """Read a pipeline from a YAML file.
+
+    Parameters
+    ----------
+    file : the file.
+
+    Returns
+    -------
+    The pipeline.
 
     Raises
     ------
     SpecError
-        If the file is not one; the message has file, line and key.
+        If the file is not valid; the message names file, line and key.
     """
     path = Path(file)
     return validate(Pipeline, load_yaml(path), path, {})
@@ -115,15 +151,25 @@ def develop(
     exposure_gain: float | None = None,
     noise: FrameNoise | None = None,
 ) -> Development:
-    """As `process`; the result also says what steps found out (`Development.report`).
+    """As `process`, with measurements: the result also has the report of each step (`Development.report`).
 
-    What is measured on a chart is measured on the linear data without denoise, also where that step is there.
+    Charts are measured on linear data before noise reduction, even if the pipeline has a denoise step.
 
     Parameters
     ----------
-    illumination : relative illumination [row, col], for a lens_shading step without figures.
-    exposure_gain : for an automatic exposure, instead of measuring the frame.
-    noise : of the sensor, for a denoise step; a `Frame` says its exposure itself.
+    frame_or_raw, mosaic, pipeline : as for `process`.
+    illumination : relative illumination [row, col], for a lens_shading step without values of its own.
+    exposure_gain : factor of an automatic exposure; None measures the frame.
+    noise : noise of the sensor, for a denoise step; a `Frame` supplies its own exposure.
+
+    Returns
+    -------
+    The picture and the reports of its steps.
+
+    Raises
+    ------
+    RangeError, SpecError
+        If the frame does not fit the camera, or a step lacks an input.
     """
     camera = mosaic if isinstance(mosaic, Camera) else Camera.of(mosaic)
     raw = np.asarray(frame_or_raw.raw if isinstance(frame_or_raw, Frame) else frame_or_raw)
@@ -146,7 +192,7 @@ def develop(
 
 
 def _charts_measured(state: Development, chain: Pipeline) -> list[Step]:
-    """The steps; where there is a denoise, those with a chart have what is measured without it."""
+    """The steps; if one is a denoise step, charts are measured on a branch without it."""
     charts = [k for k, item in enumerate(chain.steps) if getattr(item, "method", None) == "chart"]
     steps = list(chain.steps)
     if not charts or not any(isinstance(item, Denoise) for item in steps):

@@ -1,4 +1,4 @@
-"""What a camera does to colours, in one description: the ISP undoes it, an inverse pipeline applies it.
+"""Colour profile of a camera: the ISP undoes it, an inverse pipeline applies it.
 
 channel = (matrix⁻¹ · linear RGB) / white balance        DN = black + channel · (white - black)
 """
@@ -29,12 +29,12 @@ class Camera(Strict):
     ----------
     channels : names of the colours, in the order of `white_balance` and of the columns of `matrix`.
     tile : channel name of each position, [tile_row][tile_col]; ``.`` where there is no frame value. In a file
-        also as text, one line a row, names parted by spaces.
-    stands_for : as `tile`: the channel that a position without a value is filled with. Default: the channel its
-        own 2×2 cell has (a hole in a quad cell).
-    black_level_dn, white_level_dn : RAW data; white is where a pixel saturates.
-    white_balance : gain of each channel that makes white equal in all.
-    matrix : [3][channel], balanced channels to linear RGB.
+        also as text: one line per row, names separated by spaces.
+    stands_for : as `tile`: the channel that a position without a value is filled with. Default: the channel
+        of its 2×2 cell (a hole in a quad cell).
+    black_level_dn, white_level_dn : levels of RAW data, DN; a pixel saturates at the white level.
+    white_balance : gain of each channel that makes white equal in all channels.
+    matrix : [3][channel], from balanced channels to linear RGB.
     transfer, gamma : from linear RGB to the values of the picture.
     """
 
@@ -79,7 +79,21 @@ class Camera(Strict):
 
     @classmethod
     def of(cls, mosaic: Mosaic) -> Camera:
-        """The camera of a recording's mosaic: its balance and matrix are those for the scene's light."""
+        """The camera that the mosaic of a recording describes. Balance and matrix are those for the light of the scene.
+
+        Parameters
+        ----------
+        mosaic : from `Recording.mosaic`.
+
+        Returns
+        -------
+        The camera.
+
+        Raises
+        ------
+        RangeError
+            If the sensor has no frame pixels.
+        """
         names = [
             [name if aps else NO_VALUE for name, aps in zip(*rows, strict=True)]
             for rows in zip(mosaic.tile_filter, mosaic.tile_aps, strict=True)
@@ -105,28 +119,45 @@ class Camera(Strict):
 
     @property
     def tile_channel(self) -> NDArray[np.int64]:
-        """Channel number of each tile position, -1 where there is no frame value."""
+        """Channel number of each tile position, [tile_row, tile_col]; -1 where there is no frame value."""
         return self._numbers(self.tile)
 
     @property
     def filled_tile(self) -> NDArray[np.int64]:
-        """The tile once holes are filled; -1 stays where nothing says with which channel."""
+        """As `tile_channel` after holes are filled; -1 remains where no channel is known."""
         return self._numbers(self.stands_for if self.stands_for is not None else _cell_channels(self.tile))
 
     def _numbers(self, tile: list[list[str]]) -> NDArray[np.int64]:
         return np.array([[-1 if name == NO_VALUE else self.channels.index(name) for name in row] for row in tile])
 
     def to_linear(self, channels: ArrayLike) -> NDArray[np.float64]:
-        """Linear RGB [..., 3] of channel values [..., channel] (black 0, saturation 1)."""
+        """Linear RGB of channel values.
+
+        Parameters
+        ----------
+        channels : [..., channel], black 0, saturation 1.
+
+        Returns
+        -------
+        [..., 3], linear RGB.
+        """
         return np.asarray(channels) * self.white_balance @ np.array(self.matrix).T
 
     def from_linear(self, linear: ArrayLike) -> NDArray[np.float64]:
-        """Channel values [..., channel] of linear RGB [..., 3], the inverse of `to_linear`; not clipped.
+        """Channel values of linear RGB, the inverse of `to_linear`; not clipped.
+
+        Parameters
+        ----------
+        linear : [..., 3], linear RGB.
+
+        Returns
+        -------
+        [..., channel], black 0, saturation 1.
 
         Raises
         ------
         RangeError
-            If the camera has not three channels that the matrix tells apart.
+            If the camera does not have three channels that the matrix can tell apart.
         """
         matrix = np.array(self.matrix)
         if matrix.shape != (3, 3) or np.linalg.cond(matrix) > 1e6:
@@ -134,12 +165,21 @@ class Camera(Strict):
         return np.asarray(linear) @ np.linalg.inv(matrix).T / self.white_balance
 
     def decode(self, picture: ArrayLike) -> NDArray[np.float64]:
-        """Linear RGB of picture values in [0, 1]."""
+        """Linear RGB of picture values.
+
+        Parameters
+        ----------
+        picture : values in [0, 1], any shape.
+
+        Returns
+        -------
+        Linear values, same shape.
+        """
         return curves.decode(picture, self.transfer, self.gamma)
 
 
 def _cell_channels(tile: list[list[str]]) -> list[list[str]]:
-    """A tile whose holes have the channel that the rest of their 2×2 cell agrees on, if it does."""
+    """The tile with holes replaced by the channel that the rest of their 2×2 cell agrees on, if it does."""
     out = [list(row) for row in tile]
     for i, j in np.argwhere(np.array(tile) == NO_VALUE):
         top, left = i // 2 * 2, j // 2 * 2
@@ -150,12 +190,20 @@ def _cell_channels(tile: list[list[str]]) -> list[list[str]]:
 
 
 def load_camera(file: str | Path) -> Camera:
-    """A camera from a YAML file.
+    """Read a camera from a YAML file.
+
+    Parameters
+    ----------
+    file : the file.
+
+    Returns
+    -------
+    The camera.
 
     Raises
     ------
     SpecError
-        If the file is not one; the message has file, line and key.
+        If the file is not valid; the message names file, line and key.
     """
     path = Path(file)
     return validate(Camera, load_yaml(path), path, {})

@@ -1,6 +1,7 @@
-"""What a run leaves: frames, events, their truth and a manifest.
+"""The result of a run: frames, events, their truth and a manifest.
 
-Every folder gets its previews here: a recording does not know them, and they are loaded when the first one is drawn.
+Every folder gets its previews through this module. A recording does not import them, and the code that draws them is
+loaded when the first one is drawn.
 """
 
 from pathlib import Path

@@ -25,13 +25,13 @@ BRIGHTEST_DN = 65535e3
 SIGNAL_RANGE = (
     f"signal_dn must be 0 or above (the clean light signal, black subtracted), and at most {BRIGHTEST_DN:g} DN"
 )
-#: Largest number that a capture may state, and in which doubles are still whole.
+#: Largest number that a capture may state; up to here float64 holds all whole numbers.
 _MOST = 2.0**53
 
 
 @dataclass(frozen=True)
 class CaptureSet:
-    """A folder of captures and what ``capture.yaml`` says of it."""
+    """A folder of captures and the content of its ``capture.yaml``."""
 
     folder: Path
     spec: CaptureSpec
@@ -43,7 +43,7 @@ class CaptureSet:
         Raises
         ------
         SpecError
-            If it is missing, is not a stack of whole-number frames, or does not fit the tile.
+            If the file is missing, is not a stack of whole-number frames, or does not fit the tile.
         """
         return FrameStack(self._file(name), self.spec)
 
@@ -73,7 +73,7 @@ class CaptureSet:
 
 
 def read_captures(folder: str | Path) -> CaptureSet:
-    """The capture set in `folder`.
+    """Open the capture set in `folder`.
 
     Raises
     ------
@@ -162,7 +162,7 @@ class FrameStack:
         return exposures.astype(np.int64)
 
     def __iter__(self) -> Iterator[NDArray]:
-        """Frames [row, col] of all exposures in order; each is valid until the next is asked for."""
+        """Frames [row, col] of all exposures in order; each is valid until the next one is requested."""
         shape = self.shape[2:]
         for frame in stream_member(self.file, "frames", int(np.prod(self.shape[:2])), shape):
             if int(frame.max()) > self._full or (self._dtype.kind == "i" and int(frame.min()) < 0):
@@ -173,7 +173,7 @@ class FrameStack:
 
 
 def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least: float = 0.0) -> float:
-    """The one number that an array holds.
+    """The single number that an array holds.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least:
 
 
 def count_maps(captures: CaptureSet, name: str, member: str) -> Iterator[NDArray]:
-    """Maps [row, col] of a member [k, row, col], one at a time."""
+    """Maps [row, col] of a member [k, row, col] of a ``.npz`` file, one at a time."""
     file = captures.folder / f"{name}.npz"
     shape, _ = member_header(file, member)
     if len(shape) != 3:

@@ -1,7 +1,7 @@
-"""A simple colour view of one RAW frame, for people.
+"""A simple colour view of one RAW frame, for display.
 
-It averages each channel over its neighbourhood, balances white, applies one matrix and the sRGB curve; it is no
-demosaicing to measure with.
+It averages each channel over its neighbourhood, balances white, and applies one matrix and the sRGB curve. It is not
+a demosaicing to measure with.
 """
 
 from __future__ import annotations
@@ -16,12 +16,17 @@ Picture = NDArray[np.uint8]  # [row, col, 3], sRGB
 
 
 def colour_picture(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 1024) -> Picture:
-    """A colour view of one frame from its valid pixels, at full size or binned by whole tiles.
+    """A colour view of the valid pixels of one frame, at full size or binned by whole tiles.
 
     Parameters
     ----------
-    raw : [row, col] DN.
-    max_width : wider frames are binned until they fit.
+    raw : [row, col], DN.
+    mosaic : description of the tile and its colours.
+    max_width : wider frames are binned until they fit, px.
+
+    Returns
+    -------
+    uint8 [row, col, 3], sRGB.
     """
     tile_cols = mosaic.tile_shape[1]
     if raw.shape[1] <= max_width:
@@ -71,7 +76,7 @@ def _smoothed(raw: NDArray[np.uint16], mosaic: Mosaic) -> NDArray[np.float32]:
 def _developed(channels: NDArray[np.float32], mosaic: Mosaic) -> NDArray[np.float32]:
     """Linear sRGB, exposed so that the brightest half percent reaches white; dark frames stay dark."""
     span = float(mosaic.white_level_dn - mosaic.black_level_dn)
-    # saturated channels are held at one level, or highlights would turn magenta
+    # saturated channels are clipped to one level, otherwise highlights would turn magenta
     balanced = np.minimum(channels / np.array(mosaic.neutral, dtype=np.float32), span)
     linear = balanced @ np.array(mosaic.camera_to_srgb, dtype=np.float32).T
     white = max(float(np.percentile(linear.max(axis=-1)[::2, ::2], 99.5)), 0.02 * span)

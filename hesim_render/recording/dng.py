@@ -1,8 +1,8 @@
 """One RAW frame as a DNG file: exact DN, uncompressed, with the true colour pattern of the tile.
 
-The mosaic is the file's first image, so that every TIFF reader gets the DN themselves; a small
-8-bit sRGB picture follows as a second image (NewSubfileType 1). Readers know 2×2 patterns only and
-develop a 4×4 pattern wrongly, which is why a recording also holds a 2×2 ``preview.dng``; `binned`
+The mosaic is the first image of the file, so every TIFF reader gets the DN themselves. A small
+8-bit sRGB picture follows as a second image (NewSubfileType 1). Most readers support 2×2 patterns only and
+develop a 4×4 pattern wrongly, so a recording also holds a 2×2 ``preview.dng``; `binned`
 makes its pixels. Tags follow DNG 1.4 and TIFF/EP (ISO 12234-2).
 """
 
@@ -43,8 +43,11 @@ def write_dng(
 
     Parameters
     ----------
-    raw : [row, col] DN; row 0, column 0 is tile position (0, 0).
-    description : goes into ImageDescription as JSON (time stamps and the like).
+    path : the file.
+    raw : [row, col], DN; row 0, column 0 is tile position (0, 0).
+    mosaic : description of the tile and its colours.
+    exposure_us : exposure, µs.
+    description : stored in ImageDescription as JSON (time stamps and the like).
     thumbnail : sRGB [row, col, 3].
 
     Raises
@@ -104,7 +107,7 @@ def read_dng(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
 
 @contextlib.contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """A library's log, off: what it would say of a damaged file is in our one error."""
+    """Switch off the log of a library; our own error reports a damaged file."""
     log = logging.getLogger(name)
     before = log.disabled
     log.disabled = True
@@ -149,7 +152,7 @@ def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:
 
 
 def _ascii(text: str) -> str:
-    """What an ASCII tag can hold of a name."""
+    """The ASCII part of a name."""
     return printable(text).encode("ascii", "backslashreplace").decode("ascii")
 
 
@@ -174,9 +177,9 @@ def _rationals(values: NDArray[np.float64]) -> tuple[int, ...]:
 
 
 def binned(raw: NDArray[np.uint16], mosaic: Mosaic) -> tuple[NDArray[np.uint16], Mosaic] | None:
-    """A quad mosaic as a 2×2 one at half size: each colour cell becomes the mean of its frame pixels.
+    """A quad mosaic as a 2×2 mosaic at half size: each colour cell becomes the mean of its frame pixels.
 
-    What quad sensors do themselves when they bin; event pixels do not take part. None where the
+    Quad sensors bin in the same way. Event pixels do not take part. The result is None if the
     tile is not made of 2×2 cells of one filter.
     """
     channel = mosaic.tile_channel

@@ -25,15 +25,15 @@ _COLUMNS = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _LONGEST_US = 2**32 - 1
 _LATEST_US = 2**53  # 285 years
 _LARGEST_CHUNK_BYTES = 1 << 26
-_BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event and its columns as they are read
+_BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event, and its columns while they are read
 #: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
 _FILTERS = {1, 2, 3, 32000, 32001}
 
 
 class _Disk:
-    """The file under HDF5, which crashes where it cannot close: it never hears that the disk is full, `check` tells.
+    """File object for HDF5 that never reports a write error, because HDF5 crashes if it cannot close its file.
 
-    What cannot be written is dropped; the file is of no use then and about to be removed.
+    `check` raises the first error. After an error, further data are dropped; the file is useless then and is removed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,7 +57,7 @@ class _Disk:
     def readinto(self, buffer: Any) -> int:
         view = memoryview(buffer).cast("B")
         found = self._file.readinto(view) or 0
-        view[found:] = bytes(len(view) - found)  # what was dropped
+        view[found:] = bytes(len(view) - found)  # data that were dropped
         return len(view)
 
     def truncate(self, size: int) -> int:
@@ -71,18 +71,19 @@ class _Disk:
         """Nothing is buffered."""
 
     def check(self) -> None:
-        """Raise what was kept from HDF5."""
+        """Raise the error that was kept from HDF5."""
         if self._error is not None:
             raise self._error
 
 
 class EventFileWriter:
-    """Appends events, in order of time, with memory for one chunk only.
+    """Appends events in order of time, with memory for one chunk only.
 
     Parameters
     ----------
+    path : the file.
     shape : rows and columns of the event grid.
-    begin_us, end_us : time range of the recording; `begin_us` becomes ``t_offset``.
+    begin_us, end_us : time range of the recording, µs; `begin_us` becomes ``t_offset``.
 
     Raises
     ------
@@ -111,7 +112,7 @@ class EventFileWriter:
         self._file.attrs["end_us"] = end_us
 
     def append(self, events: NDArray) -> None:
-        """Add events; times must not go back."""
+        """Append events (`EVENT_DTYPE`), which must not be earlier than those before."""
         if events.size == 0:
             return
         times = events["t_us"]
@@ -135,14 +136,14 @@ class EventFileWriter:
             dataset = self._file[f"events/{name}"]
             dataset.resize((self._written + block.size,))
             dataset[self._written :] = columns[name].astype(kind)
-        # milliseconds that begin after the last one settled and not after this block's last event
+        # milliseconds after the last indexed one, up to the last event of this block
         new_ms = np.arange(self._first_of_ms.size, relative[-1] // 1000 + 1)
         index = self._written + np.searchsorted(relative, new_ms * 1000, side="left")
         self._first_of_ms = np.concatenate([self._first_of_ms, index.astype(np.uint64)])
         self._written += block.size
 
     def close(self) -> None:
-        """Write what is pending and the millisecond index."""
+        """Write the pending events and the millisecond index."""
         with self._told():
             self._flush()
             missing = self._duration_us // 1000 + 2 - self._first_of_ms.size
@@ -153,7 +154,7 @@ class EventFileWriter:
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:
-        """What the disk said comes before what HDF5 makes of it."""
+        """Raise an error of the disk in place of the error that HDF5 makes of it."""
         try:
             yield
         except (OSError, RuntimeError):
@@ -162,7 +163,7 @@ class EventFileWriter:
         self._disk.check()
 
     def abandon(self) -> None:
-        """Close without finishing; the file is about to be removed."""
+        """Close the unfinished file before it is removed."""
         self._file.close()
         self._disk.close()
 
@@ -175,21 +176,23 @@ def read_events(
     shape: tuple[int, int] | None = None,
     count: int | None = None,
 ) -> NDArray:
-    """Events with begin_us <= t_us < end_us (default: all), read from disk in that part only.
+    """Events with begin_us <= t_us < end_us (default: all); only that part of the file is read.
 
     Parameters
     ----------
-    shape : rows and columns of the event grid, in which coordinates must lie.
-    count : how many events the file must hold.
+    path : the file.
+    begin_us, end_us : the interval, µs.
+    shape : rows and columns of the event grid, which must contain all coordinates.
+    count : number of events that the file must hold.
 
     Returns
     -------
-    `EVENT_DTYPE`, in order of time.
+    Structured array [event] of `EVENT_DTYPE`, in order of time.
 
     Raises
     ------
     SpecError
-        If the file cannot be read, leads to other files, or its parts do not fit each other.
+        If the file cannot be read, links to other files, or its parts do not fit each other.
     """
     with reading(path, "as events"), h5py.File(path, "r") as file:
         columns = {name: _column(file, f"events/{name}", path, kind) for name, kind in _COLUMNS.items()}
@@ -226,7 +229,7 @@ def read_events(
 
 
 def _dataset(file: Any, name: str, path: Path) -> Any:
-    """A data set that lies in this file itself."""
+    """A data set that is stored in this file itself."""
     parts = name.split("/")
     for k in range(len(parts)):
         part = "/".join(parts[: k + 1])
@@ -245,7 +248,7 @@ def _dataset(file: Any, name: str, path: Path) -> Any:
 
 
 def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
-    """A one-dimensional data set, all of it in the file: none of it is filled in where nothing was stored."""
+    """A one-dimensional data set whose values are all stored, without fill values."""
     found = _dataset(file, name, path)
     if found.dtype.kind != "u" or found.dtype.itemsize > np.dtype(kind).itemsize:
         raise SpecError(f"{name} holds {found.dtype.name}; expected {np.dtype(kind).name}", file=path)
@@ -271,7 +274,7 @@ def _offset(file: Any, path: Path) -> int:
 
 
 def _index(file: Any, total: int, path: Path) -> NDArray[np.int64]:
-    """``ms_to_idx``, from 0 to the number of events and never going back."""
+    """``ms_to_idx``: starts at 0, ends at the number of events, and never decreases."""
     found = _column(file, "ms_to_idx", path)
     if not 0 < found.shape[0] <= _LONGEST_US // 1000 + 3:
         raise SpecError(f"ms_to_idx holds {found.shape[0]} values; expected one for each ms", file=path)
@@ -284,7 +287,7 @@ def _index(file: Any, total: int, path: Path) -> NDArray[np.int64]:
 def _range(
     index: NDArray[np.int64], offset: int, count: int, begin_us: int | None, end_us: int | None
 ) -> tuple[int, int]:
-    """Indices that hold the wanted times, by whole milliseconds."""
+    """Indices of the events in the wanted whole milliseconds."""
     last_ms = index.size - 1
     first, last = 0, count
     if begin_us is not None:
@@ -297,7 +300,7 @@ def _range(
 def _check_index(
     times: Any, first: int, last: int, offset: int, begin_us: int | None, end_us: int | None, path: Path
 ) -> None:
-    """The events just outside the range that the index gave must be outside the time that is wanted."""
+    """Check that the events just outside the indexed range lie outside the wanted time."""
     early = begin_us is not None and first > 0 and int(times[first - 1]) + offset >= begin_us
     late = end_us is not None and last < times.shape[0] and int(times[last]) + offset < end_us
     if early or late:

@@ -1,4 +1,4 @@
-"""The folder of a recording, as it is written."""
+"""Writer of a recording's folder."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from hesim_render.recording.dng import write_dng
 from hesim_render.recording.event_file import EventFileWriter
 from hesim_render.recording.frame import EventTruth, Frame
 
-#: Called with each folder when all of a recording is in it, before it gets its name: who draws pictures of recordings
-#: adds to this, so that those who write them need not know of it.
+#: Functions called with each complete folder before it gets its name. A module that draws pictures of recordings
+#: appends its function here, so that the writer does not need to import it.
 DRAWERS: list[Callable[[Path], object]] = []
 
 
 class FolderWriter:
-    """Streams a recording into a folder; see `RecordingWriter` for the face to use.
+    """Streams a recording into a folder; `RecordingWriter` is the public interface.
 
     Parameters
     ----------
-    manifest : without frames and counts (those of another recording are dropped).
+    path : folder to write.
+    manifest : the manifest; its frames and counts (those of another recording) are dropped.
+    overwrite : replace an existing recording.
     """
 
     def __init__(self, path: str | Path, manifest: Mapping[str, Any], overwrite: bool = False) -> None:
@@ -94,7 +96,7 @@ class FolderWriter:
         self._dropped = int(count)
 
     def finish(self) -> Path:
-        """Write the manifest, let `DRAWERS` draw, and give the folder its name; returns it."""
+        """Write the manifest, call `DRAWERS`, and rename the folder to its final name, which is returned."""
         with output_errors(self._folder.target):
             self._events.close()
             self.manifest["counts"] = {

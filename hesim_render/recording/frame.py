@@ -1,4 +1,4 @@
-"""One RAW frame and the truth behind it."""
+"""One RAW frame and its noise-free truth."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Frame:
 
     @property
     def times(self) -> dict[str, Any]:
-        """Everything but the images, as the manifest has it."""
+        """All fields except the images, as in the manifest."""
         return {
             "index": self.index,
             "t_us": self.t_us,

@@ -1,4 +1,4 @@
-"""``recording.json``: which specs, seed, versions and units made a recording; written, read and checked."""
+"""``recording.json``: specifications, seed, versions and units of a recording; written, read and checked."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def build(
     duration_us: int,
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The manifest of a recording about to be made; frames and counts are added as it grows."""
+    """The manifest of a new recording; frames and counts are added as it grows."""
     layout, spec = sensor.layout, sensor.spec
     light = mixed_light(getattr(scene, "lights", ()))
     return {
@@ -102,7 +102,7 @@ def _file_hashes(scene: BaseModel) -> dict[str, str]:
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of everything whose change may change the bits of a recording."""
+    """Versions of all software whose change may change the bits of a recording."""
     found = {"python": platform.python_version()}
     for name in ("hesim_render", "mitsuba", "drjit", "numpy"):
         try:
@@ -127,12 +127,12 @@ def to_text(value: Any, indent: str = "") -> str:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """The manifest of a recording folder, as `RecordingSpec` has checked it.
+    """Read the manifest of a recording folder and check it against `RecordingSpec`.
 
     Raises
     ------
     SpecError
-        If it is not a recording, or one of another schema; with the key that is wrong.
+        If it is not a recording, or has another schema; the message names the key.
     """
     file = folder / MANIFEST_NAME
     if not file.is_file():
@@ -147,16 +147,17 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def sensor_spec(manifest: Mapping[str, Any], folder: Path | None = None) -> SensorSpec:
-    """The sensor of a recording, without the place of its calibration.
+    """The sensor of a recording, without the path of its calibration.
 
     Parameters
     ----------
-    folder : of the recording, for the error.
+    manifest : the manifest.
+    folder : folder of the recording, for the error.
 
     Raises
     ------
     SpecError
-        If the manifest holds none that this version knows.
+        If the manifest holds no sensor that this version knows.
     """
     try:
         return SensorSpec.model_validate(manifest["sensor"]["spec"])

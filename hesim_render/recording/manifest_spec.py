@@ -1,4 +1,4 @@
-"""The model of ``recording.json``: a manifest is checked by it before anything of it is used."""
+"""The model of ``recording.json``; a manifest is validated before any part of it is used."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LATEST_US = 2**53  # 285 years
 
 
 class _Open(BaseModel):
-    """A part to which runs add what they like; what is read of it is checked."""
+    """A part to which a run may add any keys; the keys that are read are validated."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -110,7 +110,7 @@ class _Lens(Strict):
 
 
 class _Source(Strict):
-    """A file that the recording was made from."""
+    """A file from which the recording was made."""
 
     name: str
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
@@ -190,7 +190,7 @@ class RecordingSpec(Strict):
 
 
 def _names_a_table(node: Any) -> bool:
-    """Whether a dumped spec names a CSV file, which would be read where the recording lies."""
+    """True if a dumped spec names a CSV file, which would be read relative to the recording."""
     if isinstance(node, Mapping):
         return any((key == "csv" and value is not None) or _names_a_table(value) for key, value in node.items())
     if isinstance(node, list):

@@ -1,4 +1,4 @@
-"""Pictures of a recording, for people: the RAW mosaic, events over a frame, and sheets of them."""
+"""Pictures of a recording for display: the RAW mosaic, events over a frame, and sheets of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from hesim_render.spectral.colorimetry import encode_srgb
 ON_COLOUR = np.array([255, 150, 20], dtype=np.float32)
 OFF_COLOUR = np.array([30, 160, 255], dtype=np.float32)
 _BACKGROUND, _INK, _FAINT = (24, 24, 27), (235, 235, 235), (150, 150, 155)
-_PANEL_PX, _WIDEST_PX = 640, 832  # small frames are magnified to about the first, none is wider than the second
+_PANEL_PX, _WIDEST_PX = (
+    640,
+    832,
+)  # small frames are magnified to about the first width; no panel is wider than the second
 #: Linear tint of each DNG colour code, red to white.
 _TINT = np.array(
     [[1, 0.08, 0.06], [0.1, 0.9, 0.12], [0.1, 0.2, 1], [0.1, 0.9, 1], [1, 0.2, 1], [1, 0.9, 0.1], [0.9, 0.9, 0.9]],
@@ -25,9 +28,9 @@ _TINT = np.array(
 
 
 def mosaic_picture(raw: NDArray[np.uint16], mosaic: Mosaic, scale: int = 1) -> Picture:
-    """The RAW mosaic itself, each pixel in the tint of its filter, magnified `scale` times.
+    """The RAW mosaic, each pixel in the tint of its filter, magnified `scale` times.
 
-    Pixels that give only events are dark; from scale 6 on they carry a dot in their filter's tint.
+    Pixels that give only events are dark; from scale 6 on they have a dot in the tint of their filter.
     """
     span = float(mosaic.white_level_dn - mosaic.black_level_dn)
     signal = np.clip(raw.astype(np.float32) - np.float32(mosaic.black_level_dn), 0, span)
@@ -47,7 +50,7 @@ def mosaic_picture(raw: NDArray[np.uint16], mosaic: Mosaic, scale: int = 1) -> P
 
 
 def events_picture(background: Picture, events: NDArray, event_shape: tuple[int, int]) -> Picture:
-    """Events over a dimmed grey frame: ON orange, OFF blue, stronger where there are more.
+    """Events over a dimmed grey frame: ON orange, OFF blue, stronger for more events.
 
     Parameters
     ----------
@@ -61,7 +64,7 @@ def events_picture(background: Picture, events: NDArray, event_shape: tuple[int,
     rows, cols = event_shape
     if rows == 0 or cols == 0:
         return canvas.astype(np.uint8)
-    # a grid finer than the picture is summed over the picture's pixels, so that no event gets lost
+    # an event grid finer than the picture is summed over the picture's pixels, so that no event is lost
     height, width = min(rows, size[0]), min(cols, size[1])
     cell = events["y"].astype(np.int64) * height // rows * width + events["x"].astype(np.int64) * width // cols
     on = np.bincount(cell[events["polarity"] > 0], minlength=height * width).reshape(height, width)
@@ -77,7 +80,7 @@ def events_picture(background: Picture, events: NDArray, event_shape: tuple[int,
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture of a sheet and the line under it."""
+    """One picture of a sheet and its caption."""
 
     picture: Picture
     caption: str
@@ -101,7 +104,7 @@ def every_tile(raw: NDArray[np.uint16], mosaic: Mosaic, step: int) -> NDArray[np
 
 
 def fitted(picture: Picture, width_px: int) -> Picture:
-    """A picture at `width_px`: whole-number magnification where that fits, else an area average."""
+    """A picture at `width_px`: magnified by a whole number if that fits, otherwise an area average."""
     rows, cols = picture.shape[:2]
     if width_px % cols == 0:
         scale = width_px // cols
@@ -111,7 +114,9 @@ def fitted(picture: Picture, width_px: int) -> Picture:
 
 
 def busiest_window(picture: Picture, fraction: float) -> tuple[float, float]:
-    """Relative (row, col) of the top left of the window of this relative size with the most contrast."""
+    """Relative (row, col) of the top left corner of the window with the most contrast; `fraction` is its relative
+    size.
+    """
     grey = picture.astype(np.float32).mean(axis=2)
     steps = np.linspace(0.0, 1.0 - fraction, 9)
     height, width = max(2, int(grey.shape[0] * fraction)), max(2, int(grey.shape[1] * fraction))

@@ -35,7 +35,14 @@ from hesim_render.recording.frame import EventTruth, Frame
 
 
 class StoredFrames(Sequence[Frame]):
-    """Frames of a recording on disk; each is read when asked for and not kept."""
+    """Frames of a recording on disk. Each frame is read when it is asked for and is not kept.
+
+    Parameters
+    ----------
+    folder : the recording's folder.
+    entries : the manifest's list of frames.
+    shape : rows and columns of a frame, px.
+    """
 
     def __init__(self, folder: Path, entries: Sequence[Mapping[str, Any]], shape: tuple[int, int]) -> None:
         self._folder, self._entries, self._shape = folder, list(entries), shape
@@ -67,10 +74,10 @@ class Recording:
 
     Parameters
     ----------
-    frames : a list, or `StoredFrames` of a folder.
-    manifest : see `hesim_render.recording.manifest`.
-    events : structured array; None reads those of `path` on first use.
-    event_truth : None reads those of `path`.
+    frames : a list, or the `StoredFrames` of a folder.
+    manifest : what `recording.json` holds, see `hesim_render.recording.manifest`.
+    events : structured array [event] of `EVENT_DTYPE`; None reads the events of `path` on first use.
+    event_truth : noise-free flux of the event pixels; None reads the truth of `path` on first use.
     path : the folder, None for a recording in memory.
 
     Examples
@@ -99,7 +106,7 @@ class Recording:
 
     @property
     def events(self) -> NDArray:
-        """All events, `EVENT_DTYPE`, in order of time; `event_slice` reads a part of them."""
+        """All events, structured array [event] of `EVENT_DTYPE`, in order of time; `event_slice` reads only a part."""
         if self._events is None:
             self._events = no_events() if self.path is None else self._read_events(None, None)
         return self._events
@@ -110,7 +117,21 @@ class Recording:
         return read_events(inside(self.path, "events.h5"), begin_us, end_us, shape=self.event_shape, count=count)
 
     def event_slice(self, begin_us: int, end_us: int) -> NDArray:
-        """Events with begin_us <= t_us < end_us; from disk, only that part is read."""
+        """Events of a time interval; from disk, only the events of that interval are read.
+
+        Parameters
+        ----------
+        begin_us, end_us : the interval begin_us <= t_us < end_us, µs.
+
+        Returns
+        -------
+        Structured array [event] of `EVENT_DTYPE`, in order of time.
+
+        Raises
+        ------
+        SpecError
+            If the event file is missing, damaged or does not match the manifest.
+        """
         if self._events is None and self.path is not None:
             return self._read_events(begin_us, end_us)
         low, high = np.searchsorted(self.events["t_us"], [begin_us, end_us], side="left")
@@ -118,7 +139,7 @@ class Recording:
 
     @property
     def event_truth(self) -> EventTruth | None:
-        """Noise-free flux of the event pixels, None where the sensor has none."""
+        """Noise-free flux of the event pixels, e⁻/s; None where the sensor has no event pixels."""
         if self._event_truth is None and self.path is not None and (self.path / "truth" / "events.npz").is_file():
             names = ("flux_mean_e_per_s", "flux_stderr_e_per_s")
             maps = _read_maps(inside(self.path, "truth/events.npz"), names, self.event_shape)
@@ -127,6 +148,7 @@ class Recording:
 
     @cached_property
     def mosaic(self) -> Mosaic:
+        """Tile, filters, levels and colour profile of the sensor, from the manifest."""
         return Mosaic.model_validate(self.manifest["mosaic"])
 
     @property
@@ -137,10 +159,20 @@ class Recording:
 
     @property
     def duration_us(self) -> int:
+        """Length of the recording, µs."""
         return self.manifest["time"]["end_us"] - self.manifest["time"]["begin_us"]
 
     def save(self, path: str | Path, overwrite: bool = False) -> Path:
-        """Write the recording as a folder; it appears whole or not at all.
+        """Write the recording as a folder, which appears whole or not at all.
+
+        Parameters
+        ----------
+        path : folder to write.
+        overwrite : replace an existing recording.
+
+        Returns
+        -------
+        The folder, absolute.
 
         Raises
         ------
@@ -158,12 +190,20 @@ class Recording:
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:
-        """Open a recording folder; frames and events are read when they are used.
+        """Open a recording folder. Frames and events are read when they are used.
+
+        Parameters
+        ----------
+        path : the folder.
+
+        Returns
+        -------
+        The recording.
 
         Raises
         ------
         SpecError
-            If it is not a recording that this version reads.
+            If the folder is missing, or is not a recording that this version reads.
         """
         folder = Path(path).expanduser().resolve()
         if not folder.is_dir():
@@ -174,6 +214,6 @@ class Recording:
 
 
 def _read_maps(file: Path, names: tuple[str, ...], shape: tuple[int, int]) -> list[NDArray[np.float32]]:
-    """Maps of float32 of one size, in the order of their names."""
+    """float32 maps of one shape from an `.npz` file, in the order of `names`."""
     found = read_arrays(file, names, only=names, shapes=dict.fromkeys(names, shape), kinds="f")
     return [found[name].astype(np.float32, copy=False) for name in names]

@@ -1,4 +1,4 @@
-"""The previews of a recording: a contact sheet, a 2×2 DNG of a quad mosaic, an animation if it moves."""
+"""The previews of a recording: a contact sheet, a 2×2 DNG of a quad mosaic, and an animation of a moving scene."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hesim_render.recording.frame import Frame
     from hesim_render.recording.recording import Recording
 
-#: Events of a moving scene are shown over a window of this length, µs.
+#: Length of the window of events that is shown for a moving scene, µs.
 WINDOW_US = 10_000
 _ANIMATION_STEPS = 30
 _ANIMATION_WIDTH_PX = 640
@@ -29,7 +29,7 @@ _ZOOM = 8
 def write_previews(recording: Recording, folder: Path) -> list[Path]:
     """Write ``preview.png`` and, where they apply, ``preview.dng`` and ``preview.gif``; returns their paths.
 
-    Each takes the place of an earlier one in one step; a link of its name is replaced, not followed.
+    Each file replaces an earlier one in one step. A link with its name is replaced, not followed.
     """
     written = [folder / "preview.png"]
     with replacing(written[0]) as temporary:
@@ -54,7 +54,7 @@ def write_previews(recording: Recording, folder: Path) -> list[Path]:
 
 
 def moves(recording: Recording) -> bool:
-    """Whether the scene of a recording has motion; a video counts as such."""
+    """True if the scene of a recording has motion; a video always counts as moving."""
     if "video" in recording.manifest["settings"]:
         return True
     scene = recording.manifest.get("scene") or {}
@@ -80,7 +80,7 @@ def contact_sheet(recording: Recording) -> Image.Image:
     else:
         colour = _black(recording)
     if min(recording.event_shape) > 0:
-        # a scene that stands still gives only noise: show all of it
+        # a static scene gives only noise events: show all of them
         window_us = WINDOW_US if moves(recording) else end_us - begin_us
         first = max(begin_us, min(middle_us - window_us // 2, end_us - window_us))
         last = min(first + window_us, end_us)
@@ -107,7 +107,7 @@ def contact_sheet(recording: Recording) -> Image.Image:
 
 
 def _mosaic_panels(frame: Frame, recording: Recording, colour: Picture, width_px: int, step: int) -> list[Panel]:
-    """The RAW mosaic in its filters' tints, and its busiest part magnified."""
+    """The RAW mosaic in the tints of its filters, and its part with the most contrast magnified."""
     mosaic = recording.mosaic
     rows, cols = frame.raw.shape
     tile_rows, tile_cols = mosaic.tile_shape

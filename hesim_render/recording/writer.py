@@ -1,4 +1,4 @@
-"""Takes what a run makes, as it comes, into a folder or into memory."""
+"""Writer of a run's frames and events, into a folder or into memory."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ if TYPE_CHECKING:
 
 
 class RecordingWriter:
-    """Takes frames and events as they come; into a folder, or into memory without `path`.
+    """Takes frames and events as they come, and writes them into a folder, or keeps them in memory without `path`.
 
-    Use as a context manager and end with `finish`; leaving without it (an error, an interrupt)
-    removes what was written.
+    Use it as a context manager and end with `finish`. Leaving it without `finish` (an error, an interrupt) removes
+    what was written.
 
     Parameters
     ----------
     path : folder to write, None to collect in memory.
-    sensor : region and lens as used.
-    scene : the scene file's model, None where there is none (a video).
-    duration_us : length of the recording.
-    settings : what else was asked for (``clean``, ``without``, ``samples``, ``backend``); plain values.
+    sensor : with the region and lens in use.
+    scene : model of the scene file, None where there is none (a video).
+    seed : seed of the run, for the manifest.
+    duration_us : length of the recording, µs.
+    settings : further settings of the run (``clean``, ``without``, ``samples``, ``backend``); plain values.
     overwrite : replace an existing recording.
-    mosaic : instead of the sensor's under the scene's light, where that says too little (a video's light).
+    mosaic : description of the mosaic; default: that of the sensor under the light of the scene. A video gives its own.
 
     Raises
     ------
@@ -66,21 +67,37 @@ class RecordingWriter:
         self._dropped = 0
 
     def add_frame(self, frame: Frame) -> None:
-        """The next frame, in order of time."""
+        """Add the next frame; frames come in order of time.
+
+        Parameters
+        ----------
+        frame : the frame, with its truth.
+        """
         if self._folder is not None:
             self._folder.add_frame(frame)
         else:
             self._frames.append(frame)
 
     def add_events(self, events: NDArray) -> None:
-        """The next block of events (`EVENT_DTYPE`), in order of time."""
+        """Add the next block of events; blocks come in order of time.
+
+        Parameters
+        ----------
+        events : structured array [event] of `EVENT_DTYPE`, in order of time.
+        """
         if self._folder is not None:
             self._folder.add_events(events)
         elif events.size:
             self._events.append(events)
 
     def set_event_truth(self, flux_mean_e_per_s: NDArray, flux_stderr_e_per_s: NDArray) -> None:
-        """Noise-free flux of the event pixels, [y, x] or flat, e⁻/s."""
+        """Set the noise-free flux of the event pixels, mean over the recording.
+
+        Parameters
+        ----------
+        flux_mean_e_per_s : [y, x] or flat, e⁻/s.
+        flux_stderr_e_per_s : its standard error, same shape, e⁻/s.
+        """
         grid = self._manifest["event_grid"]
         shape = (grid["height"], grid["width"])
         truth = EventTruth(
@@ -93,18 +110,28 @@ class RecordingWriter:
             self._truth = truth
 
     def set_events_dropped(self, count: int) -> None:
-        """How many events were lost in the read-out; they are in no other count."""
+        """Set how many events were lost in the read-out. No other count includes them.
+
+        Parameters
+        ----------
+        count : number of lost events.
+        """
         if self._folder is not None:
             self._folder.set_events_dropped(count)
         self._dropped = int(count)
 
     def add_settings(self, settings: Mapping[str, Any]) -> None:
-        """What only the run itself could tell, beside the settings given at the start."""
+        """Add settings that are known only after the run, to those given at the start.
+
+        Parameters
+        ----------
+        settings : names and plain values.
+        """
         for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
             manifest["settings"] = {**manifest["settings"], **settings}
 
     def finish(self) -> Recording:
-        """The recording; a folder is complete and has its name now."""
+        """Finish and return the recording. A folder is now complete and has its final name."""
         if self._folder is not None:
             return Recording.load(self._folder.finish())
         events = np.concatenate(self._events) if self._events else no_events()

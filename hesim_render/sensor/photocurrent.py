@@ -1,4 +1,4 @@
-"""Eq. 1 on any radiance cube: from spectral radiance to electrons, without a renderer."""
+"""Eq. 1 for any radiance cube: electrons from spectral radiance, without a renderer."""
 
 from __future__ import annotations
 
@@ -27,11 +27,21 @@ Quadrature = Literal["trapezoid", "rectangle"]
 def band_weights(
     response: Spectrum, wavelength_nm: NDArray[np.float64], quadrature: Quadrature = "trapezoid"
 ) -> NDArray[np.float64]:
-    """Weights w with ∫ R(λ) L(λ) dλ = Σ_b w_b L(λ_b), in the unit of R × nm.
+    """Quadrature weights w with ∫ R(λ) L(λ) dλ = Σ_b w_b L(λ_b).
 
-    ``trapezoid``: L is linear between bands and zero outside them; the product is integrated by a
-    trapezoid on the merged grid of R and the bands, refined to 1 nm or finer. ``rectangle``:
-    w_b = R(λ_b)·Δλ on an even grid, the rule of ISETCam; up to 8 % off at 10 nm.
+    ``trapezoid``: L is linear between the bands and zero outside them. The product R·L is integrated by the trapezoidal
+    rule on the merged grid of R and the bands, refined to 1 nm or finer. ``rectangle``: w_b = R(λ_b)·Δλ on an even
+    grid, the rule of ISETCam; its error is up to 8 % at 10 nm.
+
+    Parameters
+    ----------
+    response : R(λ).
+    wavelength_nm : [band], increasing, nm.
+    quadrature : ``trapezoid`` or ``rectangle``.
+
+    Returns
+    -------
+    [band], in the unit of R times nm.
 
     Raises
     ------
@@ -56,7 +66,7 @@ def band_weights(
     trapezoid = np.zeros_like(grid)
     trapezoid[:-1] += step / 2
     trapezoid[1:] += step / 2
-    # each grid point's share goes to the two bands around it, as linear interpolation has it
+    # linear interpolation splits the weight of each grid point between the two bands around it
     weight = trapezoid * response.at(grid)
     right = np.clip(np.searchsorted(bands, grid, side="right"), 1, bands.size - 1)
     fraction = (grid - bands[right - 1]) / (bands[right] - bands[right - 1])
@@ -75,25 +85,26 @@ def photocurrent(
     filter: str | None = None,
     quadrature: Quadrature = "trapezoid",
 ) -> NDArray[np.float64] | Float:
-    """I_c of Eq. 1: mean electrons that a radiance gives within an exposure.
+    """I_c of Eq. 1: mean electrons of an exposure to a spectral radiance.
 
     I_c = Δt · V · ∫ P_c(λ) C_f(λ) L(λ) dλ with P_c = A_pix·FF·G·τ_lens·η·λ/(h c) (see
-    `Sensor.spectral_response`); radiance is constant over the exposure.
+    `Sensor.spectral_response`). The radiance is constant over the exposure.
 
     Parameters
     ----------
     spectral_radiance : [..., band], W m⁻² sr⁻¹ nm⁻¹; a NumPy array, or a Dr.Jit TensorXf for
-        derivatives. Without `filter` it must be [row, col, band] with the sensor's own rows and
-        columns, seen pixel by pixel through the mosaic; relative illumination V applies.
-    wavelength_nm : [band], increasing.
+        derivatives. Without `filter` it must be [row, col, band] with the rows and columns of the sensor;
+        each pixel then applies its own filter and its relative illumination V.
+    wavelength_nm : [band], increasing, nm.
+    sensor : supplies responses, mosaic and relative illumination.
     exposure_us : Δt, µs.
-    filter : name of one filter: every element is seen through it, on the optical axis (V = 1), and
-        the leading shape is free.
+    filter : name of one filter that all elements are seen through, on the optical axis (V = 1). The
+        leading shape is then free.
     quadrature : see `band_weights`.
 
     Examples
     --------
-    Light that is the same at all wavelengths, against the integral of the response (e⁻/s per W m⁻² sr⁻¹ nm⁻¹):
+    Compare light of equal radiance at all wavelengths with the integral of the response (e⁻/s per W m⁻² sr⁻¹ nm⁻¹):
 
     >>> import numpy as np
     >>> import hesim_render as hr
@@ -105,7 +116,7 @@ def photocurrent(
 
     Returns
     -------
-    Electrons, with the shape of the radiance less its last axis; NumPy float64 for NumPy input, a
+    Electrons, with the shape of the radiance without its last axis; NumPy float64 for NumPy input, a
     Dr.Jit TensorXf (differentiable with respect to the radiance) for Dr.Jit input.
 
     Raises

@@ -1,4 +1,4 @@
-"""A sensor ready to use: its file, the region read out, its lens, and both noise models."""
+"""A sensor ready to use: its specification, read-out region, lens and both noise models."""
 
 from __future__ import annotations
 
@@ -27,16 +27,18 @@ from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 class Sensor(PlainState):
     """One sensor file over one read-out region.
 
-    It holds all that its file and a calibration's maps told: a pickle or a copy of it needs none of these files.
+    A sensor holds everything that its file and the maps of a calibration say. A pickle or a copy of it needs none of
+    these files.
 
     Parameters
     ----------
-    layout : region, tile and event grid; `layout.spec` is the file.
+    layout : region, tile and event grid; `layout.spec` is the content of the sensor file.
     lens : the lens in use (a scene may replace f-number, focal length and focus).
+    file : name or path that the sensor was loaded from, for error messages; empty where there is none.
 
     Examples
     --------
-    A crop sees what those pixels of the full sensor see. Noise formulas are at hand:
+    A crop sees what those pixels of the full sensor see. The noise formulas are attributes:
 
     >>> import hesim_render as hr
     >>> sensor = hr.load_sensor("reference-mono").crop(64, 48)
@@ -54,6 +56,17 @@ class Sensor(PlainState):
 
     @classmethod
     def from_spec(cls, spec: SensorSpec, file: str = "") -> Sensor:
+        """The whole sensor that a specification describes, with its own lens.
+
+        Parameters
+        ----------
+        spec : validated content of a sensor file.
+        file : name or path of that file, for error messages.
+
+        Returns
+        -------
+        The sensor, with all rows and columns read out.
+        """
         return cls(Layout.full(spec), Lens.of(spec), file)
 
     def __repr__(self) -> str:
@@ -68,25 +81,38 @@ class Sensor(PlainState):
 
     @property
     def spec(self) -> SensorSpec:
+        """Validated content of the sensor file."""
         return self.layout.spec
 
     @property
     def name(self) -> str:
+        """Name of the sensor, from its file."""
         return self.spec.name
 
     @property
     def rows(self) -> int:
+        """Rows of the read-out region, px."""
         return self.layout.rows
 
     @property
     def cols(self) -> int:
+        """Columns of the read-out region, px."""
         return self.layout.cols
 
     def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> Sensor:
-        """The same sensor with a smaller read-out region (columns first, as in 512x384).
+        """The same sensor with a smaller read-out region (width first, as in 512x384).
 
-        The region is centred unless `x`, `y` (its first column and row) are given, and always
-        starts at a whole tile. Device maps and random numbers follow the full sensor's pixels.
+        The region always starts at a whole tile. Device maps and random numbers belong to the full sensor's pixels,
+        so a crop gives the values that the full sensor gives there.
+
+        Parameters
+        ----------
+        width_px, height_px : size of the region, px; whole tiles.
+        x, y : its first column and row inside the current region, px; default: the region is centred.
+
+        Returns
+        -------
+        The cropped sensor.
 
         Raises
         ------
@@ -96,37 +122,51 @@ class Sensor(PlainState):
         return replace(self, layout=self.layout.crop(width_px, height_px, x, y))
 
     def with_lens(self, **changes: float | None) -> Sensor:
-        """With another `f_number`, `focal_length_mm` or `focus_distance_m` (see `Lens.of`)."""
+        """The same sensor with another lens.
+
+        Parameters
+        ----------
+        changes : `f_number`, `focal_length_mm` or `focus_distance_m`, see `Lens.of`.
+
+        Returns
+        -------
+        The sensor with the new lens.
+        """
         return replace(self, lens=Lens.of(self.spec, **changes))
 
     @cached_property
     def responses(self) -> dict[str, Spectrum]:
-        """P_c·C_f of Eq. 1 per filter, on the optical axis: e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹."""
+        """P_c·C_f of Eq. 1 for each filter, on the optical axis: e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹."""
         return {name: optics.response(self.spec, name, self.lens) for name in self.spec.filters}
 
     def spectral_response(self, wavelength_nm: ArrayLike) -> dict[str, NDArray[np.float64]]:
-        """The P_c(λ)·C_f(λ) of Eq. 1 at `wavelength_nm`, per filter.
+        """P_c(λ)·C_f(λ) of Eq. 1 for each filter.
+
+        P_c(λ)·C_f(λ) = A_pix·FF·G·τ·C_f·η·λ/(hc) on the optical axis, with G = π/(1 + 4N²(1 + |m|)²).
+
+        Parameters
+        ----------
+        wavelength_nm : wavelengths, any shape, nm.
 
         Returns
         -------
-        {filter: array like wavelength_nm}, in e⁻/s per W m⁻² sr⁻¹ nm⁻¹: A_pix·FF·G·τ·C_f·η·λ/(hc),
-        on the optical axis, with G = π/(1 + 4N²(1 + |m|)²).
+        {filter: array like wavelength_nm}, in e⁻/s per W m⁻² sr⁻¹ nm⁻¹.
         """
         return {name: response.at(wavelength_nm) for name, response in self.responses.items()}
 
     @cached_property
     def relative_illumination(self) -> NDArray[np.float32]:
-        """V(x) at every pixel, [row, col]."""
+        """Relative illumination V(x) of every pixel, [row, col]."""
         return optics.relative_illumination(self.layout, self.lens)
 
     @cached_property
     def aps(self) -> ApsNoise:
-        """The frame pixels' noise model.
+        """Noise model of the frame pixels.
 
         Raises
         ------
         SpecError
-            If the sensor has none, or its measured maps do not cover the region read out.
+            If the sensor has no frame pixels, or its measured maps do not cover the read-out region.
         """
         if self.spec.aps is None:
             raise SpecError(f"sensor {self.name!r} has no frame pixels")
@@ -135,12 +175,12 @@ class Sensor(PlainState):
 
     @cached_property
     def evs(self) -> EvsNoise:
-        """The event pixels' noise model.
+        """Noise model of the event pixels.
 
         Raises
         ------
         SpecError
-            If the sensor has none, or its measured maps do not cover the region read out.
+            If the sensor has no event pixels, or its measured maps do not cover the read-out region.
         """
         if self.spec.evs is None:
             raise SpecError(f"sensor {self.name!r} has no event pixels")
@@ -149,7 +189,7 @@ class Sensor(PlainState):
 
     @property
     def _signal_scale(self) -> NDArray[np.float64]:
-        """Per event position: response of the signal reference's filter over the position's own."""
+        """For each event position: response of the signal reference's filter over the position's own response."""
         assert self.spec.evs is not None
         reference = self.spec.evs.signal_reference.filter
         positions = self.spec.positions("evs")
@@ -162,7 +202,12 @@ class Sensor(PlainState):
 
 
 def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Sensor:
-    """A sensor by shipped name (``hesim-render list sensors``) or path of a YAML file.
+    """Load a shipped sensor by name (``hesim-render list sensors``), or a sensor file by path.
+
+    Parameters
+    ----------
+    name_or_path : name of a shipped sensor, or path of a YAML file.
+    overrides : dotted keys and their values, applied before validation (``aps.exposure_us``).
 
     Examples
     --------
@@ -170,9 +215,13 @@ def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     >>> hr.load_sensor("eiger", {"aps.exposure_us": 2000}).spec.aps.exposure_us
     2000
 
+    Returns
+    -------
+    The sensor, with all rows and columns read out.
+
     Raises
     ------
     SpecError
-        With file, line and key of what is wrong.
+        If the file is not valid; the message names file, line and key.
     """
     return Sensor.from_spec(read_sensor(name_or_path, overrides), str(name_or_path))

@@ -1,1 +1,1 @@
-"""Who can say how many photo-electrons per second each pixel gets."""
+"""Sources of flux: the mean number of photo-electrons per second of each pixel, from renders or videos."""

@@ -1,9 +1,9 @@
-"""Crosstalk: part of a pixel's electrons is collected by its four neighbours, whatever their roles.
+"""Crosstalk: the four neighbours of a pixel collect a part of its electrons, whatever their roles.
 
-Charge that is set free under one pixel diffuses to the next before either is read. With c the part that leaves,
-Φ' = (1 − c)·Φ + c/4·(Φ above + Φ below + Φ left + Φ right): the kernel is symmetric, so that no electron is
-lost. At the border of the region a pixel keeps the share of the neighbour it lacks. What a pixel receives
-falls into its own exposure, also with a rolling shutter.
+Charge that is generated under one pixel diffuses to its neighbours before read-out. With c the part that leaves a
+pixel, Φ' = (1 − c)·Φ + c/4·(Φ above + Φ below + Φ left + Φ right). The kernel is symmetric, so no electron is
+lost. At the border of the region, a pixel keeps the share of a missing neighbour. The charge that a pixel receives
+counts for its own exposure, also with a rolling shutter.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from hesim_render.sources.protocol import FluxSource, Sample
 
 
 def mixed(image: NDArray, part: float) -> NDArray:
-    """Φ' of an image [row, col] of electrons or their rate."""
+    """Apply crosstalk to an image [row, col] of electrons or of electron rates; returns Φ' [row, col]."""
     if part == 0:
         return image
     padded = np.pad(image, 1, mode="edge")
@@ -29,19 +29,19 @@ def mixed(image: NDArray, part: float) -> NDArray:
 
 
 def with_crosstalk(flux: FluxSource, shape: tuple[int, int], part: float) -> FluxSource:
-    """The source as the pixels of a region [row, col] see it; itself where no part leaves a pixel."""
+    """A source with crosstalk over a region [row, col]; the source itself if `part` is 0."""
     return flux if part <= 0 else CrosstalkFlux(flux, shape, part)
 
 
 class CrosstalkFlux:
-    """A source of flux behind crosstalk; implements `FluxSource`.
+    """A source of flux with crosstalk; implements `FluxSource`.
 
-    It asks the source for the neighbours of the listed pixels too, each over the listed pixel's interval: where
-    intervals differ from row to row a pixel is asked for up to three times.
+    It also asks its source for the neighbours of the listed pixels, each over the listed pixel's interval. Where
+    intervals differ from row to row, a pixel is asked for up to three times.
 
     Parameters
     ----------
-    flux : the source.
+    flux : the source without crosstalk.
     shape : rows and columns of the read-out region.
     part : c, 0 to 1.
     """
@@ -87,7 +87,7 @@ class CrosstalkFlux:
             yield Sample(*self._mix((sample.half_a, sample.half_b), index))
 
     def _sites(self, own: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Each pixel and its four neighbours, itself where it lacks one, [5, n]."""
+        """Each pixel and its four neighbours, [5, n]; the pixel itself in place of a missing neighbour."""
         rows, cols = self._shape
         row, col = np.divmod(own, cols)
         return np.stack(

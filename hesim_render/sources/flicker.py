@@ -1,10 +1,10 @@
-"""Flicker: lights whose power follows a waveform, exactly, at the cost of one render for each waveform.
+"""Flicker: lights whose power follows a waveform, exactly, at the cost of one render per waveform.
 
-Light adds up: Φ(t) = Σ w(t)·Φ_w, where Φ_w is the flux with only the lights of waveform w lit at their mean level and
-all others dark, and w has the time mean 1. While the geometry stands still each Φ_w is rendered once and the
-mean over an interval is exact: Φ_w times the mean of w, in closed form. Where something moves, the mean of a
-product is taken as the product of the means over pieces of time in which the image hardly moves, or ln w departs from
-a straight line by 0.002 or less: in each cell of time (`schedule.CELL_US`) those that are fewer.
+Light adds up: Φ(t) = Σ w(t)·Φ_w. Φ_w is the flux with only the lights of waveform w on, at their mean level, and w has
+the time mean 1. In a static scene each Φ_w is rendered once, and the mean over an interval is exact: Φ_w times the
+mean of w, in closed form. In a moving scene the mean of the product is replaced by the product of the means, over
+pieces of time. Within a piece either the image hardly moves, or ln w departs from a straight line by 0.002 or less; in
+each cell of time (`schedule.CELL_US`) the kind with fewer pieces is used.
 """
 
 from __future__ import annotations
@@ -24,19 +24,23 @@ from hesim_render.sources.scene import Scene
 from hesim_render.sources.still import Kept
 from hesim_render.spectral.waveform import Waveform
 
-#: Most steps in which an event window that is passing a jump is followed.
+#: Largest number of samples while an event window passes over a jump of the light.
 _WINDOW_STEPS = 8
 
 
 def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_us: float = 1.0) -> FluxSource:
-    """The source of a scene's flux, whatever its lights do.
+    """The source of a scene's flux, with steady or flickering lights.
 
     Parameters
     ----------
     scene : with or without waveforms.
-    make : builds the source of one part of it, called once where no light flickers; the second argument is the
+    make : builds the source of one part of the scene; called once where no light flickers. The second argument is the
         highest power of the part's light over its mean.
-    window_us : in which event pixels integrate; a jump of the light is followed through it.
+    window_us : length of the window in which event pixels integrate, µs. Samples follow a jump of the light through it.
+
+    Returns
+    -------
+    A `FluxSource`.
     """
     parts = light_parts(scene)
     if len(parts) == 1 and parts[0][0] is None:
@@ -47,18 +51,18 @@ def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_
 
 
 class FlickerFlux:
-    """Sources of one scene under its different lights, each times its waveform; implements `FluxSource`.
+    """Sum of sources under the different lights of one scene, each times its waveform; implements `FluxSource`.
 
     Parameters
     ----------
-    waveforms : of each source; None is steady.
-    sources : of the same geometry and camera.
-    window_us : in which event pixels integrate.
+    waveforms : waveform of each source; None is steady.
+    sources : sources with the same geometry and camera.
+    window_us : length of the window in which event pixels integrate, µs.
 
     Attributes
     ----------
     sources : as given.
-    sensor, view : of the first source, where it has any.
+    sensor, view : those of the first source, where it has any.
     is_static : False.
     """
 
@@ -72,14 +76,14 @@ class FlickerFlux:
         self._still = Kept(self.sources) if first.is_static else None
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Those of the scene's motion, µs."""
+        """Slice edges of the scene's motion, µs."""
         return self.sources[0].slice_edges_us(begin_us, end_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval that follow motion and light, µs.
 
-        Around a jump of the light they are whole µs: the last before it, and some until a window that
-        begins after it has passed.
+        Around a jump of the light they are whole µs: the last one before the jump, and some more until a window that
+        begins after the jump has passed.
         """
         times = [self.sources[0].sample_times_us(begin_us, end_us), self._follow_us(begin_us, end_us)]
         steps = max(1, min(_WINDOW_STEPS, round(self._window_us)))
@@ -115,14 +119,16 @@ class FlickerFlux:
         return self._pieces(pixels, begin, end, np.concatenate([[low], cuts, [high]]))
 
     def _cuts_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly inside an interval between which image or light hardly change: in every cell the fewer."""
+        """Times strictly inside an interval between which the image, or the light, hardly changes; see the module
+        docstring.
+        """
         light = self._follow_us(begin_us, end_us)
         if light.size == 0:
             return light
         cuts = [np.empty(0)]
         for number in range(int(begin_us // CELL_US), -(-int(np.ceil(end_us)) // CELL_US)):
             low, high = number * CELL_US, (number + 1) * CELL_US
-            # of whole cells, whatever part of them is asked for
+            # computed for whole cells, so that the result does not depend on the interval
             bright = self._follow_us(low, high)
             motion = self.sources[0].sample_times_us(low, high) if bright.size else bright
             cuts += [min(bright, motion, key=len), np.array([high], np.float64)]
@@ -132,7 +138,9 @@ class FlickerFlux:
     def _piece(
         self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, weights: list[NDArray[np.float64]]
     ) -> Halves:
-        """Every source's mean times that of its waveform; sources that are dark meanwhile are not asked."""
+        """Sum of each source's mean times the mean of its waveform. Sources without power in the interval are not
+        asked.
+        """
         lit = [number for number, weight in enumerate(weights) if np.any(weight)]
         halves = [self.sources[number].mean_flux(pixel, begin, end) for number in lit]
         if not lit:
@@ -141,7 +149,7 @@ class FlickerFlux:
         return _weighted(halves, [weights[number] for number in lit])
 
     def _pieces(self, pixel: NDArray[np.uint32], begin: NDArray, end: NDArray, bounds: NDArray[np.float64]) -> Halves:
-        """The same piece by piece; a pixel takes part in those that meet its interval."""
+        """As `_piece`, piece by piece. A pixel takes part in the pieces that overlap its interval."""
         import drjit as dr
 
         types = jit()
@@ -150,7 +158,7 @@ class FlickerFlux:
         totals = [types.Float(np.zeros(pixel.size, np.float32)) for _ in range(2)]
         for number, (low, high) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
             first, last = np.clip(begin, low, high), np.clip(end, low, high)
-            # an interval without length lies in the piece that begins there, or before the very end
+            # an empty interval belongs to the piece that begins there; at the very end, to the last piece
             instant = (length == 0) & (begin >= low) & ((begin < high) | (number == bounds.size - 2))
             share = np.divide(last - first, length, out=instant.astype(np.float64), where=length > 0)
             where = np.flatnonzero(share)
@@ -169,7 +177,9 @@ class FlickerFlux:
         return blocks_of_run(self.instants_us, window_us, begin_us, end_us)
 
     def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        """Whole µs, from `begin_us` to `end_us` with both, that follow motion and light; multiples of `CELL_US` too."""
+        """Whole µs from `begin_us` to `end_us`, both included, that follow motion and light; with multiples of
+        `CELL_US`.
+        """
         inner = np.rint(self.sample_times_us(begin_us - 1, end_us + 1)).astype(np.int64)
         cells = np.arange(begin_us // CELL_US, end_us // CELL_US + 1, dtype=np.int64) * CELL_US
         every = np.unique(np.concatenate([np.rint([begin_us, end_us]).astype(np.int64), inner, cells]))
@@ -178,7 +188,7 @@ class FlickerFlux:
     def flux_of_blocks(self, pixel: NDArray[np.uint32], blocks: Iterable[Block]) -> Iterator[Sample]:
         """See `FluxSource.flux_of_blocks`.
 
-        Windows in which light and image both change are cut into pieces, which are windows of their own.
+        Windows in which both light and image change are cut into pieces, which are windows of their own.
         """
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
         if self._still is not None:
@@ -202,9 +212,9 @@ class FlickerFlux:
                 yield self._sum([next(samples) for _ in range(count)], weights[first : first + count] * share[:, None])
 
     def _cut(self, block: Block) -> tuple[Block, NDArray[np.int64]]:
-        """Pieces of a block's windows; and how many each wanted one has.
+        """Cut the windows of a block into pieces. Returns the pieces, and the number of pieces of each wanted window.
 
-        Of the first window, which belongs to the block before, there is the last piece: where that one ends.
+        The first window belongs to the previous block. Only its last piece is kept, which ends where the window ends.
         """
         begin, end, wanted, counts = [], [], [], []
         for number, (low, high, asked) in enumerate(zip(block.begin_us, block.end_us, block.wanted, strict=True)):
@@ -219,10 +229,10 @@ class FlickerFlux:
         return Block(*map(np.concatenate, (begin, end, wanted))), np.array(counts, np.int64)
 
     def _sum(self, samples: Sequence[tuple[Sample, ...]], weights: NDArray[np.float64]) -> Sample:
-        """Of all sources, [source] each, in the pieces of a window; `weights` [piece, source]."""
+        """Weighted sum over all sources, [source] each, and over the pieces of a window; `weights` [piece, source]."""
         every = [sample for piece in samples for sample in piece]
         half_a, half_b = _weighted([(one.half_a, one.half_b) for one in every], list(weights.ravel()))
-        # the halves of all pieces have the same random numbers: their errors add up; those of two sources do not
+        # all pieces use the same random numbers, so their errors add linearly; errors of two sources are independent
         of_sources = np.zeros((len(self.sources), len(every[0].error) if every[0].error is not None else 0), np.float32)
         for number, total in enumerate(of_sources):
             for piece, weight in zip(samples, weights[:, number], strict=True):
@@ -231,7 +241,7 @@ class FlickerFlux:
                     total += np.float32(weight) * error
         return Sample(half_a, half_b, np.sqrt(np.sum(of_sources**2, axis=0)))
 
-    # ---- for the audit, where the sources have what it takes ---------------------------------------
+    # ---- for the audit, if the sources are auditable -----------------------------------------------
 
     @property
     def _auditable(self) -> list[AuditableFlux]:
@@ -239,11 +249,11 @@ class FlickerFlux:
 
     @property
     def rays_traced(self) -> int:
-        """Of all sources."""
+        """Rays traced so far by all sources."""
         return sum(source.rays_traced for source in self._auditable)
 
     def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
-        """None: light changes everywhere."""
+        """No pixel is still, because the light changes everywhere."""
         return np.zeros(pixel.size, np.bool_)
 
     def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
@@ -280,11 +290,11 @@ class FlickerFlux:
 
 
 def _weighted(halves: Sequence[Halves], weights: Sequence[ArrayLike]) -> Halves:
-    """Σ weight · half, of both halves; weights are one number or one for each pixel."""
+    """Σ weight · half, for both halves; a weight is a number, or one number per pixel."""
     import drjit as dr
 
     types = jit()
-    # opaque: a number inside the kernel would make it a new one at every time
+    # opaque: a literal number would make a new kernel at every time
     factors = [
         dr.opaque(types.Float, float(np.asarray(w)))
         if np.ndim(w) == 0

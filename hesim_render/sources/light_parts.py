@@ -1,4 +1,4 @@
-"""A scene once for each different waveform of its lights."""
+"""Split a scene by the waveforms of its lights."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from hesim_render.spectral.waveform import Waveform
 
 
 def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
-    """The scene once for each different waveform, lit only by the lights that have it; first those without any.
+    """The scene once per different waveform, lit only by the lights with that waveform; lights without one come first.
 
-    Scenes without flicker are one part, themselves. A level of a Mitsuba scene is of all its light: it has to be a
-    factor already (`in_absolute_light`).
+    A scene without flicker is one part, the scene itself. A level of a Mitsuba scene holds for all of its light
+    together, so it must already be converted to a factor (`in_absolute_light`).
     """
     own = scene.spec.mitsuba
     if own is not None:
@@ -41,7 +41,7 @@ def _flicker(spec: WaveformSpec | None) -> WaveformSpec | None:
 
 
 def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None]:
-    """Each once, None first."""
+    """Each waveform once, None first."""
     found: list[WaveformSpec | None] = [None] if None in kinds else []
     for kind in kinds:
         if kind not in found:

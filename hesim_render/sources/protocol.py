@@ -1,7 +1,7 @@
-"""The hinge of the house: who can say how many photo-electrons per second each pixel gets.
+"""The protocol of flux sources, which separates light from sensors.
 
-Every source answers the calls of `FluxSource`: renders, flickering light, crosstalk, video, what stands still. Nothing
-downstream knows which one it is.
+Every source implements `FluxSource`: renders, flickering light, crosstalk, video, static scenes. The capture does not
+know which one it uses.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Sample:
 
     Parameters
     ----------
-    half_a, half_b : Dr.Jit Float [n], e⁻/s, as `FluxSource.mean_flux` gives them.
-    error : [n], e⁻/s, the standard error that the source expects; None where it has none.
+    half_a, half_b : Dr.Jit Float [n], e⁻/s, as from `FluxSource.mean_flux`.
+    error : [n], e⁻/s, the standard error that the source states; None where it states none.
     """
 
     half_a: Float
@@ -35,25 +35,25 @@ class Sample:
 class FluxSource(Protocol):
     """Noise-free photo-electron rate Φ of physical pixels, each through its own filter.
 
-    Frames ask for the mean over each row's exposure (`mean_flux`), piece by piece where the source has slices. Event
-    pixels are asked for in many windows at once (`flux_of_blocks`).
+    Frames use the mean over each row's exposure (`mean_flux`), piece by piece if the source has slices. Event pixels
+    use many windows at once (`flux_of_blocks`).
     """
 
-    #: True where Φ does not depend on time: one call then serves all times.
+    #: True if Φ does not depend on time; one call then serves all times.
     is_static: bool
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly between `begin_us` and `end_us` at which the source moves to its next state.
+        """Times strictly between `begin_us` and `end_us` at which the source changes to its next state, µs.
 
-        Between two edges the source may be frozen where it cannot do better (object poses); no `mean_flux` call may
-        straddle an edge. Empty for a source that takes intervals of any length.
+        Between two edges a source may be frozen (object poses), so a `mean_flux` call must not span an edge. The result
+        is empty for a source that takes intervals of any length.
         """
         ...
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly between `begin_us` and `end_us` close enough together to follow the motion.
+        """Times strictly between `begin_us` and `end_us` that are dense enough to follow the motion, µs.
 
-        The image moves about half a pixel, or less, from one time to the next. Empty for a static source.
+        The image moves about half a pixel or less from one time to the next. The result is empty for a static source.
         """
         ...
 
@@ -67,24 +67,28 @@ class FluxSource(Protocol):
 
         Returns
         -------
-        half_a, half_b : Dr.Jit Float [n]. Two independent estimates: their mean is the flux, half
-            their difference its standard error. Both use the same random numbers at every call, so
-            a static pixel is exactly static; therefore accumulate each half over time and compare
-            the sums, never add the errors of slices. Exact sources return the same array twice.
+        half_a, half_b : Dr.Jit Float [n], two independent estimates. Their mean is the flux, half their difference its
+            standard error. Both use the same random numbers in every call, so a static pixel is exactly constant.
+            Therefore add up each half over time and compare the sums; do not add the errors of slices. Exact sources
+            return the same array twice.
         """
         ...
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
-        """Windows in which the pixels of a sensor without a tick of its own are sampled.
+        """Windows in which the pixels of a sensor without a tick are sampled.
 
-        The first one begins when the run begins. The last one ends when the run ends, or at the source's next instant:
-        a source whose instants do not depend on begin and end of a run gives the same at a time whatever else it is
-        asked for.
+        The first window begins when the run begins. The last one ends when the run ends, or at the source's next
+        instant. A source whose instants do not depend on the begin and end of a run gives the same flux at a time,
+        whatever else it is asked for.
 
         Parameters
         ----------
-        window_us : length of a window.
-        begin_us, end_us : of the run.
+        window_us : length of a window, µs.
+        begin_us, end_us : begin and end of the run, µs.
+
+        Yields
+        ------
+        Blocks of windows, in order of time.
         """
         ...
 
@@ -95,21 +99,25 @@ class FluxSource(Protocol):
         ----------
         pixel : [n] mosaic indices.
         blocks : in order of time.
+
+        Yields
+        ------
+        One `Sample` per wanted window.
         """
         ...
 
 
 @runtime_checkable
 class AuditableFlux(FluxSource, Protocol):
-    """A source whose values can be found again by other random numbers."""
+    """A source whose values can be estimated again with other random numbers."""
 
     @property
     def rays_traced(self) -> int:
-        """So far."""
+        """Number of rays traced so far."""
         ...
 
     def still_pixels(self, pixel: NDArray[np.uint32]) -> NDArray[np.bool_]:
-        """Which pixels nothing that moves can come near at any time, [n], as far as that is known."""
+        """Event pixels [n] that are known to be constant: no moving object can come near them at any time."""
         ...
 
     def reference_flux(
@@ -120,14 +128,21 @@ class AuditableFlux(FluxSource, Protocol):
         quality: float,
         events: bool,
     ) -> NDArray[np.float64]:
-        """Mean Φ of each listed pixel in its own window, e⁻/s, by random numbers that the run has not.
+        """Mean Φ of each listed pixel in its own window, e⁻/s, with random numbers that the run does not use.
 
         Parameters
         ----------
-        quality : wanted error over the sensor's noise, that of events or of exposures.
+        pixel : [n], mosaic indices.
+        begin_us, end_us : [n], the windows, µs.
+        quality : wanted error over the sensor's noise.
+        events : True for the noise of events, False for that of exposures.
+
+        Returns
+        -------
+        [n], e⁻/s.
         """
         ...
 
     def noise_unit(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64], events: bool) -> NDArray[np.float64]:
-        """What one standard deviation of each pixel's noise is worth at a flux [..., n], e⁻/s."""
+        """Change of flux equal to one standard deviation of each pixel's noise, at a flux [..., n], e⁻/s."""
         ...

@@ -13,17 +13,17 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.problems import spec_error
 from hesim_render.specs.scene import CameraSpec, SceneSpec, TrackSpec, read_scene
 
-#: Most things a short description names.
+#: Largest number of parts that a short description names.
 _MOST_PARTS = 6
 
 
 @dataclass(frozen=True, repr=False)
 class Scene:
-    """What is seen, how it is lit, from where, and how it moves.
+    """Geometry, lights, camera and motion of a scene.
 
     Parameters
     ----------
-    spec : the validated scene file.
+    spec : validated content of the scene file.
 
     Examples
     --------
@@ -51,11 +51,12 @@ class Scene:
 
     @property
     def name(self) -> str:
+        """Name of the scene, from its file."""
         return self.spec.name
 
     @property
     def file(self) -> str:
-        """The file it was read from, empty where it was given directly."""
+        """Path of the scene file; empty if the scene was given directly."""
         return str(self.spec.file) if self.spec.file else ""
 
     @classmethod
@@ -75,21 +76,27 @@ class Scene:
         name: str = "mitsuba",
         allow_outside: bool = False,
     ) -> Scene:
-        """A scene that Mitsuba itself can load.
+        """A scene in Mitsuba's own format.
 
         Parameters
         ----------
         scene : a dictionary as for ``mitsuba.load_dict`` (such as ``mitsuba.cornell_box()``), or the
             path of an XML file.
-        camera : keys of `CameraSpec`; default the scene's first sensor, whose whole picture then just
-            fits into the read-out region.
+        camera : keys of `CameraSpec`. Default: the first sensor of the scene, with its whole picture fitted
+            into the read-out region.
         motion : tracks (keys of `TrackSpec`) of shapes, by their id, and of ``camera``.
-        max_depth : path length; default the scene's own path tracer with its depth, else 8.
-        radiance_scale : multiplies all radiance, which is taken as W m⁻² sr⁻¹ nm⁻¹.
-        illuminance_lux, irradiance_w_m2 : in its place: the level that all light of the scene together makes, lx or
-            W m⁻² (360 to 830 nm), on the plane through `plane_point_m` [3] with the normal `plane_normal` [3].
-        waveforms : flicker of emitters (keys of a scene file's ``waveform``), by the id of their shape or their own.
-        allow_outside : let an XML file name files outside of its folder; a dictionary may.
+        max_depth : path length. Default: the depth of the scene's own path tracer, else 8.
+        radiance_scale : factor on all radiance, which is then taken as W m⁻² sr⁻¹ nm⁻¹.
+        illuminance_lux, irradiance_w_m2 : instead of `radiance_scale`: level that all light of the scene together
+            makes on a plane, lx or W m⁻² (360 to 830 nm).
+        plane_point_m, plane_normal : [3] each, a point and the normal of that plane, m.
+        waveforms : flicker of emitters (keys of a scene file's ``waveform``), by the id of the emitter or of its shape.
+        name : name of the scene.
+        allow_outside : let an XML file name files outside its own folder. A dictionary always may.
+
+        Returns
+        -------
+        The scene. Mitsuba loads it when it is rendered.
 
         Raises
         ------
@@ -129,12 +136,13 @@ class Scene:
 def load_scene(
     name_or_path: str | Path, overrides: Mapping[str, Any] | None = None, *, allow_outside: bool = False
 ) -> Scene:
-    """A scene by shipped name (``hesim-render list scenes``) or path of a YAML file.
+    """Load a shipped scene by name (``hesim-render list scenes``), or a scene file by path.
 
     Parameters
     ----------
+    name_or_path : name of a shipped scene, or path of a YAML file.
     overrides : dotted keys and their values, applied before validation (``camera.f_number``).
-    allow_outside : let the scene name files (spectra, meshes, textures, includes) outside of its folder.
+    allow_outside : let the scene name files (spectra, meshes, textures, includes) outside its own folder.
 
     Examples
     --------
@@ -142,9 +150,13 @@ def load_scene(
     >>> hr.load_scene("flat-field", {"light.illuminance_lux": 50}).spec.lights[0].illuminance_lux
     50.0
 
+    Returns
+    -------
+    The scene.
+
     Raises
     ------
     SpecError
-        With file, line and key of what is wrong.
+        If the file is not valid; the message names file, line and key.
     """
     return Scene(read_scene(name_or_path, overrides, allow_outside))

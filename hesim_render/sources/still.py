@@ -1,4 +1,4 @@
-"""A source that stands still: rendered once, it serves all times."""
+"""A static source: it is rendered once and serves all times."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hesim_render.sources.window_by_window import WindowByWindow
 
 
 class Kept:
-    """Flux of sources that stand still: every pixel is rendered once, when it is first asked for.
+    """Flux of static sources: every pixel is rendered once, when it is first asked for.
 
     Parameters
     ----------
-    sources : asked for the same pixels.
+    sources : static sources; all are asked for the same pixels.
     """
 
     def __init__(self, sources: Sequence[FluxSource]) -> None:
@@ -60,11 +60,11 @@ class Kept:
 
 
 class StillFlux(WindowByWindow):
-    """A static source, whose pixels are rendered together when one of them is first asked for.
+    """A static source. All its pixels are rendered together when one of them is first asked for.
 
     Parameters
     ----------
-    source : does not change.
+    source : a source that does not change.
     pixel : [n], mosaic indices of all pixels that will be asked for.
     """
 
@@ -75,11 +75,11 @@ class StillFlux(WindowByWindow):
         self._is_rendered = False
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """None."""
+        """No edges."""
         return np.empty(0)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """None."""
+        """No times."""
         return np.empty(0)
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:

@@ -1,4 +1,4 @@
-"""Event samples of sources that take one window after another."""
+"""Event samples of sources that compute one window after another."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hesim_render.sources.protocol import Sample
 
 
 class WindowByWindow(ABC):
-    """What `FluxSource` asks for beyond edges, times and the mean over an interval, made of these."""
+    """Implements `sample_blocks` and `flux_of_blocks` of `FluxSource` by means of its other three calls."""
 
     @abstractmethod
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:

@@ -32,12 +32,20 @@ from hesim_render.specs.yamlfile import read_yaml
 
 
 def read_calibration(file: str | Path) -> dict[str, Any]:
-    """A ``calibration.yaml`` as plain dictionaries, lists and numbers, checked by `CalibrationSpec`.
+    """Read a ``calibration.yaml`` and check it against `CalibrationSpec`.
+
+    Parameters
+    ----------
+    file : the calibration.
+
+    Returns
+    -------
+    Plain dictionaries, lists and numbers.
 
     Raises
     ------
     SpecError
-        If it cannot be read, is of another schema, or is not as 'calibrate' writes it; with lines and keys.
+        If the file cannot be read, has another schema, or is not valid; the message names lines and keys.
     """
     path = Path(file)
     data = read_yaml(path, with_lines=False)
@@ -57,7 +65,7 @@ SENSOR_MAPS = {
 
 @contextlib.contextmanager
 def as_written(file: str | Path) -> Iterator[None]:
-    """Turn what comes of a calibration that lacks a part, or has another in its place, into a `SpecError`."""
+    """Turn errors from a calibration with a missing or misplaced part into a `SpecError`."""
     try:
         yield
     except HesimError:
@@ -69,13 +77,7 @@ def as_written(file: str | Path) -> Iterator[None]:
 
 
 def map_file(file: Path, data: Mapping[str, Any], section: str) -> Path:
-    """The map file of a section, in the calibration's own folder.
-
-    Raises
-    ------
-    SpecError
-        If it is not there, or elsewhere.
-    """
+    """Path of a section's map file, in the folder of the calibration; a `SpecError` if it is missing or elsewhere."""
     name = data[section]["maps"]["file"]
     if not (file.parent / name).exists():
         raise SpecError(f"no such file; it belongs to {file.name}: copy it along", file=file.parent / name)
@@ -91,17 +93,23 @@ def file_digest(file: Path) -> str:
 def read_maps(
     file: str | Path, section: str, data: Mapping[str, Any] | None = None, names: Iterable[str] | None = None
 ) -> dict[str, NDArray]:
-    """The maps of a section, ``aps`` or ``evs``, of a calibration.
+    """Read the maps of one section of a calibration.
 
     Parameters
     ----------
-    data : what `read_calibration` gave, where it was called before.
-    names : which maps, of those that are there; default all.
+    file : the calibration.
+    section : ``aps`` or ``evs``.
+    data : result of an earlier `read_calibration`, if there is one.
+    names : names of the maps to read, as far as they exist; default all.
+
+    Returns
+    -------
+    {name: array}, mostly [row, col] over the captured region; docs/calibration.md lists names and units.
 
     Raises
     ------
     SpecError
-        If the section or its map file is missing, cannot be read, or is not the one the calibration was written with.
+        If the section or its map file is missing or unreadable, or the file is not the one the calibration names.
     """
     path = Path(file)
     data = read_calibration(path) if data is None else data
@@ -113,7 +121,7 @@ def read_maps(
 def _maps_and_digest(
     file: Path, data: Mapping[str, Any], section: str, names: Iterable[str] | None
 ) -> tuple[dict[str, NDArray], str]:
-    """Maps of a section that is there, and the SHA-256 of their file, which must be the one stated."""
+    """Maps of an existing section, and the SHA-256 of their file, which must be the stated one."""
     maps = map_file(file, data, section)
     digest = file_digest(maps)
     if data[section]["maps"].get("sha256", digest) != digest:
@@ -123,14 +131,14 @@ def _maps_and_digest(
 
 @dataclass(frozen=True)
 class MeasuredMaps:
-    """What a sensor keeps of its calibration: no file is needed afterwards.
+    """Maps that a sensor keeps of its calibration, so that it needs no file afterwards.
 
     Attributes
     ----------
-    sha256 : of the calibration and its maps; two of one hash are equal.
-    file : for errors.
-    roi : region that was captured, None for the whole sensor.
-    sections : arrays of ``aps`` and ``evs``, as far as they were calibrated, by name.
+    sha256 : hash of the calibration and its maps; equal hashes mean equal maps.
+    file : path for error messages.
+    roi : captured region, None for the whole sensor.
+    sections : arrays of ``aps`` and ``evs`` by name, as far as they were calibrated.
     """
 
     sha256: str
@@ -140,9 +148,9 @@ class MeasuredMaps:
 
 
 class NoiseFile(Strict):
-    """The calibration a sensor file points at, and its maps, read once.
+    """The calibration that a sensor file points at, and its maps, which are read once.
 
-    A dump holds the SHA-256 of the calibration and its maps, not its place.
+    A dump holds the SHA-256 of the calibration and its maps, not their path.
     """
 
     file: str
@@ -157,20 +165,14 @@ class NoiseFile(Strict):
 
     @property
     def measured(self) -> MeasuredMaps:
-        """The maps that a simulation takes from the calibration; the first call reads them.
-
-        Raises
-        ------
-        SpecError
-            If they cannot be read, or are not those that the calibration or `sha256` names.
-        """
+        """Maps that a simulation uses; the first call reads them. A `SpecError` says why they cannot be used."""
         if self._measured is None:
             self.keep_maps(self.read())
         assert self._measured is not None
         return self._measured
 
     def keep_maps(self, data: Mapping[str, Any]) -> None:
-        """Read the maps of the calibration `data`, and keep them; raises as `measured`."""
+        """Read and keep the maps of the calibration `data`; raises as `measured`."""
         digest = hashlib.sha256(bytes.fromhex(file_digest(self.path)))
         sections = {}
         for section in SECTIONS:
@@ -208,7 +210,7 @@ class NoiseFile(Strict):
 
 
 class NoisePart(Strict):
-    """What of a sensor file is read before the rest of it."""
+    """The part of a sensor file that is read before the rest."""
 
     noise: NoiseFile
 

@@ -1,8 +1,8 @@
-"""Where the camera stands, and one ray per sample of each mosaic pixel.
+"""Camera placement, and one ray per sample of each mosaic pixel.
 
-Camera space: x to the right of the image, y up, looking along −z, the origin at the centre of the
-entrance pupil. The optical axis meets the chip at the *full* sensor's centre, or where the lens in use says
-(`Lens.axis_mm`); places on the chip are counted from that centre.
+Camera space: x to the right of the image, y up, view direction −z, the origin at the centre of the
+entrance pupil. The optical axis meets the chip at the centre of the *full* sensor, or at the place that the lens in use
+states (`Lens.axis_mm`). Positions on the chip are measured from that centre.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class View:
     Parameters
     ----------
     camera_to_world : 4×4 rigid, at rest (before any motion of the camera).
-    sensor : with the lens in use.
-    of_region : whether it was placed by the read-out region, so that another region sees another picture.
-    near_m : nothing before this depth is seen, m.
+    sensor : the sensor, with the lens in use.
+    of_region : True if the read-out region decides the placement, so that another region sees another picture.
+    near_m : surfaces nearer than this depth are not seen, m.
     """
 
     camera_to_world: NDArray[np.float64]
@@ -47,7 +47,7 @@ class View:
 
     @property
     def followed_mm(self) -> tuple[float, float, float, float]:
-        """Part of the chip in which motion is followed, as `region_mm`: the same for all crops of one picture."""
+        """Part of the chip where motion is followed, as `region_mm`: the same for all crops of one picture."""
         if self.of_region:
             return self.region_mm
         geometry = self.sensor.spec.geometry
@@ -56,15 +56,15 @@ class View:
 
     @property
     def region_mm(self) -> tuple[float, float, float, float]:
-        """Read-out region on the chip from its centre: left, right, top, bottom (y downwards), mm."""
+        """Read-out region relative to the centre of the chip: left, right, top, bottom (y downwards), mm."""
         x, y = pixel_centres_mm(self.sensor.layout)
         half = self.sensor.spec.geometry.pitch_um * 1e-3 / 2
         return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
     def project(self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64] | None = None) -> NDArray:
-        """Column and row (pixels, fractional, of this region) of world points [..., 3]; [..., 2].
+        """Column and row (fractional pixels of this region) of world points [..., 3]; [..., 2].
 
-        Points beside or behind the pupil are taken at a small positive depth.
+        Points beside or behind the pupil are treated as if at a small positive depth.
         """
         matrix = self.camera_to_world if camera_to_world is None else camera_to_world
         local = (points - matrix[..., None, :3, 3]) @ matrix[..., :3, :3]
@@ -79,12 +79,12 @@ class View:
     def project_on_sensor(
         self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Column and row (pixels, fractional, of the full sensor) of world points [k, n, 3] through k poses.
+        """Column and row (fractional pixels of the full sensor) of world points [k, n, 3] for k poses of the camera.
 
         Returns
         -------
-        places : [k, n, 2]; points beside or behind the pupil are taken at a small positive depth.
-        px_per_m : [k, n], pixels for a metre across the axis there.
+        places : [k, n, 2]; points beside or behind the pupil are treated as if at a small positive depth.
+        px_per_m : [k, n], pixels per metre across the axis at that depth.
         """
         left, _, top, _ = self.region_mm
         geometry = self.sensor.spec.geometry
@@ -108,7 +108,7 @@ class View:
 
 
 def look_at(origin: Vector, target: Vector, up: Vector) -> NDArray[np.float64]:
-    """Camera-to-world matrix of a camera at `origin` that looks at `target`, `up` upwards in the image.
+    """Camera-to-world matrix of a camera at `origin` that looks at `target`, with `up` upwards in the image.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _region_size_mm(sensor: Sensor) -> tuple[float, float]:
 
 
 def _with_image_distance(sensor: Sensor, camera: CameraSpec, image_mm: float, object_mm: float | None) -> Sensor:
-    """The sensor with the focal length that puts its image at `image_mm` when focused at `object_mm`."""
+    """The sensor with the focal length that gives an image distance of `image_mm` when focused at `object_mm`."""
     fixed = sensor.spec.lens.magnification
     focus_mm = camera.focus_distance_m * MM_PER_M if camera.focus_distance_m else object_mm
     if fixed != "focus":
@@ -147,13 +147,13 @@ def _with_image_distance(sensor: Sensor, camera: CameraSpec, image_mm: float, ob
 
 
 def _turned_to_region(view: View, towards: tuple[float, float] = (0.0, 0.0)) -> View:
-    """The camera turned so that the middle of its region, not the optical axis, looks along its −z.
+    """The camera turned so that the centre of its region, not the optical axis, looks along its −z.
 
-    A field of view is stated for the region; a region far off the axis would look past the scene.
+    A field of view is stated for the region. Without the turn, a region far from the axis would look past the scene.
 
     Parameters
     ----------
-    towards : where the middle looks instead: tangents to the right and downwards.
+    towards : direction of the centre instead of −z: tangents to the right and downwards.
     """
     left, right, top, bottom = view.region_mm
     image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
@@ -170,11 +170,12 @@ def _turned_to_region(view: View, towards: tuple[float, float] = (0.0, 0.0)) -> 
 
 
 def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View:
-    """Back off along +z until the target's image takes `fit_margin` of the region, both ways inside.
+    """Move the camera back along +z until the target's image fills `fit_margin` of the region and fits in both
+    directions.
 
-    The magnification m this needs fixes the distance: d = f (1 + 1/m) for a thin lens focused on the
-    target, else d = v/m with the image distance v that the file or the field of view sets. Where the
-    region is off the optical axis the camera moves sideways, so that the target still fills it.
+    The required magnification m fixes the distance: d = f (1 + 1/m) for a thin lens focused on the
+    target, else d = v/m with the image distance v that the file or the field of view sets. If the
+    region is off the optical axis, the camera moves sideways so that the target still fills it.
     """
     assert scene.target is not None
     width_mm, height_mm = _region_size_mm(sensor)
@@ -200,19 +201,25 @@ def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View
 
 
 def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera | None = None) -> View:
-    """The camera of a scene: its pose at rest and the sensor with focal length, f-number and focus resolved.
+    """Place the camera of a scene: its pose at rest, and the sensor with focal length, f-number and focus resolved.
 
-    With a `camera` section: `fit` as in `CameraSpec`, else the stated origin and target; focus
-    defaults to the distance between them. `horizontal_fov_deg` spans the read-out region's width as
-    if it were centred on the axis, and the camera is turned so that the region's middle looks at the
-    target; with a focal length a region off the axis sees its part of the full sensor's picture.
-    Without a `camera` section, the Mitsuba scene's first sensor: its whole picture (the film's crop window, where it
-    has one) just fits into the region, focused at infinity. A principal point off the picture's middle becomes one off
-    the chip's, about which the lens's fall-off of light lies too.
+    With a `camera` section: `fit` as in `CameraSpec`, otherwise the stated origin and target; the focus defaults to the
+    distance between them. `horizontal_fov_deg` spans the width of the read-out region as if it were centred on the
+    axis, and the camera is turned so that the centre of the region looks at the target. With a focal length, a region
+    off the axis sees its part of the full sensor's picture. Without a `camera` section, the first sensor of the Mitsuba
+    scene is used: its whole picture (the film's crop window, where it has one) just fits into the region, focused at
+    infinity. If its principal point is off the centre of the picture, the axis moves on the chip accordingly, and the
+    lens's relative illumination with it.
 
     Parameters
     ----------
-    mitsuba_sensor : of the Mitsuba scene; needed only without a `camera` section.
+    scene : content of the scene file.
+    sensor : the sensor, with its own lens.
+    mitsuba_sensor : sensor of the Mitsuba scene; needed only without a `camera` section.
+
+    Returns
+    -------
+    The placed camera.
 
     Raises
     ------
@@ -244,9 +251,9 @@ def _from_mitsuba(scene: SceneSpec, sensor: Sensor, camera: MitsubaCamera | None
     width_mm, height_mm = _region_size_mm(sensor)
     image_mm = min(width_mm / (right - left), height_mm / (bottom - top))
     matrix = camera.to_world @ MITSUBA_AXES
-    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)  # a scale in to_world says nothing about the view
+    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)  # a scale in to_world does not affect the view
     used = _with_image_distance(sensor, CameraSpec(), image_mm, None)
-    # the middle of the picture, not the axis, is in the middle of the region
+    # the centre of the picture, not the axis, lies at the centre of the region
     middle = (left + right) / 2, (top + bottom) / 2
     lens = replace(used.lens, axis_mm=(-middle[0] * image_mm, -middle[1] * image_mm))
     return _turned_to_region(View(matrix, replace(used, lens=lens), True, camera.near_m), middle)
@@ -255,7 +262,7 @@ def _from_mitsuba(scene: SceneSpec, sensor: Sensor, camera: MitsubaCamera | None
 class RayFactory:
     """Primary rays of mosaic pixels on the device: box aperture, Gaussian PSF, pinhole at the entrance pupil.
 
-    Rows and columns are those of the full sensor, so that a crop's rays are the full sensor's to the bit.
+    Rows and columns are those of the full sensor, so a crop's rays equal those of the full sensor to the bit.
     """
 
     def __init__(self, view: View) -> None:
@@ -264,7 +271,7 @@ class RayFactory:
         types = jit()
         geometry, lens = view.sensor.spec.geometry, view.sensor.lens
         pitch_mm = geometry.pitch_um * 1e-3
-        # opaque, so that another lens or sensor compiles nothing
+        # opaque, so that another lens or sensor needs no new kernel
         self._middle = [
             dr.opaque(types.Float, (count - 1) / 2 + axis / pitch_mm)
             for count, axis in zip((geometry.cols, geometry.rows), lens.axis_mm, strict=True)
@@ -279,7 +286,7 @@ class RayFactory:
         self._near = dr.opaque(types.Float, view.near_m) if view.near_m > 0 else None
 
     def rays(self, row: Float, col: Float, aperture: Point2, blur: Point2 | None) -> tuple[Point3, Vector3]:
-        """Origin and unit direction in world space, the camera at rest.
+        """Origin and unit direction of one ray per lane in world space, with the camera at rest.
 
         Parameters
         ----------
@@ -295,12 +302,12 @@ class RayFactory:
             radius = self._sigma_px * dr.sqrt(-2 * dr.log(1 - blur[0]))
             sine, cosine = dr.sincos(2 * dr.pi * blur[1])
             offset_x, offset_y = offset_x + radius * cosine, offset_y + radius * sine
-        # half-integers from the middle of the chip are exact in float32
+        # half-integers relative to the centre of the chip are exact in float32
         x = (col - self._middle[0] + offset_x) * self._step
         y = (row - self._middle[1] + offset_y) * self._step
         local = dr.normalize(types.Array3f(x, -y, -1.0))
         direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
         origin = types.Array3f(*self._origin)
-        if self._near is not None:  # where a ray passes that depth
+        if self._near is not None:  # the ray starts at that depth
             origin = dr.fma(direction, self._near / -local.z, origin)
         return origin, direction

@@ -68,16 +68,17 @@ def render_cube(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Spectral radiance of one instant on a pixel grid, at exact wavelengths.
 
-    Each value is the radiance averaged over the pixel's pitch (and the lens PSF); neither filter nor
-    relative illumination enters.
+    Each value is the radiance averaged over one pixel pitch (and the lens PSF). Filters and relative
+    illumination are not applied.
 
     Parameters
     ----------
-    scene : what is seen; objects and camera are frozen at `t_us`.
-    sensor : whose pixel grid, or (rows, cols) of an ideal camera.
-    bands_nm : wavelengths in nm, increasing, 360 to 830.
+    scene : the scene; objects and camera are frozen at `t_us`.
+    sensor : sensor whose pixel grid is used, or (rows, cols) of an ideal camera.
+    bands_nm : [band], wavelengths in nm, increasing, 360 to 830.
     samples : rays per pixel and group of four bands, even.
-    seed : of the random numbers; all bands share them.
+    t_us : instant, µs.
+    seed : seed of the random numbers; all bands share them.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The renderer as a source of flux: Φ of any mosaic pixels over any time slice."""
+"""The exact mode of the renderer as a source of flux: Φ of any mosaic pixels over any time slice."""
 
 from __future__ import annotations
 
@@ -24,28 +24,30 @@ MAX_MOTION_PX = 0.5
 
 
 def used_responses(sensor: Sensor) -> dict[str, Spectrum]:
-    """Responses of the filters that occur in the tile."""
+    """Responses of the filters that occur in the tile, by name."""
     spec = sensor.spec
     used = {spec.pixels[letter].filter for letter in "".join(spec.tile_rows)}
     return {name: response for name, response in sensor.responses.items() if name in used}
 
 
 def require_finite(half_a: Float, half_b: Float, scene: Scene, layout: Layout, pixel: NDArray[np.uint32]) -> None:
-    """Refuse flux that is not a number or infinite.
+    """Refuse flux that is NaN or infinite.
 
     Parameters
     ----------
-    half_a, half_b : Dr.Jit Float [n], of the mosaic indices `pixel` of the region `layout`.
+    half_a, half_b : Dr.Jit Float [n], flux, e⁻/s.
+    scene : for the error message.
+    layout, pixel : the region, and [n] mosaic indices in it.
 
     Raises
     ------
     SpecError
-        With scene file and the first such pixel.
+        Names the scene file and the first such pixel.
     """
     import drjit as dr
 
     if np.isfinite(dr.sum(half_a)[0]) and np.isfinite(dr.sum(half_b)[0]):
-        return  # one number for the host, not one for each pixel
+        return  # transfers one number to the host, not one per pixel
     both = np.array(half_a) + np.array(half_b)
     wrong = np.flatnonzero(~np.isfinite(both))
     if wrong.size:
@@ -60,26 +62,26 @@ def require_finite(half_a: Float, half_b: Float, scene: Scene, layout: Layout, p
 class RenderedFlux(WindowByWindow):
     """Φ = V(x) · ∫ L(x, t, λ) R(λ) dλ in e⁻/s, by path tracing; implements `FluxSource`.
 
-    R = A_pix·FF·G·τ_lens·C_f·η·λ/(hc) with G = π/(1 + 4N²(1 + |m|)²) is the pixel's own response; L is
-    averaged over the pixel's whole pitch (a box) after the lens PSF, and over the time interval where
+    R = A_pix·FF·G·τ_lens·C_f·η·λ/(hc) with G = π/(1 + 4N²(1 + |m|)²) is the pixel's own response. L is
+    averaged over the whole pixel pitch (a box) after the lens PSF, and over the time interval if
     the camera moves. Objects stand still within a slice (`slice_edges_us`), at the pose of its middle.
 
     The lens is a pinhole at the entrance pupil: everything is in focus. Random numbers are a pure
-    function of (seed, pixel on the full sensor, sample): neither chunking, order, crop nor time enters.
+    function of (seed, pixel on the full sensor, sample). They do not depend on chunks, order, crop or time.
 
     Parameters
     ----------
-    scene, sensor : what and through what; a scene may replace focal length, f-number and focus.
+    scene, sensor : the scene and the sensor that sees it; a scene may replace focal length, f-number and focus.
     samples : rays per pixel and call, even; one half of them makes `half_a`, the other `half_b`.
         Powers of two stratify best.
-    seed : of the run.
-    max_motion_px : how far an object may move within a slice.
+    seed : seed of the run.
+    max_motion_px : largest motion of an object within a slice, pixels.
     progress : called with the number of rays traced so far, after each block.
-    block_rays : most rays that are traced at a time.
+    block_rays : largest number of rays that are traced at a time.
 
     Attributes
     ----------
-    sensor : with the lens in use.
+    sensor : the sensor, with the lens in use.
     view : the placed camera.
     is_static : True where nothing moves.
 
@@ -125,7 +127,7 @@ class RenderedFlux(WindowByWindow):
         return self._timeline.edges_us(begin_us, end_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly inside the interval that follow all motion, the camera's too, µs."""
+        """Times strictly inside the interval that follow all motion, including that of the camera, µs."""
         return self._timeline.sample_times_us(begin_us, end_us)
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
@@ -157,10 +159,10 @@ class RenderedFlux(WindowByWindow):
         return self._wavelengths.sample(dr.gather(jit().UInt32, self._filter, pixel), u)
 
     def _weigh(self, pixel: UInt32, radiance: Bands) -> list[Float]:
-        """Wavelengths are distributed as R, so Φ = V · ∫R dλ · mean of L."""
+        """Mean of L times V · ∫R dλ, because wavelengths are distributed as R."""
         import drjit as dr
 
         types = jit()
         total = self._wavelengths.total(dr.gather(types.UInt32, self._filter, pixel))
-        # not dr.mean, which has the number of lanes in the kernel: each new one would compile
+        # not dr.mean: it puts the number of lanes into the kernel, so that each new number would compile again
         return [dr.sum(radiance) / len(radiance) * total * dr.gather(types.Float, self._illumination, pixel)]

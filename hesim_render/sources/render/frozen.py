@@ -1,4 +1,4 @@
-"""Single pixels at single instants, by Mitsuba alone."""
+"""Flux of single pixels at single instants, by Mitsuba alone."""
 
 from __future__ import annotations
 
@@ -19,40 +19,43 @@ from hesim_render.sources.render.specfilm import camera_at, perspective_dict
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
 
-#: Cells in which a waveform's power is taken as even for choosing instants, in a window; they are weighted exactly.
+#: Cells of a window in which a waveform's power counts as constant to draw instants; their weights are exact.
 _CELLS = 64
-#: Times in a window at which it is looked how far objects move; and how far they go from one to the next at most. What
-#: goes farther jumps.
+#: Times in a window at which the motion of objects is measured, and the largest motion between two. An object that
+#: moves farther jumps.
 _STEPS, _MOST_STEP_PX = 65, 2.0
 
 
 @dataclass(frozen=True)
 class Work:
-    """What each repeat does for a pixel: so many instants, with so many rays each."""
+    """Work of each repeat for a pixel: number of instants, and of rays at each."""
 
     instants: int
     samples: int
 
     @property
     def rays(self) -> int:
+        """Number of rays."""
         return self.instants * self.samples
 
 
 class FrozenPixels:
-    """Single pixels of a scene that stands still at chosen instants, by Mitsuba's own cameras, films and integrators.
+    """Single pixels of a scene frozen at chosen instants, rendered by Mitsuba's own cameras, films and integrators.
 
-    In a scalar variant nothing is compiled: a pixel of an instant takes 20 µs and a ray 1 µs.
+    In a scalar variant nothing is compiled: a pixel at an instant takes 20 µs and a ray 1 µs.
 
     Parameters
     ----------
     mi : the mitsuba module in a scalar spectral variant, which must be current whenever this is used.
-    waveform : of the light, None where that is steady.
-    scene : lit by that light alone.
-    sensor : through what.
+    waveform : waveform of the light, None if it is steady.
+    scene : the scene, lit by that light alone.
+    sensor : the sensor that sees it.
 
     Attributes
     ----------
-    view : the placed camera; `is_dark`, whether nothing emits; `is_static`, whether nothing moves.
+    view : the placed camera.
+    is_dark : True if nothing emits.
+    is_static : True if nothing moves.
     """
 
     def __init__(self, mi: MitsubaModule, waveform: Waveform | None, scene: Scene, sensor: Sensor) -> None:
@@ -93,7 +96,7 @@ class FrozenPixels:
     ) -> NDArray[np.float64]:
         """Independent estimates of the mean flux over a window, [repeat, pixel], e⁻/s.
 
-        Where nothing moves, of the flux while the light has its mean power.
+        In a static scene, the result is the flux at the mean power of the light.
         """
         if self.is_static:
             span_us = (0.0, 0.0)
@@ -127,7 +130,9 @@ class FrozenPixels:
     def _instants(
         self, span_us: tuple[float, float], rng: np.random.Generator, shape: tuple[int, int]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times, one in each equal part of the light of a window, and what each counts; [repeat, instant] both."""
+        """Times, one in each part of a window with an equal share of the light, and their weights; both [repeat,
+        instant].
+        """
         begin, end = span_us
         share = (np.arange(shape[1]) + rng.random(shape)) / shape[1]
         if self.is_static or begin == end:
@@ -149,7 +154,9 @@ class FrozenPixels:
         return times, np.divide(power, even, out=np.zeros(shape), where=even > 0) * total[-1] / (end - begin)
 
     def motion_px(self, begin_us: float, end_us: float) -> float:
-        """About how far anything moves in the picture, or one picture beside it, within a window."""
+        """Approximate motion of any object within a window, inside the picture or at most one picture beside it,
+        pixels.
+        """
         times, farthest = np.linspace(begin_us, end_us, _STEPS), 0.0
         knots = [frame.t_us for track in self._scene.spec.motion for frame in track.keyframes]
         inside = [float(t) for t in knots if begin_us < t < end_us]

@@ -1,8 +1,8 @@
-"""Mitsuba scenes in absolute light: the factor to their radiance that makes a level on a plane what was asked for.
+"""Absolute light of Mitsuba scenes: the factor on their radiance that gives a wanted level on a plane.
 
-The irradiance of all light together, what surfaces throw back included, is measured by paths from a point of the plane:
-with light sampled there and directions of a Lambertian surface, weighted against each other [veach1995], and the
-scene's own integrator beyond.
+The irradiance of all light together, interreflections included, is measured by paths from a point of the plane. Light
+sampling and directions of a Lambertian surface are combined at that point by multiple importance sampling [veach1995];
+beyond it, the scene's own integrator is used.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import MitsubaSpec, SceneSpec
 from hesim_render.spectral.spectrum import LUMINOUS_EFFICACY_LM_PER_W, RENDERABLE_NM, Spectrum, constant, photopic
 
-#: Standard error that is aimed at, relative; and the largest one with which a level is still taken.
+#: Relative standard error that is aimed at, and the largest one that is accepted.
 WISH, MOST_ERROR = 1e-3, 1e-2
-#: Independent estimates, whose scatter is the error; and rays of each: for a look, and at most.
+#: Number of independent estimates, whose scatter gives the error; rays of each in the pilot, and at most.
 _ESTIMATES, _LOOK, _MOST = 64, 1 << 10, 1 << 17
 #: Rays at a time.
 _BLOCK = 1 << 20
@@ -36,16 +36,17 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class LightLevel:
-    """What was asked for, and how it was reached.
+    """A wanted level of light, and how it was reached.
 
     Parameters
     ----------
-    level : on the plane, at t = 0; `unit`, lx or W m⁻².
-    plane_point_m, plane_normal : of the plane.
-    measured : level with a factor of 1.
-    error : standard error of that, relative.
-    radiance_scale : factor to the scene's radiance.
-    rays : with which it was measured.
+    level : wanted level on the plane at t = 0, in `unit`.
+    unit : lx or W m⁻².
+    plane_point_m, plane_normal : point, m, and normal of the plane.
+    measured : level with a factor of 1, in `unit`.
+    error : relative standard error of `measured`.
+    radiance_scale : factor on the scene's radiance.
+    rays : number of rays of the measurement.
     """
 
     level: float
@@ -58,15 +59,15 @@ class LightLevel:
     rays: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The fields as plain values."""
         return asdict(self)
 
 
 def in_absolute_light(scene: Scene) -> tuple[Scene, LightLevel | None]:
-    """A scene whose light has a factor in place of a level, and how that was found; the scene itself if it had none.
+    """The scene with a factor on its radiance instead of a level, and how the factor was found.
 
-    Of the light all emitters that are lit count, at their time means, and everything stands where it does at t = 0.
-    The numbers are a pure function of the scene.
+    A scene without a level is returned unchanged, with None. All lit emitters count at their time means, and everything
+    stands where it does at t = 0. The numbers are a pure function of the scene.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def _measured(spec: SceneSpec, source: MitsubaSpec) -> LightLevel:
     built.pose(0.0)
     meter = _Meter(built, spec, key, response, source.plane_point_m, source.plane_normal)
     look = meter.estimates(_LOOK, Stream.LIGHT_LEVEL_PILOT)
-    # how many rays there are is decided by rays that are not among them
+    # a separate pilot decides the number of rays, so that the decision does not bias the estimate
     scatter = float(_error(look))
     rays = min(_MOST, max(_LOOK, 1 << ceil(log2(max(1.0, _LOOK * (scatter / WISH) ** 2)))))
     values = meter.estimates(rays, Stream.LIGHT_LEVEL)
@@ -118,7 +119,7 @@ def _measured(spec: SceneSpec, source: MitsubaSpec) -> LightLevel:
 
 
 def _error(values: np.ndarray) -> float:
-    """Relative standard error of the mean of independent estimates; 1 of nothing."""
+    """Relative standard error of the mean of independent estimates; 1 if the mean is not above 0."""
     mean = values.mean()
     return float(values.std(ddof=1) / np.sqrt(values.size) / mean) if mean > 0 else 1.0
 
@@ -129,9 +130,9 @@ class _Meter:
     Parameters
     ----------
     built : the scene, posed.
-    spec, key : where it stands, for errors.
-    response : to the spectral irradiance.
-    point, normal : of the plane, normal not of length 1.
+    spec, key : scene file and key, for errors.
+    response : response to the spectral irradiance.
+    point, normal : point and normal of the plane; the normal may have any length.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class _Meter:
         self._sampler = sampler_class(mi.variant())()
 
     def estimates(self, rays: int, stream: Stream) -> np.ndarray:
-        """Independent estimates of the level, of so many rays each, a power of two."""
+        """Independent estimates of the level from `rays` rays each, a power of two."""
         import drjit as dr
 
         types = jit()
@@ -171,7 +172,7 @@ class _Meter:
         return np.concatenate(found)
 
     def _level(self) -> Float:
-        """Of one ray a lane."""
+        """Level from one ray per lane."""
         import drjit as dr
 
         mi, scene, sampler = self._mi, self._scene, self._sampler
@@ -200,7 +201,7 @@ class _Meter:
 
 
 def _beyond_one(mi: MitsubaModule, built: BuiltScene, spec: SceneSpec, key: str) -> MitsubaObject | None:
-    """The scene's integrator as it goes on from a surface: its paths one segment shorter; None where they end there."""
+    """The scene's integrator for paths that continue from a surface: one segment shorter; None if paths end there."""
     plugin = built.integrator_plugin
     if plugin is None:
         raise SpecError(

@@ -1,7 +1,7 @@
-"""What flux windows really have: Mitsuba's own cameras, films and integrators, averaged over instants.
+"""Reference flux of time windows: Mitsuba's own cameras, films and integrators, averaged over instants.
 
-Nothing of it comes from the tracers of this package: neither rays, wavelengths, random numbers, films nor motion
-within a window. Objects and camera are moved by giving Mitsuba their poses, one instant after the other. It is slow
+The reference shares nothing with the tracers of this package: neither rays, wavelengths, random numbers, films nor
+motion within a window. Mitsuba gets the poses of objects and camera for one instant after the other. This is slow
 for whole pictures and quick for some pixels.
 """
 
@@ -21,15 +21,15 @@ from hesim_render.sources.render.scene.mitsuba_version import using_variant
 from hesim_render.sources.scene import Scene
 
 VARIANT = "scalar_spectral"
-#: Independent renders whose scatter is the error; of the pilot, which says how long each of them is.
+#: Number of independent renders, whose scatter gives the error; and of the pilot, which decides their length.
 REPEATS, _PILOT_REPEATS = 16, 8
-#: Fewest instants of a repeat, and for each pixel that anything moves in a window, in all repeats together.
+#: Least number of instants of a repeat; and, for each pixel of motion in a window, of all repeats together.
 _LEAST_INSTANTS, _INSTANTS_PER_PX = 4, 16
-#: Rays at an instant: at least, and at most.
+#: Least and largest number of rays at an instant.
 SAMPLES, _MOST_SAMPLES = 16, 1024
-#: Rays of a pixel in a window and repeat at most.
+#: Largest number of rays of a pixel in a window and repeat.
 MOST_RAYS = 1 << 15
-#: The pilot's own scatter is not exact: so much less is asked for.
+#: Factor on the wanted error, because the scatter from the pilot is uncertain.
 _MARGIN = 0.8
 
 
@@ -40,11 +40,11 @@ class WindowFlux:
     Parameters
     ----------
     flux : mean Φ of each pixel through its own filter, e⁻/s.
-    stderr : standard error of each from the scatter of `repeats` independent estimates, so a ratio with it is
-        distributed as Student's t with `repeats` - 1 degrees of freedom. Of pixels in a window some instants are the
-        same, and where nothing moves all windows are: their errors are not independent.
-    instants : at which each was rendered, in all repeats and for all waveforms together.
-    repeats : see `stderr`.
+    stderr : standard error from the scatter of `repeats` independent estimates, e⁻/s. A deviation over it has Student's
+        t distribution with `repeats` - 1 degrees of freedom. Pixels in a window share some instants, and in a static
+        scene all windows are equal, so their errors are not independent.
+    instants : number of instants of each value, over all repeats and waveforms.
+    repeats : number of independent estimates.
     """
 
     flux: NDArray[np.float64]
@@ -56,21 +56,21 @@ class WindowFlux:
 class WindowReference:
     """Mean Φ of pixels over windows, in e⁻/s, by Mitsuba alone.
 
-    Instants are drawn at random in equal parts of a window, so that the mean over them is that over the window however
-    few they are: more of them make the error smaller and change nothing else. How many there are is decided by a pilot
-    that is not in the estimate. Flickering light weights instants by its power.
+    Instants are drawn at random in equal parts of a window, so the mean over them is unbiased for any number of
+    instants; more of them only reduce the error. A pilot that is not part of the estimate decides their number.
+    Flickering light weights instants by its power.
 
     Parameters
     ----------
-    scene : shapes and camera may move, emitting shapes as well.
+    scene : shapes, emitting shapes and the camera may move.
     sensor : relative illumination, transmittance, f-number and responses apply as in the renderer.
-    samples : rays of a pixel at an instant, a power of 4.
+    samples : rays per pixel and instant, a power of 4.
     repeats : independent estimates, 2 or more.
-    most_rays : of one pixel in one window and repeat; the error says where that was not enough.
+    most_rays : largest number of rays of a pixel in a window and repeat; the error tells where it was not enough.
 
     Attributes
     ----------
-    sensor : with the lens in use.
+    sensor : the sensor, with the lens in use.
 
     Raises
     ------
@@ -117,9 +117,14 @@ class WindowReference:
         ----------
         windows_us : [window, 2], begin and end of each, µs.
         pixel : [n], mosaic indices (row · cols + col of the region).
-        error_wanted : standard error that is asked for, e⁻/s; one for all, or [window, n].
-        seed : of everything random, which depends besides on the pixel's place on the full sensor and the window alone.
-        instants : of each repeat, in place of what the pilot finds necessary.
+        error_wanted : wanted standard error, e⁻/s; one number, or [window, n].
+        seed : seed of all random numbers, which otherwise depend only on the window and on the pixel's place on the
+            full sensor.
+        instants : number of instants per repeat; default: what the pilot finds necessary.
+
+        Returns
+        -------
+        Flux and standard error, [window, n].
 
         Raises
         ------
@@ -144,7 +149,7 @@ class WindowReference:
                 if part.is_dark:
                     continue
                 for index, spans in enumerate([windows] if part.is_static else windows[:, None]):
-                    # where nothing moves, one window stands for all
+                    # in a static scene, one window stands for all
                     place = slice(None) if part.is_static else slice(index, index + 1)
                     found = self._window(part, spans, pixels, each[place], [seed, number], instants)
                     total[place] += found.flux
@@ -161,7 +166,7 @@ class WindowReference:
         key: list[int],
         instants: int | None,
     ) -> WindowFlux:
-        """Of a single window; of any number of them where nothing moves."""
+        """Flux in a single window; in a static scene, in any number of windows."""
         power = np.ones(len(windows)) if part.waveform is None else part.waveform.mean(windows[:, 0], windows[:, 1])
         span = (float(windows[0, 0]), float(windows[0, 1]))
         begin = self._least(part, *span)
@@ -173,7 +178,7 @@ class WindowReference:
             if part.is_static:
                 wanted = (wanted / np.maximum(power, 1e-300)[:, None]).min(axis=0, keepdims=True)
             error = pilot.std(axis=0, ddof=1) / np.sqrt(self._repeats)
-            # the variance falls with the number of rays or, as they are stratified, faster
+            # the variance falls at least as fast as 1/rays, and faster with stratification
             step = np.searchsorted([work.rays for work in ladder], begin.rays * (error / (_MARGIN * wanted[0])) ** 2)
             step = np.minimum(step, len(ladder) - 1)
         flux, stderr = np.zeros(pixels.size), np.zeros(pixels.size)
@@ -194,7 +199,9 @@ class WindowReference:
         return Work(max(1, min(1 << ceil(log2(wanted)), self._most_rays // self._samples)), self._samples)
 
     def _ladder(self, work: Work, is_static: bool) -> list[Work]:
-        """From the least work to the most; where anything moves, instants become more and rays at each of them."""
+        """Steps from the least to the most work. With motion, the number of instants and the rays at each grow in
+        turn.
+        """
         found = [work]
         while 4 * work.rays <= self._most_rays:
             more_rays = work.samples < _MOST_SAMPLES and (is_static or len(found) % 2 == 0)
@@ -214,5 +221,5 @@ def reference_windows(
     *,
     instants: int | None = None,
 ) -> WindowFlux:
-    """Mean Φ of pixels over windows by Mitsuba's own cameras and integrators; see `WindowReference.flux`."""
+    """Mean Φ of pixels over windows by Mitsuba's own cameras and integrators; see `WindowReference` and its `flux`."""
     return WindowReference(scene, sensor).flux(windows_us, pixel, error_wanted, seed, instants=instants)

@@ -59,7 +59,7 @@ def perspective_dict(
         "type": "perspective",
         "fov": degrees(2 * atan(width / 2 / image_mm)),
         "fov_axis": "x",
-        # Mitsuba counts the offset of the film's centre from the axis, in units of its size
+        # Mitsuba measures the offset of the film's centre from the axis in units of the film's size
         "principal_point_offset_x": ((left + right) / 2 - axis_x) / width,
         "principal_point_offset_y": ((top + bottom) / 2 - axis_y) / height,
         "near_clip": max(1e-4, view.near_m),
@@ -90,15 +90,21 @@ def reference_flux(
 ) -> ReferenceFlux:
     """Flux at one instant through `mitsuba.render` and a ``specfilm`` whose channels are the pixel responses.
 
-    Shares with `RenderedFlux` the scene's geometry and the lens, but neither rays, wavelengths,
-    random numbers nor film; it also runs in scalar variants. Relative illumination applies.
+    It shares the scene's geometry and the lens with `RenderedFlux`, but neither rays, wavelengths,
+    random numbers nor film. It also runs in scalar variants. Relative illumination is applied.
 
     Parameters
     ----------
+    scene, sensor : the scene and the sensor that sees it.
     samples : rays per pixel and repeat.
-    t_us : objects, camera and lights are frozen at this time.
-    variant : a spectral Mitsuba variant, such as ``scalar_spectral``; default the backend's.
+    t_us : instant at which objects, camera and lights are frozen, µs.
+    variant : a spectral Mitsuba variant, such as ``scalar_spectral``; default: that of the backend.
     repeats : independent renders, 2 or more; their scatter gives the standard error.
+    seed : seed of the random numbers.
+
+    Returns
+    -------
+    Flux and standard error per filter, [row, col], e⁻/s.
 
     Raises
     ------
@@ -137,7 +143,7 @@ def reference_flux(
 def _renders(
     mi: MitsubaModule, scene: Scene, sensor: Sensor, samples: int, t_us: float, repeats: int, seed: int
 ) -> tuple[View, NDArray[np.float64]]:
-    """The placed camera and [repeat, row, col, filter] before relative illumination, lights at their mean."""
+    """The placed camera and [repeat, row, col, filter] without relative illumination, lights at their mean power."""
     built = build(mi, scene.spec, used_responses(sensor))
     view = place_camera(scene.spec, sensor, built.mitsuba_sensor())
     responses = used_responses(view.sensor)
@@ -150,7 +156,7 @@ def _renders(
         "height": view.sensor.rows,
         "component_format": "float32",
         "rfilter": {"type": "box"},
-        # channels come back in the order of their names
+        # Mitsuba returns channels in the order of their names
         **{f"channel_{number:03d}": spectrum_dict(response) for number, response in enumerate(responses.values())},
     }
     camera = mi.load_dict(perspective_dict(mi, view, camera_at(scene, view, t_us), film))

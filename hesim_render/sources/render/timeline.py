@@ -1,4 +1,4 @@
-"""When the scene moves on: time slices short enough that no moving object goes far within one."""
+"""Time slices of a moving scene, short enough that no object moves far within one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.scene.trajectory import Trajectory
 
-#: Steps in which the path of an object's corners is measured between two keyframes, at least.
+#: Least number of steps in which the path of an object's corners is measured between two keyframes.
 _LEAST_STEPS = 16
 #: Largest turn of one such step.
 _STEP_RAD = np.radians(5.0)
@@ -21,19 +21,20 @@ _CAMERA_STEP_US = 2000.0
 
 
 class Timeline:
-    """Slices of an animated scene; a pure function of time, whatever interval is asked for.
+    """Slices of an animated scene; a pure function of time, independent of the interval that is asked for.
 
-    Between two keyframes of any object, time is cut evenly into slices within which no corner of
+    Between two keyframes of any object, time is cut evenly into slices. Within a slice, no corner of
     a moving object's bounding box moves more than `max_motion_px` in the image.
 
     Parameters
     ----------
-    view : the camera at rest; `camera` its track, if it moves.
-    trajectories : of the moving objects.
-    corners : bounding-box corners of each, at rest, [k, 3] in metres.
-    scene_corners : corners of the whole scene's box at rest, [8, 3]; what a moving camera sees go by.
-    max_motion_px : motion allowed within a slice, pixels.
-    min_slice_us : no slice is shorter.
+    view : the camera at rest.
+    camera : track of the camera, None if it rests.
+    trajectories : tracks of the moving objects.
+    corners : bounding-box corners of each, at rest, [k, 3], m.
+    scene_corners : corners of the whole scene's box at rest, [8, 3], m; they bound what a moving camera sees.
+    max_motion_px : largest motion within a slice, pixels.
+    min_slice_us : shortest slice, µs.
     """
 
     def __init__(
@@ -76,14 +77,14 @@ class Timeline:
             turn = float(np.max(np.abs(trajectory.arc_rad)))
             steps = _LEAST_STEPS + int(np.ceil(turn / _STEP_RAD))
             times = np.linspace(begin_us, end_us, steps + 1)
-            # the wrap of a repeating track falls on the knot itself: stay on this side of it
+            # a repeating track jumps at the knot itself: use the pose before the jump
             times[-1] -= 1e-6 * (end_us - begin_us)
             poses = trajectory.matrix(times)
             points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
             camera = np.broadcast_to(self._view.camera_to_world, poses.shape)
             if self._camera is not None:
                 camera = self._camera.matrix(times) @ camera
-            # both places through the same camera: its own motion is rendered ray by ray
+            # project both positions through the same camera, because each ray follows the camera's motion itself
             first = self._view.project(points[:-1], camera[:-1])
             second = self._view.project(points[1:], camera[:-1])
             step_px = np.linalg.norm(second - first, axis=-1).max(axis=-1)
@@ -93,10 +94,10 @@ class Timeline:
         return np.linspace(begin_us, end_us, pieces + 1)[1:-1]
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly inside an interval between which the image moves by `max_motion_px` or less.
+        """Times strictly inside an interval between which the image moves by `max_motion_px` or less, µs.
 
-        Objects and the camera both count: the slice edges, and between them evenly as many times as
-        the camera's own motion asks for.
+        Motion of objects and of the camera counts. The times are the slice edges and, evenly between them, as many
+        more as the camera's motion requires.
         """
         bounds = np.concatenate([[begin_us], self.edges_us(begin_us, end_us), [end_us]])
         if self._camera is None:
@@ -105,14 +106,14 @@ class Timeline:
         return np.concatenate(pieces)[1:]
 
     def _camera_pieces(self, begin_us: float, end_us: float) -> int:
-        """How many parts of an interval keep the camera's own image motion below the limit."""
+        """Number of parts of an interval that keeps the camera's own image motion below the limit."""
         pieces = int(np.ceil(self.camera_motion_px(begin_us, end_us) / self._max_motion_px - 1e-9))
         return max(1, min(pieces, int((end_us - begin_us) / self._min_slice_us)))
 
     def camera_motion_px(self, begin_us: float, end_us: float) -> float:
-        """Farthest that anything at rest may move in the image during an interval, pixels.
+        """Upper bound of the image motion of resting surfaces during an interval, pixels.
 
-        Measured at the nearest and the farthest corner of the scene's box, at the pace of the fastest part.
+        It is measured at the nearest and the farthest corner of the scene's box, at the speed of the fastest part.
         """
         if self._camera is None:
             return 0.0
@@ -138,12 +139,12 @@ class Timeline:
         return every[(every > begin_us) & (every < end_us)]
 
     def pose_time_us(self, begin_us: float, end_us: float) -> float:
-        """Middle of the slice that holds an interval: when objects stand where they are drawn."""
+        """Middle of the slice that contains an interval, µs: objects are drawn at their pose of this time."""
         middle = (begin_us + end_us) / 2
         if not self._trajectories:
             return middle
         knots = self._knots(middle, middle)
-        if knots[0] > middle or knots[-1] < middle:  # before the first or after the last keyframe: held
+        if knots[0] > middle or knots[-1] < middle:  # the pose is held before the first and after the last keyframe
             return middle
         if knots[0] == knots[-1]:
             return float(knots[0])

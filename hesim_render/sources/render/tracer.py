@@ -22,7 +22,7 @@ from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
 
-#: So many rays are traced at a time, for bounded memory.
+#: Number of rays traced at a time, to bound memory.
 BLOCK_RAYS = 1 << 20
 
 #: (mosaic index, u in [0, 1)) → the four wavelengths of a ray, nm.
@@ -32,22 +32,22 @@ Values = Callable[[UInt32, Bands], list[Float]]
 
 
 class Tracer:
-    """A scene, a placed camera and the pixels of its sensor; what the tracers of both modes have in common.
+    """A scene, a placed camera and the pixels of its sensor: the common part of the tracers of both modes.
 
     Parameters
     ----------
-    scene, sensor : what and through what.
+    scene, sensor : the scene and the sensor that sees it.
     responses : spectra that the scene must cover.
     progress : called with the number of rays traced so far, after each block.
-    block_rays : most rays that are traced at a time.
+    block_rays : largest number of rays traced at a time.
 
     Attributes
     ----------
     built, view : the scene in Mitsuba, the placed camera.
-    sensor : with the lens in use.
-    camera : its trajectory, or None where it rests.
+    sensor : the sensor, with the lens in use.
+    camera : trajectory of the camera, None if it rests.
     radiance_scale : factor from the scene's own radiance to W m⁻² sr⁻¹ nm⁻¹.
-    rays_done : so far.
+    rays_done : number of rays traced so far.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class Tracer:
         self._full_cols = dr.opaque(types.UInt32, self.sensor.spec.geometry.cols)
 
     def _row_and_col(self, index: UInt32) -> tuple[UInt32, UInt32]:
-        """Of a pixel's number on the full sensor; that is what its random numbers follow, too."""
+        """Row and column of a pixel's number on the full sensor, which also keys its random numbers."""
         row = index // self._full_cols
         return row, index - row * self._full_cols
 
@@ -91,13 +91,13 @@ class Tracer:
 
 
 class PixelTracer(Tracer):
-    """Averages over each pixel's rays, every pixel with as many, objects at rest.
+    """Averages over the rays of each pixel. Every pixel has the same number of rays, and objects are at rest.
 
     Parameters
     ----------
     scene, sensor, responses, progress, block_rays : see `Tracer`.
-    samples : rays per pixel, even; a half of them for each of two independent estimates.
-    seed : of the run.
+    samples : rays per pixel, even; one half for each of two independent estimates.
+    seed : seed of the run.
 
     Raises
     ------
@@ -134,7 +134,7 @@ class PixelTracer(Tracer):
         return self.view.sensor.rows * self.view.sensor.cols
 
     def pose(self, t_us: float) -> None:
-        """Put moving objects at their place of `t_us`."""
+        """Put moving objects at their poses of `t_us`."""
         if self.built.trajectories and t_us != self._posed_us:
             self.built.pose(t_us)
             self._posed_us = t_us
@@ -147,7 +147,14 @@ class PixelTracer(Tracer):
         wavelengths: Wavelengths,
         values: Values,
     ) -> list[Halves]:
-        """Averages over the rays of each listed pixel, the camera moving through the pixel's own interval.
+        """Averages over the rays of each listed pixel. The camera moves through the pixel's own interval.
+
+        Parameters
+        ----------
+        pixel : [n], mosaic indices.
+        begin_us, end_us : [n] or scalar, µs.
+        wavelengths : draws the wavelengths of a ray.
+        values : map radiance to the quantities to average.
 
         Returns
         -------
@@ -168,7 +175,7 @@ class PixelTracer(Tracer):
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
         times = None
         if self.camera is not None:
-            # wrapped on the host in double precision, pixel by pixel: no rounding depends on the others
+            # repeated tracks are wrapped on the host in float64, per pixel, so that rounding does not depend on others
             local = self.camera.local_us(begin) if self.camera.repeat else begin - self.camera.knots_us[0]
             times = [np.broadcast_to(v, pixel.shape).astype(np.float32) for v in (local, end - begin)]
         parts: list[list[Halves]] = []

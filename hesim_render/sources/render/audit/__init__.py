@@ -1,1 +1,1 @@
-"""What a run is worth: random pixels over stretches of time, rendered again."""
+"""The audit: a random sample of pixels and windows is rendered again, and bounds the error of a run."""

@@ -1,9 +1,9 @@
-"""What a run is worth, measured: random pixels over stretches of time are rendered again, with other random numbers.
+"""The audit of a run: random pixels over stretches of time are rendered again, with other random numbers.
 
-The audit decides nothing about the picture. Its units are stretches of windows of one pixel (`units`): as many in
-each stretch of time, of pixels that are drawn independently of each other; of a sensor with a tick one window of a
-stretch is judged, so that nothing is counted twice that belongs together. They are rendered with random numbers of
-their own and so many rays that their error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for
+The audit does not influence the picture. Its units are stretches of successive windows of one pixel (`units`). Each
+stretch of time has the same number of units, and their pixels are drawn independently. For a sensor with a tick, only
+one window of a stretch is judged, so that correlated windows are not counted twice. The reference uses random numbers
+of its own, and so many rays that its error is a small part of the tolerance. Every bound holds with `CONFIDENCE` for
 the whole run, at whatever number of units the audit stops (`confidence`).
 """
 
@@ -22,37 +22,38 @@ from hesim_render.sources.render.audit.units import NotedFlux, Units
 
 #: Confidence of each stated bound.
 CONFIDENCE = 0.99
-#: What a run should have: share of values off by more than the tolerance, of signal events missed, of events too many.
+#: Limits for a run: share of values off by more than the tolerance, of signal events missed, of extra events.
 MOST_OFF, MOST_MISSED, MOST_EXTRA = 0.02, 0.02, 0.01
-#: Deviation that counts, in wanted errors.
+#: Smallest deviation that counts as off, in wanted errors.
 TOLERANCE = 3.0
-#: Windows of a unit before those that are judged, these, and after them: an event may come one window early or late.
+#: Windows of a unit: before the judged ones, judged, after them. An event may come one window early or late.
 STRETCHES = {"previous_sample": (2, 1, 1), "last_event": (1, 8, 1)}
-#: Events that are counted of a unit at most.
+#: Largest number of events that is counted in a unit.
 _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
-#: Part of the units of pixels that nothing can come near which is rendered again; they count for more.
+#: Units of pixels that no moving object can come near: this part is rendered again, with a weight of 1 over it.
 _STILL_PART = 0.25
-#: Wanted error of the reference over the sensor's noise, as a part of the run's quality.
+#: Quality of the reference, as a part of the quality of the run.
 _REFERENCE = 0.5
-#: Units that are looked at before it is asked whether they are enough: at first, and later on.
+#: Sizes of the first and of the largest batch; after each batch the audit checks whether it has enough units.
 _LEAST_BATCH, _MOST_BATCH = 256, 16384
-#: Rays of an audit at most: a part of the run's own, or so many if that is more.
+#: Upper limit for the rays of an audit: a part of the run's own rays, or a fixed number if that is more.
 _PART, _RAYS = 0.25, 30_000_000
 
 
 class _Tally:
-    """What units were seen to have, arrays [unit] in the random order in which they are looked at.
+    """Results of the units, arrays [unit] in the random order in which units are examined.
 
     Parameters
     ----------
-    units : so many.
+    units : number of units.
 
     Attributes
     ----------
-    off : share of values off by more than the tolerance, times the number of units that this one stands for.
-    expected : the same of what the error which the run states puts there by itself.
-    events : what `compare` counted; `by_error`, what it counts of the reference with the stated error on top.
-    eventful : first so many of which all that have events in the run were looked at; `looked_at`, all.
+    off : share of values off by more than the tolerance, times the weight of the unit.
+    expected : the share that the stated error of the run alone would put there, times the weight.
+    events : counts from `compare`. `by_error` : counts after the stated error is added to the reference.
+    eventful : length of the first part in which all units with events in the run were examined.
+    looked_at : length of the first part in which all units were examined.
     """
 
     def __init__(self, units: int) -> None:
@@ -63,35 +64,35 @@ class _Tally:
         self._deviations: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
 
     def note(self, place: NDArray[np.int64], deviation: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
-        """Deviations of some units, [window, unit], absolute, in units of noise, and how many each stands for."""
+        """Note absolute deviations of some units, [window, unit], in units of noise, with the weight of each unit."""
         each = np.broadcast_to(place, deviation.shape), deviation, np.broadcast_to(weight, deviation.shape)
         self._deviations.append(tuple(values.ravel() for values in each))  # type: ignore[arg-type]
 
     def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Deviations and weights of all that were looked at, the least first."""
+        """Deviations and weights of all examined units, in increasing order of deviation."""
         place, deviation, weight = (np.concatenate(values) for values in zip(*self._deviations, strict=True))
         among = np.flatnonzero(place < self.looked_at)
         order = among[np.argsort(deviation[among])]
         return deviation[order], weight[order]
 
     def rate(self, values: NDArray[np.float64]) -> float:
-        """Mean over units, of something that only events have."""
+        """Mean over units of a quantity that is 0 in units without events."""
         rare = values[: self.eventful][self.has_event[: self.eventful]].sum() / max(1, self.eventful)
         other = values[: self.looked_at][~self.has_event[: self.looked_at]].sum() / max(1, self.looked_at)
         return float(rare + other)
 
 
 class Audit:
-    """One run, audited.
+    """Audit of one run.
 
     Parameters
     ----------
-    noted : what it gave.
-    source : rendered it, and renders units again.
-    quality : that was asked for.
-    noise : of the event pixels, None where there are none.
-    event_pixel : mosaic indices in the order of the event grid.
-    seed : of the choices.
+    noted : units noted while the source passed its values on.
+    source : source of the run; renders the reference.
+    quality : quality that was asked for.
+    noise : noise model of the event pixels, None where there are none.
+    event_pixel : [n], mosaic indices in the order of the event grid.
+    seed : seed of the random choices.
     """
 
     def __init__(
@@ -108,7 +109,7 @@ class Audit:
         self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 2]))
 
     def run(self) -> dict[str, Any]:
-        """Bounds, estimates and deviations, and whether they are what they should be; plain values."""
+        """Run the audit. Returns bounds, estimates, deviations and a verdict, as plain values."""
         own = self._source.rays_traced
         room = max(_PART * own, _RAYS)
         found: dict[str, Any] = {"confidence": CONFIDENCE, "tolerance_noise": TOLERANCE * self._quality}
@@ -119,11 +120,11 @@ class Audit:
         return found | self._verdict([found[name] for name in kinds])
 
     def _one(self, noted: list[Units], events: bool, room: float) -> dict[str, Any]:
-        """Of the event pixels, or of frames.
+        """Audit the event pixels, or the frames.
 
-        Units have one random order. In some first part of it, all are looked at that have an event in the run; they are
-        few, tell how many events there are, and only they can have one too many. In a first part of that, the others
-        are looked at as well: something may be off or missed in any of them.
+        All units have one random order. In a first part of this order, all units with an event in the run are examined:
+        they are few, they estimate the number of events, and only they can have an extra event. In a shorter first
+        part, the other units are examined as well, because any of them may have a value that is off or a missed event.
         """
         begin, batches = self._source.rays_traced, self._batches(noted)
         tally, result, seen = _Tally(sum(units.pixel.size for units in noted)), dict[str, Any](), 0
@@ -150,7 +151,7 @@ class Audit:
         return result
 
     def _batches(self, noted: list[Units]) -> list[list[tuple[NDArray[np.int64], Units]]]:
-        """All units in a random order, more and more at a time, those of equal shape together, with their places."""
+        """All units in random order, in batches of growing size, grouped by shape, with their places in that order."""
         which = np.concatenate([np.full(units.pixel.size, number) for number, units in enumerate(noted)])
         inside = np.concatenate([np.arange(units.pixel.size) for units in noted])
         order, found, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
@@ -169,7 +170,12 @@ class Audit:
         return found
 
     def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: _Tally, which: str) -> None:
-        """Render some units again and count what is found: those with events, the others, or all of frames."""
+        """Render the reference of some units of a batch and count the results.
+
+        Parameters
+        ----------
+        which : ``eventful`` (units with events in the run), ``calm`` (the others) or ``frames`` (all).
+        """
         for place, units in batch:
             if which == "frames":
                 some, still = np.arange(place.size), np.zeros(place.size, np.bool_)
@@ -204,17 +210,19 @@ class Audit:
             found = self._compare(part, part.flux, other)
             for total, values in zip(vars(tally.events).values(), vars(found).values(), strict=True):
                 total[place[moving]] = values
-            # what an error like the stated one does to the reference
+            # counts that an error as large as the stated one causes on its own
             by_error = self._compare(part, other + part.difference, other)
             tally.by_error[place[moving]] = by_error.missed + by_error.extra + by_error.flips
 
     def _reference(self, units: Units, still: NDArray[np.bool_], which: str) -> NDArray[np.float64]:
-        """Flux of units by other random numbers, [window, unit]; what is not needed is as the run has it."""
+        """Flux by other random numbers, [window, unit], e⁻/s. Windows that are not needed keep the values of the
+        run.
+        """
         needed = np.zeros(units.flux.shape, np.bool_)
         core = np.flatnonzero(units.core)
         needed[core] = True
         if which == "calm" and core[0] > 0:
-            # where the run has no event near by, only missed ones are asked for
+            # a unit without events in the run can only have missed ones: their windows are enough
             needed[core[0] - 1] |= ~still
         elif which == "eventful":
             needed[:] |= ~still
@@ -229,14 +237,14 @@ class Audit:
         return reference
 
     def _has_event(self, units: Units) -> NDArray[np.bool_]:
-        """Units in which the run itself may have an event, [unit]."""
+        """Units in which the run may have an event, [unit]."""
         assert self._noise is not None
         signal = self._log(units.pixel, units.flux)
         on, off = self._thresholds(units.pixel)
         if self._noise.spec.reference == "previous_sample":
             change = np.diff(signal, axis=0)
             return np.asarray(((change > on) | (change < -off)).any(axis=0))
-        # the level that its events start from is not known: with less than half a threshold there is none
+        # The reference level of the comparator is not known. A range below half a threshold gives no event.
         return np.asarray(np.ptp(signal, axis=0) > 0.5 * np.minimum(on, off))
 
     def _log(self, pixel: NDArray[np.uint32], flux: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -252,12 +260,12 @@ class Audit:
         return on, off
 
     def _place(self, pixel: NDArray[np.uint32]) -> NDArray[np.int64]:
-        """On the event grid."""
+        """Places of mosaic indices on the event grid."""
         order = np.argsort(self._event_pixel)
         return order[np.searchsorted(self._event_pixel, pixel, sorter=order)]
 
     def _compare(self, units: Units, flux: NDArray[np.float64], reference: NDArray[np.float64]) -> Counted:
-        """Events of a flux of some units against those of the reference, all [window, unit]."""
+        """Compare the events of a flux with those of the reference; both are [window, unit], e⁻/s."""
         assert self._noise is not None
         run = self._log(units.pixel, flux)
         error = self._log(units.pixel, flux + units.error) - run
@@ -286,7 +294,7 @@ class Audit:
         return found | self._event_bounds(tally) if events else found
 
     def _event_bounds(self, tally: _Tally) -> dict[str, Any]:
-        """Of missed and extra events. Units in which nothing can move have neither."""
+        """Bounds of missed and extra events. Units in which nothing can move have neither."""
         assert self._noise is not None
         most, counted = float(_MOST_EVENTS[self._noise.spec.reference]), tally.events
         each = 1 - (1 - CONFIDENCE) / 2
@@ -312,7 +320,7 @@ class Audit:
         }
 
     def _verdict(self, parts: list[dict[str, Any]]) -> dict[str, Any]:
-        """Whether the run is what it should be: shown with confidence, shown not to be, or neither."""
+        """Verdict: the limits are met with confidence, not met, or neither is shown."""
         shares = [(part[name], part[f"{name}_at_most"], part[f"{name}_wanted_at_most"])
                   for part in parts for name in ("off", "missed", "extra")
                   if name in part and (name == "off" or part["true_events"])]  # fmt: skip
@@ -331,6 +339,6 @@ _PARTS = {"median": 0.5, "p95": 0.95, "p99": 0.99}
 
 
 def _rounded_down(value: float) -> float:
-    """To two digits."""
+    """Round down to two significant digits."""
     step = 10 ** (np.floor(np.log10(value)) - 1)
     return float(np.floor(value / step + 1e-9) * step)

@@ -1,4 +1,4 @@
-"""Noise-free events of one run against those of another: which are missed, which are too many."""
+"""Compare the noise-free events of a run with those of a reference: missed and extra events."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: Standard errors by which a signal must exceed the threshold for its event to count as missed or too many.
+#: An event counts as missed or extra only if its signal exceeds the threshold by this many standard errors.
 SURE = 3.0
 
 
@@ -17,11 +17,11 @@ class Counted:
 
     Parameters
     ----------
-    true, found : events of the reference and of the run.
-    missed : true ones that no found one is like, though the reference exceeds the threshold by more than `SURE`
+    true, found : number of events of the reference and of the run.
+    missed : true events without a matching found one, where the reference exceeds the threshold by more than `SURE`
         standard errors.
-    extra : found ones that no true one is like, though the run exceeds the threshold by that much.
-    flips : all others that have no like.
+    extra : found events without a matching true one, where the run exceeds the threshold by that much.
+    flips : all other events without a match.
     """
 
     true: NDArray[np.float64]
@@ -38,16 +38,20 @@ def compare_ticks(
     thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
     core: NDArray[np.bool_],
 ) -> Counted:
-    """Of a sensor that compares successive samples.
+    """Compare events of a sensor with a tick, which compares successive samples.
 
-    Two events are alike if their polarity agrees and their ticks differ by at most one.
+    Two events match if their polarities agree and their ticks differ by at most one.
 
     Parameters
     ----------
     run, reference : ln x, [window, unit].
     error : standard error of `run`, [window, unit].
     thresholds : θ₊ and θ₋ of each unit's pixel, [unit].
-    core : [window], in which events are counted.
+    core : [window], windows in which events are counted.
+
+    Returns
+    -------
+    Counts per unit.
     """
     true, found, missed, extra, flips = counts = [np.zeros(run.shape[1]) for _ in range(5)]
     change, wanted = np.diff(run, axis=0), np.diff(reference, axis=0)
@@ -70,7 +74,7 @@ def compare_ticks(
 
 
 def _near(which: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Windows next to or among those marked, [window, unit]."""
+    """The marked windows and their direct neighbours in time, [window, unit]."""
     found = which.copy()
     found[1:] |= which[:-1]
     found[:-1] |= which[1:]
@@ -85,13 +89,19 @@ def compare_crossings(
     core: NDArray[np.bool_],
     most: int,
 ) -> Counted:
-    """Of an asynchronous sensor: both signals start from the reference, whose every event sets the level of both.
+    """Compare events of an asynchronous sensor, which compares with the level of its last event.
 
-    An event of one signal has its like if the other one crosses the same level within a step of the source.
+    Both signals start from the reference level. Every event of the reference sets the level of both. An event of one
+    signal has a match if the other signal crosses the same level within one step of the source.
 
     Parameters
     ----------
-    most : events that are counted of a unit at most.
+    run, reference, error, thresholds, core : as for `compare_ticks`.
+    most : largest number of events that is counted in a unit.
+
+    Returns
+    -------
+    Counts per unit.
     """
     count = run.shape[1]
     true, found, missed, extra, flips = (np.zeros(count) for _ in range(5))
@@ -104,7 +114,7 @@ def compare_crossings(
         for sign, theta in ((1.0, theta_on), (-1.0, theta_off)):
             ahead, own = sign * reference, sign * run
             goal = sign * level + theta
-            # the run's own crossing of what the reference does not reach near by
+            # a crossing of the run at a level that the reference does not reach within one step
             over = (own[k] > goal) & (own[k - 1] <= goal) & (ahead[around].max(axis=0) < goal)
             sure = over & (own[around].max(axis=0) > goal + SURE * spread)
             if core[k]:

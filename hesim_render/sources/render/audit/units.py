@@ -1,4 +1,4 @@
-"""What a source gives to a few random pixels, noted while it is passed on: the units of the audit."""
+"""Units of the audit: values that a source gives for random pixels, noted while they are passed on."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 
-#: Units noted in a run, about.
+#: Approximate number of units noted in a run.
 _UNITS = 200_000
 _BY_WINDOW = ("begin_us", "end_us", "flux", "difference", "error")
 
@@ -26,11 +26,11 @@ class Units:
     Parameters
     ----------
     pixel : [unit], mosaic indices.
-    begin_us, end_us : each unit's own windows.
-    core : [window], those that are judged; the others lie before and after them.
-    flux : as it was given, e⁻/s.
-    difference : half the difference of both halves, e⁻/s: it varies as the flux's own error does.
-    error : standard error that the source expects, e⁻/s; 0 where it tells none.
+    begin_us, end_us : windows of each unit, µs.
+    core : [window], windows that are judged; the others lie before and after them.
+    flux : flux that the source gave, e⁻/s.
+    difference : half the difference of the two halves, e⁻/s; it has the distribution of the flux's own error.
+    error : standard error that the source states, e⁻/s; 0 where it states none.
     """
 
     pixel: NDArray[np.uint32]
@@ -48,16 +48,16 @@ class Units:
 
     @classmethod
     def joined(cls, parts: Sequence[Units]) -> Units:
-        """Units of the same shape."""
+        """Join units of the same shape."""
         values = {name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in _BY_WINDOW}
         return cls(pixel=np.concatenate([part.pixel for part in parts]), core=parts[0].core, **values)
 
 
 @dataclass
 class _Open:
-    """Units that are being noted: places in the list, how many windows until they are full, and what was given so far.
+    """Units that are still being noted: places in the list, windows left until they are full, and values so far.
 
-    `skipped` is how many windows of a unit lie before the first one of the run.
+    `skipped` is the number of windows of a unit that lie before the first window of the run.
     """
 
     place: NDArray[np.int64]
@@ -68,21 +68,21 @@ class _Open:
 
 
 class NotedFlux:
-    """Another source; implements `FluxSource`.
+    """Wraps a source and notes values of random units; implements `FluxSource`.
 
-    Units are drawn evenly over the pixels of each stretch or frame, independently of each other and of all values.
+    Units are drawn uniformly over the pixels of each stretch or frame, independently of each other and of all values.
 
     Parameters
     ----------
-    source : the other one.
+    source : the wrapped source.
     event_pixel : [n], mosaic indices of the event pixels.
-    samples, frames : windows that event pixels will be asked for, and calls for frames, about.
-    before, core, after : windows of a unit: so many before those that are judged, those, and after them.
-    seed : of the choice.
+    samples, frames : approximate number of windows for event pixels, and of calls for frames.
+    before, core, after : numbers of windows of a unit: before the judged ones, judged, after them.
+    seed : seed of the random choices.
 
     Attributes
     ----------
-    events, frames : what was noted; units of frames have one window.
+    events, frames : units noted so far; units of frames have one window.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class NotedFlux:
 
         units: deque[_Open] = deque()
         if among.size:
-            # of the first windows, which have fewer before them
+            # units at the begin of the run have fewer windows before the judged ones
             units.extend(self._open(among, skipped) for skipped in range(self._before, 0, -self._core))
         for number, sample in enumerate(self.source.flux_of_blocks(pixel, told(blocks))):
             window = times.popleft()

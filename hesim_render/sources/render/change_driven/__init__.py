@@ -1,1 +1,1 @@
-"""The default source: what changes is rendered, with as many rays as its noise asks for."""
+"""Change-driven rendering, the default source: only changes are rendered, with as many rays as the noise requires."""

@@ -1,4 +1,4 @@
-"""How exact a render is wanted: its error is measured against the noise of the sensor's own pixels."""
+"""Wanted error of a render, in units of the noise of the sensor's own pixels."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
 
-#: What a pixel is asked for: its part of a frame or, if it gives none, of an event's window ("any"); or the latter.
+#: Use of a pixel: "events" is a window of an event pixel; "any" is a frame exposure, or a window where there is none.
 Role = Literal["any", "events"]
 
-#: Flux [..., n], e⁻/s → what one standard deviation of the noise of each of n pixels is worth there, e⁻/s.
+#: Maps flux [..., n], e⁻/s, to the noise unit of n pixels: the change of flux equal to one standard deviation, e⁻/s.
 NoiseUnit = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 class Noise:
-    """Noise of a sensor's pixels, in terms of the flux behind it.
+    """Noise of a sensor's pixels, expressed as flux.
 
     Parameters
     ----------
-    sensor : with both noise models.
-    most_power : largest factor by which a flux is multiplied afterwards (a flickering light's power over its mean).
+    sensor : with its noise models.
+    most_power : largest factor by which the flux is multiplied later (largest over mean power of a flickering light).
     """
 
     def __init__(self, sensor: Sensor, most_power: float = 1.0) -> None:
@@ -35,21 +35,27 @@ class Noise:
         if spec.aps is not None:
             for place in spec.positions("aps"):
                 self._is_frame[place] = True
-        #: Number of the event position of each place of the tile; of others, the first.
+        #: Number of the event position at each place of the tile; 0, the first one, at other places.
         self._position = np.zeros((rows, cols), np.int64)
         if spec.evs is not None:
             for number, place in enumerate(spec.positions("evs")):
                 self._position[place] = number
 
     def of(self, role: Role, index: NDArray[np.uint32]) -> NoiseUnit:
-        """Of listed pixels; in a role that they do not have, of the first pixel that has it (crosstalk, neighbours).
+        """Noise unit of listed pixels. A pixel without the role takes that of the first position that has it.
 
-        Frames: read noise, shot noise, dark noise, rounding and PRNU of one exposure. Events: one standard deviation of
+        Such pixels occur as sources of crosstalk and as neighbours. The noise of a frame pixel is read noise, shot
+        noise, dark noise, rounding and PRNU of one exposure. The noise of an event pixel is one standard deviation of
         ln x of one window, at least θ/20.
 
         Parameters
         ----------
+        role : use of the pixels.
         index : [n], numbers on the full sensor.
+
+        Returns
+        -------
+        Function from flux [..., n] to the noise unit [..., n], both e⁻/s.
         """
         row, col = np.divmod(index.astype(np.int64), self._sensor.spec.geometry.cols)
         rows, cols = self._position.shape
@@ -76,7 +82,7 @@ class Noise:
         return lambda flux: (noise.noise_equivalent_e(flux * seconds, position) / seconds).astype(np.float32)
 
     def is_apart(self, role: Role) -> bool:
-        """Whether the pixels of a role have no neighbours to ask: fewer than half of all pixels have it."""
+        """True if pixels of a role have no direct neighbours of that role: fewer than half of all pixels have it."""
         spec = self._sensor.spec
         counted = spec.positions("evs" if role == "events" or spec.aps is None else "aps")
         return 2 * len(counted) < self._position.size

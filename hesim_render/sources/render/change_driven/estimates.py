@@ -1,4 +1,4 @@
-"""What the default source holds of its pixels: flux with both halves and its error, what rests, and what was done."""
+"""Data of the default source: flux with both halves and its error, pixels at rest, and counts of the work done."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Flux:
 
     @classmethod
     def zeros(cls, windows: int, pixels: int) -> Flux:
+        """Flux 0 of all pixels in all windows."""
         return cls(*(np.zeros((windows, pixels), np.float32) for _ in range(3)))
 
     @property
@@ -34,23 +35,25 @@ class Flux:
         return self.half_a, self.half_b, self.error
 
     def at(self, place: slice | NDArray) -> Flux:
-        """Of some pixels."""
+        """Flux of the pixels at some places."""
         return Flux(*(values[:, place] for values in self.arrays))
 
     def put(self, place: slice | NDArray, flux: Flux) -> None:
-        """Take the flux of some pixels."""
+        """Set the flux of the pixels at some places."""
         for values, found in zip(self.arrays, flux.arrays, strict=True):
             values[:, place] = found
 
 
 @dataclass
 class Still:
-    """Pixels of a region whose flux is the same at all times, as far as that is known yet.
+    """Pixels of a region whose flux is known to be the same at all times.
 
     Parameters
     ----------
-    span_us : for which it is asked whether anything can come near; None where all may change, or nothing moves at all.
-    known : [pixel], which are; `flux`, [1, pixel], theirs.
+    span_us : interval in which moving objects are tested for coming near, µs; None where all pixels may change, or
+        nothing moves.
+    known : [pixel], True where the flux is known to be constant.
+    flux : [1, pixel], flux of these pixels.
     """
 
     span_us: tuple[float, float] | None
@@ -60,16 +63,16 @@ class Still:
 
 @dataclass(frozen=True)
 class Band:
-    """Some of the listed pixels.
+    """A part of the listed pixels.
 
     Parameters
     ----------
     place : [n], places in the list.
     sites : the pixels and their neighbours.
-    unit : noise of the sites.
-    apart : whether the pixels have no neighbours to ask.
-    pilot_rays : of each pixel in each window.
-    quality : wanted error in units of noise.
+    unit : noise unit of the sites.
+    apart : True if the pixels have no direct neighbours.
+    pilot_rays : pilot rays per pixel and window.
+    quality : wanted error in noise units.
     """
 
     place: NDArray[np.int64]
@@ -87,13 +90,13 @@ class Band:
 
 @dataclass
 class Counts:
-    """What was done so far.
+    """Work done so far.
 
     Parameters
     ----------
-    pilot_rays, rays : of pilots, and of what they asked for.
-    pairs : pairs of a pixel and a window that were rendered.
-    values : flux of so many pairs was given; the rest was filled in, or known.
+    pilot_rays, rays : rays of pilot passes, and of the final render.
+    pairs : rendered pairs of a pixel and a window.
+    values : pairs whose flux was given out; those not rendered were interpolated or already known.
     """
 
     pilot_rays: int = 0

@@ -1,4 +1,4 @@
-"""What a run will take, from a few patches of the picture looked at beforehand."""
+"""Forecast of the time and memory of a run, from pilot passes over a few patches of the picture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.mosaic.schedule import Block, Exposure
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
-#: Patches of so many pixels by side, and blocks spread over the run, in which rays are counted.
+#: Number of patches, side of a patch, px, and number of blocks over the run, in which rays are counted.
 _PATCHES, _SIDE, _BLOCKS = 6, 12, 3
 #: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
 #: of the stages, bytes.
@@ -20,13 +20,13 @@ _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a run will take, right to about a factor of two.
+    """Estimated time and memory of a run, right to about a factor of two.
 
     Parameters
     ----------
-    seconds : of rendering.
-    peak_bytes : of memory.
-    rays : in all.
+    seconds : time of rendering, s.
+    peak_bytes : peak memory, bytes.
+    rays : total number of rays.
     """
 
     seconds: float
@@ -50,12 +50,17 @@ def forecast(
     frame_pixel: NDArray[np.uint32],
     exposures: Sequence[Exposure],
 ) -> Estimate:
-    """Time and memory of a run.
+    """Forecast the time and memory of a run.
 
     Parameters
     ----------
-    sources : of one scene, each is asked for all of it.
-    event_pixel, blocks : what they will be asked for, and `frame_pixel`, `exposures` for frames.
+    sources : renderers of one scene; the whole run is asked of each.
+    event_pixel, blocks : [n] mosaic indices of event pixels, and the blocks of windows of the run.
+    frame_pixel, exposures : [n] mosaic indices of frame pixels, and the exposures of the run.
+
+    Returns
+    -------
+    The estimate.
     """
     is_static = sources[0].is_static
     rng = np.random.default_rng(sources[0].seed)
@@ -85,7 +90,7 @@ def forecast(
 
 
 def _patches(pixel: NDArray[np.uint32], source: ChangeDrivenFlux, rng: np.random.Generator) -> NDArray[np.uint32]:
-    """Listed pixels in some small squares: neighbours are looked at together, as in the run."""
+    """Listed pixels in some small squares. Squares keep neighbours together, as in the run."""
     row, col = np.divmod(pixel.astype(np.int64), source.sensor.cols)
     side = _SIDE * max(1.0, np.sqrt(source.sensor.rows * source.sensor.cols / pixel.size))
     found = np.zeros(pixel.size, np.bool_)

@@ -1,4 +1,4 @@
-"""Pixels that are looked at: those of a list, and those next to them."""
+"""The pixels of a list and their neighbours."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-#: How far from a listed pixel its neighbours reach, pixels.
+#: Largest distance of a neighbour from its listed pixel, pixels.
 REACH = 3
 
 
 @dataclass(frozen=True)
 class Sites:
-    """Listed pixels and their neighbours on the mosaic of the full sensor, whatever region is read out.
+    """Listed pixels and their neighbours on the mosaic of the full sensor, independent of the read-out region.
 
-    What is told of a pixel's neighbourhood is thus the same for a crop as for the full sensor, to the bit: sums have
+    Statistics over a pixel's neighbourhood are therefore equal to the bit for a crop and for the full sensor. Sums add
     their terms in the same order.
 
     Parameters
     ----------
     index : [m], numbers on the full sensor, increasing.
-    listed : [n], places in `index` of the listed pixels, in the order of the list.
-    shape : rows and columns of the rectangle around all sites, and `cell` [m] their places in it; None where the
-        listed pixels have no neighbours.
+    listed : [n], places of the listed pixels in `index`, in the order of the list.
+    shape : rows and columns of the rectangle around all sites; None where the listed pixels have no neighbours.
+    cell : [m], places of the sites in that rectangle.
     """
 
     index: NDArray[np.uint32]
@@ -34,13 +34,13 @@ class Sites:
 
     @classmethod
     def alone(cls, pixel: NDArray[np.uint32]) -> Sites:
-        """Pixels without neighbours."""
+        """Listed pixels without neighbours."""
         index, listed = np.unique(pixel, return_inverse=True)
         return cls(index, listed.astype(np.int64))
 
     @classmethod
     def around(cls, pixel: NDArray[np.uint32], rows: int, cols: int) -> Sites:
-        """Pixels with their neighbours, up to `REACH` away, on a full sensor of so many rows and columns."""
+        """Listed pixels with their neighbours up to `REACH` away, on a full sensor of the given size."""
         row, col = np.divmod(pixel.astype(np.int64), cols)
         top, bottom = max(0, int(row.min()) - REACH), min(rows, int(row.max()) + REACH + 1)
         left, right = max(0, int(col.min()) - REACH), min(cols, int(col.max()) + REACH + 1)
@@ -63,7 +63,7 @@ class Sites:
         return self.index.size
 
     def mean(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Mean over the sites among each listed pixel's 3×3, of values [m]; [n]."""
+        """Mean of `values` [m] over the sites in the 3×3 neighbourhood of each listed pixel, [n]."""
         if self.shape is None:
             return values[self.listed]
         if not self._count:
@@ -76,7 +76,7 @@ class Sites:
         return self._at_listed(across[:-2] + across[1:-1] + across[2:])
 
     def most(self, values: NDArray, radius: int) -> NDArray:
-        """Largest value within `radius` pixels of each listed one, diagonally too, of values [m]; [n]."""
+        """Largest of `values` [m] at most `radius` pixels away from each listed pixel, also diagonally, [n]."""
         if self.shape is None:
             return values[self.listed]
         lowest = False if values.dtype == np.bool_ else -np.inf
@@ -105,7 +105,7 @@ class Sites:
 
 
 def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:
-    """How many other windows of its row come before each pair's, [n]."""
+    """For each pair: the number of other windows of its row that come first, [n]."""
     pairs, inverse = np.unique(np.stack([row.astype(np.int64), window.astype(np.int64)]), axis=1, return_inverse=True)
     if pairs.shape[1] == 0:
         return np.empty(0, np.int64)
@@ -115,7 +115,7 @@ def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.i
 
 
 def of_own_row(sites: Sites, window: NDArray[np.integer], cols: int) -> NDArray[np.int64]:
-    """Window of each site: that of the listed pixels of its row, or of the nearest row that has any."""
+    """Window of each site: that of the listed pixels in its row, or in the nearest row that has any."""
     row, listed = sites.index.astype(np.int64) // cols, sites.index[sites.listed].astype(np.int64) // cols
     rows, first = np.unique(listed, return_index=True)
     nearest = np.searchsorted((rows[1:] + rows[:-1]) / 2, row)

@@ -1,4 +1,4 @@
-"""Flux of (pixel, time window) pairs in any order: each ray has its own instant inside its pixel's window."""
+"""Flux of (pixel, time window) pairs in any order. Each ray has its own instant inside the window of its pixel."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from hesim_render.sources.render.transport.paths import PathIntegrator
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
 
-#: Rays of a pair; one kernel serves all their numbers at once.
+#: Least and largest number of rays of a pair; one kernel serves all numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
 
 
 @dataclass(frozen=True)
 class PairFlux:
-    """Flux of pairs, one entry a pair.
+    """Flux of pairs, one entry per pair.
 
     Parameters
     ----------
     half_a, half_b : two independent estimates of the mean flux, e⁻/s, float32.
-    met : whether any path came through the box of a moving object.
+    met : True if any path came through the box of a moving object.
     """
 
     half_a: NDArray[np.float32]
@@ -52,14 +52,14 @@ class PairFlux:
 
 @dataclass(frozen=True)
 class PilotFlux:
-    """What a few rays of each pair say, one entry a pair: of both estimates, see `MattIntegrator`.
+    """Statistics of a few rays of each pair, one entry per pair, for both estimators of `MattIntegrator`.
 
     Parameters
     ----------
     lit, hidden : mean flux, e⁻/s, float32.
-    lit_scatter, hidden_scatter : of single rays, e⁻/s, float32: root of the mean fourth power of deviations over their
-        mean square. For rays of which one half says one thing and one half another it is the standard deviation; where
-        few say something else it is more, as stratified rays gain less then.
+    lit_scatter, hidden_scatter : scatter of single rays, e⁻/s, float32: the root of the mean fourth power of deviations
+        over their mean square. It equals the standard deviation if half of the rays give one value and half another.
+        It is larger if few rays deviate, because stratification then gains less.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
     """
@@ -73,16 +73,16 @@ class PilotFlux:
 
 
 class PairTracer(Tracer):
-    """Paths from mosaic pixels into a `MovingScene`.
+    """Traces paths from mosaic pixels into a `MovingScene`.
 
     Random numbers are a pure function of (seed, stream, pixel on the full sensor, half, sample), the same in every
-    window: a pixel whose paths nothing crosses is exactly constant. Pixels are told by their number on the full sensor,
-    so that a crop's are the full sensor's to the bit.
+    window, so a pixel whose paths no object crosses is exactly constant. Pixels are identified by their number on the
+    full sensor, so a crop has the values of the full sensor to the bit.
 
     Parameters
     ----------
     scene, sensor, responses, progress, block_rays : see `Tracer`.
-    seed : of the run.
+    seed : seed of the run.
 
     Raises
     ------
@@ -120,7 +120,7 @@ class PairTracer(Tracer):
 
     @property
     def is_matt(self) -> bool:
-        """Whether all that is seen is direct light on matt surfaces."""
+        """True if all visible light is direct light on matt surfaces."""
         return isinstance(self._integrator, MattIntegrator)
 
     def trace(
@@ -139,12 +139,17 @@ class PairTracer(Tracer):
         Parameters
         ----------
         pixel : [n], number on the full sensor.
-        window : [n], number of its window among `windows`.
-        samples : [n], rays of each pair, a power of two from `LEAST_SAMPLES` to `MOST_SAMPLES`.
-        lit : [n], which of the two estimates to take, see `MattIntegrator`.
-        stream : of random numbers.
-        span_us : interval in which `PairFlux.met` asks what moving objects come near; default that of the windows.
-        repeat : each number has random numbers of its own.
+        window : [n], number of the window among `windows`.
+        windows : the windows.
+        samples : [n], rays per pair, a power of two from `LEAST_SAMPLES` to `MOST_SAMPLES`.
+        lit : [n], True takes the lit estimator, False the hidden one, see `MattIntegrator`.
+        stream : stream of random numbers.
+        span_us : interval in which `PairFlux.met` tests for moving objects, µs; default: the windows themselves.
+        repeat : number of the repetition; each has its own random numbers.
+
+        Returns
+        -------
+        Flux of the pairs, [n].
         """
         out = PairFlux(
             np.empty(pixel.size, np.float32), np.empty(pixel.size, np.float32), np.empty(pixel.size, np.bool_)
@@ -162,7 +167,7 @@ class PairTracer(Tracer):
             self._trace_block(lanes, packets[part], moments, key, out, part)
             self._report((int(ends[last - 1]) - done) * _PACKET)
             first = last
-        # the lit estimate of a pixel that is dark after all may fall below nothing; no flux does
+        # the lit estimate of a dark pixel may be negative; a flux is not
         below = np.minimum(out.mean, 0)
         scale = self._scale(pixel)
         half_a = out.half_a - below
@@ -180,13 +185,19 @@ class PairTracer(Tracer):
         stream: Stream = Stream.RENDER_PILOT,
         span_us: tuple[float, float] | None = None,
     ) -> PilotFlux:
-        """A few rays of every listed pair, with random numbers of their own: what they show may decide about the pair.
+        """Statistics of a few rays of every listed pair, with random numbers of their own.
+
+        Decisions may depend on these rays without bias, because the final render uses other random numbers [kirk1991].
 
         Parameters
         ----------
         pixel, window, windows, stream, span_us : see `trace`.
-        samples : rays of each pair, a power of two.
-        footprint_px : width of the area in which they start, pixels.
+        samples : rays per pair, a power of two.
+        footprint_px : width of the area in which the rays start, pixels.
+
+        Returns
+        -------
+        Statistics of the pairs, [n].
         """
         import drjit as dr
 
@@ -206,9 +217,9 @@ class PairTracer(Tracer):
         return out
 
     def least_distance_m(self, t_us: float, grid: tuple[int, int] = (24, 32)) -> float:
-        """Least distance from the camera, along its axis, of what rests, seen by an even grid over the picture, m.
+        """Least depth of the resting surfaces in view, over an even grid of the picture, m.
 
-        Infinite where nothing is seen.
+        Depth is measured along the camera's axis. It is infinite where nothing is seen.
         """
         import drjit as dr
 
@@ -241,20 +252,22 @@ class PairTracer(Tracer):
         return dr.opaque(jit().UInt64, stream_key(key + repeat, stream) if repeat else key)
 
     def _scale(self, pixel: NDArray[np.uint32]) -> NDArray[np.float32]:
-        """From the flux on the optical axis to that of each pixel."""
+        """Factor from the flux on the optical axis to that of each pixel."""
         row, col = np.divmod(pixel.astype(np.int64), self.sensor.spec.geometry.cols)
         return optics.relative_illumination_at(self.sensor.spec, self.sensor.lens, row, col) * np.float32(
             self.radiance_scale
         )
 
     def _moments(self, windows: Windows, span_us: tuple[float, float] | None) -> Moments:
-        """Windows on the device, and the boxes in which objects stay in each, or in all of `span_us`."""
+        """Windows on the device, with the boxes that contain each object during each window, or during all of
+        `span_us`.
+        """
         groups = self.parts.groups
         tracks = [group.trajectory for group in groups] + ([self.camera] if self.camera else [])
         return Moments.of(windows, span_us, tracks, len(groups), self._boxes)
 
     def _boxes_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
-        """Boxes in which each group stays in some intervals, [interval, group, 2, 3], m."""
+        """Boxes that contain each group during some intervals, [interval, group, 2, 3], m."""
         found = [stays_in(group.corners, group.trajectory, spans_us) for group in self.parts.groups]
         return np.stack(found, axis=1) if found else np.empty((len(spans_us), 0, 2, 3))
 
@@ -267,7 +280,7 @@ class PairTracer(Tracer):
         out: PairFlux,
         part: slice,
     ) -> None:
-        """Trace some pairs, packet after packet of `_PACKET` rays."""
+        """Trace some pairs in packets of `_PACKET` rays."""
         import drjit as dr
 
         types = jit()
@@ -289,7 +302,7 @@ class PairTracer(Tracer):
         met = _bits(types.UInt32, met, used * _PACKET)
         dr.eval(flux, met)
         self._sampler.rest()
-        # sums within halves of packets, the smallest half there is
+        # sums over half packets: a half of a pair is never smaller
         sums = np.array(dr.block_sum(flux, _PACKET // 2))
         bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, _PACKET))
         rays = packets * _PACKET
@@ -327,7 +340,7 @@ class PairTracer(Tracer):
             mean = dr.block_sum(values, samples) * share
             square = dr.square(values - dr.gather(types.Float, mean, lane))
             fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
-            # of the scene's own scatter these rays are a sample
+            # these rays are a sample of the scatter in the scene
             scatter = dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
             dr.eval(mean, scatter)
             getattr(out, name)[part], getattr(out, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
@@ -337,7 +350,7 @@ class PairTracer(Tracer):
     def _rays_of(
         self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float
     ) -> tuple[Float, Float, Float, Mask]:
-        """What an integrator's `flux` returns of one ray per lane, on the optical axis's scale."""
+        """The integrator's `flux` of one ray per lane, with the scale of the optical axis."""
         import drjit as dr
 
         mi, types = self.built.mi, jit()
@@ -366,7 +379,7 @@ def _bits(kind: type[UInt32], condition: Mask, count: int) -> UInt32:
 
 
 def _told(integrator: MitsubaObject, property_name: str) -> int:
-    """A depth that an integrator was given, -1 for none; Mitsuba tells it only in words."""
+    """A depth limit of an integrator, -1 for none. Mitsuba gives it only in the text of the integrator."""
     for line in str(integrator).splitlines():
         name, _, value = line.strip().rstrip(",").partition(" = ")
         if name == property_name:

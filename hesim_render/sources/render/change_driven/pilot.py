@@ -1,8 +1,8 @@
-"""The pilot pass: a few rays of each pixel in each window, which decide how the picture is rendered.
+"""The pilot pass: a few rays of each pixel in each window decide how the final render spends its rays.
 
-Its rays have random numbers of their own, so that what they show may decide about the picture without favouring what
-the picture's rays happen to miss [kirk1991]. They are the
-same at all times: differences between two windows are changes of the scene, not of the rays.
+Pilot rays have random numbers of their own. Decisions that depend on them therefore do not favour what the rays of the
+final render happen to miss [kirk1991]. The pilot rays are the same at all times, so a difference between two windows is
+a change of the scene, not of the rays.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 
-#: Fluxes times this have squares that float32 can hold, with digits to spare.
+#: Scale of fluxes before they are squared, so that float32 can hold the squares.
 _SMALLER = np.float32(1e-4)
 
 
 @dataclass(frozen=True)
 class Closer:
-    """Sites by which something small may come in a window, and what many rays say of them.
+    """Sites where a small object may pass during a window, and the statistics of extra pilot rays there.
 
     Parameters
     ----------
     place : [k], places among the sites.
-    rays : [k], so many.
-    lit_scatter, hidden_scatter : [k], e⁻/s.
+    rays : [k], number of rays.
+    lit_scatter, hidden_scatter : [k], scatter of single rays, e⁻/s.
     """
 
     place: NDArray[np.int64]
@@ -43,14 +43,14 @@ class Closer:
 
 @dataclass(frozen=True)
 class Pilot:
-    """Of sites in successive windows, all arrays [window, site]; see `PilotFlux` and `MattIntegrator`.
+    """Statistics of sites in successive windows, all arrays [window, site]; see `PilotFlux` and `MattIntegrator`.
 
     Parameters
     ----------
-    lit, hidden : mean flux by both estimates, e⁻/s.
-    lit_scatter, hidden_scatter : of single rays in both, e⁻/s.
+    lit, hidden : mean flux by each estimator, e⁻/s.
+    lit_scatter, hidden_scatter : scatter of single rays for each estimator, e⁻/s.
     unshadowed : flux if nothing hid any light, e⁻/s.
-    closer : what more rays say of some sites, one entry a window; none where there were no more.
+    closer : results of extra rays at some sites, one entry per window; empty where there were none.
     """
 
     lit: NDArray[np.float32]
@@ -62,16 +62,19 @@ class Pilot:
 
     @property
     def windows(self) -> int:
+        """Number of windows."""
         return self.lit.shape[0]
 
     def flux_of(self, window: int) -> NDArray[np.float32]:
-        """In one window, by the estimate that scatters less there, [site]."""
+        """Flux in one window, by the estimator with less scatter there, [site], e⁻/s."""
         chosen = self.lit_scatter[window] <= self.hidden_scatter[window]
         return np.where(chosen, self.lit[window], self.hidden[window])
 
     @property
     def steady_flux(self) -> NDArray[np.float32]:
-        """By one estimate at all times: what changes is the scene."""
+        """Flux by the same estimator in all windows, [window, site], e⁻/s, so that every difference is a change of
+        the scene.
+        """
         chosen = self.lit_scatter.sum(axis=0) <= self.hidden_scatter.sum(axis=0)
         return np.where(chosen, self.lit, self.hidden)
 
@@ -86,20 +89,21 @@ def take_pilot(
     span_us: tuple[float, float] | None,
     closer: Sequence[Sequence[Look]] = (),
 ) -> tuple[Pilot, NDArray[np.bool_]]:
-    """Trace the pilot.
+    """Trace the pilot pass.
 
     Parameters
     ----------
-    numbers : of each site's windows, [window, site].
-    rays : of each site in each window.
-    width_px : of the area in which they start.
-    span_us : interval, with all windows in it, for which the second result is told; None for not at all.
-    closer : of each window, sites that are looked at closer; see `Zoom`.
+    tracer, sites, windows : renderer, pixels with neighbours, and all windows.
+    numbers : [window, site], window number of each site.
+    rays : rays per site and window.
+    width_px : width of the area in which the rays start, px.
+    span_us : interval around all windows for which `near` is computed, µs; None: not computed.
+    closer : for each window, the sites that get extra rays; see `Zoom`.
 
     Returns
     -------
-    pilot : of all windows; where nothing comes near the rays, they are traced in the first one only.
-    near : [site], whether a ray came near what moves within the interval; True where the camera moves.
+    pilot : statistics of all windows. Sites near which nothing moves are traced in the first window only.
+    near : [site], True if a ray came near a moving object within the interval; always True if the camera moves.
     """
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
     near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
@@ -124,11 +128,13 @@ def _look_closer(
     width_px: float,
     closer: Sequence[Sequence[Look]],
 ) -> list[Closer]:
-    """What more rays say: of large things it takes the pilot's place, of small ones it is returned for each window."""
+    """Trace extra pilot rays. Results for large objects replace those of the pilot; those for small objects are
+    returned.
+    """
     looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
     nothing = Closer(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
     parts = [[nothing] for _ in closer]
-    # large things first: a pixel may show something small as well
+    # large objects first: a pixel may show a small object as well, whose result must stay
     for is_small, rays in sorted({(look.is_small, look.rays) for _, look in looks}):
         alike = [(window, look.place) for window, look in looks if (look.is_small, look.rays) == (is_small, rays)]
         place = np.concatenate([places for _, places in alike])
@@ -159,19 +165,21 @@ def allocate(
     tuning: Tuning,
     is_knot: bool,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32]]:
-    """Rays of each listed pixel in one window, its estimate, and its expected error.
+    """Allocate rays to each listed pixel in one window.
 
     Parameters
     ----------
-    units : what the noise of each site is worth in each window, e⁻/s, [window, site].
-    quality : wanted error in these units.
-    gain : of stratified rays.
-    is_knot : whether the window is the first or the last of its block. It is of two blocks, so that nothing in the
-        windows beside it may count.
+    pilot, window, sites : statistics of the pilot, number of the window, and pixels with neighbours.
+    units : [window, site], noise units, e⁻/s.
+    quality : wanted error in noise units.
+    gain : error law of stratified rays.
+    tuning : constants.
+    is_knot : True if the window is the first or the last of its block. It then belongs to two blocks, and the windows
+        beside it must not influence it.
 
     Returns
     -------
-    rays, lit, error : [n] each; see `Plan`.
+    rays, lit, error : [n] each: number of rays, choice of the lit estimator, and expected error; see `Plan`.
     """
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
     flux, here = pilot.flux_of(window), sites.listed
@@ -189,12 +197,12 @@ def allocate(
     open_flux = pilot.unshadowed[window]
     lit = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
     scatter = np.sqrt(np.where(lit, *squares)) / _SMALLER
-    # a part of what the next pixels show may reach into this one unseen
+    # an edge in a neighbour may reach into this pixel between the pilot rays
     around = np.stack([pilot.flux_of(number) for number in range(low, min(high, units.shape[0]))])
     highest, lowest = around.max(axis=0), around.min(axis=0)
     contrast = np.maximum(sites.most(highest, 1) - value, value + sites.most(-lowest, 1))
     unseen = np.float32(tuning.unseen_area**0.5) * contrast
-    # some of the light that is hidden here may be seen, where it is seen near by
+    # if a neighbour sees light that is hidden here, part of it may be visible here too
     lit_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
     brighter = np.maximum(sites.most(highest, 2) - value, np.where(lit_near, open_flux[here] - value, 0))
     wanted_error = np.float32(quality) * own
@@ -202,7 +210,7 @@ def allocate(
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
     if pilot.closer:
-        # what so many rays did not meet, one ray of a few could: it would weigh far too much
+        # With fewer rays than the closer look, a single ray could hit the small object and weigh far too much.
         looked = np.zeros(sites.size, np.float32)
         np.maximum.at(looked, pilot.closer[window].place, pilot.closer[window].rays.astype(np.float32))
         wanted = np.maximum(wanted, looked[here])

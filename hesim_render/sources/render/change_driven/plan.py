@@ -1,4 +1,4 @@
-"""What a block of windows is rendered of, and what is filled in."""
+"""The plan of a block of windows: which windows of a pixel are rendered, and which are interpolated."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 
 
 def changes(flux: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Windows next to which a pilot changes, [window, site].
+    """Windows next to which the pilot's flux changes, [window, site].
 
-    A window is marked where the flux has left the last marked one by more than `least`; so is the one before it, where
-    most of that happened in one step. The first and the last window have no marks for being so.
+    A window is marked if the flux differs from that of the last marked window by more than `least`. The window before
+    it is marked as well, if most of the change happened in that one step. The first and the last window are not marked
+    for their position alone.
 
     Parameters
     ----------
-    flux : of a pilot, [window, site].
-    least : change that counts, in the same unit, [window, site].
+    flux : [window, site], flux of the pilot, e⁻/s.
+    least : [window, site], smallest change that counts, e⁻/s.
+
+    Returns
+    -------
+    Marks, [window, site].
     """
     marked = np.zeros(flux.shape, np.bool_)
     level = flux[0].copy()
@@ -37,7 +42,7 @@ def changes(flux: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np
 
 
 def longer(marked: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Marks, [window, site], and so many windows before and after each."""
+    """Extend marks [window, site] by `by` windows before and after each."""
     found = marked.copy()
     for shift in range(1, by + 1):
         found[shift:] |= marked[:-shift]
@@ -51,10 +56,10 @@ class Plan:
 
     Parameters
     ----------
-    rendered : which pairs are; the first and the last window always, the rest is filled in on straight lines.
-    rays : of each rendered pair, a power of two.
-    lit : which estimate it takes, see `MattIntegrator`.
-    error : its expected standard error, e⁻/s.
+    rendered : True for rendered pairs. The first and the last window always are; the others are interpolated linearly.
+    rays : number of rays of each rendered pair, a power of two.
+    lit : True for the lit estimator, False for the hidden one, see `MattIntegrator`.
+    error : expected standard error, e⁻/s.
     """
 
     rendered: NDArray[np.bool_]
@@ -66,14 +71,20 @@ class Plan:
 def plan(
     pilot: Pilot, sites: Sites, unit: NoiseUnit, quality: float, gain: Gain, tuning: Tuning, is_knot: bool
 ) -> Plan:
-    """From what the pilot shows of a block, or of one window.
+    """Plan a block, or a single window, from the pilot pass.
 
     Parameters
     ----------
-    unit : what the noise of each site is worth, at its flux.
-    quality : wanted error in these units.
-    gain : of stratified rays.
-    is_knot : whether the first and the last window may be ends of blocks.
+    pilot, sites : statistics of the pilot, and pixels with neighbours.
+    unit : noise unit of each site at its flux.
+    quality : wanted error in noise units.
+    gain : error law of stratified rays.
+    tuning : constants.
+    is_knot : True if the first and the last window may be ends of blocks.
+
+    Returns
+    -------
+    The plan.
     """
     count, last = pilot.windows, pilot.windows - 1
     shape = count, sites.listed.size
@@ -90,7 +101,7 @@ def plan(
             near = sites.most(great[window], 1) | sites.most(huge[window], 2)
             out.rendered[window] = marked[window][sites.listed] | near
         if pilot.closer:
-            # what comes and goes within a window or two has no straight lines
+            # an object that passes within a window or two does not change the flux linearly
             looked_at = np.zeros(flux.shape, np.bool_)
             for window, closer in enumerate(pilot.closer):
                 looked_at[window, closer.place] = True
@@ -103,12 +114,13 @@ def plan(
 
 
 def fill_in(values: NDArray[np.float32], known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> None:
-    """Put what is not known on straight lines between what is, in place.
+    """Interpolate unknown values linearly between known ones, in place.
 
     Parameters
     ----------
-    values, known : [window, pixel]; the first and the last window are known.
-    centre_us : [window], increasing.
+    values : [window, pixel], changed in place.
+    known : [window, pixel], True where a value is known; the first and the last window are.
+    centre_us : [window], increasing, µs.
     """
     number = np.arange(known.shape[0], dtype=np.int16)[:, None]
     before = np.maximum.accumulate(np.where(known, number, np.int16(-1)), axis=0)

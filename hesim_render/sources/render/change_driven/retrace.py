@@ -1,4 +1,4 @@
-"""Pairs traced again, with random numbers that nothing else has: what the audit compares with."""
+"""Reference values of the audit: pairs traced again, with a stream of random numbers of their own."""
 
 from __future__ import annotations
 
@@ -22,14 +22,21 @@ def traced_again(
     gain: Gain,
     tuning: Tuning,
 ) -> NDArray[np.float64]:
-    """Mean Φ of each listed pixel in its own window, e⁻/s.
+    """Mean Φ of each listed pixel in its own window, with random numbers that only the audit uses.
 
     Parameters
     ----------
+    tracer : the renderer.
     index : [n], numbers on the full sensor.
-    unit : noise of these pixels.
-    quality : wanted error in these units.
-    gain : of stratified rays.
+    begin_us, end_us : [n], the windows, µs.
+    unit : noise unit of these pixels.
+    quality : wanted error in noise units.
+    gain : error law of stratified rays.
+    tuning : constants.
+
+    Returns
+    -------
+    [n], e⁻/s.
     """
     span, window = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
     windows, window = Windows(span[0], span[1]), window.ravel()

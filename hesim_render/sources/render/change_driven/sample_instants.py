@@ -1,4 +1,4 @@
-"""When an asynchronous sensor is sampled: instants close enough together to follow all motion."""
+"""Sample instants of an asynchronous sensor, dense enough to follow all motion."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, fastest_turn_rad_per_s, places
 from hesim_render.sources.render.transport.moving_scene import Group
 
-#: Motion between two instants, pixels. ln x is taken as straight between them: the threshold crossings of an edge of
+#: Motion between two instants, pixels. ln x is interpolated linearly between them: the crossings of an edge of
 #: contrast 4 are then off by less than 2 % of the time of a tenth of a pixel.
 STEP_PX = 0.05
-#: Instants are no closer together, µs, but at keyframes.
+#: Least distance of two instants, µs; keyframes are exempt.
 LEAST_US = 10
 #: Cells for which distances are taken together, and the part of a distance that is relied on: between the rays that
 #: measure how far the scene is, something may be nearer.
 _CELLS, _SURE = BLOCK_INTERVALS, 0.5
-#: Objects nearer to the camera than this part of their own distance from its axis's foot count as being there.
+#: Least depth of an object that is assumed, as a part of its distance from the camera.
 _NEAREST = 0.05
 
 
 class MotionClock:
-    """Instants of a scene; a pure function of time, whatever interval or region is asked for.
+    """Sample instants of a scene: a pure function of time, independent of the interval or region that is asked for.
 
-    In every cell the speed in the image is bounded from the tracks' own speeds and the least distances: instants are
-    even parts of a cell in which nothing moves by more than `STEP_PX`, and keyframes.
+    In every cell of time, the speed in the image is bounded from the speeds of the tracks and the least distances. The
+    instants divide a cell evenly, so that nothing moves by more than `STEP_PX` between two of them. Keyframes are
+    added.
 
     Parameters
     ----------
-    view : the camera at rest; `camera` its track, if it moves.
-    groups : what moves.
-    distance_m : least distance from the camera, along its axis, of what rests and is seen at a time, m.
+    view : the camera at rest.
+    camera : track of the camera, None if it rests.
+    groups : moving objects.
+    distance_m : least depth, along the camera's axis, of the resting surfaces that are visible at a time in µs, m.
     """
 
     def __init__(
@@ -57,12 +59,12 @@ class MotionClock:
         axis_x, axis_y = lens.axis_mm
         reach = max(axis_x - left, right - axis_x), max(axis_y - top, bottom - axis_y)
         corner = np.array(reach) / lens.image_distance_mm
-        #: 1/cos of the angle at which the farthest corner is seen.
+        #: 1/cos of the view angle of the farthest corner of the region.
         self._stretch = float(np.sqrt(1 + corner @ corner))
         self._speed_of = lru_cache(maxsize=1024)(self._per_metre)
 
     def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
-        """Whole µs from `begin_us` to `end_us`, with both; multiples of `CELL_US` are among them."""
+        """Instants from `begin_us` to `end_us`, both included, in whole µs; multiples of `CELL_US` are among them."""
         cells = range(int(begin_us // CELL_US), -(-int(np.ceil(end_us)) // CELL_US))
         ends = np.rint([begin_us, end_us]).astype(np.int64)
         keyframes = (_keyframes(track, begin_us, end_us) for track in self._tracks)
@@ -76,7 +78,7 @@ class MotionClock:
         return np.rint(np.linspace(begin, end, pieces + 1)).astype(np.int64)
 
     def _motion_px(self, begin_us: float, end_us: float) -> float:
-        """Farthest that anything can move in the image within a cell."""
+        """Upper bound of the motion of anything in the image within a cell, pixels."""
         turn, shift = 0.0, 0.0
         if self._camera is not None:
             turn = fastest_turn_rad_per_s(self._camera, begin_us, end_us)
@@ -89,7 +91,9 @@ class MotionClock:
         return fastest * self._px_per_rad * S_PER_US * (end_us - begin_us)
 
     def _per_metre(self, number: int) -> tuple[float, list[float]]:
-        """Radians in the image for a metre of motion of what rests, and of each group, at most, within some cells."""
+        """Upper bounds within some cells: radians in the image per metre of motion, of resting surfaces and of each
+        group.
+        """
         begin, end = number * _CELLS * CELL_US, (number + 1) * _CELLS * CELL_US
         resting = 0.0
         if self._camera is not None:
@@ -97,7 +101,9 @@ class MotionClock:
         return resting, [self._stretch / self._depth_m(group, begin, end) for group in self._groups]
 
     def _depth_m(self, group: Group, begin_us: float, end_us: float) -> float:
-        """Least depth of a group before the camera within an interval, or a small part of its distance."""
+        """Least depth of a group in front of the camera within an interval, at least a small part of its distance,
+        m.
+        """
         times = np.array([begin_us, 0.5 * (begin_us + end_us), end_us])
         poses = np.broadcast_to(self._view.camera_to_world, (3, 4, 4))
         moved = 0.0
@@ -116,7 +122,7 @@ class MotionClock:
 
 
 def _keyframes(track: Trajectory, begin_us: float, end_us: float) -> NDArray[np.int64]:
-    """Keyframes of a track within an interval, and one µs after each: something may jump there."""
+    """Keyframes of a track within an interval, and 1 µs after each, because an object may jump there."""
     knots = track.knots_us
     if track.repeat:
         first, last = (np.floor((t - knots[0]) / track.period_us) for t in (begin_us, end_us))

@@ -1,10 +1,10 @@
-"""Where the pilot looks closer: pixels through which something comes that few rays could miss.
+"""Extra pilot rays for pixels that a small object may cross, because few rays could miss it.
 
-Sixteen rays miss what covers a fiftieth of a pixel seven times out of ten, and a spark or a glint can be hundreds of
-times as bright as what is around it. Small objects therefore get more pilot rays, and their pixels are rendered while
-they are there. Where surfaces may shine, so do large ones, with fewer rays, as many as there is room for. Outlines hold
-for every instant of a window (`motion_bounds`), and how many rays there are depends on the whole picture, not on the
-part of it that is read out.
+Sixteen rays miss an object that covers a fiftieth of a pixel seven times out of ten, and a spark or a glint can be
+hundreds of times as bright as its surroundings. Small objects therefore get more pilot rays, and their pixels are
+rendered while they pass. Where surfaces may be glossy, large objects get extra rays too, but fewer, within a budget.
+Outlines hold for every instant of a window (`motion_bounds`). The number of rays depends on the whole picture, not on
+the read-out region.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.motion_bounds import places, places_seen
 from hesim_render.sources.render.transport.moving_scene import Group
 
-#: Parts of a window to which its begin and its end are rounded away from its middle.
+#: Begin and end of a window are rounded outwards to this part of its length.
 _PARTS = 8
 
 
 @dataclass(frozen=True)
 class Look:
-    """A closer look at some places.
+    """Extra pilot rays at some places.
 
     Parameters
     ----------
-    place : [k], among those that were asked about.
-    rays : of each.
-    is_small : whether by something small.
+    place : [k], places among the pixels that were asked about.
+    rays : rays per pixel.
+    is_small : True if a small object causes the look.
     """
 
     place: NDArray[np.int64]
@@ -44,12 +44,12 @@ class Look:
 
 @dataclass(frozen=True)
 class Outline:
-    """Convex outline of what an object sweeps within a window, on the full sensor.
+    """Convex outline of the area that an object sweeps within a window, on the full sensor.
 
     Parameters
     ----------
-    low, high : columns and rows within which it lies, [2] each, pixels.
-    sides : [k, 3], (a, b, c) with a·col + b·row + c ≤ 0 inside, (a, b) of length 1; none for the whole box.
+    low, high : [2] each, least and largest column and row, pixels.
+    sides : [k, 3], (a, b, c) with a·col + b·row + c ≤ 0 inside, (a, b) of length 1; empty if the box is the outline.
     """
 
     low: NDArray[np.float64]
@@ -57,7 +57,7 @@ class Outline:
     sides: NDArray[np.float64]
 
     def inside(self, col: NDArray[np.float64], row: NDArray[np.float64], margin_px: float) -> NDArray[np.bool_]:
-        """Whether points lie inside or within a margin of it."""
+        """True for points inside the outline or at most `margin_px` pixels outside it."""
         found = np.ones(np.broadcast(col, row).shape, np.bool_)
         for a, b, c in self.sides:
             found &= a * col + b * row + c <= margin_px
@@ -65,13 +65,14 @@ class Outline:
 
 
 class Zoom:
-    """Small moving objects of a scene.
+    """Finds the pixels that get extra pilot rays because of moving objects.
 
     Parameters
     ----------
-    view : the camera at rest; `camera` its track, if it moves.
-    groups : what moves.
-    is_matt : whether all surfaces are: then nothing large needs a closer look.
+    view : the camera at rest.
+    camera : track of the camera, None if it rests.
+    groups : moving objects.
+    is_matt : True if all surfaces are matt; large objects then need no extra rays.
     tuning : constants.
     """
 
@@ -86,7 +87,9 @@ class Zoom:
         self._low, self._high = np.array([left, top]) + middle, np.array([right, bottom]) + middle
 
     def _outlines(self, begin_us: float, end_us: float) -> list[tuple[list[Outline], int, bool]]:
-        """Outlines in one window, how many pilot rays a pixel in any of them gets, and whether they are small."""
+        """Outlines in one window, the number of pilot rays of a pixel inside any of them, and whether they are
+        small.
+        """
         found: dict[bool, list[tuple[float, Outline]]] = {True: [], False: []}
         margin, tuning = self._tuning.zoom_margin_px, self._tuning
         for group in self._groups:
@@ -110,7 +113,9 @@ class Zoom:
         return looks
 
     def _outline(self, group: Group, begin_us: float, end_us: float) -> tuple[float, Outline | None]:
-        """Least extent of an object in the image at an instant, pixels, and what it sweeps; None outside."""
+        """Least extent of an object in the image at any instant, pixels, and the area that it sweeps; None outside
+        the view.
+        """
         points, extents, wider = [], [], 0.0
         if self._camera is None:
             found = places(group.corners, group.trajectory, begin_us, end_us)
@@ -129,19 +134,24 @@ class Zoom:
         try:
             sides = ConvexHull(every).equations.copy()
             sides[:, 2] -= wider
-        except QhullError:  # points on a line, seen edge-on: the box around them will do
+        except QhullError:  # points on a line (an object seen edge-on): use their bounding box
             sides = np.empty((0, 3))
         return float(min(extents)), Outline(low, high, sides)
 
     def sites(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, numbers: NDArray[np.int64]
     ) -> list[list[Look]]:
-        """Which pixels are looked at closer, some at a time, for each row of `numbers`.
+        """Pixels that get extra pilot rays, as a list of looks for each row of `numbers`.
 
         Parameters
         ----------
-        row, col : [m], on the full sensor.
-        numbers : of each pixel's window, [k, m].
+        row, col : [m], places on the full sensor.
+        windows : all windows.
+        numbers : [k, m], window number of each pixel.
+
+        Returns
+        -------
+        k lists of looks.
         """
         if not self._groups or row.size == 0:
             return []
@@ -153,7 +163,7 @@ class Zoom:
         top, left = int(row.min()), int(col.min())
         shape = int(row.max()) - top + 1, int(col.max()) - left + 1
         begin, end = windows.begin_us[number], windows.end_us[number]
-        # rows of a rolling shutter have windows of their own, of which many share one look at a little more
+        # rows of a rolling shutter have different windows; rounded outwards, many of them share one look
         step = np.maximum((end - begin) / _PARTS, 1.0)
         times = np.stack([np.floor(begin / step) * step, np.ceil(end / step) * step])
         looks, which = np.unique(times, axis=1, return_inverse=True)
@@ -165,7 +175,7 @@ class Zoom:
         return found
 
     def _image(self, outlines: list[Outline], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """Pixels inside any outline, of a rectangle that begins at a row and column."""
+        """Pixels inside any outline, within a rectangle that begins at row `top` and column `left`."""
         image, margin = np.zeros(shape, np.bool_), self._tuning.zoom_margin_px
         for outline in outlines:
             low = np.maximum(np.floor(outline.low - margin).astype(np.int64) - [left, top], 0)

@@ -1,15 +1,14 @@
 """Constants of change-driven rendering, in one place.
 
-Each says where it comes from by a letter:
+A letter says where each constant comes from:
 
 - F: fitted on the scenes `star`, `sweep` and `glass` of `benchmarks/change_driven.py` (the gains by
   `benchmarks/allocation.py`).
-- H: the scenes of `tests/support/hidden_scenes.py`, on which nothing was fitted, showed that it is needed and how
-  large.
+- H: required by the scenes of `tests/support/hidden_scenes.py`, which also set its size; nothing was fitted on them.
 - C: chosen, not fitted: a bound on work, or a size that follows from the others.
 
-All were judged on the scenes of `tests/support/random_scenes.py` and of `tests/support/hidden_scenes.py`; none was
-chosen on the former.
+All constants were judged on the scenes of `tests/support/random_scenes.py` and of `tests/support/hidden_scenes.py`.
+None was chosen on the random scenes.
 """
 
 from __future__ import annotations
@@ -22,61 +21,67 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Tuning:
-    """How the rays of a run are spent.
+    """Constants that decide how a run spends its rays.
 
-    A *wanted error* is quality times the noise of the pixel, in its flux. Ray numbers are of one pixel in one window or
-    exposure. "Without" says what happens where a constant is left out of the method.
+    The *wanted error* of a pixel is quality times its noise, as flux. Ray numbers are per pixel and window or exposure.
+    "Without" states what goes wrong if the method leaves the constant out.
 
     Parameters
     ----------
-    pilot_rays : rays, F. Of the pilot pass where a role's pixels lie next to each other; they tell whether a pixel
-        changes and how many rays it gets. Half as many: edges are seen in steps of an eighth of a pixel.
-    lone_pilot_rays : rays, F. The same where pixels lie apart (event pixels of a hybrid tile). Without (as few as
-        `pilot_rays`): such pixels have no neighbours to ask, and changes are missed.
-    frame_pilot_rays : rays, H. Of the pilot of a frame pixel in an exposure. Without: what passes in a small part of
-        the exposure is missed.
-    zoom_rays : rays, H. Most that a pilot sends to a pixel by which something comes that it could miss; a pair gets as
-        many, if the thing is small. Without: objects smaller than a pixel come and go unseen, or are met by one ray
-        that weighs far too much.
-    zoom_room, gloss_room : rays over pixels of the picture, C. All these rays in a window, for small things and for
-        others. Without: a scene of many small or glossy objects takes more rays for looking than for its picture.
-    zoom_margin_px : px, C. Added around their outlines. Without: a pixel that an outline only touches is not looked at.
-    small_px : px, F. Largest least extent of a thing that is small. Without (0): as without `zoom_rays`.
-    footprint_px : px, F. Width of the area in which the pilot's rays start. Without (1): edges are noticed only after
+    pilot_rays : rays, F. Pilot rays where the pixels of a role are direct neighbours; they decide whether a pixel
+        changes and how many rays it gets. With half as many, edges appear to move in steps of an eighth of a pixel.
+    lone_pilot_rays : rays, F. Pilot rays where these pixels lie apart (event pixels of a hybrid tile). Without (as few
+        as `pilot_rays`): changes are missed, because such pixels have no neighbours to show them.
+    frame_pilot_rays : rays, H. Pilot rays of a frame pixel in an exposure. Without: objects that pass in a small part
+        of the exposure are missed.
+    zoom_rays : rays, H. Largest number of pilot rays for a pixel that is crossed by an object which few rays could
+        miss; a pair gets as many if the object is small. Without: objects smaller than a pixel come and go unseen, or
+        one ray hits them and weighs far too much.
+    zoom_room, gloss_room : rays over pixels of the picture, C. Budget of these rays in a window, for small objects and
+        for others. Without: a scene of many small or glossy objects spends more rays on the pilot than on its picture.
+    zoom_margin_px : px, C. Margin around the outlines of these objects. Without: pixels that an outline only touches
+        get no extra rays.
+    small_px : px, F. An object is small if its least extent in the image is at most this. Without (0): as without
+        `zoom_rays`.
+    footprint_px : px, F. Width of the area in which pilot rays start. Without (1): edges are noticed only after
         they have entered the pixel.
     lone_footprint_px : px, F. The same where pixels lie apart. Without: as above, with no neighbour to notice them.
-    tolerance : wanted errors, C. Deviation of a value up to which it is not called off. Without: nothing
-        says how far from the truth a straight line may be.
-    change : tolerances, F. Change of a pilot's flux that counts. Larger: what is filled in is further off; smaller:
-        more pixels are rendered.
-    great : changes that count, F. From such a change on, the pixels next to it are rendered too. Without: an edge's
-        faint outskirts are filled in by straight lines.
-    huge : changes that count, F. From such a change on, those two pixels away are rendered too. Without: as above, of
-        lamps and their glare.
-    huge_windows : windows, F. How much longer, before and after, a huge change counts. Without (0): the first trace of
-        a lamp that comes is filled in.
-    least_rays : rays, C. Fewest of a pair: two halves of four. Without: the difference of the halves tells no error.
-    ray_weight : wanted errors, H. What a single ray of a pair brings at most. Without: a ray that sees what no pilot
-        ray saw (a lamp through a gap) makes a value that is far off, and its stated error with it.
-    most_rays : rays, C. Most of a pair. Without: one pixel that sees a lamp in a rough mirror takes all the time.
-    matt_gain, path_gain : (factor, power), no unit, F. Standard error of n stratified rays is factor · n^-power of
-        the scatter, for direct light on matt surfaces and for paths. Without (1, 0.5): the error of independent rays
-        is planned for, which takes several times as many.
-    frame_margin : factor, H. By which the wanted error of an exposure is smaller than `quality` says. Without (1): the
-        error is too large where much moves within the exposure, as rays gain less there than the fit says.
-    unseen_area : part of a pixel, F. In which the pilot may have missed what the next pixels show. Without (0): an edge
-        that the pilot of 16 rays just missed gets the rays of an even area.
-    most_unseen_rays : rays, F. Most that a pair gets for that. Without: every pixel next to a lamp gets `most_rays`.
-    bright_rays : rays per noise unit, F. That a pair gets where a pixel up to two away is brighter by one. Without (0):
-        as without `unseen_area`, next to lamps.
-    knot_factor : factor, F. Times as many rays where a pair ends a block. Without (1): the straight lines of all
-        windows that are filled in from there carry its error.
-    audit_pilot_rays : rays, C. Of the audit's own pilot. Without (as few as `pilot_rays`): the audit's reference has
-        as poor a plan as the values that it judges.
-    least_audit_rays : rays, C. Fewest of the audit's trace. Without: as above.
+    tolerance : wanted errors, C. Largest deviation of a value that does not count as off. Without: the error of
+        linear interpolation has no limit.
+    change : tolerances, F. Smallest change of the pilot's flux that counts. Larger: interpolated values are further
+        off. Smaller: more pixels are rendered.
+    great : changes that count, F. From this size on, the neighbours of a changing pixel are rendered too. Without:
+        the faint outskirts of an edge are interpolated.
+    huge : changes that count, F. From this size on, pixels two away are rendered too. Without: as above, for lamps
+        and their glare.
+    huge_windows : windows, F. A huge change counts this much longer, before and after. Without (0): the first light
+        of an approaching lamp is interpolated.
+    least_rays : rays, C. Least number for a pair: two halves of four. Without: the difference of the halves gives no
+        error estimate.
+    ray_weight : wanted errors, H. Largest contribution of a single ray to a pair. Without: a ray that sees what no
+        pilot ray saw (a lamp through a gap) makes a value that is far off, and its stated error with it.
+    most_rays : rays, C. Largest number for a pair. Without: one pixel that sees a lamp in a rough mirror takes all the
+        time.
+    matt_gain, path_gain : (factor, power), no unit, F. The standard error of n stratified rays is factor · n^-power
+        times the scatter, for direct light on matt surfaces and for paths. Without (1, 0.5): the plan assumes
+        independent rays and spends several times as many.
+    frame_margin : factor, H. The wanted error of an exposure is divided by this. Without (1): the error is too large
+        where much moves within the exposure, because rays gain less there than the fit says.
+    unseen_area : part of a pixel, F. Area in which the pilot may have missed what the neighbours show. Without (0): an
+        edge that the 16 pilot rays just missed gets the rays of a uniform area.
+    most_unseen_rays : rays, F. Largest number that a pair gets for that. Without: every pixel next to a lamp gets
+        `most_rays`.
+    bright_rays : rays per noise unit, F. Rays for each noise unit by which a pixel up to two away is brighter. Without
+        (0): as without `unseen_area`, next to lamps.
+    knot_factor : factor, F. Factor on the rays of a pair at the end of a block. Without (1): all windows that are
+        interpolated from there carry its error.
+    audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
+        as poor as that of the values it judges.
+    least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
     audit_ray_weight : wanted errors of the audit, C. As `ray_weight`. Without (as large): the reference is no better
-        than what it judges.
-    most_audit_times : traces, C. Most of one value. Without: a few values take the time of the whole audit.
+        than the values it judges.
+    most_audit_times : traces, C. Largest number of traces of one value. Without: a few values take the time of the
+        whole audit.
     """
 
     pilot_rays: int = 16
@@ -112,22 +117,24 @@ class Tuning:
 
 @dataclass(frozen=True)
 class Gain:
-    """Standard error of n stratified rays over their scatter: factor · n^-power.
+    """Error law of stratified rays: standard error = factor · n^-power · scatter, for n rays.
 
     Parameters
     ----------
-    factor, power : see above.
+    factor, power : constants of the law, no unit.
     """
 
     factor: float
     power: float
 
     def error(self, scatter: NDArray[np.float32], rays: NDArray[np.integer]) -> NDArray[np.float32]:
-        """Expected standard error, in the unit of the scatter."""
+        """Expected standard error, in the unit of `scatter`."""
         return np.float32(self.factor) * scatter * rays.astype(np.float32) ** np.float32(-self.power)
 
     def rays(self, scatter_over_error: NDArray[np.float32]) -> NDArray[np.float32]:
-        """So many that a wanted error is reached; any number, not yet a power of two."""
+        """Number of rays that reaches a wanted error, from the scatter over that error; not yet rounded to a power
+        of two.
+        """
         return (np.float32(self.factor) * scatter_over_error) ** np.float32(1 / self.power)
 
 

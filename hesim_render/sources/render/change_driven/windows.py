@@ -14,7 +14,7 @@ from hesim_render.core.tables import table
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows
 
-#: Intervals for which boxes of moving objects are found, in one call.
+#: Largest number of intervals for which one call finds the boxes of moving objects.
 _MOST_BINS = 64
 
 
@@ -32,11 +32,12 @@ class Windows:
 
     @property
     def size(self) -> int:
+        """Number of windows."""
         return self.begin_us.size
 
     @property
     def span_us(self) -> tuple[float, float]:
-        """Begin of the first and end of the last."""
+        """Begin of the first and end of the last window, µs."""
         return float(self.begin_us.min()), float(self.end_us.max())
 
 
@@ -46,9 +47,10 @@ class Moments:
 
     Parameters
     ----------
-    length_us : Float, of each window.
-    times, boxes : see `Moment`; `bins`, UInt32, of each window.
-    tracks, groups : so many.
+    length_us : Float [window], length of each, µs.
+    times, boxes : tables as in `Moment`.
+    bins : UInt32 [window], number of the boxes of each window.
+    tracks, groups : numbers of tracks and of moving groups.
     """
 
     length_us: Float
@@ -59,7 +61,7 @@ class Moments:
     groups: int
 
     def at(self, window: UInt32, share: Float) -> Moment:
-        """A share of each lane's window."""
+        """Instants in the window of each lane, as shares of its length."""
         import drjit as dr
 
         instant = share * dr.gather(type(self.length_us), self.length_us, window)
@@ -79,22 +81,27 @@ class Moments:
 
         Parameters
         ----------
-        span_us : interval in which boxes hold; None for that of each window, or of a few that lie near each other.
-        tracks : of all that moves, those of groups first.
-        groups : so many.
-        boxes_of : intervals, µs → boxes in which each group stays, [interval, group, 2, 3], m.
+        windows : the windows.
+        span_us : interval for which boxes hold, µs; None: for each window, or for a few windows close in time.
+        tracks : tracks of everything that moves, those of groups first.
+        groups : number of groups.
+        boxes_of : maps intervals, µs, to boxes that contain each group, [interval, group, 2, 3], m.
+
+        Returns
+        -------
+        The windows, evaluated on the device.
         """
         import drjit as dr
 
         types = jit()
-        # wrapped on the host in double precision: float32 µs would lose their fractions within seconds
+        # repeated tracks are wrapped on the host in float64: float32 loses fractions of a µs within seconds
         times = [
             track.local_us(windows.begin_us) if track.repeat else windows.begin_us - track.knots_us[0]
             for track in tracks
         ]
         bins, spans = _bins(windows) if span_us is None else (np.zeros(windows.size, np.uint32), (span_us,))
         boxes = boxes_of(spans)
-        # never one entry, which would be a constant in the kernel; rows of boxes are fetched by fours
+        # padded, because a table of one entry becomes a constant in the kernel, and boxes are fetched four at a time
         lengths, local, sides = (
             table(types.Float, np.append(values.astype(np.float32).ravel(), np.zeros(8, np.float32)))
             for values in (
@@ -110,7 +117,7 @@ class Moments:
 
 
 def _bins(windows: Windows) -> tuple[NDArray[np.uint32], tuple[tuple[float, float], ...]]:
-    """Windows that lie near each other in time, together: a number for each window, an interval for each number."""
+    """Group windows that are close in time: a group number for each window, and an interval for each group."""
     order = np.argsort(windows.begin_us, kind="stable")
     number = np.empty(windows.size, np.uint32)
     number[order] = np.arange(windows.size) * min(windows.size, _MOST_BINS) // windows.size

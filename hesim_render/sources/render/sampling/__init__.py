@@ -1,1 +1,1 @@
-"""Stratified sequences and wavelengths."""
+"""Stratified sequences of random numbers, and the sampling of wavelengths."""

@@ -1,17 +1,17 @@
 """Random numbers of a rendered sample: a pure function of (seed, pixel, half, sample, dimension).
 
-Every draw of every pixel and half, of one to three dimensions, is a Sobol' sequence of its own: sample j
-of n takes point π(j) of the sequence, π a random permutation, and each coordinate is shifted digitally
+Every draw of every pixel and half, of one to three dimensions, is a Sobol' sequence of its own. Sample j
+of n takes point π(j) of the sequence, with π a random permutation, and each coordinate is shifted digitally
 (XOR) by random bits. Permutation and shifts are hashed from the number of the draw and four keys, which
-Philox4x32 gives with the counters (pixel on the full sensor, half). Each sample is uniform, so estimates
-are unbiased; the n samples of a half are stratified in every single dimension and jointly in those of one
-draw, unlike draws are independent, and so are the halves. (At the vertex of a path one point serves
-two ends that never meet in a product, see `next_vertex`.) (Owen scrambling in place of the shift was
-measured: 1.6 times the error at 16 samples, for the spectra are smooth.)
+Philox4x32 computes from the counters (pixel on the full sensor, half). Each sample is uniform, so estimates
+are unbiased. The n samples of a half are stratified in every single dimension, and jointly in the dimensions of one
+draw. Different draws are independent, and so are the halves. (At the vertex of a path one point serves
+two decisions whose results are never multiplied, see `next_vertex`.) (Owen scrambling instead of the shift was
+measured: 1.6 times the error at 16 samples, because the spectra are smooth.)
 
-Place in the pixel and instant are one draw: an edge that moves is a surface in those three dimensions,
-and where it passes over a pixel or two within the window, 128 rays of a half have 0.6 times the error
-that they have with the instant drawn apart (0.37 against 0.6 of that of independent rays).
+The position in the pixel and the instant are one draw, because a moving edge is a surface in these three dimensions.
+Where an edge passes over a pixel or two within the window, 128 rays of a half have 0.6 times the error that they have
+if the instant is drawn separately (0.37 instead of 0.6 times the error of independent rays).
 
 Padding of low-dimensional sequences: [kollig2002]; permutation: [kensler2013]; hash: lowbias32 of [wellons2018].
 """
@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, UInt32, UInt64
 
-#: Bits of an index that one table of the third generator matrix covers.
+#: Number of index bits that one table of the third generator matrix covers.
 _TABLE_BITS = 11
-#: 2^32 over the golden ratio: what successive draws are apart before they are hashed.
+#: 2^32 over the golden ratio: distance of successive draw numbers before they are hashed.
 _ODD = 0x9E3779B9
 
 
@@ -56,7 +56,7 @@ def permute(index: UInt32, mask: UInt32 | int, key: UInt32) -> UInt32:
 
 
 def scramble(x: UInt32) -> UInt32:
-    """A hash of UInt32 to UInt32, one to one, each bit of which depends about evenly on all."""
+    """A bijective hash of UInt32 to UInt32; every bit of the result depends on all bits of `x`."""
     x = (x ^ (x >> 16)) * 0x7FEB352D
     x = (x ^ (x >> 15)) * 0x846CA68B
     return x ^ (x >> 16)
@@ -102,11 +102,13 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
     assert mi.variant() == variant
 
     def _unit(bits: UInt32) -> Float:
-        """The middle of one of 2^23 strata: at 0 itself some surfaces send no ray on, and the sample would be lost."""
+        """The centre of one of 2^23 strata. At exactly 0 some surfaces reflect no ray, and the sample would be lost."""
         return (mi.Float(bits >> 9) + 0.5) * 2.0**-23
 
     class CounterSampler(mi.Sampler):
-        """See the module. Its state is plain Dr.Jit arrays: only those take part in symbolic loops."""
+        """See the module docstring. Its state is plain Dr.Jit arrays, because only those take part in symbolic
+        loops.
+        """
 
         def __init__(self, props: MitsubaObject = None) -> None:
             super().__init__(props if props is not None else mi.Properties())
@@ -115,7 +117,9 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             self.rest()
 
         def rest(self) -> None:
-            """Let go of a wavefront: what is left of one changes the next one's kernel, which then compiles anew."""
+            """Release the state of a wavefront. A leftover state would change the next kernel, which would compile
+            again.
+            """
             self.keys: tuple[UInt32, ...] | UInt32 = ()
             self.sample, self.dimension = mi.UInt32(), mi.UInt32()
             self._mask: UInt32 | int = 0
@@ -136,7 +140,7 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             ----------
             key : UInt64, opaque.
             pixel, half, sample : UInt32 per lane; `sample` counts within its half.
-            samples_per_half : n; a number, or with `most` a UInt32 per lane, a power of two each.
+            samples_per_half : n, a power of two: a number, or with `most` a UInt32 per lane.
             most : largest n of all lanes.
             """
             self.keys = mi.Philox4x32(key, pixel, half, mi.UInt32(0)).next_uint32x4()
@@ -145,7 +149,7 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
 
         def _draw(self) -> tuple[UInt32, list[UInt32]]:
-            """Index of the point to take, and the random bits that shift its coordinates."""
+            """Index of the next point, and the random bits that shift its coordinates."""
             self.dimension = self.dimension + 1
             bits = [scramble(key + self.dimension * _ODD) for key in self.keys]
             return (permute(self.sample, self._mask, bits[0]) if self._bits else self.sample), bits
@@ -159,7 +163,7 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2]))
 
         def next_3d(self) -> tuple[Point2, Float]:
-            """A pair, and a third number stratified with it; for up to 2^22 samples in a half."""
+            """A pair and a third number, stratified jointly; for up to 2^22 samples in a half."""
             point, bits = self._draw()
             x, y = zero_two_point(point)
             return mi.Point2f(_unit(x ^ bits[1]), _unit(y ^ bits[2])), _unit(self._third(point) ^ bits[3])
@@ -172,14 +176,14 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             return z
 
         def next_vertex(self) -> tuple[Point2, Float, Point2, Float]:
-            """What a path needs where it meets a surface.
+            """Random numbers for one vertex of a path.
 
             Returns
             -------
-            place, lobe : [0, 1)² and [0, 1), stratified together: how the surface sends the path on.
-            light : [0, 1)², a point on a lamp. The same point as `place` with other shifts: no light is the product of
-                what the two decide.
-            luck : [0, 1), whether the path goes on at all.
+            place, lobe : [0, 1)² and [0, 1), stratified jointly: sampling of the surface.
+            light : [0, 1)², a point on a lamp. It is the same point as `place` with other shifts, because the results
+                of the two are never multiplied.
+            luck : [0, 1), for Russian roulette.
             """
             point, bits = self._draw()
             x, y = zero_two_point(point)
@@ -194,7 +198,7 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             return self
 
         def seed(self, *_: Any) -> None:
-            """The counters are the seed; integrators that call this change nothing."""
+            """Does nothing: the counters are the seed. Some integrators call it."""
 
         def schedule_state(self) -> None:
             dr.schedule(self.dimension)

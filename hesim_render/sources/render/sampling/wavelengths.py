@@ -1,4 +1,4 @@
-"""Which wavelengths a ray carries: importance-sampled from its pixel's own filter × QE × λ."""
+"""Wavelengths of a ray, importance-sampled from the response of its pixel: filter × QE × λ."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import table
 from hesim_render.spectral.spectrum import Spectrum
 
-#: Parts of a response's integral for which the first cell is tabled: few of them hold more than the end of one cell.
+#: Parts of a response's integral with a tabulated first cell. Few parts contain more than one end of a cell.
 _BINS = 4096
-#: Marks the parts that do hold more.
+#: Marks the parts that contain more.
 _SEVERAL = 1 << 31
 
 
 class WavelengthSampler:
-    """Four wavelengths per ray, distributed exactly as its filter's response R(λ).
+    """Four wavelengths per ray, distributed exactly as the response R(λ) of its filter.
 
     R is piecewise linear, so its normalised integral is inverted in closed form within a cell (a
-    quadratic) and the mean of L(λ) over samples, times ∫R dλ, is ∫ L R dλ without bias and with no
-    variance from R. All tables lie in flat arrays, the same length for each filter: the filter is
+    quadratic). The mean of L(λ) over samples, times ∫R dλ, estimates ∫ L R dλ without bias and without
+    variance from R. All tables lie in flat arrays with the same length for each filter, so the filter is
     an offset.
 
     Parameters
@@ -44,7 +44,7 @@ class WavelengthSampler:
             share, more = (area / area[-1]).astype(np.float32), room - grid.size
             place = np.arange(_BINS + 1, dtype=np.float32) / _BINS
             start = np.clip(np.searchsorted(share, place, side="right") - 1, 0, grid.size - 2)
-            # where a part goes over into the next cell, 2 (never reached) where it does not
+            # share at which a part enters the next cell; 2 (never reached) where it stays in one
             over = np.where(start[1:] > start[:-1], share[start[:-1] + 1], np.float32(2)).view(np.uint32)
             first = start[:-1] | np.where(start[1:] > start[:-1] + 1, _SEVERAL, 0)
             starts.append(np.append(np.stack([first, over], axis=1), [[start[-1], 0]], axis=0))
@@ -102,11 +102,11 @@ class WavelengthSampler:
         def unsure(low: list[UInt32], high: list[UInt32]) -> Mask:
             return functools.reduce(operator.or_, (a < b for a, b in zip(low, high, strict=True)))
 
-        # no step nearly always; only in the tails does a bin hold many cells
+        # this loop rarely takes a step: only in the tails does a part contain many cells
         low, _ = dr.while_loop((low, high), unsure, halve, label="wavelengths")
         wavelengths = []
         for place, cell in zip(places, (base + a for a in low), strict=True):
-            # one packet each: gathers of single numbers cost more than what is done with them
+            # fetch whole packets: gathers of single numbers cost more than the arithmetic
             begin, end, first, second = dr.gather(types.Array4f, self._cells, 2 * cell)
             left, right = dr.gather(types.Array2f, self._cells, 4 * cell + 2)
             share = dr.clip((place - begin) / dr.maximum(end - begin, 1e-30), 0, 1)

@@ -1,1 +1,1 @@
-"""From a scene file or a Mitsuba scene to objects that can be moved."""
+"""Scene files and Mitsuba scenes as loaded scenes whose objects can be moved."""

@@ -1,4 +1,4 @@
-"""From a scene file to a Mitsuba scene whose objects can be moved."""
+"""Build a Mitsuba scene with movable objects from a scene file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.spectral.spectrum import Spectrum, require_coverage
 
-#: Shapes that have no inside: they are seen from both sides.
+#: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")
 
 
@@ -45,12 +45,12 @@ class BuiltScene:
     integrator : a path tracer of the scene's depth.
     parameters : mitsuba.traverse(scene).
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
-    trajectories : of the groups that really move.
+    trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    paints : of all shapes but lamps, where all are matt and the light is direct; else None.
-    exact_because : why the scene needs the exact mode; None where it does not.
-    camera : the Mitsuba scene's own, where it is used.
-    integrator_plugin : what a Mitsuba scene's integrator was made of; None where it was made before.
+    paints : paint of all shapes except lamps, if all are matt and the light is direct; otherwise None.
+    exact_because : why the scene needs the exact mode; None if it does not.
+    camera : the Mitsuba scene's own camera, if it is used.
+    integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
     """
 
     mi: MitsubaModule
@@ -66,7 +66,7 @@ class BuiltScene:
     integrator_plugin: dict[str, Any] | None = None
 
     def pose(self, t_us: float) -> None:
-        """Put every moving object at its pose of `t_us`."""
+        """Move every moving object to its pose at `t_us`."""
         for name, trajectory in self.trajectories.items():
             matrix = trajectory.matrix(t_us)
             for shape in self.groups[name]:
@@ -75,7 +75,7 @@ class BuiltScene:
             self.parameters.update()
 
     def rest(self) -> None:
-        """Put every moving object back where the file places it."""
+        """Move every moving object back to its place in the file."""
         for name in self.trajectories:
             for shape in self.groups[name]:
                 shape.set_pose(np.eye(4))
@@ -84,14 +84,14 @@ class BuiltScene:
 
     @property
     def corners(self) -> NDArray[np.float64]:
-        """Corners of the box around all shapes as they stand, [8, 3]; the origin where there are none."""
+        """Corners of the box around all shapes at their current poses, [8, 3], m; the origin if there are none."""
         box = self.scene.bbox()
         if not self.scene.shapes():
             return np.zeros((8, 3))
         return box_corners(np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel())
 
     def mitsuba_sensor(self) -> MitsubaCamera | None:
-        """The camera of the scene's own first sensor, if it has one and the scene file has none."""
+        """The camera of the scene's own first sensor, if there is one and the scene file has no camera."""
         return self.camera
 
 
@@ -101,7 +101,12 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     Parameters
     ----------
     mi : the mitsuba module with the wanted variant set.
+    spec : content of the scene file.
     responses : spectra that light and reflectance must cover (≥ 99.9 % of each), by name.
+
+    Returns
+    -------
+    The loaded scene.
 
     Raises
     ------
@@ -155,7 +160,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
 
 
 def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
-    """Mitsuba's dictionary of a scene file, which shape ids belong to each movable name, and the shapes' paint."""
+    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, and the paint of the shapes."""
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
@@ -180,7 +185,7 @@ def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[
 
 
 def _paint(item: ObjectSpec, name: str) -> Paint:
-    """What `_object` paints an object with."""
+    """The paint of an object."""
     colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
     u, v = item.pattern_count
     return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
@@ -216,7 +221,7 @@ def _object(mi: MitsubaModule, item: ObjectSpec, name: str, folder: Path) -> Mit
 def _mesh_file(
     mi: MitsubaModule, item: ObjectSpec, placement: NDArray[np.float64], bsdf: dict[str, Any], folder: Path
 ) -> MitsubaObject:
-    """A mesh file, scaled so that its bounding box becomes `size_m` and centred on the object's place."""
+    """A mesh file, scaled to a bounding box of `size_m` and centred on the object's place."""
     path = folder / str(item.mesh)
     if not path.is_file():
         raise SpecError(f"no such mesh file: {path}", key=f"objects.{item.name}.mesh")
@@ -239,14 +244,14 @@ def _rectangle_mesh() -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
-    """Six faces, normals outwards, each with its own u, v from 0 to 1."""
+    """Six faces with outward normals, each with its own u, v from 0 to 1."""
     vertices: list[NDArray] = []
     faces: list[NDArray] = []
     uv: list[NDArray] = []
     flat, triangles, flat_uv = _rectangle_mesh()
     for axis in range(3):
         for sign in (1.0, -1.0):
-            # cyclic axes keep the face right-handed; mirroring u on the far side turns its normal round
+            # cyclic axes keep the face right-handed; mirroring u on the far side flips its normal
             face = np.empty((4, 3))
             face[:, (axis + 1) % 3], face[:, (axis + 2) % 3], face[:, axis] = flat[:, 0] * sign, flat[:, 1], sign
             faces.append(triangles + 4 * len(vertices))
@@ -256,9 +261,9 @@ def _box_mesh() -> tuple[NDArray, NDArray, NDArray]:
 
 
 def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
-    """Key and spectrum of a scene file's light and reflectances; none in darkness or for a Mitsuba scene.
+    """Key and spectrum of a scene file's lights and reflectances; none in darkness or for a Mitsuba scene.
 
-    A Mitsuba scene is taken as it is: its RGB colours become spectra over the whole visible range.
+    The RGB colours of a Mitsuba scene become spectra over the whole visible range, so there is nothing to check.
     """
     if spec.mitsuba is not None or not any(light.is_lit for light in spec.lights):
         return
@@ -275,12 +280,12 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
 
 
 def check_coverage(spec: SceneSpec, responses: Mapping[str, Spectrum]) -> None:
-    """Refuse a scene whose light or a reflectance covers less than 99.9 % of a response.
+    """Refuse a scene in which a light or a reflectance covers less than 99.9 % of a response.
 
     Raises
     ------
     SpecError
-        With scene file and key.
+        Names scene file and key.
     """
     for key, spectrum in named_spectra(spec):
         for name, response in responses.items():

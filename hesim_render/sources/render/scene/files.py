@@ -1,4 +1,4 @@
-"""Files that a scene of Mitsuba's own names: those of a stranger's scene must lie in its folder."""
+"""File names in Mitsuba scenes: a scene from elsewhere may name files in its own folder only."""
 
 from __future__ import annotations
 
@@ -14,22 +14,24 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
 from hesim_render.specs.scene import OUTSIDE
 
-#: Mitsuba 3.9 orders parameters by the numbers in their names, and crashes where one does not fit.
+#: Mitsuba 3.9 sorts parameters by the numbers in their names, and crashes if a number does not fit 32 bits.
 _LONG_NUMBER = re.compile(r"\d{10,}")
 
 
 def check_xml(file: Path, root: Path | None, find: Callable[[str], str]) -> None:
-    """Refuse an XML scene that names files outside of `root`, before Mitsuba reads any of them, or would crash it.
+    """Refuse an XML scene that names files outside `root` or would crash Mitsuba's parser, before Mitsuba reads any
+    file.
 
     Parameters
     ----------
-    root : None lets them lie anywhere.
-    find : where Mitsuba looks for a name.
+    file : the XML file.
+    root : folder of the allowed files; None allows all.
+    find : Mitsuba's search for a file name.
 
     Raises
     ------
     SpecError
-        If it does, or is not valid XML.
+        If the scene is refused, or is not valid XML.
     """
     defaults: dict[str, str] = {}
     waiting, seen = [file], set()
@@ -50,12 +52,12 @@ def check_xml(file: Path, root: Path | None, find: Callable[[str], str]) -> None
 
 
 def require_short_number(name: str, file: Path | None) -> None:
-    """Refuse the name of a parameter at whose number Mitsuba's parser ends the process.
+    """Refuse a parameter name with a number at which Mitsuba's parser ends the process.
 
     Raises
     ------
     SpecError
-        If it holds a number that is no 32-bit one.
+        If a number in the name does not fit 32 bits.
     """
     if _LONG_NUMBER.search(name):
         raise SpecError(f"the name {name[:40]!r} holds too large a number", file=file)
@@ -64,7 +66,7 @@ def require_short_number(name: str, file: Path | None) -> None:
 def require_state_inside(
     mi: MitsubaModule, state: Any, root: Path, find: Callable[[str], str], file: Path | None
 ) -> None:
-    """The same of a scene that Mitsuba has parsed, before anything is made of it."""
+    """As `check_xml`, for a scene that Mitsuba has parsed but not yet built."""
     for node in state.nodes:
         for key in node.props:
             if key == "filename" and node.props.type(key) == mi.Properties.Type.String:
@@ -80,7 +82,7 @@ def _elements(file: Path) -> Iterator[ElementTree.Element]:
 
 
 def _names(element: ElementTree.Element) -> list[str]:
-    """Files that an element names: by an attribute of its own, or as a parameter."""
+    """Files that an element names, in an attribute of its own or as a parameter."""
     named = element.get("value") if element.get("name") == "filename" else None
     return [name for name in (element.get("filename"), named) if name]
 

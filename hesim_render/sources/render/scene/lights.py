@@ -1,4 +1,4 @@
-"""Absolute emitters: a light's level on a named plane becomes radiance, intensity or irradiance."""
+"""Absolute emitters: radiance, intensity or irradiance of a light from its level on a stated plane."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, tra
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectral.spectrum import Spectrum, summed
 
-#: Dimmest light, relative to facing the plane squarely, that can still set a level on it.
+#: Least cosine at which a light can still set a level on its plane.
 _GRAZING = 1e-6
 
 
 def form_factor_integral(
     corners: NDArray[np.float64], point: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> float:
-    """∫ cos θ dω over a polygon as seen from `point` on a plane with unit `normal`, in sr: E = L × this.
+    """∫ cos θ dω over a polygon as seen from a point of a plane, in sr: E = L × this.
 
-    Lambert's formula, ½ Σ γ_i (Γ_i · n) with γ_i the angle that edge i subtends and Γ_i the unit
-    normal of the plane through `point` and that edge; the part below the plane's horizon is cut off.
+    Lambert's formula, ½ Σ γ_i (Γ_i · n) [lambert1760], with γ_i the angle that edge i subtends and Γ_i the unit
+    normal of the plane through `point` and that edge. The part below the horizon of the plane is cut off.
 
     Parameters
     ----------
-    corners : polygon's corners in order, [n, 3].
+    corners : corners of the polygon in order, [n, 3], m.
+    point : [3], m.
+    normal : unit normal of the plane, [3].
     """
     rays = _clip_to_horizon(corners - point, normal)
     if len(rays) < 3:
@@ -57,9 +59,9 @@ def _clip_to_horizon(rays: NDArray[np.float64], normal: NDArray[np.float64]) -> 
 
 
 def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
-    """Placement [4, 4] of an area light: columns are half its width, half its height, its unit normal, its centre.
+    """Placement [4, 4] of an area light: columns are half its width, half its height, its unit normal, its centre, m.
 
-    The normal points at the plane point; the width runs horizontally (along x where the light
+    The normal points at the plane point; the width runs horizontally (along x if the light
     shines straight up or down).
     """
     assert light.position_m is not None and light.size_m is not None
@@ -77,9 +79,14 @@ def area_light_frame(light: LightSpec) -> NDArray[np.float64]:
 def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
     """Entries of the Mitsuba scene for its lights, at their time means.
 
-    ``uniform``: L = E/π from everywhere, as of a plane under an even sky, visible behind the scene; several
-    are one sky of their sum. ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``:
-    a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black where it is switched off.
+    ``uniform``: L = E/π from all directions, as for a plane under a uniform sky, visible behind the scene; several
+    become one sky of their sum. ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``:
+    a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black if it is switched off.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    given : lights of the scene file.
 
     Raises
     ------
@@ -100,8 +107,8 @@ def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
         else:
             entries[name] = _beam(light, level, key_of(given, number))
     if skies:
-        # Sampling directions by the BSDF alone has no variance under an even sky, sampling the sky has: its
-        # weight is 0. Where no other light takes the share that Mitsuba insists on, a black point light does.
+        # Under a uniform sky, sampling by the BSDF alone has no variance, but sampling of the sky has. The sky's
+        # weight is therefore 0. Mitsuba needs one emitter with a weight: without another light, a black point light.
         radiance = skies[0] if len(skies) == 1 else summed(*skies)
         if not any(entry["type"] != "rectangle" or "emitter" in entry for entry in entries.values()):
             black = {"type": "uniform", "value": 0.0}
@@ -111,20 +118,20 @@ def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
 
 
 def name_of(given: Sequence[LightSpec], number: int) -> str:
-    """Name of a light's entry in the Mitsuba scene."""
+    """Name of a light in the Mitsuba scene."""
     return "light" if len(given) == 1 else f"light_{number}"
 
 
 def key_of(given: Sequence[LightSpec], number: int) -> str:
-    """Where a light stands in the scene file."""
+    """Key of a light in the scene file."""
     return "light" if len(given) == 1 else f"light.{number}"
 
 
 def geometry_on_plane(light: LightSpec, key: str) -> float:
-    """What a light of unit strength gives its plane at its point, unshadowed: irradiance is strength times this.
+    """Irradiance on its plane point by a light of unit strength, without shadows.
 
-    ``area``: radiance, ∫ cos θ dω in sr. ``point``: intensity, cos θ/d² in sr/m². ``directional``: irradiance across
-    the beam, cos θ.
+    Unit of strength and result: ``area``: radiance, ∫ cos θ dω in sr. ``point``: intensity, cos θ/d² in sr/m².
+    ``directional``: irradiance across the beam, cos θ.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The camera of a Mitsuba scene: what of it says where it stands and what it sees."""
+"""The camera of a Mitsuba scene: its position and field of view."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hesim_render.sources.render.scene.plugins import Used
 
 @dataclass(frozen=True)
 class MitsubaCamera:
-    """A perspective sensor of Mitsuba's.
+    """A perspective sensor of a Mitsuba scene.
 
     Parameters
     ----------
-    to_world : 4×4, from Mitsuba's axes: x to the left of the picture, y up, looking along +z.
-    picture : tangents of the angles from the optical axis at which the picture ends: left, right, top, bottom; to the
-        right and downwards. Of a film with a crop window the picture is that window.
-    near_m : nothing before this depth is seen.
+    to_world : 4×4, from Mitsuba's axes: x to the left of the picture, y up, view direction +z.
+    picture : tangents of the angles between the optical axis and the borders of the picture: left, right, top, bottom;
+        positive to the right and downwards. If the film has a crop window, the picture is that window.
+    near_m : surfaces nearer than this depth are not seen, m.
     """
 
     to_world: NDArray[np.float64]
@@ -35,12 +35,14 @@ class MitsubaCamera:
 
         Parameters
         ----------
+        mi : the mitsuba module.
+        scene : the loaded scene.
         used : that sensor, from `check_camera`.
 
         Raises
         ------
         SpecError
-            If it asks for an exposure, or does not see as far as there are shapes.
+            If the sensor asks for an exposure, or its far plane cuts off shapes.
         """
         sensor = scene.sensors()[0]
         told = mi.traverse(sensor)
@@ -65,7 +67,7 @@ class MitsubaCamera:
 
 
 def _farthest(scene: MitsubaObject, to_world: NDArray[np.float64]) -> float:
-    """Largest depth along the axis of anything in a scene; minus infinity where there is nothing."""
+    """Largest depth of anything in a scene along the axis, m; minus infinity in an empty scene."""
     if not scene.shapes():
         return -np.inf
     box = scene.bbox()

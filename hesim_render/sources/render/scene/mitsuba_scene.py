@@ -1,4 +1,4 @@
-"""Scenes of Mitsuba's own: an XML file, a built-in, or a dictionary."""
+"""Scenes in Mitsuba's own formats: an XML file, a built-in scene, or a dictionary."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from hesim_render.specs.scene import MitsubaSpec, SceneSpec
 
 #: Path length for a scene without an integrator of its own.
 _DEFAULT_DEPTH = 8
-#: Segments from which on Russian roulette ends some paths. Mitsuba's default is 5; but a vector of lanes takes as long
-#: as its longest path, so that roulette saves little, and what it adds to the noise is a lot.
+#: First segment with Russian roulette. Mitsuba's default is 5. But a vector of lanes takes as long
+#: as its longest path, so roulette saves little time and adds much noise.
 _ROULETTE = {"rr_depth": 16}
 
 
 @dataclass(frozen=True)
 class MitsubaScene:
-    """What was loaded.
+    """A loaded Mitsuba scene.
 
     Parameters
     ----------
     scene : mitsuba.Scene.
-    integrator : its own, or a path tracer where it has none.
-    integrator_plugin : what that was made of; None where it was made before.
-    exact_because : why it needs the exact mode; None where it does not.
-    camera : its first sensor, where there is one and the scene file has no camera.
+    integrator : its own integrator, or a path tracer if it has none.
+    integrator_plugin : plugin description of the integrator; None if it was given as an object.
+    exact_because : why the scene needs the exact mode; None if it does not.
+    camera : its first sensor, if there is one and the scene file has no camera.
     """
 
     scene: MitsubaObject
@@ -53,12 +53,12 @@ class MitsubaScene:
 
 
 def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> MitsubaScene:
-    """A scene of Mitsuba's own, with the emitters that are wanted.
+    """Load a Mitsuba scene with the wanted emitters.
 
     Raises
     ------
     SpecError
-        If Mitsuba refuses it, a plugin of it is not rendered, or a name is not one of an emitter.
+        If Mitsuba refuses the scene, a plugin of it is not rendered, or a name does not belong to an emitter.
     """
     where: tuple[Path | None, str | None] = (spec.file, "mitsuba.inline")
     if source.file is not None:
@@ -67,7 +67,7 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
             raise SpecError(f"no such Mitsuba scene file: {path}", file=spec.file, key="mitsuba.file")
         where = (path, None)
 
-    root: Path | None = None  # a dictionary that a program gave is its own
+    root: Path | None = None  # a program may name any file in its own dictionary
     if not spec.allow_outside and spec.file is not None:
         root = spec.folder
     elif not spec.allow_outside and source.file is not None:
@@ -122,18 +122,19 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
 
 
 def path_tracer(mi: MitsubaModule, depth: int) -> MitsubaObject:
-    """Mitsuba's, for paths of so many segments."""
+    """Mitsuba's path tracer for paths of up to `depth` segments."""
     return mi.load_dict({"type": "path", "max_depth": depth, **_ROULETTE})
 
 
 def _plugin_dict(
     mi: MitsubaModule, node: Mapping[str, Any], file: Path | None = None, key: str = "mitsuba.inline"
 ) -> dict[str, Any]:
-    """A dictionary as YAML writes it: 4×4 lists become transforms, lists of numbers in spectra become text.
+    """A Mitsuba dictionary from YAML: 4×4 lists become transforms, lists of numbers in spectra become text.
 
     Parameters
     ----------
-    file, key : where it stands.
+    node : the dictionary as read.
+    file, key : file and key of the dictionary, for errors.
     """
     content: dict[str, Any] = {}
     for name, value in node.items():
@@ -147,7 +148,7 @@ def _plugin_dict(
         elif isinstance(value, list) and name in ("wavelengths", "values"):
             content[name] = ",".join(f"{float(v):.9g}" for v in value)
         elif isinstance(value, mi.Bitmap):
-            content[name] = mi.Bitmap(value)  # a texture takes what is in it away: the next one would be black
+            content[name] = mi.Bitmap(value)  # a copy: a texture empties its bitmap
         else:
             content[name] = value
     return content

@@ -1,7 +1,7 @@
 """Everything that depends on Mitsuba's version or its global state, in one place.
 
-Mitsuba 3.10 renames mesh parameters and brings animated transforms: what it touches is here and
-in `builder`.
+Mitsuba 3.10 renames mesh parameters and brings animated transforms: this module and `builder` contain all code that
+these changes affect.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from hesim_render.sources.render.scene.files import check_xml, require_state_ins
 from hesim_render.spectral.spectrum import Spectrum
 
 _LEAST_THREADS = 2
-#: Largest departure of a wavelength from an even grid, relative, that counts as rounding.
+#: Largest relative deviation of a wavelength from an even grid that counts as rounding.
 _EVEN = 1e-9
-#: Values below are none in 32 bit; Mitsuba's reader of numbers refuses them.
+#: Smaller values are zero in float32, and Mitsuba's parser refuses them.
 _NOTHING = 1e-37
 
 
 def mitsuba() -> MitsubaModule:
-    """The mitsuba module, its variant set to the selected backend's, its log kept to errors.
+    """The mitsuba module with the variant of the selected backend; its log shows errors only.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def mitsuba() -> MitsubaModule:
         if mi.variant() != wanted:
             mi.set_variant(wanted)
     mi.set_log_level(mi.LogLevel.Error)
-    resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs know it as an object
+    resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs declare it as an object
     if str(resolver[0]) != str(_home(mi)):
         resolver.prepend(str(_home(mi)))
     _have_threads()
@@ -54,16 +54,16 @@ def mitsuba() -> MitsubaModule:
 def _home(mi: MitsubaModule) -> Path:
     """Folder of Mitsuba's own plugins and data.
 
-    It comes first wherever files are looked for: Mitsuba takes ``plugins/TYPE.so`` from the first folder that has it,
-    by default the working folder, so that files beside a scene, or where a program is started, would run as its code.
+    It is searched first for all files. Mitsuba loads ``plugins/TYPE.so`` from the first folder that has it,
+    by default from the working folder, so files beside a scene or in the working folder would run as its code.
     """
     return Path(mi.__file__).resolve().parent
 
 
 def _have_threads() -> None:
-    """Let there be two threads at least: on a machine of one core Mitsuba would wait for ever.
+    """Make sure that Mitsuba has at least two threads; with one it would wait for ever.
 
-    It reads and writes EXR files in tasks of its pool, one of which waits for others.
+    It reads and writes EXR files in tasks of its thread pool, and one of them waits for others.
     """
     import drjit as dr
 
@@ -73,7 +73,7 @@ def _have_threads() -> None:
 
 @contextmanager
 def using_variant(name: str | None) -> Iterator[MitsubaModule]:
-    """The mitsuba module in another variant for a while (``scalar_spectral``); None keeps the backend's.
+    """The mitsuba module, temporarily in another variant (``scalar_spectral``); None keeps the variant of the backend.
 
     Raises
     ------
@@ -112,17 +112,19 @@ def as_spec_error(file: str | Path | None, key: str | None = None) -> Iterator[N
 def load_scene(
     mi: MitsubaModule, source: Path | dict[str, Any], review: Callable[[Any], None], root: Path | None = None
 ) -> MitsubaObject:
-    """A scene from an XML file or a dictionary, nothing merged.
+    """Load a scene from an XML file or a dictionary, without merging shapes.
 
     Parameters
     ----------
-    review : called with the `ParserState` of what was read, before anything is made of it; it may change that.
-    root : folder in which all files that it names must lie; None lets them lie anywhere.
+    mi : the mitsuba module.
+    source : path of an XML file, or a dictionary.
+    review : called with the `ParserState` before the scene is built; it may change the state.
+    root : folder that must contain all files that the scene names; None allows all.
     """
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
-    resolver = mi.file_resolver()  # type: ignore[operator]  # its stubs have it as a plain object
+    resolver = mi.file_resolver()  # type: ignore[operator]  # the stubs declare it as a plain object
     inner = mi.FileResolver(resolver)
     if isinstance(source, Path):
         inner.prepend(str(source.resolve().parent))
@@ -139,7 +141,7 @@ def load_scene(
             file = source if isinstance(source, Path) else None
             require_state_inside(mi, state, root, lambda name: str(find(name)), file)
         parser.transform_all(config, state)
-        mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> of the file has put its own folder first
+        mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> element puts its own folder first
         review(state)
         return parser.instantiate(config, state)
     finally:
@@ -147,17 +149,18 @@ def load_scene(
 
 
 def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:
-    """Take the unwanted emitters out of a parsed scene; a shape that loses its own stays.
+    """Remove the unwanted emitters from a parsed scene. A shape without its emitter stays.
 
     Parameters
     ----------
-    shines : whether the emitter of a name is wanted. Its name is the id of its shape, or its own.
-    names : that must be emitters of the scene.
+    state : the `ParserState`.
+    shines : True for the name of a wanted emitter; the name is the id of its shape, or its own.
+    names : names that must belong to emitters of the scene.
 
     Raises
     ------
     SpecError
-        If a name is not one of an emitter.
+        If a name does not belong to an emitter.
     """
     import mitsuba as mi
 
@@ -171,7 +174,7 @@ def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) 
             if child.type != mi.ObjectType.Emitter:
                 continue
             both = [node.props.id(), child.props.id()] if node.type == mi.ObjectType.Shape else [child.props.id()]
-            # its own name counts where it is asked for: in a dictionary each shape may call its light 'emitter'
+            # an emitter's own name counts only if it was asked for: a dictionary may name every emitter 'emitter'
             name = next((name for name in both if name in names), both[0])
             known.add(name)
             if not shines(name):
@@ -183,14 +186,15 @@ def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) 
 
 
 def spectrum_dict(spectrum: Spectrum) -> dict[str, Any]:
-    """A spectrum as an explicit Mitsuba plugin, absolute: Mitsuba neither normalises nor reshapes it.
+    """A spectrum as an explicit, absolute Mitsuba plugin that Mitsuba neither normalises nor reshapes.
 
-    (A bare number as radiance would mean a spectrum shaped like D65, and ``d65`` is normalised.) On an evenly
-    spaced grid, ``regular``: the same values without the search that makes ``irregular`` 15-30 % of a render.
+    (A bare number as radiance would mean a spectrum with the shape of D65, and ``d65`` is normalised.) An evenly
+    spaced grid becomes ``regular``, which has the same values as ``irregular`` without its search. That search takes
+    15-30 % of a render.
     """
     spectrum = Spectrum(spectrum.wavelength_nm, np.where(np.abs(spectrum.values) < _NOTHING, 0.0, spectrum.values))
     if not np.any(spectrum.values):
-        return {"type": "uniform", "value": 0.0}  # an all-zero table is refused
+        return {"type": "uniform", "value": 0.0}  # Mitsuba refuses an all-zero table
     low, high = spectrum.support_nm
     even = np.linspace(low, high, spectrum.wavelength_nm.size)
     if np.abs(spectrum.wavelength_nm - even).max() <= _EVEN * high:
@@ -234,7 +238,7 @@ def transform(mi: MitsubaModule, matrix: NDArray[np.float64] | Sequence[Sequence
 
 
 class Movable:
-    """One shape of a loaded scene whose pose can be set: initial geometry, moved by a rigid pose."""
+    """One shape of a loaded scene with an adjustable pose: its initial geometry, moved by a rigid pose."""
 
     def __init__(self, parameters: MitsubaObject, prefix: str, shape: MitsubaObject) -> None:
         self._parameters = parameters
@@ -258,12 +262,12 @@ class Movable:
                 self.corners = unit @ self._to_world[:3, :3].T + self._to_world[:3, 3]
 
     def set_pose(self, pose: NDArray[np.float64]) -> None:
-        """Put the shape at `pose` (4×4 rigid) times its initial placement; takes effect at ``parameters.update()``."""
+        """Set the shape to `pose` (4×4, rigid) times its initial placement; takes effect at ``parameters.update()``."""
         rotation, shift = pose[:3, :3], pose[:3, 3]
         if self._to_world is not None:
             import mitsuba as mi
 
-            # a transform whose entries are arrays, not literals: setting it does not recompile anything
+            # the entries of the transform are arrays, not literals, so setting it compiles nothing
             self._parameters[f"{self.prefix}.to_world"] = mi.AffineTransform4f((pose @ self._to_world).tolist())
             return
         positions = self._vertices @ rotation.T + shift

@@ -1,4 +1,4 @@
-"""What matt shapes are painted with."""
+"""Paint of matt shapes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from hesim_render.spectral.spectrum import Spectrum
 
 @dataclass(frozen=True)
 class Paint:
-    """What a shape is painted with: one matt colour, or checks of two.
+    """Paint of a shape: one matt colour, or a checkerboard of two.
 
     Parameters
     ----------
     shape : id of the shape in the Mitsuba scene.
     colours : one or two reflectances.
-    scale : what (u, v) of the shape are multiplied by before checks of half a unit are laid on them.
-    two_sided : whether the back is painted as well; else it is black.
+    scale : factors on (u, v) of the shape; the squares of the checkerboard then have a side of one half.
+    two_sided : True if the back is painted as well; otherwise the back is black.
     """
 
     shape: str

@@ -1,8 +1,8 @@
-"""What is done with each plugin that a scene of Mitsuba's own may name.
+"""Treatment of each plugin that a Mitsuba scene may name.
 
-Every one is taken as Mitsuba takes it, or leads to the exact mode with a reason, or is refused by name, place and what
-to write instead. A few are the business of the sensor file: what they say is not asked for. Nothing that is not in
-these tables is loaded, so that a scene file cannot name a library to run either.
+A plugin is rendered as Mitsuba renders it, or leads to the exact mode with a reason, or is refused with its name, its
+place and an alternative. A few plugins belong to the sensor file, so their settings are ignored. Plugins that are not
+in these tables are never loaded, so a scene file cannot name a library to run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 
-#: Rendered in both modes as Mitsuba renders them, by the kind of plugin.
+#: Plugins that both modes render as Mitsuba does, by kind.
 HONOURED: dict[str, tuple[str, ...]] = {
     "Integrator": ("path",),
     "Sensor": ("perspective",),
@@ -37,7 +37,7 @@ HONOURED: dict[str, tuple[str, ...]] = {
     "Volume": ("constvolume", "gridvolume"),
 }
 
-#: Rendered in the exact mode alone, and why.
+#: Plugins that only the exact mode renders, and why.
 EXACT: dict[str, dict[str, str]] = {
     "Integrator": {
         "volpath": "it follows light through media, not only between surfaces",
@@ -54,7 +54,7 @@ EXACT: dict[str, dict[str, str]] = {
     },
 }
 
-#: The sensor file says this: pixels are boxes that integrate, with noise of their own.
+#: Ignored, because the sensor file decides: pixels are boxes that integrate, with noise of their own.
 OF_THE_SENSOR_FILE: dict[str, tuple[str, ...]] = {
     "Film": ("hdrfilm",),
     "Sampler": ("independent", "ldsampler", "multijitter", "orthogonal", "stratified"),
@@ -66,7 +66,7 @@ _BESIDE = "it adds other quantities to a picture; put the integrator that is ins
 _DERIVATIVES = "it is made for derivatives; use 'path'"
 _CAMERA = "use a 'perspective' sensor, or add a 'camera' section to the scene file"
 
-#: Refused, and what to do.
+#: Plugins that are refused, and alternatives.
 REFUSED: dict[str, dict[str, str]] = {
     "Integrator": {
         "aov": _BESIDE,
@@ -99,7 +99,7 @@ REFUSED: dict[str, dict[str, str]] = {
     "BSDF": {name: _UNPOLARISED for name in ("circular", "measured_polarized", "polarizer", "retarder")},
 }
 
-#: Class names of objects that were made before they were put into a dictionary. (All written in Python share one.)
+#: Class names of objects that a dictionary may contain. (All objects written in Python share one.)
 _MADE: dict[str, tuple[str, str]] = {
     "AOVIntegrator": ("Integrator", "aov"),
     "BatchSensor": ("Sensor", "batch"),
@@ -132,12 +132,12 @@ _KINDS = {
     for kind, names in table.items()
     for name in names
 }
-#: What a dictionary may name beside plugins.
+#: Types that a dictionary may name besides plugins.
 _BESIDE_PLUGINS = ("scene", "ref", "rgb", "spectrum")
 _THROUGH_MEDIA = ("volpath", "volpathmis")
-#: With these the path length may be set from outside.
+#: Integrators whose path length can be set.
 _HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
-#: What belongs to a camera: looked at where that camera is used.
+#: Kinds that belong to a camera; they are checked only if that camera is used.
 OF_A_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
 _PLACE = re.compile(r"(?P<file>.+) \(line (?P<line>\d+), col \d+\)")
 _KEY = re.compile(r'dictionary node "(?P<key>.*)"')
@@ -149,11 +149,11 @@ class Used:
 
     Parameters
     ----------
-    kind, name : of the plugin.
-    own_id : its id, empty where it has none.
-    place : arguments of a `SpecError` that say where it stands.
-    node : of Mitsuba's parser; None where the object was made before.
-    owners : nodes that it belongs to.
+    kind, name : kind and type name of the plugin.
+    own_id : its id, empty if it has none.
+    place : arguments of a `SpecError` that state its place.
+    node : node of Mitsuba's parser; None for an object given in a dictionary.
+    owners : nodes that contain it.
     """
 
     kind: str
@@ -164,7 +164,7 @@ class Used:
     owners: tuple[Any, ...]
 
     def refused(self, why: str) -> SpecError:
-        """That this plugin is not rendered."""
+        """The error that this plugin is not rendered."""
         return SpecError(f"{self}: {why}", **self.place)
 
     def __str__(self) -> str:
@@ -172,12 +172,12 @@ class Used:
 
 
 def require_known(name: Any, file: Path | None, key: str) -> None:
-    """Refuse a type in a dictionary that is no plugin of Mitsuba's: to look what it is Mitsuba would load it.
+    """Refuse a type in a dictionary that is not a plugin of Mitsuba. To examine an unknown type, Mitsuba would load it.
 
     Raises
     ------
     SpecError
-        With its place.
+        Names the place.
     """
     if not isinstance(name, str) or (name not in _KINDS and name not in _BESIDE_PLUGINS):
         raise SpecError(f"type {name!r} is no plugin of Mitsuba's that is known here", file=file, key=key)
@@ -194,7 +194,7 @@ def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]
     found: list[Used] = []
     for node, above in zip(nodes, owners, strict=True):
         place, name = _place(mi, state, node, file), node.props.plugin_name()
-        # of what is written in Python a parsed dictionary does not tell the kind
+        # a parsed dictionary does not state the kind of an object written in Python
         kind = _KINDS.get(name, "Plugin") if node.type.name == "Unknown" else node.type.name
         if kind != "Scene":
             found.append(Used(kind, name, node.props.id(), place, node, tuple(above)))
@@ -206,7 +206,7 @@ def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]
 
 
 def _place(mi: MitsubaModule, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
-    """Arguments of a `SpecError` for where a node stands."""
+    """Arguments of a `SpecError` that state the place of a node."""
     told, own = mi.parser.file_location(state, node), node.props.id()
     if match := _PLACE.fullmatch(told):
         return {"file": match["file"], "line": int(match["line"]), "key": own or None}
@@ -216,7 +216,7 @@ def _place(mi: MitsubaModule, state: Any, node: Any, file: Path | None) -> dict[
 
 
 def _made(mi: MitsubaModule, value: Any, place: Mapping[str, Any], owner: Any) -> Iterator[Used]:
-    """An object that was made before, and what is in it."""
+    """An object given in a dictionary, and the objects in it."""
     if not isinstance(value, mi.Object):
         return
     for item in mi.traverse(value).hierarchy:
@@ -232,11 +232,11 @@ def _made(mi: MitsubaModule, value: Any, place: Mapping[str, Any], owner: Any) -
 
 
 def exact_reason(found: Iterable[Used], moving: Iterable[str]) -> str | None:
-    """Why a scene needs the exact mode, None where it does not.
+    """Why a scene needs the exact mode; None if it does not.
 
     Parameters
     ----------
-    found : from `used_plugins`.
+    found : plugins from `used_plugins`.
     moving : ids of shapes that move.
 
     Raises
@@ -265,7 +265,7 @@ def _why_refused(used: Used) -> str | None:
     if why is not None or used.name in EXACT.get(used.kind, {}):
         return why
     if used.node is None and used.kind not in ("Integrator", "Sensor"):
-        return None  # of a class of Mitsuba's own that is nowhere refused
+        return None  # an object of a Mitsuba class that no table refuses
     known = HONOURED.get(used.kind, ()) + OF_THE_SENSOR_FILE.get(used.kind, ())
     return None if used.name in known else f"it is not known here; use one of {', '.join(sorted(known))}"
 
@@ -279,7 +279,7 @@ def _exact_where_it_moves(used: Used, moved: set[str]) -> str | None:
 
 
 def _check_media(plugins: Iterable[Used], moved: set[str]) -> None:
-    """Refuse media that the integrator would not see, or that would stay behind."""
+    """Refuse media that the integrator would not see, or that would not move with their shape."""
     integrator = next((used.name for used in plugins if used.kind == "Integrator"), None)
     for used in plugins:
         shapes = [owner for owner in used.owners if owner.type.name == "Shape"]
@@ -293,7 +293,7 @@ def _check_media(plugins: Iterable[Used], moved: set[str]) -> None:
 
 
 def set_depth(found: Iterable[Used], depth: int) -> bool:
-    """Give a parsed scene's integrator a path length; False where it has none.
+    """Set the path length of a parsed scene's integrator; returns False if the scene has no integrator.
 
     Raises
     ------
@@ -307,14 +307,14 @@ def set_depth(found: Iterable[Used], depth: int) -> bool:
             raise used.refused("it was made before, so that max_depth cannot be set; give it as a dictionary")
         if used.name in _HAVE_DEPTH:
             used.node.props["max_depth"] = depth
-        elif depth != 2:  # 'direct' is that
+        elif depth != 2:  # 'direct' has depth 2
             raise used.refused(f"it has no path length, and the scene file asks for max_depth {depth}; use 'path'")
         return True
     return False
 
 
 def integrator_plugin(found: Iterable[Used], otherwise: dict[str, Any]) -> dict[str, Any] | None:
-    """A parsed scene's integrator as a dictionary, or another where it has none; None where it was made before."""
+    """A parsed scene's integrator as a dictionary; `otherwise` if there is none; None if it was given as an object."""
     for used in found:
         if used.kind == "Integrator":
             return None if used.node is None else {"type": used.name, **dict(used.node.props.items())}
@@ -322,12 +322,12 @@ def integrator_plugin(found: Iterable[Used], otherwise: dict[str, Any]) -> dict[
 
 
 def check_camera(found: Iterable[Used]) -> Used | None:
-    """The first sensor of a parsed scene, if it has any.
+    """The first sensor of a parsed scene, None if it has no sensor.
 
     Raises
     ------
     SpecError
-        If it asks for what is not rendered: with the plugin, its place, and what to do.
+        If the sensor asks for something that is not rendered; the message has plugin, place and alternative.
     """
     plugins = list(found)
     first = next((used for used in plugins if used.kind == "Sensor"), None)

@@ -21,7 +21,7 @@ from hesim_render.specs.target import (
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.spectrum import Spectrum, constant
 
-#: Largest angle of one straight piece of a Siemens star's rim; its sagitta is 4e-6 of the diameter.
+#: Largest angle of one straight piece of the rim of a Siemens star; its sagitta is 4e-6 of the diameter.
 _RIM_STEP_RAD = radians(0.5)
 
 
@@ -31,9 +31,9 @@ class Piece:
 
     Parameters
     ----------
-    name : what it is (a patch's name, ``light``, ``dark``, ``step 3``).
+    name : name of the part (a patch's name, ``light``, ``dark``, ``step 3``).
     reflectance : diffuse, 0 to 1.
-    vertices_m : [n, 3], z = 0.
+    vertices_m : [n, 3], z = 0, m.
     faces : [m, 3], counter-clockwise as seen from +z.
     """
 
@@ -61,12 +61,12 @@ def _box(x0: float, x1: float, y0: float, y1: float) -> list[tuple[float, float]
 
 
 def patch_boxes(rows: int, cols: int, width_m: float, height_m: float, fill: float) -> NDArray[np.float64]:
-    """Limits x0, x1, y0, y1 of centred patches, [rows · cols, 4], row by row from the top left."""
+    """Limits x0, x1, y0, y1 of centred patches, [rows · cols, 4], m, row by row from the top left."""
     pitch_x, pitch_y = width_m / cols, height_m / rows
     row, col = (index.ravel() for index in np.mgrid[:rows, :cols])
     x = (col + 0.5) * pitch_x - width_m / 2
     y = height_m / 2 - (row + 0.5) * pitch_y
-    # one margin all round: the smaller pitch sets it, so frames between patches are equally wide
+    # the smaller pitch sets one margin for all sides, so that frames between patches are equally wide
     margin = (1 - fill) / 2 * min(pitch_x, pitch_y)
     half_x, half_y = pitch_x / 2 - margin, pitch_y / 2 - margin
     return np.column_stack([x - half_x, x + half_x, y - half_y, y + half_y])
@@ -112,14 +112,14 @@ def _checkerboard(target: CheckerboardTarget) -> list[Piece]:
 
 def _slanted_edge(target: SlantedEdgeTarget) -> list[Piece]:
     w, h = target.width_m / 2, target.height_m / 2
-    # the edge runs through the centre; clockwise from the vertical, so its upper end leans to the right
+    # the edge passes through the centre, turned clockwise from the vertical: its upper end leans to the right
     lean = tan(radians(target.angle_deg))
     ends = [(x, y) for x, y in ((-lean * h, -h), (lean * h, h)) if abs(x) <= w]
     if len(ends) == 2:
         (x0, _), (x1, _) = ends
         dark = [(-w, -h), (x0, -h), (x1, h), (-w, h)]
         light = [(x0, -h), (w, -h), (w, h), (x1, h)]
-    else:  # a wide tilt meets the left and right sides instead
+    else:  # with a large tilt the edge meets the left and right sides instead
         y = w / lean
         upper, lower = [(-w, -y), (w, y), (w, h), (-w, h)], [(-w, -h), (w, -h), (w, y), (-w, -y)]
         dark, light = (upper, lower) if lean > 0 else (lower, upper)
@@ -143,7 +143,7 @@ def _siemens_star(target: SiemensStarTarget) -> list[Piece]:
     outline = np.unique(np.concatenate([rim_angles[:-1], corners]))
     closed = np.append(outline, outline[0] + 2 * pi)
     for a, b in zip(closed[:-1], closed[1:], strict=True):
-        # points between two rim points lie on the rim's straight piece, so nothing overlaps
+        # points between two rim points lie on the straight piece of the rim, so pieces do not overlap
         inner = [_on_rim(float(angle), rim_angles, radius) for angle in (a, b)]
         outer = [_on_rectangle(float(angle), w, h) for angle in (a, b)]
         light.append([inner[0], outer[0], outer[1], inner[1]])
@@ -164,7 +164,7 @@ def _on_rectangle(angle: float, half_width: float, half_height: float) -> tuple[
 
 
 def build_target(target: TargetSpec) -> list[Piece]:
-    """A target's pieces; together they tile its rectangle exactly, without overlap."""
+    """The pieces of a target; together they tile its rectangle exactly, without overlap."""
     if isinstance(target, FlatTarget):
         w, h = target.width_m / 2, target.height_m / 2
         return [_piece("flat", target.reflectance.load(), [_box(-w, w, -h, h)])]

@@ -1,4 +1,4 @@
-"""Keyframed rigid poses on the device: of any track of several, per lane."""
+"""Keyframed rigid poses on the device, per lane, for several tracks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DevicePose:
-    """Rigid poses, one a lane: x → R x + shift; `columns` are those of R."""
+    """Rigid poses, one per lane: x → R x + shift; `columns` are those of R."""
 
     columns: tuple[Vector3, Vector3, Vector3]
     shift: Vector3
@@ -43,13 +43,13 @@ class DevicePose:
 
     @classmethod
     def none(cls, vector: type[Vector3]) -> DevicePose:
-        """Of what stays where it is."""
+        """The identity."""
         import drjit as dr
 
         return cls((vector(1, 0, 0), vector(0, 1, 0), vector(0, 0, 1)), dr.zeros(vector))
 
     def where(self, condition: Mask, other: DevicePose) -> DevicePose:
-        """This pose in lanes where a condition holds, another one in the rest."""
+        """This pose in lanes where a condition holds, `other` in the rest."""
         import drjit as dr
 
         columns = (dr.select(condition, a, b) for a, b in zip(self.columns, other.columns, strict=True))
@@ -104,7 +104,7 @@ class Tracks:
                     *track.pivot_m,
                 ]
             )
-            # one row a segment, fetched as four packets of four: gathers of single numbers cost more than the poses
+            # one row per segment, fetched as four packets of four: gathers of single numbers cost more than the poses
             columns = [
                 *(knots[:-1, None], 1 / np.diff(knots)[:, None], track.arc_rad[:, None] / 2, track.arc_axis),
                 *(track.start_rotation, track.translation_m[:-1], np.diff(track.translation_m, axis=0)),
@@ -114,7 +114,7 @@ class Tracks:
         self._heads, self._rows, self._times = (
             table(types.Float, np.concatenate(values).astype(np.float32)) for values in (heads, rows, times)
         )
-        #: Steps in which the segment of a time is found; a power of two, so that tracks alike in length share a kernel.
+        #: Steps of the search for a segment; rounded so that tracks of similar length share a kernel.
         self._most = 1 << max(0, max(map(len, rows)) - 1).bit_length()
         dr.make_opaque(self._heads, self._rows, self._times)
 
@@ -123,8 +123,8 @@ class Tracks:
 
         Parameters
         ----------
-        number : of its track, an integer or UInt32.
-        local_us : Float, time since that track's first keyframe, see `Trajectory.pose_at`.
+        number : number of its track, an integer or UInt32.
+        local_us : Float, time since that track's first keyframe, µs, see `Trajectory.pose_at`.
         """
         import drjit as dr
 
@@ -135,7 +135,7 @@ class Tracks:
         wrapped = local_us - period * dr.floor(local_us / period)
         local_us = dr.select((repeat > 0) & (local_us >= period), wrapped, local_us)
         local_us = dr.clip(local_us, 0, period)
-        last = types.UInt32(knots) - 2  # of the segments
+        last = types.UInt32(knots) - 2  # last segment
         base = types.UInt32(first_time)
         segment = dr.binary_search(
             0,

@@ -1,4 +1,4 @@
-"""Keyframed rigid poses: where an object or the camera is at any time."""
+"""Keyframed rigid poses: the pose of an object or of the camera at any time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _unit(axis: ArrayLike) -> NDArray[np.float64]:
 
 
 def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], float]:
-    """Axis and angle (rad, any number of turns) of the rotation that leads from one keyframe to the next."""
+    """Axis and angle (rad, any number of turns) of the rotation from one keyframe to the next."""
     if start.rotation_deg == 0:
         return _unit(end.rotation_axis), radians(end.rotation_deg)
     if end.rotation_deg == 0:
@@ -43,9 +43,9 @@ class Piece(NamedTuple):
 
     Parameters
     ----------
-    segment : its number.
-    first, last : shares of it, 0 to 1.
-    length_us : of the part.
+    segment : number of the segment.
+    first, last : begin and end of the part as shares of the segment, 0 to 1.
+    length_us : length of the part, µs.
     """
 
     segment: int
@@ -57,10 +57,9 @@ class Piece(NamedTuple):
 class Trajectory:
     """A track evaluated: pose(t) = translate(T(t)) · pivot + R(t) · (x − pivot).
 
-    Between keyframes T is linear and R turns at constant angular speed: about the shared axis, any
-    number of turns, where both keyframes name the same axis (a rotation of 0 shares every axis);
-    along the shortest arc otherwise. Outside the keyframes the pose is held, or the track repeats
-    with the period from its first to its last keyframe.
+    Between keyframes T is linear and R turns at constant angular speed. If both keyframes name the same axis, R turns
+    about that axis, by any number of turns (a rotation of 0 shares every axis); otherwise it takes the shortest arc.
+    Outside the keyframes the pose is held, or the track repeats with the period from its first to its last keyframe.
 
     Parameters
     ----------
@@ -83,16 +82,16 @@ class Trajectory:
 
     @property
     def period_us(self) -> float:
-        """From the first keyframe to the last."""
+        """Time from the first keyframe to the last, µs."""
         return float(self.knots_us[-1] - self.knots_us[0])
 
     @property
     def moves(self) -> bool:
-        """Whether the pose changes at all."""
+        """True if the pose changes at all."""
         return bool(np.any(np.ptp(self.translation_m, axis=0) > 0) or np.any(np.abs(self.arc_rad) > 0))
 
     def local_us(self, t_us: ArrayLike) -> NDArray[np.float64]:
-        """Time since the first keyframe, wrapped where the track repeats, else held to its ends."""
+        """Time since the first keyframe, µs, wrapped if the track repeats, otherwise clipped to its ends."""
         local = np.asarray(t_us, dtype=np.float64) - self.knots_us[0]
         return np.mod(local, self.period_us) if self.repeat else np.clip(local, 0.0, self.period_us)
 
@@ -104,20 +103,21 @@ class Trajectory:
         return self.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
 
     def throughout(self, times_us: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
-        """Segment that holds a stretch of time without `ends_us` inside, and its poses at times of it, [k, 4, 4].
+        """Segment of a time interval, and poses at times of the interval, [k, 4, 4].
 
-        At the stretch's end the pose is that before a track that repeats jumps.
+        No time of `ends_us` may lie inside the interval. At its end the pose is the one before the jump of a repeating
+        track.
         """
         middle = 0.5 * (times_us[0] + times_us[-1])
         knots, local = self.knots_us - self.knots_us[0], float(self.local_us(middle))
         segment = int(np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2))
-        if not self.repeat:  # held before and after
+        if not self.repeat:  # the pose is held before and after
             local = middle - self.knots_us[0]
         share = (local + times_us - middle - knots[segment]) / (knots[segment + 1] - knots[segment])
         return segment, self.within(np.full(share.size, segment), np.clip(share, 0.0, 1.0))
 
     def within(self, segment: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pose in the segments between two keyframes at a share of each, 0 to 1 with both ends; [..., 4, 4]."""
+        """Pose in segments at a share of each, 0 to 1 with both ends included; [..., 4, 4]."""
         each = np.ravel(segment)
         turn = Rotation.from_rotvec((np.ravel(share) * self.arc_rad[each])[:, None] * self.arc_axis[each])
         rotation = (turn * self._starts[each]).as_matrix().reshape(*share.shape, 3, 3)
@@ -130,10 +130,10 @@ class Trajectory:
         return pose
 
     def pieces(self, begin_us: float, end_us: float) -> list[Piece]:
-        """What an interval has of the segments between keyframes, in order of time; no pose is left out.
+        """The parts of segments that lie in an interval, in order of time; together they contain all poses.
 
-        A track that repeats jumps at its last keyframe, which is therefore the end of one piece and the begin of the
-        next. Of an interval of a period or more each segment comes once.
+        A repeating track jumps at its last keyframe, so that keyframe ends one piece and begins the next. In an
+        interval of a period or more each segment occurs once.
         """
         knots = self.knots_us - self.knots_us[0]
         period = float(knots[-1])
@@ -169,7 +169,7 @@ class Trajectory:
 
         Parameters
         ----------
-        local_us : Dr.Jit Float, time since the first keyframe as from `local_us`; it may run past the
+        local_us : Dr.Jit Float, time since the first keyframe, µs, as from `local_us`; it may exceed the
             end of the track by less than a period.
         """
         return self._on_device.pose(0, local_us)

@@ -1,1 +1,1 @@
-"""Paths whose rays have times of their own, and matt surfaces in closed form."""
+"""Light transport: paths whose rays have individual times, and direct light on matt surfaces in closed form."""

@@ -1,10 +1,10 @@
-"""Shapes that keep their places among themselves, and where rays meet them.
+"""Ray intersection in closed form for rigid groups of flat faces and balls.
 
-Targets are flat, and so is most of what stands around them. A few faces and balls are tried one after the other within
-the kernel, and what Mitsuba knows of a face's surface is looked up once and for all; a search through a tree of boxes,
-for which rays leave the kernel, and corners fetched for each hit take longer. Where there are many shapes, or any of
-another form, rays are met by Mitsuba (Embree on a CPU, OptiX on a GPU). What a surface does with light is Mitsuba's in
-any case.
+Targets are flat, and so are most of the surfaces around them. A few faces and balls are tested one after the other
+within the kernel, and Mitsuba's description of each face is fetched once in advance. This is faster than a search
+through a tree of boxes, for which rays leave the kernel, and than fetching corners for each hit. Groups with many
+shapes, or with shapes of another form, are intersected by Mitsuba (Embree on a CPU, OptiX on a GPU). Mitsuba evaluates
+the reflection of all surfaces.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from hesim_render.core.device_types import (
 )
 from hesim_render.sources.render.transport.intersections import meets_ball, to_ball, to_face
 
-#: Faces and balls of a part that are tried one by one, at most: paths of four segments among 3, 6, 12, 24 and 48 faces
+#: Largest number of faces and balls that are tested one by one: paths of four segments among 3, 6, 12, 24, 48 faces
 #: took 0.93, 0.83, 1.06, 1.08 and 1.7 times as long as with Embree (AVX-512).
 _MOST = 8
-#: How far the corners of two triangles may be off those of a parallelogram, over its size.
+#: Largest distance of the corners of two triangles from those of a parallelogram, over its size.
 _FLAT = 1e-5
-#: How far normals on a face may differ from corner to corner; and what else its triangles have, over its size.
+#: Largest difference of normals between the corners of a face, and of its other surface data, over its size.
 _SAME = 1e-5
 
 
 @dataclass(frozen=True)
 class Face:
-    """A parallelogram of two successive triangles of a mesh.
+    """A parallelogram made of two successive triangles of a mesh.
 
     Parameters
     ----------
-    triangle : number of the first; it is the half with u + v <= 1.
-    order : which corners of both triangles lie at (0, 0), (1, 0), (0, 1), and at (1, 1), (1, 0), (0, 1).
-    to_uvh : [3, 4], metres to u and v, 0 to 1 on the face, and to the height over it in metres.
-    surface : what Mitsuba says of both triangles, [2, ...] each: `n` and `shading`, normals; `s`, the first axis of the
+    triangle : number of the first triangle, the half with u + v <= 1.
+    order : numbers of the corners of both triangles at (0, 0), (1, 0), (0, 1), and at (1, 1), (1, 0), (0, 1).
+    to_uvh : [3, 4], maps a point in metres to u and v (0 to 1 on the face) and to its height above the face, m.
+    surface : Mitsuba's data of both triangles, [2, ...] each: `n` and `shading`, normals; `s`, first axis of the
         shading frame; `dp_du`, `dp_dv`; and `uv` [2, 3, 2], texture coordinates at (0, 0) and their change along u, v.
     """
 
@@ -58,7 +58,10 @@ class Face:
 
 
 def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
-    """The faces of a mesh if they are all it is, not too many, and flat to light as well; else none."""
+    """The faces of a mesh, if it consists of a few flat faces only; otherwise an empty list.
+
+    Faces must be flat for shading as well.
+    """
     if not shape.is_mesh() or shape.face_count() > 2 * _MOST or shape.face_count() % 2:
         return []
     vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
@@ -90,7 +93,7 @@ def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
 def _parallelogram(
     one: NDArray[np.float64], other: NDArray[np.float64]
 ) -> tuple[tuple[int, int, int], tuple[int, int, int]] | None:
-    """Which corners of two triangles lie at (0, 0), (1, 0), (0, 1), and at (1, 1), (1, 0), (0, 1); None if none do.
+    """Corner order of two triangles that form a parallelogram, as in `Face.order`; None if they do not.
 
     Parameters
     ----------
@@ -110,7 +113,7 @@ def _parallelogram(
 
 
 def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np.float64]]:
-    """What Mitsuba says of a mesh's surface at the corners of its triangles, [faces, 2, 3 corners, ...] each."""
+    """Mitsuba's surface data at the corners of a mesh's triangles, [faces, 2, 3 corners, ...] each."""
     import drjit as dr
 
     count = shape.face_count()
@@ -126,7 +129,7 @@ def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np
 
 @dataclass(frozen=True)
 class Ball:
-    """Middle, m, and the square of its radius, m²."""
+    """Centre, m, and squared radius, m², of a ball."""
 
     middle: NDArray[np.float64]
     square: float
@@ -134,14 +137,14 @@ class Ball:
 
 @dataclass(frozen=True)
 class SimpleForm:
-    """Faces and balls, each with its shape of Mitsuba."""
+    """Faces and balls, each with its Mitsuba shape."""
 
     faces: list[tuple[Face, MitsubaObject]]
     balls: list[tuple[Ball, MitsubaObject]]
 
     @classmethod
     def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> SimpleForm | None:
-        """That of all shapes of a scene, if they are nothing else and not too many."""
+        """The faces and balls of a scene; None if it has other shapes, or too many."""
         form = cls([], [])
         for shape in scene.shapes():
             if shape.class_name() == "Sphere":
@@ -155,28 +158,29 @@ class SimpleForm:
 
 
 class Part:
-    """Some shapes in the frame in which they rest.
+    """Shapes in the frame in which they are at rest.
 
     Parameters
     ----------
     mi : the mitsuba module.
-    scene : of Mitsuba, with these shapes.
-    apart : whether most rays pass far from them: Mitsuba is then asked only about rays that meet a ball around them.
+    scene : Mitsuba scene with these shapes.
+    apart : True if most rays pass far from the shapes. Mitsuba is then asked only about rays that meet a ball around
+        them.
     """
 
     def __init__(self, mi: MitsubaModule, scene: MitsubaObject, apart: bool) -> None:
         import drjit as dr
 
         self._mi = mi
-        #: Middle and square of the radius of each ball, and its shape.
+        #: Centre and squared radius of each ball, and its shape.
         self._balls: list[tuple[Point3, Float, MitsubaObject]] = []
-        #: Rows of the map to u, v and height of each face, its first triangle, and its shape.
+        #: For each face: rows of the map to u, v and height; number of its first triangle; its shape.
         self._faces: list[tuple[list[tuple[Vector3, Float]], int, MitsubaObject]] = []
-        #: What Mitsuba said of their surfaces: one value for both triangles, or one for each.
+        #: Mitsuba's surface data of the faces: one value for both triangles, or one for each.
         self._surfaces: list[dict[str, list[Any]]] = []
-        #: What Mitsuba searches, and the ball around it.
+        #: The scene that Mitsuba intersects, and the ball around it.
         self._scene = self._around = None
-        #: The shapes, if they are met in closed form.
+        #: The shapes, if they are intersected in closed form.
         self.form = SimpleForm.of(mi, scene)
         if self.form is not None:
             for face, shape in self.form.faces:
@@ -195,21 +199,23 @@ class Part:
 
     @property
     def face_count(self) -> int:
-        """Faces that are tried one by one."""
+        """Number of faces that are tested one by one."""
         return len(self._faces)
 
     def nearest(self, ray: Ray, coherent: Mask, active: Mask) -> tuple[Interaction, UInt32]:
-        """The first surface before a ray's `maxt`.
+        """Intersect rays with the part: the nearest surface before `maxt`.
 
         Parameters
         ----------
         ray : Ray3f in the part's own frame.
-        coherent : whether neighbouring lanes' rays are alike.
+        coherent : True if rays of neighbouring lanes are similar.
+        active : lanes to trace.
 
         Returns
         -------
-        hit : `PreliminaryIntersection3f`, its t infinite where there is none; on a face, with the place on that.
-        face : UInt32, 1 to `face_count`, and 0 for anything else.
+        hit : `PreliminaryIntersection3f`, its t infinite where nothing is hit; on a face, with the position on the
+            face.
+        face : UInt32, 1 to `face_count` for a face, and 0 for anything else.
         """
         import drjit as dr
 
@@ -236,7 +242,7 @@ class Part:
         return found, face
 
     def blocks(self, ray: Ray, active: Mask) -> Mask:
-        """Whether anything lies on a ray before its `maxt`."""
+        """True where a ray hits anything before its `maxt`."""
         if self._scene is not None:
             return self._scene.ray_test(ray, active & self._near(ray))
         blocked = self._mi.Bool(False)
@@ -249,13 +255,15 @@ class Part:
         return blocked & active
 
     def surface(self, hit: Interaction, face: UInt32, ray: Ray, flags: MitsubaObject, active: Mask) -> Interaction:
-        """What a ray has met, `SurfaceInteraction3f` in the part's own frame; its t is infinite where that is nothing.
+        """Surface at the hit points, `SurfaceInteraction3f` in the part's own frame; t is infinite where nothing was
+        hit.
 
         Parameters
         ----------
-        hit, face : given by `nearest` for `ray`.
-        flags : `RayFlags` of what to know of it. Of faces all is known.
-        active : lanes in which anything is wanted.
+        hit, face : results of `nearest` for `ray`.
+        ray : the rays.
+        flags : `RayFlags`, fields to compute. Faces always have all fields.
+        active : lanes in which a result is needed.
         """
         si = hit.compute_surface_interaction(ray, flags, active & (face == 0))
         if self._faces:
@@ -263,7 +271,7 @@ class Part:
         return si
 
     def _describe_faces(self, si: Interaction, ray: Ray, hit: Interaction, face: UInt32) -> None:
-        """Put the surface of faces into a `SurfaceInteraction3f`, where a ray has met one."""
+        """Fill in the surface data of lanes that hit a face."""
         import drjit as dr
 
         u, v = hit.prim_uv
@@ -289,12 +297,12 @@ class Part:
         si.wi = dr.select(here, si.sh_frame.to_local(-ray.d), si.wi)
 
     def _near(self, ray: Ray) -> Mask:
-        """Whether a ray meets the ball around all, where there is one."""
+        """True where a ray meets the ball around all shapes, if there is one."""
         return self._mi.Bool(True) if self._around is None else meets_ball(ray, ray.maxt, self._around)
 
 
 def _on_device(mi: MitsubaModule, values: NDArray[np.float64]) -> list[Any]:
-    """Values of both triangles, [2, ...], or one where they are alike."""
+    """Values of both triangles, [2, ...]; one value where they are equal."""
     alike = np.allclose(values[0], values[1], rtol=0, atol=_SAME * np.abs(values).max())
     kept = values[:1] if alike else values
     if values.ndim == 2:
@@ -303,6 +311,6 @@ def _on_device(mi: MitsubaModule, values: NDArray[np.float64]) -> list[Any]:
 
 
 def _ball_around(box: MitsubaObject, factor: float) -> Ball:
-    """About the middle of a box, its radius `factor` times half the diagonal."""
+    """Ball about the centre of a box; its radius is `factor` times half the diagonal."""
     low, high = (np.array(corner, np.float64).ravel() for corner in (box.min, box.max))
     return Ball((low + high) / 2, float((factor * np.linalg.norm(high - low) / 2) ** 2))

@@ -1,4 +1,4 @@
-"""Where a ray meets a ball or a face, in closed form."""
+"""Intersections of rays with balls and faces, in closed form."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from hesim_render.core.device_types import Float, Mask, Point2, Point3, Ray, Vec
 
 
 def to_ball(ray: Ray, middle: Point3, square: Float) -> Float:
-    """Distance along a ray to a ball; negative or not a number where it lies behind or is missed."""
+    """Distance along a ray to a ball, m; negative or NaN where the ball lies behind the ray or is missed."""
     import drjit as dr
 
     to = middle - ray.o
     along = dr.dot(to, ray.d)
-    # of the two roots the one without cancellation, and the other by their product
+    # compute the root without cancellation, and the other one from the product of both roots
     root = dr.sqrt(square - dr.squared_norm(dr.fma(-along, ray.d, to)))
     far = along + dr.mulsign(root, along)
     other = (dr.squared_norm(to) - square) * dr.rcp(far)
@@ -22,13 +22,14 @@ def to_ball(ray: Ray, middle: Point3, square: Float) -> Float:
 
 
 def to_face(ray: Ray, rows: Sequence[tuple[Vector3, Float]]) -> tuple[Float, Point2, Mask]:
-    """Distance along a ray to a face's plane, the place there, and whether it lies on the face.
+    """Distance along a ray to the plane of a face, position on the face, and whether it lies on the face.
 
-    Where the ray runs along the plane they are not numbers, and it does not.
+    Distance and position are NaN, and the mask is False, where the ray is parallel to the plane.
 
     Parameters
     ----------
-    rows : of the map to u, v and height: three of a vector and a number.
+    ray : Ray3f.
+    rows : rows of the map to u, v and height: three pairs of a vector and a number.
     """
     import drjit as dr
     import mitsuba as mi
@@ -37,17 +38,17 @@ def to_face(ray: Ray, rows: Sequence[tuple[Vector3, Float]]) -> tuple[Float, Poi
     t = -(dr.dot(normal, ray.o) + height) * dr.rcp(dr.dot(normal, ray.d))
     point = dr.fma(ray.d, t, ray.o)
     u, v = dr.dot(u_row, point) + u_0, dr.dot(v_row, point) + v_0
-    # not dr.minimum and dr.maximum: what those do about NaN takes time
+    # not dr.minimum and dr.maximum: their handling of NaN takes time
     return t, mi.Point2f(u, v), (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
 
 
 def meets_ball(ray: Ray, length: Float, ball: tuple[Point3, Float]) -> Mask:
-    """Whether the first `length` metres of a ray meet a ball, given by its middle and the square of its radius."""
+    """True where the first `length` metres of a ray meet a ball, given by its centre and squared radius."""
     import drjit as dr
 
     middle, square = ball
     to = middle - ray.o
     along, far = dr.dot(to, ray.d), dr.squared_norm(to)
-    # from outside it has to lie ahead, and its near side, whatever the radius, no farther than the ray goes
+    # seen from outside, the ball must lie ahead, and its near side must be within the length of the ray
     ahead = (far <= square) | ((along > 0) & ((along <= length) | (dr.square(along - length) <= square)))
     return ahead & (dr.fma(-along, along, far) <= square)

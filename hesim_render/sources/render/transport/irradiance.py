@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import Float, MitsubaModule, Point2, Point3, Vector3
 
-#: Area over squared distance below which a rectangle counts as a point at its middle: the sum over edges loses its
-#: digits in float32 there, and the middle is right to about this part.
+#: Area over squared distance below which a rectangle counts as a point at its centre: the sum over edges loses its
+#: digits in float32 there, and the relative error of the point is about as large as this number.
 _SMALL_SR = 1e-4
 
 
 class RectangleLight:
-    """A rectangle that shines from its front, of radiance 1.
+    """A rectangle that emits from its front, with radiance 1.
 
     Parameters
     ----------
     mi : the mitsuba module.
-    frame : [4, 4]; columns are half the width, half the height, the unit normal and the middle, metres.
+    frame : [4, 4]; columns are half the width, half the height, the unit normal and the centre, m.
     """
 
     def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64]) -> None:
@@ -35,16 +35,20 @@ class RectangleLight:
         dr.make_opaque(self._half_width, self._half_height, self._normal, self._middle, self._corners, self._area_m2)
 
     def irradiance(self, point: Point3, normal: Vector3) -> Float:
-        """∫ cos θ dω over the rectangle, what lies below the horizon cut off; sr.
+        """∫ cos θ dω over the part of the rectangle above the horizon, sr.
 
-        Lambert's formula, ½ |Σ γ_i (Γ_i · n)| with γ_i the angle that edge i subtends and Γ_i the unit normal of the
+        Lambert's formula, ½ |Σ γ_i (Γ_i · n)|, with γ_i the angle that edge i subtends and Γ_i the unit normal of the
         plane through the point and that edge ([lambert1760]; for polygons [baum1989]).
-        Clipping a convex polygon at a plane leaves its edges shortened, and one more along the horizon.
+        Clipping a convex polygon at a plane shortens its edges and adds one edge along the horizon.
 
         Parameters
         ----------
         point : Point3f per lane.
         normal : unit Vector3f per lane.
+
+        Returns
+        -------
+        Float per lane, sr.
         """
         import drjit as dr
 
@@ -72,12 +76,16 @@ class RectangleLight:
         return dr.select(before > 0, exact, 0.0)
 
     def sample(self, point: Point3, normal: Vector3, place: Point2) -> tuple[Point3, Float]:
-        """A point drawn evenly on the rectangle, and its share of the irradiance: the mean of that is `irradiance`.
+        """A point drawn uniformly on the rectangle, and its contribution to the irradiance, whose mean is `irradiance`.
 
         Parameters
         ----------
         point, normal : see `irradiance`.
-        place : Point2f in [0, 1)².
+        place : Point2f in [0, 1)², random numbers.
+
+        Returns
+        -------
+        The point, Point3f, and its contribution, Float, sr.
         """
         import drjit as dr
 

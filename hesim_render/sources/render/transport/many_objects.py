@@ -1,7 +1,8 @@
-"""Many moving objects of simple form: met one after another in a loop over tables.
+"""Many moving objects of simple form, tested one after another in a loop over tables.
 
-The kernel is the same however many there are. Objects are what `closed_form` knows: balls, boxes, rectangles. Each is
-tried in its own frame, at the ray's own time, where the ray meets the box that holds it meanwhile.
+The kernel does not depend on the number of objects. Objects consist of the forms of `closed_form`: balls, boxes,
+rectangles. Each is tested in its own frame at the ray's own time, if the ray meets the box that contains the object
+during the window.
 """
 
 from __future__ import annotations
@@ -28,18 +29,19 @@ from hesim_render.sources.render.transport.closed_form import SimpleForm
 from hesim_render.sources.render.transport.intersections import to_ball, to_face
 from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
 
-#: Entries of a row of the tables of balls and of faces.
+#: Number of entries in a row of the table of balls and of the table of faces.
 _BALL, _FACE = 8, 16
 
 
 class Fleet:
-    """Groups in closed form.
+    """Moving groups in closed form.
 
     Parameters
     ----------
     mi : the mitsuba module.
-    forms : of each group.
-    numbers : of each group among all of the scene's; `tracks` of all of these.
+    forms : faces and balls of each group.
+    numbers : number of each group among all groups of the scene.
+    tracks : tracks of all groups of the scene.
     """
 
     def __init__(self, mi: MitsubaModule, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks) -> None:
@@ -64,18 +66,20 @@ class Fleet:
         dr.make_opaque(self._heads, self._balls, self._faces, self._count)
 
     def nearest(self, ray: Ray, moment: Moment, length: Float, active: Mask) -> tuple[Interaction, UInt32, Mask]:
-        """The first surface before a distance.
+        """Intersect rays with all groups: the nearest surface within a distance.
 
         Parameters
         ----------
         ray : Ray3f, world space.
-        length : how far along the ray it counts, m.
+        moment : time of each ray.
+        length : largest distance along the ray, m.
+        active : lanes to trace.
 
         Returns
         -------
-        hit : `PreliminaryIntersection3f` in the frame of the group met, its t infinite where there is none.
-        group : UInt32, number of that among all of the scene's.
-        met : Bool, whether the ray came through the box of any.
+        hit : `PreliminaryIntersection3f` in the frame of the group that was hit; t is infinite where nothing was hit.
+        group : UInt32, number of that group among all groups of the scene.
+        met : Bool, True where the ray came through the box of any group.
         """
         import drjit as dr
 
@@ -124,7 +128,7 @@ class Fleet:
         return self._hit(t, t < length, place, which, ball), group, met
 
     def blocks(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Mask, Mask]:
-        """Whether anything lies on a ray before its `maxt`; and whether it came through the box of any."""
+        """True where a ray hits anything before its `maxt`; and True where it came through the box of any group."""
         import drjit as dr
 
         mi = self._mi
@@ -161,7 +165,7 @@ class Fleet:
         return blocked, met
 
     def pose(self, group: UInt32, moment: Moment) -> DevicePose:
-        """Of the group of each lane's number."""
+        """Pose of the group whose number each lane holds."""
         return self._tracks.pose(group, moment.local_us(group))
 
     def _at_rest(self, ray: Ray, group: UInt32, moment: Moment) -> Ray:
@@ -178,7 +182,7 @@ class Fleet:
         return [(mi.Vector3f(row.x, row.y, row.z), row.w) for row in found]
 
     def _hit(self, t: Float, found: Mask, place: Point2, which: UInt32, ball: Mask) -> Interaction:
-        """What Mitsuba takes for the description of a surface."""
+        """The hit record from which Mitsuba computes a surface interaction."""
         import drjit as dr
 
         mi = self._mi
@@ -189,7 +193,7 @@ class Fleet:
         own = dr.gather(mi.Float, self._balls, _BALL * which + 4, found & ball)
         shape = mi.UInt32(dr.select(ball, own, number))
         hit.shape = dr.reinterpret_array(mi.ShapePtr, dr.select(found, shape, 0))
-        # the corner at (0, 0) or (1, 1), and those beside it along u and v, of the triangle that is met
+        # the corner at (0, 0) or (1, 1) of the triangle that was hit, and its neighbours along u and v
         u, v = place
         second = u + v > 1
         code = mi.UInt32(dr.select(second, other, one))
@@ -203,7 +207,7 @@ class Fleet:
 
 
 def _number(mi: MitsubaModule, shape: MitsubaObject) -> int:
-    """By which Dr.Jit knows a shape."""
+    """The number by which Dr.Jit identifies a shape."""
     import drjit as dr
 
     number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))

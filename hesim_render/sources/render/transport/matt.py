@@ -1,21 +1,22 @@
-"""Direct light on matt surfaces: colour, closed-form irradiance and visibility, each for itself.
+"""Direct light on matt surfaces: colour, closed-form irradiance and visibility are computed separately.
 
-Light k gives a matt surface of reflectance ρ the irradiance S_k(λ)·e_k(x, n): S_k is that of the light's own plane, e_k
-is geometry alone. A pixel of response R(λ) then takes
+Light k gives a matt surface of reflectance ρ the irradiance S_k(λ)·e_k(x, n). S_k is the irradiance on the light's own
+plane, e_k depends on geometry alone. A pixel of response R(λ) then receives
 
     Φ = Σ_k C[k, ρ, R] · e_k(x, n) · V_k(x),     C[k, ρ, R] = ∫ R(λ) ρ(λ)/π S_k(λ) dλ
 
 with V_k the visible share of the light. The spectral integrals are exact (spectra are linear between their samples) and
-tabled, e_k is a closed form, and rays are spent on visibility alone. A point drawn on the light has a share r of the
-irradiance (E[r] = e_k) and is seen or not (v = 1 or 0), which gives two unbiased estimates of e_k·V_k:
+tabulated, e_k is a closed form, and rays estimate the visibility alone. A point drawn on the light contributes r to the
+irradiance (E[r] = e_k) and is visible or not (v = 1 or 0). This gives two unbiased estimators of e_k·V_k; `lit` uses
+e_k as a control variate:
 
-    lit     e_k − (1 − v)·r     without noise where all of the light is seen
-    hidden  v·r                 without noise where none of it is
+    lit     e_k − (1 − v)·r     no noise where the whole light is visible
+    hidden  v·r                 no noise where the whole light is hidden
 
-Each pair of a pixel and a window takes the one that its pilot found less noisy.
+Each pair of a pixel and a window uses the estimator that its pilot pass found less noisy.
 
-One path of the common estimator [veach1997] multiplies all of these; at the dark side of a penumbra its error was
-three times as large with more rays.
+A path tracer with multiple importance sampling [veach1997] estimates the product of all these factors at once. On the
+dark side of a penumbra its error was three times as large, with more rays.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ _ROW = 8
 
 
 class MattIntegrator:
-    """Flux of direct light through a `MovingScene` of matt shapes; see the module.
+    """Flux of direct light through a `MovingScene` of matt shapes; the module docstring has the method.
 
     Parameters
     ----------
-    scene : what is traced.
-    paints : of all shapes but lamps.
+    scene : the scene to trace.
+    paints : paint of all shapes except lamps.
     given : lights of the scene file, in its order.
     responses : R per filter, in the order of the filter index; e⁻ s⁻¹ per W m⁻² sr⁻¹ nm⁻¹.
     """
@@ -74,7 +75,7 @@ class MattIntegrator:
         self._scene = scene
         levels = [irradiance(light) for light in given]
         skies = [level for light, level in zip(given, levels, strict=True) if light.type == "uniform" and level]
-        #: Lights that are on: S_k, and how to ask for e_k and for a point; an even sky is the last one.
+        #: Lights that are on: S_k, and an object that computes e_k and draws a point; a uniform sky comes last.
         self._lights: list[_Lamp | _Beam | _Point | _Sky] = []
         strengths: list[Spectrum] = []
         lamp_of: dict[str, int] = {}
@@ -89,7 +90,7 @@ class MattIntegrator:
                 self._lights.append(_Point(mi, np.array(light.position_m, np.float64), geometry))
             else:
                 self._lights.append(_Beam(mi, lights.beam_direction(light), geometry))
-            # where a ray runs into the light itself, it brings S_k/geometry
+            # a ray that hits the light itself carries S_k/geometry
             strengths.append(level.scaled(1 / geometry))
         irradiances = [level for light, level in zip(given, levels, strict=True) if level and light.type != "uniform"]
         if skies:
@@ -119,7 +120,9 @@ class MattIntegrator:
         strengths: Sequence[Spectrum],
         responses: Sequence[Spectrum],
     ) -> None:
-        """Paints by the number that Dr.Jit gives a shape; fluxes by (light, filter, colour) and (light, filter)."""
+        """Tables of paints, by the number that Dr.Jit gives a shape, and of fluxes by (light, filter, colour) and
+        (light, filter).
+        """
         import drjit as dr
 
         mi = self._scene.mi
@@ -143,20 +146,20 @@ class MattIntegrator:
     def flux(
         self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
     ) -> tuple[Float, Float, Float, Mask]:
-        """One ray a lane.
+        """Trace one ray per lane.
 
         Parameters
         ----------
         sampler : `next_2d`, see `CounterSampler`.
         ray : Ray3f, world space.
-        moment : when.
-        filter_index : UInt32.
+        moment : time of each ray.
+        filter_index : UInt32, filter of the ray's pixel.
 
         Returns
         -------
         lit, hidden : Float, both estimates of the flux, e⁻/s.
         unshadowed : Float, the flux if nothing hid any light, e⁻/s.
-        met : Bool, whether the path came through the box of a moving object.
+        met : Bool, True where the path came through the box of a moving object.
         """
         import drjit as dr
 
@@ -175,13 +178,13 @@ class MattIntegrator:
             beyond = (place - dr.floor(place)) > 0.5
             colour = dr.select(beyond.x == beyond.y, one, other)
 
-        # light that the ray runs into
+        # light sources that the ray hits
         emits = dr.select(hit, (lamp > 0) & front, self._has_sky)
         lights_beside_sky = len(self._lights) - self._has_sky
         source = dr.select(hit, mi.UInt32(dr.maximum(lamp - 1, 0)), mi.UInt32(lights_beside_sky))
         seen = dr.gather(mi.Float, self._emitted, source * self._filters + filter_index, emits)
 
-        # light that a painted surface sends on
+        # light that a painted surface reflects
         painted = hit & (lamp == 0) & (front | (both > 0))
         normal = mi.Vector3f(surface.shading_normal)
         normal = dr.select(front, normal, -normal)
@@ -204,7 +207,7 @@ class MattIntegrator:
 
 
 class _Lamp:
-    """A rectangle; strength is its radiance."""
+    """A rectangle light; its strength is its radiance."""
 
     def __init__(self, mi: MitsubaModule, frame: NDArray[np.float64], geometry: float) -> None:
         import drjit as dr
@@ -213,19 +216,20 @@ class _Lamp:
         self._scale = dr.opaque(mi.Float, 1 / geometry)
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
-        """e_k and r at surface points, and the ray that tells whether the point drawn on the light is seen.
+        """e_k and r at surface points, and the shadow ray to the point drawn on the light.
 
         Parameters
         ----------
         point : Interaction3f, world space.
-        normal : unit Vector3f, to the side that is seen.
+        normal : unit Vector3f, on the visible side.
+        sampler : random numbers.
         """
         drawn, share = self._rectangle.sample(point.p, normal, sampler.next_2d())
         return self._rectangle.irradiance(point.p, normal) * self._scale, share * self._scale, point.spawn_ray_to(drawn)
 
 
 class _Point:
-    """A point; strength is its intensity."""
+    """A point light; its strength is its intensity."""
 
     def __init__(self, mi: MitsubaModule, position: NDArray[np.float64], geometry: float) -> None:
         import drjit as dr
@@ -244,7 +248,7 @@ class _Point:
 
 
 class _Beam:
-    """Parallel light; strength is the irradiance across it."""
+    """Parallel light; its strength is the irradiance across the beam."""
 
     def __init__(self, mi: MitsubaModule, direction: NDArray[np.float64], geometry: float) -> None:
         import drjit as dr
@@ -261,13 +265,13 @@ class _Beam:
 
 
 class _Sky:
-    """The same light from everywhere; strength is its radiance, e_k is 1."""
+    """Uniform light from all directions; its strength is its radiance, and e_k is 1."""
 
     def __init__(self, mi: MitsubaModule) -> None:
         self._mi = mi
 
     def seen_from(self, point: Interaction, normal: Vector3, sampler: MitsubaObject) -> tuple[Float, Float, Ray]:
-        """See `_Lamp.seen_from`; directions are drawn by their cosine, so that r is 1 as well."""
+        """See `_Lamp.seen_from`. Directions have a cosine distribution, so r is 1 as well."""
         mi = self._mi
         local = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
         return mi.Float(1.0), mi.Float(1.0), point.spawn_ray(mi.Frame3f(normal).to_world(local))

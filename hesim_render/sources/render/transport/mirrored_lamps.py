@@ -1,9 +1,9 @@
-"""Images of lamps in flat mirrors: where light comes from that neither sampling a lamp nor a matt surface finds.
+"""Directions to the images of lamps in flat mirrors, which sampling of lamps and of matt surfaces both miss.
 
-A matt surface that a mirror shows a lamp is lit by its image. A shadow ray ends at the mirror, and of the surface's
-own directions few go to the image. So some of them are drawn from the cones around the images instead, and the
-density of the mixture is the density of all: one-sample multiple importance sampling with the balance heuristic
-([veach1997], section 9.2.4). Whatever such a ray runs into, the estimate stays unbiased.
+A matt surface that sees a lamp in a mirror is lit by the image of the lamp. A shadow ray to the lamp ends at the
+mirror, and few directions of the surface's own sampling hit the image. Some directions are therefore drawn from cones
+around the images instead. The density of all directions is that of the mixture: one-sample multiple importance sampling
+with the balance heuristic ([veach1997], section 9.2.4). The estimate is unbiased whatever such a ray hits.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Point3, Vector3
 
-#: Part of the directions that are drawn from the images, together. In a scene with floor, mirror and three more things
+#: Part of the directions that is drawn from all images together. In a scene with floor, mirror and three other objects
 #: 0.03 to 0.1 had the same noise within a tenth, 0.3 had more.
 _SHARE = 0.08
 #: Radius of a ball over half the diagonal of a lamp's box: a square then has as much area as the ball's disc. What lies
 #: beyond, the corners, is left to the surface's own directions; with all of it in the cones the noise was 4 % larger.
 _WITHIN = 0.8
-#: Images that are known, those of the largest lamps.
+#: Largest number of images; those of the largest lamps are kept.
 _MOST = 4
 #: Narrowest cone, as 1 - cos of its half angle: below it, float32 cannot tell whether a direction lies within.
 _NARROWEST = 1e-5
-#: How far the corners of a flat shape may be off its plane, over its size.
+#: Largest distance of the corners of a flat shape from its plane, over its size.
 _FLAT = 1e-5
 
 #: Centre and radius, m; unit normal and offset of the mirror.
@@ -33,13 +33,13 @@ Image = tuple[NDArray[np.float64], float, NDArray[np.float64], float]
 
 
 class LampImages:
-    """Balls about the images of lamps, each behind its mirror.
+    """Balls around the images of lamps, each behind its mirror.
 
     Parameters
     ----------
     mi : the mitsuba module.
-    images : centre [3] and radius of each, m, and its mirror's unit normal [3] and offset: a point x is before the
-        mirror where x · normal > offset.
+    images : for each: centre [3] and radius, m, and the unit normal [3] and offset of its mirror. A point x is in front
+        of the mirror if x · normal > offset.
     """
 
     def __init__(self, mi: MitsubaModule, images: list[Image]) -> None:
@@ -55,7 +55,7 @@ class LampImages:
 
     @classmethod
     def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> LampImages:
-        """Those of the area lights of a Mitsuba scene in its flat, perfectly reflecting shapes."""
+        """Images of the area lights of a Mitsuba scene in its flat, perfectly reflecting shapes."""
         lamps = [shape.bbox() for shape in scene.shapes() if shape.is_emitter()]
         found: list[Image] = []
         for shape in scene.shapes():
@@ -81,7 +81,9 @@ class LampImages:
 
         Parameters
         ----------
-        point, upwards : Point3f, and unit Vector3f to the side that is seen; world space.
+        point : Point3f, world space.
+        upwards : unit Vector3f, on the visible side of the surface.
+        active : lanes in use.
         """
         import drjit as dr
 
@@ -101,12 +103,12 @@ class LampImages:
 
 
 class Cones:
-    """Directions that are drawn from images instead of from a surface, per lane.
+    """Directions per lane that are drawn from images instead of from a surface.
 
     Parameters
     ----------
     mi : the mitsuba module.
-    cones : axis, 1 - cos of the half angle, and chance of being drawn, of each.
+    cones : for each: axis, 1 - cos of the half angle, and probability of being drawn.
     """
 
     def __init__(self, mi: MitsubaModule, cones: list[tuple[Vector3, Float, Float]]) -> None:
@@ -114,7 +116,7 @@ class Cones:
         self.chance = sum((chance for _, _, chance in cones), mi.Float(0.0))
 
     def sample(self, choice: Float, place: Point2) -> tuple[Vector3, Mask]:
-        """A direction, and whether one is drawn at all.
+        """Draw a direction, and tell where one was drawn at all.
 
         Parameters
         ----------
@@ -135,7 +137,7 @@ class Cones:
         return mi.Frame3f(axis).to_world(mi.Vector3f(sine * x, sine * y, 1 - below)), drawn
 
     def density(self, direction: Vector3) -> Float:
-        """Of directions drawn from the images, per steradian; its integral is `chance`."""
+        """Density of the directions drawn from images, per steradian; its integral is `chance`."""
         import drjit as dr
 
         total = self._mi.Float(0.0)
@@ -146,11 +148,11 @@ class Cones:
 
 
 def _mirror(mi: MitsubaModule, shape: MitsubaObject) -> tuple[NDArray[np.float64], float] | None:
-    """Unit normal and offset of the plane of a flat shape whose surface is nothing but a mirror; else None."""
+    """Unit normal and offset of the plane of a flat shape that is a perfect mirror; None for any other shape."""
     bsdf = shape.bsdf()
     if bsdf is None or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection):
         return None
-    # most of the light goes through a pane of glass, or is scattered
+    # not glass or a rough mirror: most of the light passes through glass, and a rough mirror scatters it
     others = (mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null)
     if any(mi.has_flag(bsdf.flags(), flag) for flag in others):
         return None

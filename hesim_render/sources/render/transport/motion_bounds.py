@@ -1,8 +1,9 @@
-"""Where moving objects are at most: boxes and outlines that hold for every instant of an interval, not for samples.
+"""Bounds of moving objects: boxes and outlines that hold at every instant of an interval, not only at samples of it.
 
-Between two keyframes an object's translation is linear and it turns at a constant speed, so that each of its points
-goes along a straight line plus an arc of a circle. A chord is off its arc by ρ (1 − cos δ/2) at most, ρ the radius and
-δ the angle; what holds a point at some instants therefore holds it in between when it is widened by that much.
+Between two keyframes an object's translation is linear and its angular speed is constant, so each of its points moves
+along a straight line plus an arc of a circle. A chord is at most ρ (1 − cos δ/2) away from its arc, with the radius ρ
+and the angle δ. A box around a point's positions at two instants, widened by that much, therefore contains the point
+at all instants in between.
 """
 
 from __future__ import annotations
@@ -17,23 +18,24 @@ from numpy.typing import NDArray
 from hesim_render.core.units import S_PER_US
 from hesim_render.sources.render.scene.trajectory import Piece, Trajectory
 
-#: Largest turn between two instants at which an object's place is taken, and most of these in a piece.
+#: Largest rotation between two instants at which the position of an object is computed, and most instants in a piece.
 _STEP_RAD, _MOST_STEPS = np.radians(5.0), 1024
 
 
 def places(
     corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float
 ) -> list[tuple[NDArray[np.float64], float]]:
-    """Where the corners of an object are at successive instants of an interval, piece by piece.
+    """Corners of an object at successive instants of an interval, piece by piece.
 
     Parameters
     ----------
-    corners : of a box around the object at rest, [n, 3], m.
+    corners : corners of a box around the object at rest, [n, 3], m.
+    trajectory : its motion.
+    begin_us, end_us : the interval, µs.
 
     Returns
-    -------
-    For each piece of the track between keyframes, the corners at its ends and some instants between, [k, n, 3], and how
-    far any point may be from the straight line between two of these, m.
+    ------- For each piece of the track between keyframes: the corners at its ends and at some instants between, [k, n,
+    3], m; and the largest distance of any point from the straight line between two of these positions, m.
     """
     found, radius = [], float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     for piece in trajectory.pieces(begin_us, end_us):
@@ -46,14 +48,16 @@ def places(
 def places_seen(
     corners: NDArray[np.float64], trajectory: Trajectory, camera: Trajectory, begin_us: float, end_us: float
 ) -> list[tuple[NDArray[np.float64], float]]:
-    """As `places`, where a camera that moves as well would see them if it rested: in its own frame of time 0.
+    """As `places`, in the frame of a moving camera, expressed as positions that the resting camera would see.
 
-    A point at q from the pivot of a camera that turns by ω_c has an acceleration of at most ω_c²|q| + 2 ω_c|q̇| + |q̈| in
-    the camera's frame. A path of acceleration a is off its chord by at most a h²/8, h the time between its ends.
+    A point at q from the pivot of a camera that turns at ω_c has an acceleration of at most ω_c²|q| + 2 ω_c|q̇| + |q̈|
+    in the camera's frame. A path of acceleration a is at most a h²/8 away from its chord, with h the time between its
+    ends.
 
     Parameters
     ----------
-    camera : its track, a motion of its pose at rest.
+    corners, trajectory, begin_us, end_us : see `places`.
+    camera : motion of the camera, relative to its pose at rest.
     """
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     inner = np.union1d(trajectory.ends_us(begin_us, end_us), camera.ends_us(begin_us, end_us))
@@ -77,7 +81,7 @@ def places_seen(
 def stays_in(
     corners: NDArray[np.float64], trajectory: Trajectory, spans_us: Sequence[tuple[float, float]]
 ) -> NDArray[np.float64]:
-    """Axis-parallel boxes [k, 2, 3], m, in which an object stays during each of k intervals; see `places`."""
+    """Axis-parallel boxes [k, 2, 3], m, that contain an object during each of k intervals; see `places`."""
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     segments: list[NDArray[np.int64]] = []
     shares: list[NDArray[np.float64]] = []
@@ -100,14 +104,14 @@ def stays_in(
 
 
 def _instants(trajectory: Trajectory, piece: Piece, radius_m: float) -> tuple[NDArray[np.float64], float]:
-    """Shares of a piece at which an object is taken, and how far it may be from straight lines between them, m."""
+    """Shares of a piece at which an object's position is computed, and a bound of its distance from the chords, m."""
     turn = abs(float(trajectory.arc_rad[piece.segment])) * (piece.last - piece.first)
     steps = min(_MOST_STEPS, max(1, ceil(turn / _STEP_RAD)))
     return np.linspace(piece.first, piece.last, steps + 1), radius_m * (1 - cos(min(turn / steps / 2, pi)))
 
 
 def _speed_and_turn(trajectory: Trajectory, begin_us: float, end_us: float) -> tuple[float, float]:
-    """Speed of the pivot, m/s, and angular speed, rad/s, in a stretch of time in one segment; 0 where it is held."""
+    """Speed of the pivot, m/s, and angular speed, rad/s, during a part of one segment; 0 where the pose is held."""
     local = 0.5 * (begin_us + end_us) - trajectory.knots_us[0]
     if not trajectory.repeat and not 0 <= local <= trajectory.period_us:
         return 0.0, 0.0
@@ -118,7 +122,7 @@ def _speed_and_turn(trajectory: Trajectory, begin_us: float, end_us: float) -> t
 
 
 def fastest_m_per_s(corners: NDArray[np.float64], trajectory: Trajectory, begin_us: float, end_us: float) -> float:
-    """Highest speed of any point of an object within an interval, m/s: |v| + ωρ of the fastest piece of its track."""
+    """Upper bound of the speed of any point of an object within an interval, m/s: |v| + ωρ of the fastest piece."""
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     fastest = 0.0
     for segment in {piece.segment for piece in trajectory.pieces(begin_us, end_us) if piece.length_us > 0}:
@@ -129,7 +133,7 @@ def fastest_m_per_s(corners: NDArray[np.float64], trajectory: Trajectory, begin_
 
 
 def fastest_turn_rad_per_s(trajectory: Trajectory, begin_us: float, end_us: float) -> float:
-    """Highest angular speed within an interval."""
+    """Highest angular speed within an interval, rad/s."""
     turns = [0.0]
     for segment in {piece.segment for piece in trajectory.pieces(begin_us, end_us) if piece.length_us > 0}:
         turns.append(

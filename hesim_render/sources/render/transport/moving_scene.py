@@ -1,11 +1,12 @@
-"""A scene in which every ray has a time of its own: what moves rests in a scene of its own, and rays go to it.
+"""A scene in which every ray has its own time: rays are transformed into the frames of moving objects.
 
-Mitsuba has no animated transforms, and setting a pose costs a rebuild. Here a ray is turned into each moving object's
-own frame at the ray's own time, met with the object at rest, and the nearest hit of all frames counts. Any number of
-instants is then one kernel, motion within an exposure is exact, and nothing is rebuilt or recompiled.
+Mitsuba has no animated transforms, and setting a pose costs a rebuild. Here each moving object rests in a scene of its
+own. A ray is transformed into the object's frame at the ray's own time and intersected with the object at rest, and the
+nearest hit of all frames counts. One kernel therefore serves any number of instants, motion within an exposure is
+exact, and nothing is rebuilt or recompiled.
 
-Objects are asked only about rays that meet the box which holds them all the while (`Moment.boxes`): poses are not even
-computed for the others.
+Objects are tested only against rays that meet the box which contains the object during the whole window
+(`Moment.boxes`). For other rays, not even the pose is computed.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ from hesim_render.sources.render.transport.closed_form import Part
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
 
-#: Objects in closed form that are tried one by one; more are tried in a loop, whose kernel serves any number.
+#: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
 _FEW = 3
 
 
 class NeedsExactMode(SpecError):
-    """A scene that paths between resting and rigidly moving surfaces do not describe."""
+    """The scene needs the exact mode: paths between resting and rigidly moving surfaces do not describe it."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,9 @@ class Group:
 
     Parameters
     ----------
-    name : of the object.
-    part : they themselves, at rest.
-    trajectory : how they move.
+    name : name of the object.
+    part : the shapes at rest.
+    trajectory : their motion.
     corners : bounding-box corners at rest, [n, 3], m.
     """
 
@@ -62,16 +63,18 @@ class Group:
 
 
 class Surface:
-    """Where rays have met a scene.
+    """Surfaces that rays have hit.
 
-    A moving object is met, and its surface evaluated, where it rests: textures and attributes of meshes are looked up
-    by the place on the mesh as it was loaded. What leaves the surface is turned to where the object is.
+    A moving object is intersected, and its surface evaluated, in its rest frame: textures and attributes of meshes are
+    looked up by the position on the mesh as it was loaded. Directions that leave the surface are turned into world
+    space.
 
     Parameters
     ----------
-    rest : `SurfaceInteraction3f` in the frame in which the met shapes rest.
-    pose : of those shapes, per lane; None where nothing moves.
-    met : Dr.Jit Bool, whether the ray came through the box of a moving object.
+    mi : the mitsuba module.
+    rest : `SurfaceInteraction3f` in the frame in which the hit shapes rest.
+    pose : pose of those shapes, per lane; None where nothing moves.
+    met : Dr.Jit Bool, True where the ray came through the box of a moving object.
     """
 
     def __init__(self, mi: MitsubaModule, rest: Interaction, pose: DevicePose | None, met: Mask) -> None:
@@ -84,27 +87,27 @@ class Surface:
 
     @property
     def shading_normal(self) -> Vector3:
-        """In world space."""
+        """Shading normal in world space."""
         n = self.rest.sh_frame.n
         return n if self._pose is None else self._pose.turn_to_world(n)
 
     def to_local(self, direction: Vector3) -> Vector3:
-        """From world space into the shading frame."""
+        """Direction in the shading frame, from world space."""
         turned = direction if self._pose is None else self._pose.turn_to_rest(direction)
         return self.rest.to_local(turned)
 
     def to_world(self, direction: Vector3) -> Vector3:
-        """From the shading frame into world space."""
+        """Direction in world space, from the shading frame."""
         turned = self.rest.to_world(direction)
         return turned if self._pose is None else type(turned)(self._pose.turn_to_world(turned))
 
 
 class MovingScene:
-    """The parts of a built scene: what rests, with all light, and each group that moves.
+    """The parts of a built scene: the resting part, with all lights, and each moving group.
 
     Parameters
     ----------
-    built : from `build`, its moving shapes anywhere.
+    built : from `build`; its moving shapes may be at any pose.
 
     Raises
     ------
@@ -131,7 +134,7 @@ class MovingScene:
         built.rest()
         parts: dict[str, dict[str, Any]] = {name: {} for name in built.trajectories}
         resting: dict[str, Any] = {}
-        #: All shapes by the ids that they were loaded with; Mitsuba gives them others in the scenes made here.
+        #: All shapes by their ids in the loaded scene; Mitsuba gives them other ids in the scenes made here.
         self.shapes = {shape.id(): shape for shape in built.scene.shapes()}
         for number, shape in enumerate(built.scene.shapes()):
             group = moving.get(shape.id())
@@ -148,7 +151,7 @@ class MovingScene:
                 resting[f"emitter_{number}"] = emitter
         self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
         lights = self.static.emitters()
-        #: Light that a ray meets: from everywhere beyond the scene, and corners of boxes around all other [n, 2, 3], m.
+        #: Lights that a ray can hit: the environment, and corners of boxes around all other lights [n, 2, 3], m.
         self.has_sky = any(light.is_environment() for light in lights)
         boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
         self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
@@ -165,7 +168,7 @@ class MovingScene:
         self._sort_groups()
 
     def _sort_groups(self) -> None:
-        """Which groups are tried one by one, and which in a loop."""
+        """Sort groups into those tested one by one and those tested in a loop."""
         simple = [number for number, group in enumerate(self.groups) if group.part.form is not None]
         together = simple if len(simple) > _FEW else []
         self._single = [number for number in range(len(self.groups)) if number not in together]
@@ -182,9 +185,10 @@ class MovingScene:
         Parameters
         ----------
         ray : Ray3f in world space.
-        moment : when.
-        coherent : whether neighbouring lanes' rays are alike.
-        flags : `RayFlags` of what to know of the surface; default all.
+        moment : time of each ray.
+        coherent : True if rays of neighbouring lanes are similar.
+        active : lanes to trace.
+        flags : `RayFlags`, fields to compute; default all.
         """
         import drjit as dr
 
@@ -225,7 +229,9 @@ class MovingScene:
         return Surface(mi, rest, DevicePose(tuple(columns), shift), met)
 
     def distance(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Float, Mask]:
-        """To the nearest surface of all parts, m, infinite where there is none; and whether it met a group's box."""
+        """Distance to the nearest surface of all parts, m, infinite where there is none; and True where a box was
+        met.
+        """
         import drjit as dr
 
         def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
@@ -241,17 +247,17 @@ class MovingScene:
         return nearest, met
 
     def resting_distance(self, ray: Ray) -> Float:
-        """To the nearest surface of what rests, m; infinite where there is none."""
+        """Distance to the nearest resting surface, m; infinite where there is none."""
         return self._resting.nearest(ray, True, self.mi.Bool(True))[0].t
 
     def occluded(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Mask, Mask]:
-        """Whether anything lies on a ray before its `maxt`; and whether it met a group's box."""
+        """True where anything lies on a ray before its `maxt`; and True where the ray met the box of a group."""
 
         def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             return (state[0] | group.part.blocks(local, near & ~state[0]),)
 
         blocked = self._resting.blocks(ray, active)
-        # what rests blocks the ray whatever moves
+        # a ray that the resting part blocks needs no test of moving groups
         free = active & ~blocked
         (blocked,), met = self._visit_groups(ray, moment, free, ray.maxt, (blocked,), visit)
         if self._fleet is not None:
@@ -262,11 +268,17 @@ class MovingScene:
     def _visit_groups(
         self, ray: Ray, moment: Moment, active: Mask, length: Float, state: LoopState, visit: Callable[..., LoopState]
     ) -> tuple[LoopState, Mask]:
-        """Let each group of those tried one by one, whose box the first `length` metres of a ray meet, change a state.
+        """Call `visit` to update a state for each group that is tested one by one and whose box a ray meets.
+
+        Parameters
+        ----------
+        length : the first metres of the ray that count.
+        state : initial values.
+        visit : returns the new state.
 
         Returns
         -------
-        state, met : the latter Dr.Jit Bool, whether any box was met.
+        state, met : the final state; and Dr.Jit Bool, True where any box was met.
         """
         import drjit as dr
 
@@ -285,16 +297,16 @@ class MovingScene:
 
 
 def _at_rest(ray: Ray, pose: DevicePose) -> Ray:
-    """A ray in the frame of what has a pose."""
+    """Transform a ray into the rest frame of a posed object."""
     local = type(ray)(ray)
     local.o, local.d = pose.to_rest(ray.o), pose.turn_to_rest(ray.d)
     return local
 
 
 def spare_even_skies(mi: MitsubaModule, emitters: Sequence[MitsubaObject]) -> None:
-    """Ask no surface for the light of a sky that is the same everywhere, where there is other light.
+    """Do not sample a uniform sky from surfaces if there is other light.
 
-    The surface's own directions find it, and rays towards it take from those to the lamps.
+    Directions of the surface's own sampling find the sky. Shadow rays to it would reduce the number of those to lamps.
     """
     even = [emitter for emitter in emitters if emitter.class_name() == "ConstantBackgroundEmitter"]
     if any(emitter.sampling_weight() > 0 for emitter in emitters if emitter not in even):
@@ -305,5 +317,5 @@ def spare_even_skies(mi: MitsubaModule, emitters: Sequence[MitsubaObject]) -> No
 
 
 def path_traced(built: BuiltScene) -> bool:
-    """Whether the scene is rendered by Mitsuba's path tracer, whose paths run between surfaces only."""
+    """True if Mitsuba's path tracer renders the scene; its paths run between surfaces only."""
     return built.integrator.class_name() == "PathIntegrator"

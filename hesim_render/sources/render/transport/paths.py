@@ -1,10 +1,9 @@
-"""A path tracer whose rays have times of their own, and which knows whether a path has come near what moves.
+"""A path tracer whose rays have individual times, and which reports whether a path came near a moving object.
 
-The estimator is the common one [veach1997]: light sampled at every vertex, combined with the
-surface's own sampling by the power heuristic; Russian roulette where a path has gone on for long. It is
-written here because Mitsuba's own follows a path through one scene at one time. What it has besides: matt
-surfaces send some paths to the images of lamps in flat mirrors (`LampImages`), and an even sky is not sampled
-(`spare_even_skies`).
+The estimator is the common one [veach1997]: light is sampled at every vertex and combined with the surface's own
+sampling by the power heuristic; long paths are ended by Russian roulette. Mitsuba's own path tracer cannot be used,
+because it follows a path through one scene at one time. This one has two additions: matt surfaces send some paths to
+the images of lamps in flat mirrors (`LampImages`), and a uniform sky is not sampled (`spare_even_skies`).
 """
 
 from __future__ import annotations
@@ -29,21 +28,21 @@ from hesim_render.sources.render.transport.mirrored_lamps import Cones, LampImag
 from hesim_render.sources.render.transport.moving_scene import MovingScene, Surface
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
-#: Chance of going on, at most, where Russian roulette is played.
+#: Largest probability of survival in Russian roulette.
 _ROULETTE_MOST = 0.95
-#: Lights that have boxes of their own to tell whether a ray may meet them; more share one.
+#: Largest number of lights with separate boxes, which tell whether a ray may hit them; more lights share one box.
 _MOST_LAMPS = 8
 
 
 class PathIntegrator:
-    """Radiance along rays through a `MovingScene`, and what a pixel makes of it.
+    """Radiance along rays through a `MovingScene`, and the resulting flux of a pixel.
 
     Parameters
     ----------
-    scene : what is traced.
+    scene : the scene to trace.
     max_depth : longest path in segments, 2 is direct light; below 0 there is no limit.
-    roulette_depth : segments from which on Russian roulette is played; below 0, never.
-    wavelengths : which of them a ray carries, by the filter of its pixel.
+    roulette_depth : first segment with Russian roulette; below 0, never.
+    wavelengths : samples the wavelengths of a ray by the filter of its pixel.
     """
 
     def __init__(self, scene: MovingScene, max_depth: int, roulette_depth: int, wavelengths: WavelengthSampler) -> None:
@@ -64,28 +63,30 @@ class PathIntegrator:
     def flux(
         self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
     ) -> tuple[Float, Float, Float, Mask]:
-        """One ray a lane; see `MattIntegrator.flux`, of whose estimates there is only one here."""
+        """Trace one ray per lane. Parameters and results as `MattIntegrator.flux`, with one estimate in place of
+        two.
+        """
         import drjit as dr
 
         ray.wavelengths = self._scene.mi.UnpolarizedSpectrum(*self._wavelengths.sample(filter_index, sampler.next_1d()))
         radiance, met = self.sample(sampler, ray, moment)
-        # not dr.mean, which has the number of lanes in the kernel: each new one would compile
+        # not dr.mean: it puts the number of lanes into the kernel, so that each new number would compile again
         flux = dr.sum(radiance) / len(radiance) * self._wavelengths.total(filter_index)
         return flux, flux, flux, met
 
     def sample(self, sampler: MitsubaObject, ray: Ray, moment: Moment) -> tuple[Bands, Mask]:
-        """One path a lane.
+        """Trace one path per lane.
 
         Parameters
         ----------
         sampler : `next_vertex`, see `CounterSampler`.
         ray : Ray3f with wavelengths, world space.
-        moment : when.
+        moment : time of each ray.
 
         Returns
         -------
         radiance : Spectrum, W m⁻² sr⁻¹ nm⁻¹.
-        met : Bool, whether any segment came through the box of a moving object.
+        met : Bool, True where any segment came through the box of a moving object.
         """
         import drjit as dr
 
@@ -93,14 +94,14 @@ class PathIntegrator:
         context = mi.BSDFContext()
         depth, met = mi.UInt32(0), mi.Bool(False)
         throughput, radiance = mi.Spectrum(1.0), mi.Spectrum(0.0)
-        stretch = mi.Float(1.0)  # of solid angle by refraction
+        stretch = mi.Float(1.0)  # change of solid angle by refraction
         before = dr.zeros(mi.Interaction3f)
         before_pdf, before_delta = mi.Float(1.0), mi.Bool(True)
         ray, active = mi.Ray3f(ray), mi.Bool(True)
         most, roulette_depth = (dr.opaque(mi.UInt32, depth) for depth in (self._max_depth, self._roulette_depth))
 
         def shine(si: Interaction, active: Mask, before: Interaction, pdf: Float, delta: Mask) -> Bands:
-            """Light that what a ray runs into gives itself."""
+            """Light that the hit surface itself emits."""
             light = si.emitter(scene.static, active)
             shines = active & (light != None)  # noqa: E711  (a Dr.Jit comparison)
             seen = mi.DirectionSample3f(scene.static, si, before)
@@ -109,7 +110,7 @@ class PathIntegrator:
             return dr.select(shines, light.eval(si, shines) * share, 0.0)
 
         def step(*state: Any) -> LoopState:
-            """One vertex from which the path may go on; its last segment is left for after the loop."""
+            """One vertex from which the path may continue. The last segment is handled after the loop."""
             sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, _ = state
             surface = scene.intersect(ray, moment, depth == 0, active)
             si = surface.rest
@@ -120,13 +121,13 @@ class PathIntegrator:
             bsdf = si.bsdf()
             place, lobe, light, luck = sampler.next_vertex()
 
-            # light sampled from here
+            # sample a light from this vertex
             asks = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             seen, weight = scene.static.sample_emitter_direction(surface.world, light, False, asks)
             asks &= seen.pdf != 0
             shadow = surface.world.spawn_ray_to(seen.p)
             infinite = mi.has_flag(seen.emitter.flags(), mi.EmitterFlags.Infinite)
-            # a sky has no distance; Mitsuba gives it one that is measured by what rests in the scene
+            # a sky has no distance; Mitsuba gives it one that depends on the size of the resting scene
             shadow.d = dr.select(infinite, seen.d, shadow.d)
             shadow.maxt = dr.select(infinite, dr.inf, shadow.maxt)
             asks &= dr.any(weight != 0)
@@ -137,11 +138,11 @@ class PathIntegrator:
             towards = surface.to_local(seen.d)
             choice = lobe
             if self._images:
-                # a lamp's image takes two segments more
+                # a path to the image of a lamp needs two more segments
                 matt = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
                 upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
                 cones = self._images.seen_from(surface.world.p, upwards, matt)
-                # what is left of the number where no cone is chosen
+                # where no cone is chosen, rescale the random number for the surface's own sampling
                 lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
             value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)
             if self._images:
@@ -151,7 +152,7 @@ class PathIntegrator:
             share = dr.select(seen.delta, 1.0, power_heuristic(seen.pdf, pdf))
             radiance = dr.fma(throughput, dr.select(clear, value * weight * share, 0.0), radiance)
 
-            # the way the surface sends the path on
+            # sample the next direction of the path
             chosen_weight = si.to_world_mueller(chosen_weight, -chosen.wo, si.wi)
             following = surface.world.spawn_ray(surface.to_world(chosen.wo))
             ray.o, ray.d, ray.maxt = following.o, following.d, following.maxt
@@ -177,12 +178,12 @@ class PathIntegrator:
         active &= most > 1
         state = sampler, depth, met, throughput, radiance, stretch, before, before_pdf, before_delta, ray, active, left
         if self._max_depth == 2:
-            end = step(*state)  # the loop itself costs time
+            end = step(*state)  # a single step needs no loop, which costs time
         else:
             end = dr.while_loop(state, lambda *values: values[-2], step, label="paths")
         _, depth, met, throughput, radiance, _, *before, ray, _, left = end
 
-        # the last segment matters only where it runs into light
+        # the last segment contributes only if it hits a light
         if not (scene.has_sky or self._lamps):
             return radiance, met
         if not scene.has_sky:
@@ -195,11 +196,11 @@ class PathIntegrator:
             si.t, near = scene.distance(ray, moment, left)
             si.wi, si.wavelengths = -ray.d, ray.wavelengths
         met |= left & near
-        # the throughput of a path that has ended may be anything
+        # the throughput of a path that has ended is undefined
         return dr.select(left, dr.fma(throughput, shine(si, left, *before), radiance), radiance), met
 
     def _near_lamps(self, ray: Ray) -> Mask:
-        """Whether a ray runs into the box around a light."""
+        """True where a ray meets the box around a light."""
         import drjit as dr
 
         inverse, near = inverse_of(ray.d), self._scene.mi.Bool(False)
@@ -218,7 +219,9 @@ def _redirected(
     chosen: Mask,
     weight: Bands,
 ) -> Bands:
-    """Weight of a surface's sample where some are drawn from cones instead; `chosen` becomes what was drawn."""
+    """Weight of a surface sample if some samples are drawn from cones; writes the sampled direction into `chosen`
+    lanes.
+    """
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""When rays set out, and the boxes that hold what moves meanwhile."""
+"""Start times of rays, and boxes that contain moving objects during a window."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from hesim_render.core.device_types import Float, Mask, Ray, UInt32, Vector3
 
 @dataclass(frozen=True)
 class Moment:
-    """When the rays of a kernel set out, per lane.
+    """Start times of the rays of a kernel, per lane.
 
     Parameters
     ----------
-    instant_us : Float, since the begin of the ray's window.
-    times : Float table, `tracks` entries a window: local time of each track at its begin, µs; `window`, UInt32, which.
-    boxes : Float table, 8 entries a group: low and high corner of the box that holds it, each with a number that means
-        nothing; `bin`, UInt32, whose boxes hold for the ray's window, and `groups` of a bin.
+    instant_us : Float, time since the begin of the ray's window, µs.
+    times : Float table, `tracks` entries per window: local time of each track at the begin of the window, µs.
+    tracks : number of tracks.
+    window : UInt32, window of each ray.
+    boxes : Float table, 8 entries per group: low and high corner of its box, each padded by one unused number.
+    groups : number of groups in a bin.
+    bin : UInt32, number of the set of boxes that holds for the ray's window.
     """
 
     instant_us: Float
@@ -31,14 +34,14 @@ class Moment:
     bin: UInt32
 
     def local_us(self, track: UInt32) -> Float:
-        """Time since a track's first keyframe, as `Tracks.pose` takes it."""
+        """Time since the first keyframe of a track, µs, as `Tracks.pose` takes it."""
         import drjit as dr
 
         kind = type(self.window)
         return dr.gather(type(self.times), self.times, self.window * self.tracks + kind(track)) + self.instant_us
 
     def box(self, group: UInt32) -> tuple[Vector3, Vector3]:
-        """Low and high corner, 3-vectors."""
+        """Low and high corner of a group's box, 3-vectors, m."""
         import drjit as dr
         import mitsuba as mi
 
@@ -48,7 +51,7 @@ class Moment:
 
 
 def box_rows(boxes: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Boxes [..., 2, 3] as `Moment` has them, [..., 8], somewhat widened: rounding must not take a rim."""
+    """Boxes [..., 2, 3] as rows of `Moment.boxes`, [..., 8]; slightly widened, so that rounding does not cut a rim."""
     low, high = boxes[..., 0, :], boxes[..., 1, :]
     margin = 1e-4 * np.linalg.norm(high - low, axis=-1, keepdims=True)
     nothing = np.zeros((*low.shape[:-1], 1))
@@ -56,7 +59,7 @@ def box_rows(boxes: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def inverse_of(direction: Vector3) -> Vector3:
-    """1 / d of each coordinate for `meets_box`; finite, for 0 · ∞ is nowhere."""
+    """1 / d of each coordinate for `meets_box`; kept finite, because 0 · ∞ is undefined."""
     import drjit as dr
 
     return dr.rcp(dr.select(abs(direction) < 1e-30, 1e-30, direction))
@@ -67,7 +70,7 @@ def meets_box(ray: Ray, inverse: Vector3, length: Float, box: tuple[Vector3, Vec
     import drjit as dr
 
     one, other = (box[0] - ray.o) * inverse, (box[1] - ray.o) * inverse
-    # not dr.minimum and dr.maximum: what those do about NaN takes most of the time
+    # not dr.minimum and dr.maximum: their handling of NaN takes most of the time
     ordered = one < other
     near, far = dr.select(ordered, one, other), dr.select(ordered, other, one)
     enter, leave = near.x, far.x

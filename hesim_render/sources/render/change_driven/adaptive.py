@@ -1,0 +1,163 @@
+"""Adaptive rendering of listed pixels: pilot pass, plan, and the rays that the plan names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.sources.render.change_driven.error_target import Noise, Role
+from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
+from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.pilot import Pilot, take_pilot
+from hesim_render.sources.render.change_driven.plan import Plan, plan
+from hesim_render.sources.render.change_driven.small_objects import Zoom
+from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
+from hesim_render.sources.render.change_driven.windows import Windows
+
+#: Pixels that are processed at a time, to bound memory.
+_BAND_PIXELS = 1 << 17
+_ALWAYS_US = (-np.inf, np.inf)
+
+
+class AdaptiveRenderer:
+    """Renders each pixel in each window with as many rays as a pilot pass says that its noise requires.
+
+    Parameters
+    ----------
+    tracer : traces the rays.
+    noise : noise of the sensor, in which errors are wanted.
+    quality : wanted error over that noise.
+    tuning : constants of the method.
+
+    Attributes
+    ----------
+    tracer, noise, quality, tuning : as given.
+    gain : gain of stratified rays in this kind of scene.
+    index : [row · cols + col], number of each mosaic pixel on the full sensor.
+    counts : work done so far.
+    """
+
+    def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning) -> None:
+        self.tracer, self.noise, self.quality, self.tuning = tracer, noise, quality, tuning
+        self.gain = Gain(*(tuning.matt_gain if tracer.is_matt else tuning.path_gain))
+        self.counts = Counts()
+        self._sensor = tracer.sensor
+        self.index = self._sensor.layout.full_index.ravel()
+        self._zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning)
+        self._kept: dict[Role, Still] = {}
+
+    def still(self, role: Role) -> Still:
+        """The pixels of a role that are known to be constant, and their flux."""
+        if role not in self._kept:
+            may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None
+            count = self.index.size
+            self._kept[role] = Still(
+                _ALWAYS_US if may_rest else None,
+                np.zeros(count, np.bool_),
+                Flux.zeros(1, count if may_rest else 0),
+            )
+        return self._kept[role]
+
+    def bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
+        """The listed pixels in bands of successive rows."""
+        index, geometry = self.index[pixel], self._sensor.spec.geometry
+        order, apart, tuning = np.argsort(index, kind="stable"), self.noise.is_apart(role), self.tuning
+        rays = tuning.lone_pilot_rays if apart else tuning.pilot_rays
+        quality = self.quality
+        if role == "any":
+            rays, quality = tuning.frame_pilot_rays, quality / tuning.frame_margin
+        for first in range(0, order.size, _BAND_PIXELS):
+            place = order[first : first + _BAND_PIXELS]
+            sites = Sites.alone(index[place]) if apart else Sites.around(index[place], geometry.rows, geometry.cols)
+            yield Band(place, sites, self.noise.of(role, sites.index), apart, rays, quality)
+
+    def pilot(
+        self,
+        band: Band,
+        windows: Windows,
+        numbers: NDArray[np.int64],
+        span_us: tuple[float, float] | None,
+    ) -> tuple[Pilot, NDArray[np.bool_]]:
+        """Pilot pass of a band in listed windows; see `take_pilot`."""
+        before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
+        width = self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
+        row, col = np.divmod(band.sites.index.astype(np.int64), cols)
+        closer = self._zoom.sites(row, col, windows, numbers)
+        found = take_pilot(self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer)
+        self.counts.pilot_rays += self.tracer.rays_done - before
+        return found
+
+    def plan(self, pilot: Pilot, band: Band, is_knot: bool) -> Plan:
+        """Which pairs of a band are rendered, with how many rays; see `plan`."""
+        return plan(pilot, band.sites, band.unit, band.quality, self.gain, self.tuning, is_knot=is_knot)
+
+    def render(
+        self,
+        band: Band,
+        windows: Windows,
+        numbers: NDArray[np.int64],
+        what: Plan,
+        span_us: tuple[float, float] | None = None,
+        first: Flux | None = None,
+    ) -> tuple[Flux, NDArray[np.bool_]]:
+        """Render the pairs that a plan names.
+
+        Parameters
+        ----------
+        numbers : [w, n], window number of each pair.
+        first : [1, n], flux in the first window, if it is already known.
+
+        Returns
+        -------
+        flux : [w, n], 0 where nothing was rendered.
+        met : [w, n], True if a path came near a moving object in `span_us`; False where nothing was rendered.
+        """
+        out, met = Flux.zeros(*what.rendered.shape), np.zeros(what.rendered.shape, np.bool_)
+        todo = what.rendered.copy()
+        if first is not None:
+            todo[0] = False
+        place = np.nonzero(todo)[1]
+        before = self.tracer.rays_done
+        got = self.tracer.trace(
+            band.index[place], numbers[todo], windows, what.rays[todo], what.lit[todo], span_us=span_us
+        )
+        self.counts.rays += self.tracer.rays_done - before
+        self.counts.pairs += place.size
+        out.half_a[todo], out.half_b[todo], met[todo] = got.half_a, got.half_b, got.met
+        np.copyto(out.error, what.error)
+        if first is not None:
+            for values, known in zip(out.arrays, first.arrays, strict=True):
+                values[0] = known[0]
+        return out, met
+
+    def alone(
+        self, pixel: NDArray[np.uint32], begin: NDArray[np.float64], end: NDArray[np.float64], role: Role, out: Flux
+    ) -> None:
+        """Put the flux of listed pixels, each in its own window, into `out` [1, n]. Constant pixels are rendered
+        once.
+        """
+        self.counts.values += pixel.size
+        still = self.still(role)
+        known = still.known[pixel]
+        out.put(known, still.flux.at(pixel[known]))
+        waiting = np.flatnonzero(~known)
+        span, number = np.unique(np.stack([begin[waiting], end[waiting]]), axis=1, return_inverse=True)
+        windows, number = Windows(span[0], span[1]), number.ravel()
+        # neighbours use the window of their own row; a row with several windows is rendered once for each
+        turn = turns(pixel[waiting] // self._sensor.cols, number)
+        for k in range(int(turn.max(initial=-1)) + 1):
+            listed, window = waiting[turn == k], number[turn == k]
+            for band in self.bands(pixel[listed], role):
+                place, own = listed[band.place], window[band.place]
+                numbers = of_own_row(band.sites, own, self._sensor.spec.geometry.cols)[None]
+                pilot, near = self.pilot(band, windows, numbers, still.span_us)
+                what = self.plan(pilot, band, is_knot=role == "events")
+                flux, met = self.render(band, windows, own[None], what, still.span_us)
+                out.put(place, flux)
+                if still.span_us is not None:
+                    fixed = ~(band.sites.most(near, REACH) | met[0])
+                    still.known[pixel[place[fixed]]] = True
+                    still.flux.put(pixel[place[fixed]], flux.at(fixed))

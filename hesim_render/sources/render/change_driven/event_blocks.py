@@ -1,0 +1,63 @@
+"""Event pixels through successive blocks of windows: constant pixels once, the others where they change."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.mosaic.schedule import Block
+from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
+from hesim_render.sources.render.change_driven.estimates import Flux
+from hesim_render.sources.render.change_driven.plan import fill_in
+from hesim_render.sources.render.change_driven.windows import Windows
+
+
+class Blocks:
+    """A list of event pixels over successive blocks.
+
+    Parameters
+    ----------
+    renderer : renders their flux.
+    pixel : [n], mosaic indices.
+    first : the first block.
+
+    Attributes
+    ----------
+    alive : places of the pixels that may change.
+    base : [1, n], flux of all pixels in the first window.
+    """
+
+    def __init__(self, renderer: AdaptiveRenderer, pixel: NDArray[np.uint32], first: Block) -> None:
+        self._renderer = renderer
+        self.base = Flux.zeros(1, pixel.size)
+        begin, end = (np.full(pixel.size, times[0]) for times in (first.begin_us, first.end_us))
+        renderer.alone(pixel, begin, end, "events", self.base)
+        renderer.counts.values -= pixel.size
+        self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
+        self._bands = list(renderer.bands(pixel[self.alive], "events"))
+        self._time = float(first.begin_us[0]), float(first.end_us[0])
+        self._last = self.base.at(self.alive)
+
+    def take(self, block: Block) -> Flux:
+        """Flux of the pixels that may change, [window, alive pixel]."""
+        renderer, windows = self._renderer, Windows(block.begin_us, block.end_us)
+        is_next = self._time == (block.begin_us[0], block.end_us[0])
+        out = Flux.zeros(windows.size, self.alive.size)
+        centre = 0.5 * (block.begin_us + block.end_us)
+        for band in self._bands:
+            first = self._last.at(band.place) if is_next else None
+            if first is not None and windows.size == 1:
+                out.put(band.place, first)
+                continue
+            numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
+            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us)
+            what = renderer.plan(pilot, band, is_knot=True)
+            numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
+            flux, _ = renderer.render(band, windows, numbers, what, first=first)
+            for values in flux.arrays[:2]:
+                fill_in(values, what.rendered, centre)
+            fill_in(flux.error, what.rendered, centre)
+            out.put(band.place, flux)
+        self._time = float(block.begin_us[-1]), float(block.end_us[-1])
+        self._last = Flux(*(values[-1:].copy() for values in out.arrays))
+        return out
