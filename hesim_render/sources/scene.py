@@ -10,8 +10,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from hesim_render.core.errors import SpecError
+from hesim_render.specs.motion import TrackSpec
 from hesim_render.specs.problems import spec_error
-from hesim_render.specs.scene import CameraSpec, SceneSpec, TrackSpec, read_scene
+from hesim_render.specs.scene import CameraSpec, SceneSpec, read_scene
 
 #: Largest number of parts that a short description names.
 _MOST_PARTS = 6

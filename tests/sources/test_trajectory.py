@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hesim_render.core.backend import jit
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.specs.scene import TrackSpec
+from hesim_render.specs.motion import TrackSpec
 
 
 def track(*keyframes, **options):

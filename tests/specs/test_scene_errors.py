@@ -9,7 +9,7 @@ from hesim_render import cli
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.exact import RenderedFlux, require_finite
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.specs.scene import TrackSpec
+from hesim_render.specs.motion import TrackSpec
 
 SCENE = """\
 schema_version: 1

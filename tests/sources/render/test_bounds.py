@@ -5,7 +5,7 @@ import pytest
 
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.motion_bounds import fastest_m_per_s, places, places_seen, stays_in
-from hesim_render.specs.scene import TrackSpec
+from hesim_render.specs.motion import TrackSpec
 
 CORNERS = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (0.2, 0.4) for z in (-0.3, 0.0)])
 

@@ -26,7 +26,7 @@ from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.specfilm import reference_flux
 from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
 from hesim_render.sources.scene import Scene
-from hesim_render.specs.scene import TrackSpec
+from hesim_render.specs.motion import TrackSpec
 
 COLS, ROWS = 16, 12
 DOCS = Path(__file__).parents[3] / "docs" / "scenes.md"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +14,7 @@ from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
@@ -29,47 +29,6 @@ from hesim_render.spectral.spectrum import Spectrum
 #: Least and largest number of rays of a pair; one kernel serves all numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
-
-
-@dataclass(frozen=True)
-class PairFlux:
-    """Flux of pairs, one entry per pair.
-
-    Parameters
-    ----------
-    half_a, half_b : two independent estimates of the mean flux, e⁻/s, float32.
-    met : True if any path came through the box of a moving object.
-    """
-
-    half_a: NDArray[np.float32]
-    half_b: NDArray[np.float32]
-    met: NDArray[np.bool_]
-
-    @property
-    def mean(self) -> NDArray[np.float32]:
-        return np.float32(0.5) * (self.half_a + self.half_b)
-
-
-@dataclass(frozen=True)
-class PilotFlux:
-    """Statistics of a few rays of each pair, one entry per pair, for both estimators of `MattIntegrator`.
-
-    Parameters
-    ----------
-    lit, hidden : mean flux, e⁻/s, float32.
-    lit_scatter, hidden_scatter : scatter of single rays, e⁻/s, float32: the root of the mean fourth power of deviations
-        over their mean square. It equals the standard deviation if half of the rays give one value and half another.
-        It is larger if few rays deviate, because stratification then gains less.
-    unshadowed : flux if nothing hid any light, e⁻/s, float32.
-    met : see `PairFlux`.
-    """
-
-    lit: NDArray[np.float32]
-    hidden: NDArray[np.float32]
-    unshadowed: NDArray[np.float32]
-    lit_scatter: NDArray[np.float32]
-    hidden_scatter: NDArray[np.float32]
-    met: NDArray[np.bool_]
 
 
 class PairTracer(Tracer):

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
-from hesim_render.sources.render.change_driven.pair_tracer import PairTracer, PilotFlux
+from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows

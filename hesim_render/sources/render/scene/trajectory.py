@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hesim_render.core.device_types import Float
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
-from hesim_render.specs.scene import KeyframeSpec, TrackSpec
+from hesim_render.specs.motion import KeyframeSpec, TrackSpec
 
 _EPSILON = 1e-12
 

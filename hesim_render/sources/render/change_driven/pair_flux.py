@@ -1,0 +1,49 @@
+"""Results of tracing pairs of a pixel and a window: flux, and the statistics of a pilot pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class PairFlux:
+    """Flux of pairs, one entry per pair.
+
+    Parameters
+    ----------
+    half_a, half_b : two independent estimates of the mean flux, e⁻/s, float32.
+    met : True if any path came through the box of a moving object.
+    """
+
+    half_a: NDArray[np.float32]
+    half_b: NDArray[np.float32]
+    met: NDArray[np.bool_]
+
+    @property
+    def mean(self) -> NDArray[np.float32]:
+        return np.float32(0.5) * (self.half_a + self.half_b)
+
+
+@dataclass(frozen=True)
+class PilotFlux:
+    """Statistics of a few rays of each pair, one entry per pair, for both estimators of `MattIntegrator`.
+
+    Parameters
+    ----------
+    lit, hidden : mean flux, e⁻/s, float32.
+    lit_scatter, hidden_scatter : scatter of single rays, e⁻/s, float32: the root of the mean fourth power of deviations
+        over their mean square. It equals the standard deviation if half of the rays give one value and half another.
+        It is larger if few rays deviate, because stratification then gains less.
+    unshadowed : flux if nothing hid any light, e⁻/s, float32.
+    met : see `PairFlux`.
+    """
+
+    lit: NDArray[np.float32]
+    hidden: NDArray[np.float32]
+    unshadowed: NDArray[np.float32]
+    lit_scatter: NDArray[np.float32]
+    hidden_scatter: NDArray[np.float32]
+    met: NDArray[np.bool_]

@@ -1,0 +1,91 @@
+"""How an object or the camera moves: keyframes of rigid motions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from hesim_render.specs.files import Strict
+from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vector
+
+
+class KeyframeSpec(Strict):
+    """A rigid pose at one time: rotate about the track's pivot, then translate; or both as one matrix.
+
+    `matrix` takes the object from where the file places it to where it is then, whatever the pivot. It becomes
+    a rotation by the shortest way from the keyframe before, and a translation.
+    """
+
+    t_us: int = Field(ge=-(10**15), le=10**15, description="time, µs from the start")
+    translation_m: Vector = (0.0, 0.0, 0.0)
+    rotation_axis: Direction = (0.0, 0.0, 1.0)
+    rotation_deg: float = Field(0.0, ge=-1e9, le=1e9)
+    matrix: RigidMatrix | None = Field(None, description="4×4 by rows, instead of translation and rotation")
+
+    @model_validator(mode="after")
+    def _check(self) -> KeyframeSpec:
+        other = self.model_fields_set & {"translation_m", "rotation_axis", "rotation_deg"}
+        if self.matrix is not None and other:
+            raise ValueError(f"give matrix or {', '.join(sorted(other))}, not both")
+        return self
+
+    def resolved(self, pivot_m: Vector, before: KeyframeSpec | None) -> KeyframeSpec:
+        """The keyframe without a matrix: x → R (x − pivot) + pivot + translation."""
+        if self.matrix is None:
+            return self
+        axis, angle_deg = _turn(rotation_vector(self.matrix), before)
+        values, pivot = np.array(self.matrix, dtype=np.float64), np.array(pivot_m, dtype=np.float64)
+        shift = values[:3, 3] - pivot + rotation_about(axis, angle_deg) @ pivot
+        return KeyframeSpec(
+            t_us=self.t_us, translation_m=tuple(shift.tolist()), rotation_axis=axis, rotation_deg=angle_deg
+        )
+
+
+def _turn(rotation: NDArray[np.float64], before: KeyframeSpec | None) -> tuple[Vector, float]:
+    """Axis and angle of a rotation vector, with the whole turns that bring it nearest to the keyframe before.
+
+    Two keyframes about one axis are any number of turns apart; matrices do not count turns.
+    """
+    angle = float(np.linalg.norm(rotation))
+    angle_deg = float(np.degrees(angle))
+    axis = rotation / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+    if before is not None and before.rotation_deg != 0:
+        shared = np.array(before.rotation_axis) / np.linalg.norm(before.rotation_axis)
+        along = float(axis @ shared)
+        if angle == 0 or abs(abs(along) - 1) < 1e-9:
+            angle_deg *= np.sign(along) if angle > 0 else 0.0
+            axis, angle_deg = shared, angle_deg + 360 * round((before.rotation_deg - angle_deg) / 360)
+    return (float(axis[0]), float(axis[1]), float(axis[2])), angle_deg
+
+
+class TrackSpec(Strict):
+    """Motion of one object (``target``, an object's name, a shape id of a Mitsuba scene) or of ``camera``.
+
+    Between keyframes the translation is linear and the rotation runs at constant angular speed:
+    about the shared axis, any number of turns, where both keyframes name the same axis (a rotation
+    of 0 shares every axis); along the shortest arc otherwise. Before the first and after the last
+    keyframe the pose is held, or the track repeats. Objects stand still within slices of time that
+    are short against their speed; the camera's motion is rendered ray by ray.
+    """
+
+    object: str = Field(min_length=1)
+    pivot_m: Vector = (0.0, 0.0, 0.0)
+    repeat: bool = False
+    keyframes: list[KeyframeSpec] = Field(min_length=2)
+
+    @field_validator("keyframes")
+    @classmethod
+    def _without_matrices(cls, frames: list[KeyframeSpec], info: ValidationInfo) -> list[KeyframeSpec]:
+        found: list[KeyframeSpec] = []
+        for frame in frames:
+            found.append(frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), found[-1] if found else None))
+        return found
+
+    @model_validator(mode="after")
+    def _check(self) -> TrackSpec:
+        times = [frame.t_us for frame in self.keyframes]
+        for earlier, later in zip(times[:-1], times[1:], strict=True):
+            if later <= earlier:
+                raise ValueError(f"keyframes must be in order of time: {later} µs follows {earlier} µs")
+        return self
