@@ -55,7 +55,7 @@ Without = Annotated[
 #: Runs with a longer estimate need a confirmation.
 LONG_MINUTES = 30
 Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace what is there")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an existing output")]
 
 
 def check_duration(duration_s: float) -> None:

@@ -59,7 +59,7 @@ def _check_aliases(text: str, file: Path) -> None:
         if isinstance(event, AliasEvent):
             if any(anchor == event.anchor for anchor, _ in open_nodes):
                 raise SpecError(
-                    f"the alias *{event.anchor} stands inside of what it means", file=file, line=_line(event)
+                    f"the alias *{event.anchor} refers to a node that contains it", file=file, line=_line(event)
                 )
             size = sizes.get(event.anchor, 1)
         elif isinstance(event, ScalarEvent):
