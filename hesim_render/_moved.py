@@ -1,4 +1,4 @@
-"""Names that modules had before: importing one gives the module that has its contents now."""
+"""Old module names: importing one gives the module that holds its content today."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-#: Old name: today's, both inside the package.
+#: Maps old names to current ones, both inside the package.
 MOVED = {
     "backend": "core.backend",
     "bands": "core.bands",
@@ -130,7 +130,7 @@ _PACKAGES = ("noise", "renderer", "video")
 
 
 class _Today(Loader):
-    """Hands out a module under an old name and leaves it as it is."""
+    """Loader that returns the current module under an old name, unchanged."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -154,6 +154,6 @@ class _Finder(MetaPathFinder):
 
 
 def install() -> None:
-    """Let old names be found."""
+    """Install the finder for old names."""
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())

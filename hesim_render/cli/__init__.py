@@ -1,4 +1,4 @@
-"""The command line. Heavy modules are imported inside the commands, so that ``--help`` is quick."""
+"""The command line. Heavy modules are imported inside the commands, so that ``--help`` is fast."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
 from hesim_render.core.output import discard_unfinished
 
-#: Exit status where the user can help it.
+#: Exit status of an error that the user can correct.
 _REFUSED = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point. Exit status 0; 2 with a line on stderr for each mistake of the user; 130 when interrupted.
+    """Entry point.
 
-    3 where a recording is complete, but worse than the quality that was asked for. Where nobody reads the output any
-    more (``| head``) a run goes on to its end, and has the status it has.
+    Exit status: 0; 2 with a line on stderr for each mistake of the user; 3 if a recording is complete, but worse than
+    the requested quality; 130 after an interrupt. If the reader of the output is gone (``| head``), a run continues to
+    its end, and its status is unaffected.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with Interrupts() as interrupts, warnings.catch_warnings():
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _note(otherwise: Callable[..., None]) -> Callable[..., None]:
-    """Shows warnings of ours as a line each, and those of others as `otherwise` does."""
+    """Show warnings of this package on one line each, and other warnings as `otherwise` does."""
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
         if issubclass(category, HesimWarning):

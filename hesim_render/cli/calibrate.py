@@ -1,4 +1,4 @@
-"""Captures and what follows from them: ``lab`` and ``calibrate``."""
+"""Captures and calibrations: ``lab`` and ``calibrate``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hesim_render.core.progress import progress_report
 
 
 class Part(StrEnum):
-    """What of a sensor is calibrated."""
+    """Part of a sensor to calibrate."""
 
     aps = "aps"
     evs = "evs"

@@ -1,4 +1,4 @@
-"""What runs here, and what there is to run: ``doctor`` and ``list``."""
+"""State of the installation, and available names: ``doctor`` and ``list``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hesim_render.cli.terminal import complain, say
 
 
 class Kind(StrEnum):
-    """What can be listed."""
+    """Kinds of names that can be listed."""
 
     scenes = "scenes"
     sensors = "sensors"
@@ -50,7 +50,7 @@ def list_(
 
 
 def _lines_of(kind: Kind) -> list[str]:
-    """One line for each name of a kind, with what it is where a file says so."""
+    """One line for each name of a kind, with a description if its file has one."""
     if kind is Kind.illuminants:
         from hesim_render.spectral.spectrum import illuminant_names
 

@@ -1,4 +1,4 @@
-"""Ctrl-C: a run ends on it within two seconds, also in native code that does not return to Python."""
+"""Ctrl-C: it ends a run within two seconds, also in native code that does not return to Python."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 
 from hesim_render.core.output import discard_unfinished
 
-#: Exit status of what was interrupted: 128 + SIGINT, as shells have it.
+#: Exit status after an interrupt: 128 + SIGINT, as in shells.
 INTERRUPTED = 130
-#: So long Python has to end the run itself, s.
+#: Time for Python to end the run itself, s.
 GRACE_S = 1.2
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupts:
-    """SIGINT and SIGTERM end a run alike; and are remembered, for a library may turn the exception into its own.
+    """Handles SIGINT and SIGTERM alike, and remembers them, because a library may replace the exception by its own.
 
-    Python runs its signal handlers between two of its own instructions, so that a long call of native code would hold
-    an interrupt up. The C part of Python's handler writes the signal's number into a pipe at once, though: a thread
-    reads it there, gives the main thread `GRACE_S`, then removes what is unfinished and ends the process.
+    Python runs its signal handlers between two of its own instructions, so a long call of native code would delay
+    an interrupt. The C part of Python's handler, however, writes the signal's number into a pipe at once. A thread
+    reads it there, waits `GRACE_S` for the main thread, then removes unfinished output and ends the process.
     """
 
     def __init__(self) -> None:

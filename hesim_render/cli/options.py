@@ -1,4 +1,4 @@
-"""What commands share: options, names to complete, and checks before any work."""
+"""Common parts of commands: options, completion of names, and checks before any work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def names_of(kind: str) -> Callable[[str], list[str]]:
-    """Completes the names of shipped files of a kind, ``scenes`` or ``sensors``."""
+    """Completion of the names of shipped files of a kind, ``scenes`` or ``sensors``."""
 
     def complete(incomplete: str) -> list[str]:
         from hesim_render.specs.files import list_names
@@ -52,10 +52,10 @@ Without = Annotated[
         autocompletion=_noise_terms,
     ),
 ]
-#: Runs that take longer, by estimate, ask to be wanted.
+#: Runs with a longer estimate need a confirmation.
 LONG_MINUTES = 30
 Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace what is there")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an existing output")]
 
 
 def check_duration(duration_s: float) -> None:
@@ -82,7 +82,7 @@ def cropped(sensor: Sensor, roi: str | None) -> Sensor:
 
 
 def told_beside(progress: ProgressReport) -> Callable[[object], None]:
-    """Prints what a run will take, while the progress gives way."""
+    """A function that prints the estimate of a run while the progress display is hidden."""
 
     def tell(expected: object) -> None:
         with progress.paused():

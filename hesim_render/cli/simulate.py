@@ -27,7 +27,7 @@ from hesim_render.core.progress import progress_report
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
 
-_NOT_MET = 3  # a recording is there, but worse than the quality that was asked for
+_NOT_MET = 3  # the recording is complete, but worse than the requested quality
 _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
 
 

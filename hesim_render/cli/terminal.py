@@ -1,4 +1,4 @@
-"""What commands read from and write to a terminal: texts into values, lines, a summary."""
+"""Terminal input and output of commands: parsing of values, lines of text, a summary."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def parse_exposures(text: str) -> list[int]:
 
 
 def say(text: str) -> None:
-    """A line on stdout. Where nobody reads any more, the run goes on: its result is not the text."""
+    """Print a line on stdout. If the reader is gone, the run continues, because its result is not the text."""
     import typer
 
     try:
@@ -60,7 +60,7 @@ def say(text: str) -> None:
 
 
 def silence_stdout() -> None:
-    """From now on stdout goes nowhere, also what is still to be flushed when Python ends."""
+    """Discard all further stdout, including text that Python still has to flush at its end."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -68,7 +68,7 @@ def silence_stdout() -> None:
 
 
 def complain(*lines: str) -> None:
-    """Lines on stderr, each with the program's name, if there is anyone to read them."""
+    """Print lines on stderr, each with the program's name; errors are ignored if stderr is closed."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         for line in lines:
             sys.stderr.write(f"hesim-render: {printable(' '.join(line.split()))}\n")
@@ -76,7 +76,7 @@ def complain(*lines: str) -> None:
 
 
 def summary(recording: Recording) -> str:
-    """What a recording holds and where, in a few lines."""
+    """Content and place of a recording, in a few lines."""
     manifest = recording.manifest
     counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
     video = manifest["settings"].get("video")
@@ -103,7 +103,7 @@ def summary(recording: Recording) -> str:
 
 
 def _reached(render: dict[str, Any] | None) -> list[str]:
-    """What a render of a wanted quality has come to."""
+    """Lines about the error that a render has reached."""
     if render is None:
         return []
     wanted = f", asked for {render['quality']:g}" if "quality" in render else ""
@@ -134,7 +134,7 @@ def _reached(render: dict[str, Any] | None) -> list[str]:
 
 
 def _verdict(audit: dict[str, Any]) -> list[str]:
-    """The line that says so if a run is not what it should be, or not shown to be."""
+    """A line if the run misses its quality, or if the audit could not show that it reaches it."""
     if not is_short_of_wish(audit):
         if audit.get("verdict") == "not shown":
             return ["  audit: too little was looked at again to confirm this run's quality; nothing speaks against it"]
@@ -143,7 +143,7 @@ def _verdict(audit: dict[str, Any]) -> list[str]:
 
 
 def is_short_of_wish(audit: dict[str, Any] | None) -> bool:
-    """Whether an audit has found that a run is not what was asked for."""
+    """True if an audit found that a run misses the requested quality."""
     return audit is not None and audit.get("verdict") == "not met"
 
 

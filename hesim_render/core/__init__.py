@@ -1,1 +1,1 @@
-"""What everything else stands on: errors, units, random numbers, the Dr.Jit backend, output folders."""
+"""The base of all other packages: errors, units, random numbers, the Dr.Jit backend, output folders."""

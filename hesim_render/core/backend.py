@@ -38,7 +38,7 @@ INSTALL_HINT = (
     "'sudo apt install libllvm19') or without root: pip install 'hesim_render[llvm]'"
 )
 
-#: What this process itself wrote into DRJIT_LIBLLVM_PATH: no wish of the user's.
+#: The value that this process itself wrote into DRJIT_LIBLLVM_PATH, as opposed to a choice of the user.
 _chosen_here = ""
 
 _SYSTEM_FOLDERS = (
@@ -84,7 +84,7 @@ print("ok")
 
 @dataclass(frozen=True)
 class Candidate:
-    """One library (or the GPU) and what the probe said of it."""
+    """One library (or the GPU) and the result of its probe."""
 
     backend: str  # "llvm" or "cuda"
     source: str  # how it was found
@@ -157,7 +157,7 @@ def _cache_file() -> Path:
 
 
 def _cache_key(candidate: Candidate) -> str | None:
-    """What a verdict depends on; None where it cannot be told, so that it is not remembered."""
+    """Everything a verdict depends on, as a key; None if it cannot be determined, so that the verdict is not cached."""
     try:
         if candidate.backend == "cuda":
             devices = ",".join(sorted(str(path) for path in Path("/dev").glob("nvidia*")))
@@ -172,7 +172,7 @@ def _cache_key(candidate: Candidate) -> str | None:
 
 
 def probe(candidate: Candidate) -> Candidate:
-    """Run a kernel with `candidate` in a child process and say how it went."""
+    """Run a kernel with `candidate` in a child process, and return the candidate with the result."""
     if candidate.path and not os.path.exists(candidate.path):
         return Candidate(**{**candidate.__dict__, "reason": "no such file"})
     command = [sys.executable, "-c", _PROBE, candidate.backend, candidate.path, *candidate.preload]
@@ -225,7 +225,7 @@ def _loaded_llvm() -> list[str]:
 
 
 def _adopt(chosen: Candidate) -> Candidate:
-    """Dr.Jit takes its LLVM when it is imported: if that happened before, see that it took a good one."""
+    """Set up the chosen library; if Dr.Jit was imported before, check that it took a working one."""
     if chosen.backend == "cuda" or "drjit" not in sys.modules:
         return chosen
     loaded = _loaded_llvm()
@@ -270,7 +270,7 @@ def select() -> Candidate:
 
 
 def prepare() -> None:
-    """Select silently, before anything imports Dr.Jit; what is wrong is told where it is first needed."""
+    """Select silently, before anything imports Dr.Jit. Errors are reported when the backend is first needed."""
     if "drjit" not in sys.modules:
         with contextlib.suppress(BackendError):
             select()

@@ -1,8 +1,8 @@
 """Names for the types of values on the device, for annotations.
 
 The types themselves come from `hesim_render.core.backend.jit` at run time: of the LLVM or of the CUDA backend, which is
-known only after a library was probed. So these names are `Any` to a type checker. They say to a reader what Dr.Jit
-would check: the kind of an array's entries. All arrays are flat; a docstring says what the entries go over
+known only after a library was probed. To a type checker these names are therefore `Any`. They tell a reader the kind
+of an array's entries, which Dr.Jit checks. All arrays are flat; a docstring names the index of the entries
 (``[pixel]``, ``[ray]``). An array of one entry stands for a number that all entries share.
 """
 
@@ -22,13 +22,13 @@ Int32: TypeAlias = Any
 UInt32: TypeAlias = Any
 #: Array of unsigned whole numbers of 64 bits: keys of generators.
 UInt64: TypeAlias = Any
-#: Array of true or false: which entries take part.
+#: Array of booleans: True for entries that take part.
 Mask: TypeAlias = Any
-#: Two or three Floats: a place on the sensor; a place, a direction or a normal in space; a colour.
+#: Two or three Floats: a position on the sensor; a position, direction or normal in space; a colour.
 Point2: TypeAlias = Any
 Point3: TypeAlias = Any
 Vector3: TypeAlias = Any
-#: Three by three or four by four Floats: a turn, or a turn with a shift.
+#: 3×3 or 4×4 Floats: a rotation, or a rigid transform.
 Matrix: TypeAlias = Any
 #: An array of a kind that the caller chooses.
 DeviceArray: TypeAlias = Any
@@ -39,9 +39,9 @@ DeviceTypes: TypeAlias = Any
 #: A number, a NumPy array, or an array on the device: what a formula takes.
 Values: TypeAlias = Any
 
-#: Both halves of an estimate, of independent rays: their mean is the value, their difference tells its error.
+#: Both halves of an estimate, from independent rays: their mean is the value, half their difference its error.
 Halves: TypeAlias = tuple[Float, Float]
-#: What a symbolic loop or branch carries from step to step.
+#: State of a symbolic loop or branch.
 LoopState: TypeAlias = tuple[Any, ...]
 
 # Of Mitsuba, which only `sources.render` imports:
@@ -52,7 +52,7 @@ MitsubaModule: TypeAlias = Any
 MitsubaObject: TypeAlias = Any
 #: ``Ray3f``: origin, direction, ``maxt``, wavelengths; one ray a lane.
 Ray: TypeAlias = Any
-#: ``Interaction3f``, ``SurfaceInteraction3f`` or ``PreliminaryIntersection3f``: where rays have met something.
+#: ``Interaction3f``, ``SurfaceInteraction3f`` or ``PreliminaryIntersection3f``: hit points of rays.
 Interaction: TypeAlias = Any
 #: One Float for each of the four wavelengths of a ray.
 Bands: TypeAlias = Any

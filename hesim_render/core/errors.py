@@ -1,7 +1,7 @@
-"""Every error a user can cause, one class per kind of cause.
+"""All errors that a user can cause, one class per kind of cause.
 
-The command line prints the message of a `HesimError` on one line and exits with status 2;
-anything else that escapes is a bug of ours and keeps its traceback.
+The command line prints the message of a `HesimError` on one line and exits with status 2.
+Any other exception that escapes is a bug of this package and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from pathlib import Path
 
 
 def closest(given: str, known: Iterable[str]) -> str | None:
-    """The known name that an unknown one resembles most, if one does."""
+    """The known name that is most similar to an unknown one; None if no name is similar."""
     import difflib
 
     return next(iter(difflib.get_close_matches(given, list(known), n=1)), None)
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
-    """What to add to a message about an unknown name."""
+    """Text to append to a message about an unknown name."""
     found = closest(given, known)
     return f" (did you mean {found!r}?)" if found is not None else ""
 
@@ -28,7 +28,7 @@ class HesimError(Exception):
 
 
 class HesimWarning(UserWarning):
-    """Something that may be meant, and may be a mistake."""
+    """A warning about input that is probably a mistake, but may be intended."""
 
 
 class SpecError(HesimError, ValueError):
@@ -37,13 +37,13 @@ class SpecError(HesimError, ValueError):
     Parameters
     ----------
     message : what is wrong and what was expected.
-    file : the file it is in, if any.
+    file : the file, if there is one.
     line : 1-based line in that file, if known.
     key : dotted key inside the file (``aps.read_noise_e``), if known.
 
     Attributes
     ----------
-    problems : all that is wrong, where there is more than one thing; `file`, `line` and `key` are the first one's.
+    problems : all errors of the file, if there are several; `file`, `line` and `key` belong to the first.
     """
 
     problems: tuple[SpecError, ...] = ()
@@ -65,7 +65,7 @@ class SpecError(HesimError, ValueError):
 
     @classmethod
     def together(cls, problems: Sequence[SpecError]) -> SpecError:
-        """One error for all problems of a file, each on a line of its own; a single one as it is."""
+        """One error for all problems of a file, one per line; a single problem is returned unchanged."""
         if len(problems) == 1:
             return problems[0]
         joined = cls("\n".join(map(str, problems)))
@@ -75,7 +75,7 @@ class SpecError(HesimError, ValueError):
 
 
 class RangeError(HesimError, ValueError):
-    """An argument lies outside the range in which the model holds."""
+    """An argument lies outside the range in which the model is valid."""
 
     def __init__(self, name: str, value: object, expected: str) -> None:
         self.name, self.value, self.expected = name, value, expected
@@ -83,7 +83,7 @@ class RangeError(HesimError, ValueError):
 
 
 class ConflictError(RangeError):
-    """Arguments that exclude each other were given together, or one without another that it needs."""
+    """Arguments that exclude each other were given together, or one without another that it requires."""
 
     def __init__(self, name: str, value: object, message: str) -> None:
         self.name, self.value = name, value
@@ -91,7 +91,7 @@ class ConflictError(RangeError):
 
 
 class TooLongError(ConflictError):
-    """A run would take longer than was allowed; the message says how long, and what takes less."""
+    """A run would take longer than allowed; the message states the time and ways to reduce it."""
 
 
 class BackendError(HesimError, RuntimeError):
@@ -99,4 +99,4 @@ class BackendError(HesimError, RuntimeError):
 
 
 class OutputError(HesimError, OSError):
-    """A result could not be written; nothing half-written is left behind."""
+    """A result could not be written. No partial output is left behind."""

@@ -1,6 +1,6 @@
-"""Files that come from a stranger: every reader of recordings, captures and calibrations goes through here.
+"""Reading of untrusted files: every reader of recordings, captures and calibrations uses this module.
 
-A damaged or hostile file costs one clear error. It names no file outside its own folder, and asks for no more
+A damaged or malicious file causes one clear error. It cannot name files outside its own folder, or request more
 memory than there is.
 """
 
@@ -18,21 +18,22 @@ from hesim_render.core.errors import HesimError, SpecError
 MOST_BYTES = 1 << 31
 #: Pixels of the largest frame.
 MOST_PIXELS = 1 << 28
-#: Text files (YAML, JSON) are larger than this only by mistake: each is held as objects, a hundred times as large.
+#: Largest text file (YAML, JSON); as Python objects it takes about a hundred times as much memory.
 MOST_TEXT_BYTES = 64 << 20
-#: Part of the machine's memory that one file may fill.
+#: Part of the machine's memory that one file may use.
 _SHARE_OF_MEMORY = 0.5
 
 
 @contextlib.contextmanager
 def reading(file: str | Path, what: str = "") -> Iterator[None]:
-    """Turn whatever a library raises on a damaged file into one `SpecError`.
+    """Turn any exception of a library on a damaged file into one `SpecError`.
 
-    For the calls of a library only: it takes every exception, as parsers of damaged bytes raise any of them.
+    Use it only around calls of a library: it catches every exception, because parsers raise any kind on damaged bytes.
 
     Parameters
     ----------
-    what : what the file cannot be read as (``as events``).
+    file : the file.
+    what : how the file was read (``as events``).
     """
     try:
         yield
@@ -47,7 +48,7 @@ def reading(file: str | Path, what: str = "") -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """One line that says why."""
+    """The reason of an error on one line."""
     if isinstance(error, KeyError):
         return f"no {error.args[0]!r}" if error.args and len(str(error.args[0])) < 80 else "a part is missing"
     if isinstance(error, zlib.error):
@@ -57,26 +58,27 @@ def reason(error: BaseException) -> str:
 
 
 def leads_out(folder: Path, name: str | Path) -> bool:
-    """Whether a name, relative to a folder, stands for something that is not in it; links are followed."""
+    """True if a name, relative to a folder, refers to something outside the folder; links are followed."""
     return not (folder / name).resolve().is_relative_to(folder.resolve())
 
 
 def printable(text: str) -> str:
-    """A text on one line without what moves the cursor, changes colours or turns the direction of writing."""
+    """A text on one line without control characters that move the cursor, change colours or the writing direction."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def inside(folder: Path, name: str, *, file: str | Path | None = None, key: str | None = None) -> Path:
-    """The file `name` in `folder`, which must be there and not elsewhere.
+    """The file `name` in `folder`, which must exist and lie in that folder.
 
     Parameters
     ----------
-    file, key : where the name stands, for the error.
+    folder, name : the folder, and a path relative to it.
+    file, key : file and key that state the name, for the error.
 
     Raises
     ------
     SpecError
-        If the name or a link leads out of the folder, or to no plain file.
+        If the name or a link leads out of the folder, or to something other than a plain file.
     """
     told = folder / name if file is None else file
     with reading(told):
@@ -89,11 +91,13 @@ def inside(folder: Path, name: str, *, file: str | Path | None = None, key: str 
 
 
 def require_memory(size_bytes: int, what: str, file: str | Path, most: int | None = None) -> None:
-    """Refuse what would not fit into memory, before it is read.
+    """Refuse data that would not fit into memory, before they are read.
 
     Parameters
     ----------
-    most : limit; default half of the machine's memory.
+    size_bytes : size of the data, bytes.
+    what, file : description and file of the data, for the error.
+    most : limit, bytes; default half of the machine's memory.
     """
     limit = _machine_bytes() * _SHARE_OF_MEMORY if most is None else most
     if size_bytes > limit:
@@ -103,12 +107,12 @@ def require_memory(size_bytes: int, what: str, file: str | Path, most: int | Non
 
 
 def read_text(file: Path) -> str:
-    """A UTF-8 text file of reasonable size.
+    """Read a UTF-8 text file of reasonable size.
 
     Raises
     ------
     SpecError
-        If it is none.
+        If the file is not text, or too large.
     """
     with reading(file):
         size = file.stat().st_size

@@ -1,4 +1,4 @@
-"""Interrupts that wait: native libraries lose a KeyboardInterrupt that comes while they are loaded."""
+"""Delayed interrupts: native libraries lose a KeyboardInterrupt that arrives while they are loaded."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from types import FrameType
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """SIGINT and SIGTERM wait until the block is left, if Python handles them.
+    """Delay SIGINT and SIGTERM until the end of the block, if Python handles them.
 
-    Raised while a native extension is imported, a KeyboardInterrupt turns into another exception, ends the process from
-    C++, or is lost. Only the main thread gets signals; elsewhere nothing is held.
+    A KeyboardInterrupt during the import of a native extension turns into another exception, ends the process from
+    C++, or is lost. Only the main thread receives signals; in other threads nothing is delayed.
     """
     held: list[tuple[int, FrameType | None]] = []
     handlers = {}

@@ -1,8 +1,8 @@
-"""The calls that a formula may use, so that one text of it serves NumPy and Dr.Jit.
+"""The array functions that a formula may use, so that one implementation serves NumPy and Dr.Jit.
 
 `+`, `-`, `*`, `/` and comparisons are those of the arrays themselves. Formulas that take a `Namespace` are in
-`pixels.aps.formulas` and `pixels.evs.formulas`: the simulator calls them with `device_namespace()`, the calibration
-with `NUMPY`, where neither Dr.Jit nor Mitsuba needs to be installed.
+`pixels.aps.formulas` and `pixels.evs.formulas`. The simulator calls them with `device_namespace()`, the calibration
+with `NUMPY`, for which neither Dr.Jit nor Mitsuba needs to be installed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Namespace:
 
     Attributes
     ----------
-    clip : of (values, least, most). where : of (mask, values where it holds, values elsewhere).
+    clip : takes (values, least, most).
+    where : takes (mask, values where it is True, values elsewhere).
     """
 
     sqrt: Callable[[Values], Values]
@@ -39,7 +40,7 @@ NUMPY = Namespace(np.sqrt, np.log, np.exp, np.minimum, np.maximum, np.clip, np.w
 
 @cache
 def device_namespace() -> Namespace:
-    """The same of Dr.Jit, which is imported here."""
+    """The functions of Dr.Jit, which is imported here."""
     from hesim_render.core.backend import jit
 
     jit()  # chooses a backend before Dr.Jit is imported

@@ -1,6 +1,6 @@
-"""``.npz`` and ``.npy`` files: written piece by piece, and read without trust in what they say of themselves.
+"""``.npz`` and ``.npy`` files: written in pieces, and read without trust in their headers.
 
-The header of an array is checked before anything of it is read, and no more is read than the header says.
+The header of an array is checked before its data are read, and no more data are read than it states.
 """
 
 from __future__ import annotations
@@ -26,23 +26,25 @@ _KINDS = {"b": "true or false", "u": "whole numbers", "i": "whole numbers", "f":
 
 
 class NpzWriter:
-    """Use as a context manager. Members are stored without compression: noise hardly shrinks, and a reader of
-    a session larger than memory is not held up by inflating.
+    """Writes an ``.npz`` file in pieces; use it as a context manager.
+
+    Members are stored without compression: noise hardly compresses, and a reader of a session larger than memory would
+    lose time on decompression.
 
     Parameters
     ----------
-    path : file to write, replaced if it is there.
+    path : file to write, replaced if it exists.
     """
 
     def __init__(self, path: Path) -> None:
         self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True)
 
     def add(self, name: str, array: NDArray) -> None:
-        """A whole array."""
+        """Add a whole array."""
         self.add_pieces(name, array.shape, array.dtype, [array])
 
     def add_pieces(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, pieces: Iterable[NDArray]) -> None:
-        """An array of `shape`, given as consecutive pieces in C order; only one of them is held at a time.
+        """Add an array of `shape` as consecutive pieces in C order; only one piece is in memory at a time.
 
         Raises
         ------
@@ -79,21 +81,22 @@ def read_arrays(
     shapes: Mapping[str, tuple[int, ...]] | None = None,
     kinds: str = "",
 ) -> dict[str, NDArray]:
-    """Arrays of an ``.npz`` file.
+    """Read arrays of an ``.npz`` file.
 
     Parameters
     ----------
-    required : names that must be there.
-    only : names to read, of those that are there; default all.
+    file : the file.
+    required : names that must exist.
+    only : names to read, as far as they exist; default all.
     skip : names not to read.
-    shapes : sizes that arrays must have.
-    kinds : kinds of value (`numpy.dtype.kind`) that arrays may have; default all.
+    shapes : required shapes, by name.
+    kinds : allowed kinds of value (`numpy.dtype.kind`); default all.
 
     Raises
     ------
     SpecError
-        If the file or a `required` array is missing, cannot be read, is not as it must be, or would take more memory
-        than a map can.
+        If the file or a `required` array is missing, unreadable, of the wrong shape or kind, or larger than the memory
+        limit of a map.
     """
     found: dict[str, NDArray] = {}
     total = 0
@@ -112,12 +115,12 @@ def read_arrays(
 
 
 def read_array(file: Path, shape: tuple[int, ...] | None = None, kinds: str = "") -> NDArray:
-    """The array of an ``.npy`` file, of a size and kind if told.
+    """The array of an ``.npy`` file; shape and kind are checked if given.
 
     Raises
     ------
     SpecError
-        If it cannot be read or is not as it must be.
+        If it cannot be read or fails a check.
     """
     with reading(file, "as an .npy file of numbers"), file.open("rb") as stream:
         found = read_header(stream, "the array", file)
@@ -126,7 +129,7 @@ def read_array(file: Path, shape: tuple[int, ...] | None = None, kinds: str = ""
 
 
 def require_names(archive: zipfile.ZipFile, file: Path, required: Iterable[str]) -> list[str]:
-    """Names of the arrays of an ``.npz`` file, all that are required among them."""
+    """Names of all arrays of an ``.npz`` file; the required ones must be among them."""
     found = [name.removesuffix(".npy") for name in archive.namelist()]
     for name in required:
         if name not in found:
@@ -146,7 +149,7 @@ def stream_member(file: Path, member: str, count: int, shape: tuple[int, ...]) -
     Raises
     ------
     SpecError
-        If it cannot be read, or is in Fortran order.
+        If the member cannot be read, or is in Fortran order.
     """
     with reading(file, _WHAT), zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
         _, dtype = _in_c_order(stream, member, file)
@@ -158,7 +161,7 @@ def stream_member(file: Path, member: str, count: int, shape: tuple[int, ...]) -
 
 
 def read_header(stream: IO[bytes], name: str, file: Path) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether it is in Fortran order, and type of the array that a stream begins with.
+    """Shape, Fortran order (True or False), and type of the array at the begin of a stream.
 
     Raises
     ------
@@ -195,7 +198,7 @@ def _require_kind(
 def _values(
     stream: IO[bytes], shape: tuple[int, ...], fortran_order: bool, dtype: np.dtype, name: str, file: Path
 ) -> NDArray:
-    """What follows a header that has been checked."""
+    """The data after a header that has been checked."""
     size = math.prod(shape) * dtype.itemsize
     require_memory(size, name, file, MOST_BYTES)
     buffer = bytearray(size)

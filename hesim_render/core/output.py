@@ -16,9 +16,9 @@ from pathlib import Path
 
 from hesim_render.core.errors import HesimError, OutputError
 
-#: Temporary files and folders of this process that have neither been committed nor discarded, and their targets.
+#: Temporary files and folders of this process that are neither committed nor discarded, with their targets.
 _unfinished: dict[Path, Path] = {}
-#: Longest part of a target's name that a temporary name repeats: names have 255 bytes at most.
+#: Longest part of a target's name in a temporary name, because file names have at most 255 bytes.
 _LONGEST_NAME = 100
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 _RENAME_EXCHANGE = 2  # of renameat2(2)
@@ -26,10 +26,10 @@ _RENAME_EXCHANGE = 2  # of renameat2(2)
 
 @atexit.register
 def discard_unfinished() -> None:
-    """Remove everything temporary that is still being written, and put back what it was to replace.
+    """Remove all unfinished temporary output, and put back what it was to replace.
 
-    An interrupt can arrive between any two instructions, also before the `try` that would have
-    discarded the folder; whoever ends on one calls this last.
+    An interrupt can arrive between any two instructions, also before the `try` block that would
+    discard the folder. Code that ends the process because of an interrupt calls this last.
     """
     for path, target in list(_unfinished.items()):
         _put_back(path.with_suffix(".old"), target)
@@ -46,7 +46,7 @@ def _remove(path: Path) -> None:
 
 
 def _prefix(target: Path) -> str:
-    """What names of temporary files and folders for a target begin with; the number of the process follows."""
+    """Common begin of the names of temporary files for a target; the process number follows."""
     name = target.name
     if len(os.fsencode(name)) > _LONGEST_NAME:
         name = f"{name[: _LONGEST_NAME // 4]}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
@@ -54,7 +54,7 @@ def _prefix(target: Path) -> str:
 
 
 def _tidy_up(target: Path) -> None:
-    """Put right what killed runs of this machine have left for a target: restore the old, remove the unfinished."""
+    """Clean up after killed runs on this machine: restore old output of a target, remove unfinished output."""
     prefix = _prefix(target)
     for suffix in (".old", ".partial"):  # first what can be put back
         for leftover in target.parent.glob(f"{glob.escape(prefix)}*{suffix}"):
@@ -64,7 +64,7 @@ def _tidy_up(target: Path) -> None:
 
 
 def _put_back(old: Path, target: Path) -> None:
-    """What was moved away to be replaced: back in its place where that is empty, else gone."""
+    """Move replaced output back if its place is empty, otherwise remove it."""
     if not old.exists():
         return
     if target.exists():
@@ -75,7 +75,7 @@ def _put_back(old: Path, target: Path) -> None:
 
 
 def _exchange(path: Path, target: Path) -> bool:
-    """Let two paths change places in one step; False where the system cannot."""
+    """Exchange two paths in one step; False if the system cannot."""
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError):
@@ -85,16 +85,18 @@ def _exchange(path: Path, target: Path) -> bool:
 
 
 def check_target(target: str | Path, marker: str, overwrite: bool = False) -> Path:
-    """Whether a folder may be written at `target`; returns its absolute path.
+    """Check that a folder may be written at `target`; returns its absolute path.
 
     Parameters
     ----------
-    marker : file that tells a folder of ours, which `overwrite` may replace; no other folder is touched.
+    target : the folder.
+    marker : file that marks a folder of this package, which `overwrite` may replace; no other folder is touched.
+    overwrite : allow replacing such a folder.
 
     Raises
     ------
     OutputError
-        If something is there that must not be replaced, or the place cannot hold a folder.
+        If something exists there that must not be replaced, or the place cannot hold a folder.
     """
     with output_errors(Path(target)):
         path = Path(target).expanduser().resolve()
@@ -114,7 +116,7 @@ def check_target(target: str | Path, marker: str, overwrite: bool = False) -> Pa
 
 
 def check_place(target: str | Path) -> Path:
-    """Whether there can be a file at `target`; returns its absolute path, in which a last link is not followed.
+    """Check that a file may be written at `target`; returns its absolute path, without following a final link.
 
     Raises
     ------
@@ -131,7 +133,7 @@ def check_place(target: str | Path) -> Path:
 
 
 def _check_name(path: Path, target: str | Path) -> None:
-    """Whether the name is short enough, and its folder can be made and written to."""
+    """Check that the name is short enough, and that its folder can be created and written to."""
     if len(os.fsencode(path.name)) > _most_bytes(path.parent):
         raise OutputError(f"{str(target)[:60]}…: the name is too long")
     for parent in path.parents:
@@ -144,7 +146,7 @@ def _check_name(path: Path, target: str | Path) -> None:
 
 
 def _most_bytes(folder: Path) -> int:
-    """Bytes that a name in a folder may have."""
+    """Longest name in a folder, bytes."""
     try:
         return os.pathconf(next(parent for parent in (folder, *folder.parents) if parent.is_dir()), "PC_NAME_MAX")
     except (OSError, ValueError):
@@ -153,7 +155,7 @@ def _most_bytes(folder: Path) -> int:
 
 @contextlib.contextmanager
 def output_errors(target: Path) -> Iterator[None]:
-    """Turns failures of writing (also those of HDF5, which come as several kinds) into `OutputError`."""
+    """Turn write errors (also the various ones of HDF5) into `OutputError`."""
     try:
         yield
     except HesimError:
@@ -164,15 +166,15 @@ def output_errors(target: Path) -> Iterator[None]:
 
 def _reason(error: Exception) -> str:
     reason = getattr(error, "strerror", None) or (str(error).splitlines() or [type(error).__name__])[0]
-    # NumPy says of a write that was cut short only how many items it had
+    # NumPy reports a truncated write only by its number of items
     return "no space left, or a limit on the size of files" if _CUT_SHORT.fullmatch(reason) else reason
 
 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """The path of a temporary file that takes the target's place when all went well, and is removed when not.
+    """Path of a temporary file that replaces the target after success, and is removed after an error.
 
-    What is at the target is replaced in one step; a link there is replaced, not followed.
+    The target is replaced in one step. If it is a link, the link is replaced, not followed.
     """
     with output_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -189,15 +191,15 @@ def replacing(target: Path) -> Iterator[Path]:
 
 
 class OutputFolder:
-    """A folder being written under a temporary name beside its target.
+    """A folder that is written under a temporary name beside its target.
 
-    `commit` gives it its name; `discard` removes it. Leftovers of killed runs of this machine are
-    removed on the way in.
+    `commit` gives it the final name; `discard` removes it. Leftovers of killed runs on this machine are
+    removed when it is created.
 
     Raises
     ------
     OutputError
-        As `check_target`, and if the temporary folder cannot be made.
+        As `check_target`, and if the temporary folder cannot be created.
     """
 
     def __init__(self, target: str | Path, marker: str, overwrite: bool = False) -> None:
@@ -211,10 +213,10 @@ class OutputFolder:
             self.path.mkdir()
 
     def commit(self) -> Path:
-        """Give the finished folder its name; what was there before is removed afterwards.
+        """Give the finished folder its name, then remove the folder that it replaces.
 
-        At every instant the name stands for the old folder or the new one. Where the file system cannot exchange two
-        folders there is one at which it stands for neither; then the old one is put back, if need be by the next run.
+        At every instant the name refers to the old folder or to the new one. If the file system cannot exchange two
+        folders, there is an instant without either; after a crash there, the next run puts the old folder back.
         """
         check_target(self.target, self._marker, self._overwrite)
         with output_errors(self.target):
@@ -238,7 +240,7 @@ class OutputFolder:
 
 
 def _is_alive_elsewhere(pid: int) -> bool:
-    """Whether another process of this number runs."""
+    """True if another process with this number is running."""
     if pid == os.getpid():
         return False
     try:

@@ -1,4 +1,4 @@
-"""Dataclasses that are pickled and copied without what they worked out."""
+"""Dataclasses whose cached values are left out of pickles and copies."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 class PlainState:
     """Base of a dataclass whose cached properties are left out of pickles and copies.
 
-    They are worked out again on first use. What is cached may be large, or arrays on a device, and reading those from a
-    pickle would load Dr.Jit before `hesim_render.core.backend` has chosen a library for it.
+    They are computed again on first use. Cached values may be large, or arrays on a device. Unpickling these would load
+    Dr.Jit before `hesim_render.core.backend` has chosen a library for it.
     """
 
     def __getstate__(self) -> dict[str, Any]:

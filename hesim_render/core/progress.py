@@ -1,4 +1,4 @@
-"""How far a run has come: a bar on a terminal, a bar in a notebook, a line now and then anywhere else."""
+"""Progress of a run: a bar on a terminal or in a notebook, occasional lines anywhere else."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from hesim_render.core.guard import printable
 #: Called with (done, total, what): µs of simulated time, or rays while a static scene renders.
 Progress = Callable[[float, float, str], None]
 
-#: A run that takes so many times its estimate says so.
+#: A run that takes this many times its estimate prints a note.
 LATE = 2.0
-_LEAST_LATE_S = 10.0  # what is over sooner is not worth a word
-#: Before this part of a phase is done the estimate has a say in what remains: the first steps compile kernels.
+_LEAST_LATE_S = 10.0  # shorter runs print no note
+#: Until this part of a phase is done, the remaining time also uses the estimate, as the first steps compile kernels.
 _SETTLED = 0.2
 _LEAST_DONE = 0.01
 _REFRESH_S = 0.5
-#: Where there is no terminal: seconds to the first line, growth from line to line, longest time between two.
+#: Without a terminal: seconds to the first line, growth of the interval per line, longest interval.
 _FIRST_LINE_S, _GROWTH, _LONGEST_S = 30.0, 2.0, 600.0
 
 
 class Pace:
-    """How fast a run goes, and what remains of it.
+    """Speed of a run, and its remaining time.
 
-    A run has phases, each with a `what` of its own. What remains is told for the phase that runs.
+    A run has phases, each with its own `what`. The remaining time is that of the current phase.
 
     Parameters
     ----------
-    clock : gives seconds.
+    clock : returns seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -47,28 +47,28 @@ class Pace:
 
     @property
     def elapsed_s(self) -> float:
-        """Since the run began."""
+        """Time since the run began, s."""
         return self._clock() - self._begin_s
 
     def expect(self, seconds: float) -> None:
-        """What the run will take from now on, s."""
+        """Set the estimated time of the run from now on, s."""
         self.estimate_s = seconds
         self._expected_at_s = self._moved_s = self._clock()
 
     def move(self, done: float, total: float, what: str) -> None:
         now = self._clock()
-        if what != self.what:  # what is done of it already was done since the last word of the phase before
+        if what != self.what:  # progress of a new phase counts from the last report of the previous phase
             self.what, self._phase_begin_s = what, now if done <= 0 else self._moved_s
         self._moved_s = now
         self.fraction = min(1.0, max(0.0, done / total)) if total > 0 else 0.0
 
     @property
     def remaining_s(self) -> float | None:
-        """Seconds to the end of the phase, None while nothing tells."""
+        """Seconds to the end of the phase; None while there is no information."""
         now = self._clock()
         by_estimate = None if self.estimate_s is None else self._expected_at_s + self.estimate_s - now
         if by_estimate is not None and by_estimate < 0:
-            by_estimate = None  # it was wrong
+            by_estimate = None  # the estimate was wrong
         if self.fraction < _LEAST_DONE:
             return by_estimate
         by_pace = (now - self._phase_begin_s) * (1 - self.fraction) / self.fraction
@@ -78,7 +78,7 @@ class Pace:
         return weight * by_pace + (1 - weight) * by_estimate
 
     def late_note(self) -> str | None:
-        """What to say of a run that takes `LATE` times its estimate; once, None before and after."""
+        """A note about a run that takes `LATE` times its estimate; once, None before and after."""
         if self._is_told or self.estimate_s is None:
             return None
         taken = self._clock() - self._expected_at_s
@@ -91,14 +91,14 @@ class Pace:
         )
 
     def describe(self) -> str:
-        """Part done and time that remains."""
+        """Part done and remaining time, as text."""
         done = f"{100 * self.fraction:.0f} % of {self.what or 'the run'}"
         left = self.remaining_s
         return f"{done}, about {in_words(left)} left" if left is not None else done
 
 
 def in_words(seconds: float) -> str:
-    """A length of time to two figures or so: ``40 s``, ``12 min``, ``3.5 h``, ``4.2 days``."""
+    """A duration in words to about two figures: ``40 s``, ``12 min``, ``3.5 h``, ``4.2 days``."""
     if seconds < 90:
         return f"{max(1, round(seconds))} s"
     if seconds < 5400:
@@ -109,7 +109,7 @@ def in_words(seconds: float) -> str:
 
 
 class _View(Protocol):
-    """Where the pace is shown."""
+    """Display of the pace."""
 
     def show(self, pace: Pace) -> None: ...
     def say(self, text: str) -> None: ...
@@ -118,10 +118,10 @@ class _View(Protocol):
 
 
 class ProgressReport:
-    """Shows how far a run has come, for as long as it is open; what `simulate` takes as `progress`.
+    """Shows the progress of a run while it is open; `simulate` takes it as `progress`.
 
-    A thread of its own keeps it fresh, and says so if the run takes `LATE` times its estimate, also while native code
-    does not come back.
+    Its own thread updates the display and reports if the run takes `LATE` times its estimate, even while native code
+    does not return.
     """
 
     def __init__(self, view: _View, pace: Pace | None = None) -> None:
@@ -134,13 +134,13 @@ class ProgressReport:
             self.pace.move(done, total, what)
 
     def expect(self, seconds: float) -> None:
-        """What the run will take from now on, s."""
+        """Set the estimated time of the run from now on, s."""
         with self._lock:
             self.pace.expect(seconds)
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """The view gives way meanwhile to what is written elsewhere."""
+        """Hide the display while other output is written."""
         with self._lock, self._view.paused():
             yield
 
@@ -168,7 +168,7 @@ class ProgressReport:
 
 
 class _Lines:
-    """A line now and then, for logs."""
+    """Occasional lines, for logs."""
 
     def __init__(self, title: str, stream: TextIO) -> None:
         self._title, self._stream = title, stream
@@ -182,7 +182,7 @@ class _Lines:
         self._next_s = now + min(_LONGEST_S, (_GROWTH - 1) * now)
 
     def say(self, text: str) -> None:
-        with contextlib.suppress(OSError, ValueError):  # nobody reads them any more: no reason to end the run
+        with contextlib.suppress(OSError, ValueError):  # a closed stream is no reason to end the run
             self._stream.write(f"{self._title}: {text}\n")
             self._stream.flush()
 
@@ -259,17 +259,17 @@ class _Notebook:
 
 
 def in_notebook() -> bool:
-    """Whether this is a kernel of Jupyter."""
+    """True if this is a kernel of Jupyter."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None
 
 
 def progress_report(title: str, stream: TextIO | None = None) -> ProgressReport:
-    """A report that fits where this runs.
+    """A report that suits the place where this runs.
 
     Parameters
     ----------
-    title : of the run.
+    title : title of the run.
     stream : default stderr.
     """
     target, title = sys.stderr if stream is None else stream, printable(title)
@@ -280,7 +280,7 @@ def progress_report(title: str, stream: TextIO | None = None) -> ProgressReport:
 
 @contextlib.contextmanager
 def shown(progress: Progress | Literal[False] | None, title: str) -> Iterator[Progress | None]:
-    """What a caller gave as `progress`: where nothing was given, a bar in a notebook and silence elsewhere."""
+    """The `progress` of a caller; by default a bar in a notebook, and nothing elsewhere."""
     if progress is None and in_notebook():
         with progress_report(title) as report:
             yield report

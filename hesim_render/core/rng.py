@@ -18,7 +18,7 @@ _MASK64 = (1 << 64) - 1
 
 
 class Stream(IntEnum):
-    """What the numbers are for. Values are part of the file format: append, never renumber."""
+    """Purposes of random numbers. The values are part of the file format: append, never renumber."""
 
     APS = 1
     EVS = 2
@@ -50,13 +50,14 @@ def stream_key(seed: int, stream: Stream) -> int:
 def philox(seed: int, stream: Stream, pixel: Any, index: int = 0, draw: int = 0) -> Any:
     """Generator for one block of pixels at one frame or tick.
 
+    Key and counters enter as opaque values, so a new seed or tick does not recompile a kernel.
+
     Parameters
     ----------
+    seed, stream : seed of the run, and purpose of the numbers; together they make the key.
     pixel : Dr.Jit UInt32, index of each pixel on the full sensor.
     index : frame or tick number (64 bits are used).
     draw : separates several blocks of four numbers for the same pixel and index.
-
-    Key and counters enter as opaque values, so a new seed or tick does not recompile a kernel.
     """
     import drjit as dr
 

@@ -1,4 +1,4 @@
-"""Tables that kernels read: kept where they are in memory, they would compile kernels anew."""
+"""Tables that kernels read, copied so that their place in memory does not make Dr.Jit compile kernels again."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def table(kind: Any, values: ArrayLike) -> Any:
-    """Numbers on the device, one after the other.
+    """Numbers on the device, in one contiguous copy.
 
-    Dr.Jit takes an array of the host where it is. Whether it is aligned there decides how a kernel fetches four numbers
-    at a time, so that the same kernel would be another one in the next process, or for the next array.
+    Dr.Jit would use an array of the host in place. Its alignment there decides how a kernel fetches four numbers
+    at a time, so the kernel would differ in the next process, or for the next array.
     """
     import drjit as dr
 
@@ -24,10 +24,10 @@ def table(kind: Any, values: ArrayLike) -> Any:
 
 
 def spread_out(kind: Any, table: NDArray, lane: Any) -> Any:
-    """Entries of a table on the host, by lane.
+    """Entries of a host table, by lane.
 
-    One kernel serves all lengths and places in memory: a table of one entry would be a constant in it, and one that
-    is read in order may be aligned or not. Both compile anew.
+    One kernel serves all lengths and places in memory. Without this, a table of one entry would be a constant in the
+    kernel, and a table that is read in order might be aligned or not; both would compile again.
     """
     import drjit as dr
 

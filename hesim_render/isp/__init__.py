@@ -1,7 +1,7 @@
 """From RAW frames to pictures: plain functions, one per step, and a pipeline that is a list of steps.
 
-Does not use the renderer, so that it works on frames of real sensors too. Dr.Jit only draws the maps of a simulated
-device anew, for the noise reduction of its recordings.
+The package does not use the renderer, so it works on frames of real sensors too. Dr.Jit is used only to draw the maps
+of a simulated device again, for the noise reduction of its recordings.
 """
 
 from hesim_render.isp.demosaicing import demosaic, remosaic

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
 
-#: Samples outside this part of the range say nothing of the light: noise below, saturation above.
+#: Samples outside this part of the range are not used: below it there is noise, above it saturation.
 _DARKEST, _BRIGHTEST = 0.01, 0.95
 
 
@@ -23,8 +23,13 @@ def white_balance(
     ----------
     raw : [row, col], black at 0, saturation at 1.
     tile : channel number of each tile position, -1 where there is none.
-    gains : one per channel; used relative to the smallest, which counts 1.
-    clip : hold all channels at 1, where the one with the smallest gain saturates; else highlights turn magenta.
+    gains : one per channel; used relative to the smallest.
+    clip : clip all channels at 1, where the channel with the smallest gain saturates. Otherwise highlights turn
+        magenta.
+
+    Returns
+    -------
+    float32 [row, col].
     """
     channels = np.asarray(tile)
     given = np.asarray(gains, dtype=np.float64)

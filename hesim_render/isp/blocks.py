@@ -1,4 +1,4 @@
-"""A mosaic as planes: one for each position of a block of whole tiles, so that each has one colour and one noise."""
+"""A mosaic as planes, one for each position of a block of whole tiles. Each plane has one colour and one noise."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
 
-#: Rows of blocks that are worked on at once.
+#: Number of block rows that are processed at once.
 BAND_BLOCKS = 8
 _LEAST_PX = 4
 
 
 def block_of(tile: ArrayLike) -> NDArray[np.int64]:
-    """The tile repeated until it measures at least 4×4: blocks of that size are worked on at once.
+    """The tile repeated until it measures at least 4×4. Blocks of that size are processed at once.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def split(image: NDArray[np.float32], block: tuple[int, ...]) -> NDArray[np.floa
 
 
 def _padded_index(size: int, period: int) -> NDArray[np.int64]:
-    """Indices into a line of `size` with a block before and whole blocks up to one block behind its end."""
+    """Indices into a line of `size`, with one block before it and whole blocks up to one block after its end."""
     index = np.arange(-period, -(-size // period) * period + period)
     index[index < 0] += period
     over = index - size + 1

@@ -1,4 +1,4 @@
-"""Patches of a colour chart in an image, and what they should look like."""
+"""Patches of a colour chart in an image, and their reference colours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colorimetry import tristimulus, xyz_to_linear_srgb
 from hesim_render.spectral.spectrum import Spectrum, constant
 
-#: The grey patches of a ColorChecker but white and black: its last row, in the order of `patch_means`.
+#: The grey patches of a ColorChecker without white and black (part of the last row), in the order of `patch_means`.
 NEUTRAL = slice(19, 23)
 
 Corner = tuple[float, float]

@@ -1,11 +1,11 @@
-"""Noise out of blocks of samples by comparing each patch with the patches that look like it.
+"""Noise reduction of blocks of samples by comparing each patch with similar patches (collaborative filtering).
 
-A patch is 2×2 neighbouring blocks. In a basis fitted to its tile (the principal axes of pictures under the prior of
-`kriging`), its coefficients are compared with those of the patches around; the mean and the spread of the 16 that are
-nearest say how much of each coefficient is picture. That is the collaborative filtering of BM3D [dabov2007] (on mosaics
-[danielyan2009]) with the statistics of non-local Bayes [lebrun2013]: a first pass with thresholds, a second as a Wiener
-filter that knows the first. Patches move by whole blocks, so that colours meet their own and the basis serves any tile,
-with holes.
+A patch is 2×2 neighbouring blocks. It is transformed into a basis that is fitted to its tile: the principal axes of
+pictures under the prior of `kriging`. Its coefficients are compared with those of the patches around. The mean and the
+spread of the 16 nearest patches estimate which part of each coefficient is picture. This is the collaborative filtering
+of BM3D [dabov2007] (on mosaics [danielyan2009]) with the statistics of non-local Bayes [lebrun2013]. The first pass
+uses thresholds; the second is a Wiener filter that uses the result of the first as pilot. Patches are displaced by
+whole blocks, so that equal colours are compared, and the basis serves any tile, also with holes.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from numpy.typing import NDArray
 from hesim_render.core.bands import in_bands
 from hesim_render.isp.kriging import ISOTROPIC
 
-#: Patches that are taken for alike, and how far they are looked for, blocks.
+#: Number of similar patches, and radius of the search, blocks.
 _ALIKE, _REACH = 16, 4
-#: Coefficients that are compared, the largest of pictures first; in the first pass only where they stand out of noise.
+#: Number of compared coefficients, largest in pictures first; the first pass compares only those above the noise.
 _COMPARED, _STANDS_OUT = 16, 1.5
-#: A mean is taken for picture from so many of its own standard deviations on.
+#: A mean counts as picture if it exceeds this many of its own standard deviations.
 _THRESHOLD = 2.7
-#: Share of a patch's own deviation, beside the spread over its group, in what the second pass takes for picture.
+#: Weight of a patch's own deviation, besides the spread over its group, in the signal variance of the second pass.
 _OWN = 0.5
-#: Added to the variance that is left in a patch before patches are weighed by it.
+#: Added to the residual variance of a patch before patches are weighted by its inverse.
 _LEAST_LEFT = 1.0
 _BAND_ROWS, _AT_ONCE = 16, 2048
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Samples in blocks, each of standard deviation 1.
+    """Samples in blocks, each with a noise of standard deviation 1.
 
     Parameters
     ----------
     values : float32 [block row, block col, sample].
     at : [sample, 2], place of each in its block (row, col), px.
     size : rows and columns of a block, px.
-    channel : of each sample.
-    amplitude : signal of each sample, relative: what white is in units of its noise.
+    channel : channel of each sample.
+    amplitude : signal of white at each sample, in units of its noise.
     """
 
     values: NDArray[np.float32]
@@ -69,7 +69,8 @@ def one_pass(
 
     Parameters
     ----------
-    pilot : values of an earlier pass, which the second pass takes for the picture; None for the first pass.
+    blocks : the samples.
+    pilot : result of the first pass, which the second pass uses as estimate of the picture; None for the first pass.
 
     Returns
     -------
@@ -78,7 +79,7 @@ def one_pass(
     values, basis = blocks.values, blocks.basis()
     patch_rows, patch_cols = values.shape[0] - 1, values.shape[1] - 1
     total, weight = np.zeros_like(values), np.zeros(values.shape[:2], dtype=np.float32)
-    lock = threading.Lock()  # neighbouring bands share a row of blocks: two summands, whose order does not matter
+    lock = threading.Lock()  # neighbouring bands share a row of blocks: a sum of two terms, whose order does not matter
 
     def work(rows: slice) -> None:
         halo = slice(max(rows.start - _REACH, 0), min(rows.stop + _REACH, patch_rows))
@@ -103,14 +104,14 @@ def one_pass(
 
 
 def _coefficients(values: NDArray[np.float32], basis: NDArray[np.float32], rows: slice) -> NDArray[np.float32]:
-    """Of the patches that begin in `rows`, [row, col, axis]."""
+    """Coefficients of the patches that begin in `rows`, [row, col, axis]."""
     above, below = values[rows], values[rows.start + 1 : rows.stop + 1]
     corners = [half[:, j : half.shape[1] - 1 + j] for half in (above, below) for j in range(2)]
     return np.concatenate(corners, axis=2) @ basis
 
 
 def _features(coefficients: NDArray[np.float32], is_noisy: bool) -> NDArray[np.float32]:
-    """What patches are compared by, [row, col, feature]."""
+    """Features by which patches are compared, [row, col, feature]."""
     found = coefficients[..., :_COMPARED].copy()
     if is_noisy:
         found[..., 1:][np.abs(found[..., 1:]) < _STANDS_OUT] = 0
@@ -118,7 +119,7 @@ def _features(coefficients: NDArray[np.float32], is_noisy: bool) -> NDArray[np.f
 
 
 def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:
-    """Flat indices of the patches most like each of those of rows `inside` (it counts itself), [patch, member]."""
+    """Flat indices of the patches most similar to each patch of rows `inside`, itself included, [patch, member]."""
     height, width = features.shape[:2]
     count = inside.stop - inside.start
     reach = range(-_REACH, _REACH + 1)
@@ -142,7 +143,7 @@ def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:
 def _estimate(
     noisy: NDArray[np.float32], clean: NDArray[np.float32] | None, alike: NDArray[np.int64], first: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Coefficients without noise of the patches from `first` on, [patch, axis], and weights [patch]."""
+    """Noise-reduced coefficients of the patches from `first` on, [patch, axis], and weights [patch]."""
     size = noisy.shape[2]
     noisy, clean = noisy.reshape(-1, size), None if clean is None else clean.reshape(-1, size)
     out = np.empty((len(alike), size), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Colour correction: a matrix from the camera's channels to linear sRGB, fitted from a chart and judged in ΔE2000."""
+"""Colour correction: a matrix from the camera's channels to linear sRGB, fitted to a chart and judged in ΔE2000."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from hesim_render.spectral.spectrum import colour_science
 
 @dataclass(frozen=True)
 class ColourFit:
-    """A matrix and how well it does on the patches it was fitted from.
+    """A matrix and its error on the patches it was fitted to.
 
     Parameters
     ----------
     matrix : [3][channel], balanced channels to linear sRGB; rows sum to 1.
-    exposure : factor of the channels that goes with the references' scale.
+    exposure : factor on the channels that matches the scale of the references.
     delta_e_2000 : [patch].
     """
 
@@ -56,15 +56,19 @@ def colour_matrix(image: NDArray[np.float32], matrix: ArrayLike) -> NDArray[np.f
 
 
 def fit_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
-    """The matrix, with rows that sum to 1 so that white stays white, of least mean ΔE2000.
+    """The matrix with the least mean ΔE2000 whose rows sum to 1, so that white stays white.
 
-    Starts from least squares in linear light ([cheung2004], with the white constraint) and minimises
-    the mean ΔE2000 from there; where that does not help the least squares stay.
+    The fit starts from least squares in linear light ([cheung2004], with the white constraint) and minimises
+    the mean ΔE2000 from there. If that does not improve the result, the least-squares matrix is kept.
 
     Parameters
     ----------
     patches : [patch, channel], linear, black at 0, white-balanced, any exposure.
     reference : [patch, 3], linear sRGB.
+
+    Returns
+    -------
+    The matrix and its errors.
 
     Raises
     ------
@@ -76,7 +80,7 @@ def fit_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
     camera, target = np.asarray(patches, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     if camera.ndim != 2 or target.shape != (len(camera), 3) or len(camera) < max(3, camera.shape[1]):
         raise RangeError("shape of patches and reference", (camera.shape, target.shape), "(n, channels) and (n, 3)")
-    # the exposure that goes with the reference: what a single factor for all would be, on the sum of the channels
+    # initial exposure: the single factor that fits the sum of the channels to that of the reference
     exposure = float((camera.mean(axis=1) @ target.mean(axis=1)) / (camera.mean(axis=1) @ camera.mean(axis=1)))
     free = _constrained_least_squares(exposure * camera, target)
     start = np.append(free.ravel(), 1.0)

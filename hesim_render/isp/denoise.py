@@ -1,8 +1,9 @@
-"""Noise reduction on the mosaic, before the demosaic, by the sensor's own noise model.
+"""Noise reduction on the mosaic before demosaicing, by the sensor's own noise model.
 
-The signal goes through a transform under which its noise is even (`stabilise`), then through two passes of
-`collaborate`, each over patches from whole blocks and from half a block on. Noise of long waves, which patches of this
-size cannot tell from picture, is taken out of the means of blocks, an image of their own with less noise.
+The signal is transformed so that its noise has the same variance everywhere (`stabilise`). Then follow two passes of
+`collaborate`, each over patches that begin at whole blocks and over patches that begin half a block further. Patches of
+this size cannot separate low-frequency noise from picture. It is removed from the means of blocks, which form an image
+of their own with less noise.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from hesim_render.isp.collaborate import Blocks
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.stabilise import Stabiliser
 
-#: Below which wave lengths the means of blocks leave the result alone: standard deviation of a Gaussian, blocks.
+#: The block means correct only longer wavelengths than this: standard deviation of a Gaussian, blocks.
 _LONG_BLOCKS = 2.0
 
 
@@ -30,10 +31,10 @@ def denoise(
 
     Parameters
     ----------
-    signal_dn : [row, col], DN above black, without what maps know (`FrameNoise.corrected`).
+    signal_dn : [row, col], DN above black, corrected by the sensor's maps (`FrameNoise.corrected`).
     tile : channel of each position, -1 where there is no value.
-    noise : of the sensor; its tile has the shape of `tile`.
-    top_dn : signal at which pixels saturate; samples there are kept.
+    noise : noise of the sensor; its tile has the shape of `tile`.
+    top_dn : signal at which pixels saturate, DN; saturated samples are kept.
     balance : gain of each channel that makes white equal in all.
 
     Returns
@@ -49,7 +50,7 @@ def denoise(
 
 
 def _stabilisers(noise: FrameNoise, tile: NDArray, top_dn: float) -> dict[tuple[int, int], Stabiliser]:
-    """The transform of each position of the tile; positions of one noise share theirs."""
+    """The transform of each tile position; positions with equal noise share one."""
     made: dict[tuple[float, float, float], Stabiliser] = {}
     found = {}
     for row, col in np.argwhere(tile >= 0):
@@ -77,7 +78,7 @@ def _each(
 
 
 def _reduced(stable: NDArray[np.float32], tile: NDArray, amplitude: NDArray) -> NDArray[np.float32]:
-    """The mosaic less noise of standard deviation 1."""
+    """The mosaic with its noise, of standard deviation 1, reduced."""
     pilot = _over_phases(stable, None, tile, amplitude)
     fine = _over_phases(stable, pilot, tile, amplitude)
     return fine + _long_waves(stable, fine, tile, amplitude)
@@ -123,7 +124,7 @@ def _image(values: NDArray[np.float32], block: NDArray, shape: tuple[int, ...]) 
 def _long_waves(
     stable: NDArray[np.float32], fine: NDArray[np.float32], tile: NDArray, amplitude: NDArray
 ) -> NDArray[np.float32]:
-    """What the means of blocks, freed of noise, have beyond those of a result, as an image."""
+    """Difference between the noise-reduced means of blocks and the block means of a result, as an image."""
     block = block_of(tile)
     channels = [np.flatnonzero(block.ravel() == c) for c in range(block.max() + 1)]
     roots = np.sqrt([len(own) for own in channels]).astype(np.float32)
@@ -147,7 +148,7 @@ def _long_waves(
 
 
 def _reduced_means(means: NDArray[np.float32], pitch_px: tuple[int, ...], amplitude: NDArray) -> NDArray[np.float32]:
-    """Means [channel, row, col] of blocks `pitch_px` apart, less noise of standard deviation 1."""
+    """Means [channel, row, col] of blocks `pitch_px` apart, with their noise, of standard deviation 1, reduced."""
     square = np.zeros((2, 2), dtype=np.int64)
     places = np.argwhere(square >= 0)
     count = len(means)

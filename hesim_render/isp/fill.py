@@ -1,7 +1,8 @@
-"""Values for pixels that have none: event pixels, which stand in a pattern, and bad pixels, which do not.
+"""Interpolated values for pixels without one: event pixels, which form a regular pattern, and bad pixels, which do not.
 
-A value is a mean of bridges between same-colour neighbours to both sides along a row, a column and the two
-diagonals; a bridge counts the more the less it rises, so that none is built across an edge.
+A value is a weighted mean over pairs of same-colour neighbours on both sides, along a row, a column and the two
+diagonals. A pair (a "bridge") has the larger weight the smaller its difference is, so that nothing is interpolated
+across an edge.
 """
 
 from __future__ import annotations
@@ -13,19 +14,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError
 
-#: Rise of a bridge that counts as none, units of white.
+#: Difference within a bridge that counts as zero, units of white.
 _EVEN = 0.01
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _Offset = tuple[int, int]
 
 
 def fill_positions(raw: NDArray[np.float32], tile: ArrayLike, filled: ArrayLike) -> NDArray[np.float32]:
-    """RAW data with values at the positions that `filled` has and `tile` has not.
+    """RAW data with values at the positions that `filled` has and `tile` lacks.
 
     Parameters
     ----------
     raw : [row, col], black at 0, white at 1.
     tile, filled : channel of each tile position before and after, -1 where there is none.
+
+    Returns
+    -------
+    float32 [row, col].
     """
     before, after = np.asarray(tile), np.asarray(filled)
     out = raw.copy()
@@ -54,12 +59,12 @@ def fill_positions(raw: NDArray[np.float32], tile: ArrayLike, filled: ArrayLike)
 
 
 def fill_pixels(raw: NDArray[np.float32], tile: ArrayLike, bad: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """RAW data with new values where `bad` [row, col] is set; positions without a channel are left alone.
+    """RAW data with new values where `bad` [row, col] is set; positions without a channel stay unchanged.
 
     Raises
     ------
     RangeError
-        If a bad pixel has no good one of its channel to be filled from, even over others just filled.
+        If a bad pixel has no good pixel of its channel nearby, not even through pixels that were filled before.
     """
     channels = np.asarray(tile)
     if bad.shape != raw.shape:
@@ -85,7 +90,7 @@ def _fill_phase(
     row: int,
     col: int,
 ) -> None:
-    """Fill the bad pixels of one tile position whose neighbours allow it; `still` keeps the others."""
+    """Fill the bad pixels of one tile position that have usable neighbours; `still` keeps the others marked."""
     period = channels.shape
     ys, xs = (index * p + o for index, p, o in zip(np.nonzero(unknown[row :: period[0], col :: period[1]]), period,
                                                    (row, col), strict=True))  # fmt: skip
@@ -108,7 +113,7 @@ def _fill_phase(
 
 
 def _bridges(tile: NDArray, channel: int, row: int, col: int) -> list[tuple[_Offset, _Offset]]:
-    """Offsets of the nearest samples of a channel to both sides, for each direction that has them."""
+    """Offsets of the nearest samples of a channel on both sides, for each direction that has them."""
     found = []
     for dy, dx in _DIRECTIONS:
         sides = []
@@ -126,7 +131,7 @@ def _bridges(tile: NDArray, channel: int, row: int, col: int) -> list[tuple[_Off
 def _mean_of_bridges(
     bridges: list[tuple[_Offset, _Offset]], neighbour: Callable[[_Offset], NDArray[np.float32]]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weighted sum of the bridges and sum of the weights; one end alone counts little, none not at all."""
+    """Weighted sum of the bridges, and the sum of weights; a single end has little weight, a missing pair none."""
     total = weights = np.float32(0)
     for one, other in bridges:
         a, b = neighbour(one), neighbour(other)
@@ -147,7 +152,7 @@ def _mean_of_bridges(
 
 
 def _kept_in_phase(size: int, period: int, margin: int) -> NDArray[np.int64]:
-    """Indices -margin … size + margin of a line, those outside moved inside by whole periods."""
+    """Indices -margin … size + margin of a line; those outside are moved inside by whole periods."""
     index = np.arange(-margin, size + margin)
     low = index < 0
     index[low] %= period

@@ -1,9 +1,10 @@
-"""The guide of a demosaic, predicted under many priors of which each place takes those that hold there.
+"""The guide channel of demosaicing, predicted under several priors that are weighted locally by their likelihood.
 
-A prior says along which direction the picture runs, and how much its colours differ. Each gives a linear prediction
-(`kriging`) and, of every sample, how far it is from what the others say. Where these residuals are much smaller under
-one prior than under the isotropic one, it counts: a mixture of linear predictors with weights by local likelihood. So
-a grating of half the Nyquist frequency, which one direction explains as detail and the other as colour, becomes detail.
+A prior states a direction along which the picture changes least, and how much its colours differ. Each prior gives a
+linear prediction (`kriging`), and for every sample its residual from the prediction by the other samples. A prior gets
+weight where its residuals are much smaller than those of the isotropic prior: a mixture of linear predictors with
+weights by local likelihood. A grating at half the Nyquist frequency, for example, which one direction explains as
+detail and the other as colour, becomes detail.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from hesim_render.core.bands import in_bands
 from hesim_render.isp import kriging
 from hesim_render.isp.kriging import Prior
 
-#: Variance of the differences of strong colours over that of what they share.
+#: Variance of the differences of strong colours over the variance of their common part.
 _STRONG = 1.0
 _TURNS = [k * np.pi / 8 for k in range(8)]
-#: The first is the one that holds where nothing speaks against it.
+#: The priors; the first one, isotropic, is the default.
 _USUAL = (Prior(), Prior(line=0), Prior(line=1), *(Prior(angle=angle) for angle in _TURNS))
 _STRONGLY_COLOURED = (
     Prior(_STRONG), Prior(_STRONG, line=0), Prior(_STRONG, line=1), Prior(_STRONG, _TURNS[2]), Prior(_STRONG, _TURNS[6])
@@ -28,20 +29,20 @@ _STRONGLY_COLOURED = (
 _GREY = (Prior(grey=True), Prior(grey=True, line=0), Prior(grey=True, line=1), Prior(grey=True, smooth=True))
 PRIORS = (*_USUAL, *_STRONGLY_COLOURED, *_GREY)
 
-#: What the squared residuals of a prior are multiplied by before they are compared, against noise in the choice: of a
+#: Factors on the squared residuals of a prior before they are compared, against noise in the choice: of a
 #: direction, and of strong colours and greys where the local mean is grey and where it is coloured.
 _DIRECTED = 1.3
 _STRONG_IN_GREY, _STRONG_IN_COLOUR = 2.5, 1.1
 _GREY_IN_GREY, _GREY_IN_COLOUR = 1.5, 4.0
-#: Standard deviation of the channels' local means that is grey, and coloured; square-root units.
+#: Standard deviation of the channels' local means that counts as grey, and as coloured; square-root units.
 _NO_COLOUR, _COLOUR = 0.03, 0.1
-#: Over how many blocks that mean goes (standard deviation): over few, edges between greys look coloured.
+#: Width of that mean (standard deviation, blocks): with a small width, edges between greys look coloured.
 _AROUND_BLOCKS = 1.4
-#: Squared residual that counts as none, square-root units squared.
+#: Squared residual that counts as zero, square-root units squared.
 _QUIET = 5e-5
-#: Weights go with the squared residual to the power of minus 2 to this: a prior that is twice as good counts 256 times.
+#: Weights are the squared residual to the power of minus 2 to this: a prior that is twice as good counts 256 times.
 _SHARPNESS = 3
-#: Rows and columns of blocks that are worked on at once: what they need stays in the cache.
+#: Rows and columns of blocks that are processed at once, so that their data stay in the cache.
 _BAND_BLOCKS, _PART_BLOCKS = 16, 64
 
 
@@ -52,7 +53,7 @@ def predict_guide(planes: NDArray[np.float32], block: NDArray, channel: int) -> 
     ----------
     planes : [position, block row, block col] of square roots, with one block of border.
     block : channel of each position, [row, col], -1 where there is none.
-    channel : the one wanted, with most samples.
+    channel : the wanted channel, the one with most samples.
 
     Returns
     -------
@@ -68,7 +69,7 @@ def predict_guide(planes: NDArray[np.float32], block: NDArray, channel: int) -> 
     colour = _saturation(planes, block)
     cell_of = [_cell(place, block.shape) for place in wanted]
 
-    wide = np.pad(planes, ((0, 0), (1, 1), (1, 1)), mode="edge")  # residuals are compared with those around
+    wide = np.pad(planes, ((0, 0), (1, 1), (1, 1)), mode="edge")  # residuals are averaged over neighbours
 
     def work(rows: slice) -> None:
         for first in range(0, width, _PART_BLOCKS):
@@ -121,7 +122,7 @@ def _energy(
 
     Parameters
     ----------
-    residual : [prior, sample, block row, block col], one block more on each side; its squares take its place.
+    residual : [prior, sample, block row, block col], with one more block on each side; overwritten by its squares.
     cells : cell of each sample.
     counts : samples per cell.
     """
@@ -140,7 +141,7 @@ def _energy(
 
 
 def _binomial(cells: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Each cell twice and its two neighbours along rows (axis 0) or columns (1), without the border of blocks."""
+    """Each cell twice plus its two neighbours along rows (axis 0) or columns (1), without the border of blocks."""
     blocks = cells.ndim - 2 + axis
     size = cells.shape[blocks] - 2
 
@@ -158,7 +159,7 @@ def _binomial(cells: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
 
 
 def _saturation(planes: NDArray[np.float32], block: NDArray) -> NDArray[np.float32]:
-    """How coloured the picture is on average around each block, 0 grey to 1, [block row, block col]."""
+    """Mean colourfulness of the picture around each block, 0 grey to 1, [block row, block col]."""
     from scipy.ndimage import gaussian_filter
 
     channels = [np.flatnonzero(block.ravel() == c) for c in range(block.max() + 1)]
@@ -176,7 +177,7 @@ def _handicap(colour: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _shares(energy: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Weights of the priors, which sum to 1, in place of their energies [cell row, cell col, prior, …]."""
+    """Weights of the priors, which sum to 1, written over their energies [cell row, cell col, prior, …]."""
     np.divide(energy.min(axis=2, keepdims=True), energy, out=energy)
     for _ in range(_SHARPNESS):
         np.multiply(energy, energy, out=energy)

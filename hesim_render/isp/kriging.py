@@ -1,10 +1,10 @@
-"""Weights of linear demosaicing: the best unbiased prediction of a colour from the samples around it.
+"""Weights of linear demosaicing: the best linear unbiased prediction of a colour from the samples around it.
 
-Universal co-kriging ([wackernagel2003], ch. 23-24), which is the linear
-minimum-mean-square demosaicing of Trussell and Hartley [trussell2002] with the constraint that planes
-of any colour come out exactly. A prior says two things of pictures: nearby samples are alike,
-cov = exp(-distance / length), and colours go together, cov(colour a, colour b) = cov · (1 + colour · [a = b]).
-`Prior` has others beside that one. No training data is needed, and any tile will do, with holes.
+The method is universal co-kriging ([wackernagel2003], ch. 23-24). It equals the linear minimum-mean-square demosaicing
+of Trussell and Hartley [trussell2002] with the constraint that planes of any colour are reproduced exactly. A prior
+states two properties of pictures. Nearby samples are similar: cov = exp(-distance / length). Colours are correlated:
+cov(colour a, colour b) = cov · (1 + colour · [a = b]). `Prior` has variants of this one. The method needs no training
+data and works for any tile, also with holes.
 
 A stencil is an array of weights [output, input position in the block, block row - 1 … + 1, block col - 1 … + 1].
 """
@@ -17,20 +17,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-#: Correlation length, px; pictures have no scale of their own, and between 10 and 100 px results hardly change.
+#: Correlation length, px. Pictures have no preferred scale, and between 10 and 100 px results hardly change.
 LENGTH_PX = 24.0
-#: How many times longer the correlation is along a direction than across it.
+#: Ratio of the correlation length along a direction to that across it.
 ELONGATION = 6.0
 #: Correlation length of a picture that is smooth on the scale of a pixel, px.
 SMOOTH_PX = 1.5
-#: Variance of the differences of colours over the variance of what they share, after white balance.
+#: Variance of the differences of colours over the variance of their common part, after white balance.
 COLOUR = 0.06
-#: Variance of noise over that of the picture; keeps the equations well posed, smooths next to nothing.
+#: Variance of noise over that of the picture; it keeps the equations well posed and hardly smooths.
 NOISE = 1e-3
-#: Samples farther than this from the block take no part, px.
+#: Samples farther than this from the block are not used, px.
 REACH_PX = 4
-#: OpenBLAS multiplies matrices of up to this many products on the calling thread; the bands of a frame are threads
-#: already, and threads of its own would only wait for each other.
+#: OpenBLAS multiplies matrices of up to this many products on the calling thread. The bands of a frame are threads
+#: already, and further threads of OpenBLAS would only wait for each other.
 _ONE_THREAD = 1 << 18
 _PIECE = 64
 
@@ -39,15 +39,15 @@ Block = tuple[tuple[int, ...], ...]
 
 @dataclass(frozen=True)
 class Prior:
-    """What is taken to be likely of a picture.
+    """Prior assumptions about a picture.
 
     Parameters
     ----------
-    colour : variance of the differences of colours over that of what they share.
+    colour : variance of the differences of colours over that of their common part.
     angle : direction in which the picture changes least, radians from the rows towards the columns; None for none.
-    line : predict from the target's own column (0) or row (1) alone; None from all around.
+    line : predict from the target's own column (0) or row (1) alone; None from all directions.
     smooth : no detail below `SMOOTH_PX` (a Matérn covariance of order 3/2) instead of detail of all sizes.
-    grey : all colours are the same, in the mean too.
+    grey : all colours are the same, also in the mean.
     """
 
     colour: float = COLOUR
@@ -57,11 +57,11 @@ class Prior:
     grey: bool = False
 
     def told_apart(self, channel: NDArray) -> NDArray:
-        """Channels, all the same where they cannot differ."""
+        """Channel numbers, all equal where the prior does not distinguish colours."""
         return np.zeros_like(channel) if self.grey else channel
 
     def covariance(self, dy: NDArray, dx: NDArray, same: NDArray) -> NDArray[np.float64]:
-        """Of samples so far apart, px; `same` says where they have the same colour."""
+        """Covariance of samples at distances dy, dx, px; `same` is True where they have the same colour."""
         shared = own = np.exp(-np.hypot(dy, dx) / LENGTH_PX)
         if self.smooth:
             far = np.hypot(dy, dx) / SMOOTH_PX
@@ -73,7 +73,7 @@ class Prior:
         return shared + self.colour * own * same
 
 
-#: Nothing known of direction, colours as in most pictures.
+#: No preferred direction, colours as in most pictures.
 ISOTROPIC = Prior()
 
 
@@ -102,13 +102,15 @@ class _Equations:
         return np.concatenate([own, *(own * shift[:, axis, None] for axis in self._moves)], axis=1)
 
     def weights(self, at: NDArray, channel: NDArray) -> NDArray[np.float64]:
-        """Of each sample for targets at `at` [m, 2], [n, m]."""
+        """Weight of each sample for targets at `at` [m, 2]; [n, m]."""
         told = self._prior.told_apart(channel)
         return self.inverse @ np.vstack([self._covariance(at, told), self._planes(at, told).T])
 
 
 def _inverse(system: NDArray) -> NDArray[np.float64]:
-    """Of a symmetric matrix; the pseudo-inverse where, on a sparse tile, the samples do not determine every plane."""
+    """Inverse of a symmetric matrix; the pseudo-inverse if the samples of a sparse tile do not determine every
+    plane.
+    """
     try:
         inverse = np.linalg.inv(system)
     except np.linalg.LinAlgError:
@@ -131,7 +133,7 @@ def _window(block: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 @functools.lru_cache(maxsize=512)
 def _equations(tile: Block, prior: Prior, line: int | None) -> tuple[NDArray[np.int64], NDArray, NDArray, _Equations]:
-    """Index, place and channel of a block's samples, all or on one line of a prior of lines, and their equations."""
+    """Index, place and channel of the used samples of a block (all, or those on one line), and their equations."""
     block = np.array(tile)
     index, at, seen = _window(block)
     if line is not None and prior.line is not None:
@@ -143,7 +145,9 @@ def _equations(tile: Block, prior: Prior, line: int | None) -> tuple[NDArray[np.
 def _known_from(
     tile: Block, prior: Prior, channel: int, place: tuple[int, int], least: int
 ) -> tuple[NDArray[np.int64], NDArray, NDArray, _Equations]:
-    """What a place is predicted from: its line, where the prior has lines and the channel occurs there often enough."""
+    """The samples that predict a place: those on its line, if the prior has lines and the channel occurs there often
+    enough.
+    """
     if prior.line is not None:
         line = np.array(tile)[:, place[1]] if prior.line == 0 else np.array(tile)[place[0]]
         if np.count_nonzero(line >= 0 if prior.grey else line == channel) * 3 > least:
@@ -157,7 +161,7 @@ def stencil(
 ) -> NDArray[np.float32]:
     """Weights for one channel at positions of the block, from all samples around.
 
-    With a prior of lines, a target on whose line the channel does not occur gets the weights from all around.
+    With a prior that uses lines, a target whose line lacks the channel gets the weights from all samples.
     """
     block = np.array(tile)
     weights = np.zeros((len(targets), block.size * 9))
@@ -169,10 +173,10 @@ def stencil(
 
 @functools.lru_cache(maxsize=256)
 def residual_stencil(tile: Block, prior: Prior = ISOTROPIC) -> NDArray[np.float32]:
-    """Weights that give how far each sample of the block is from what the others say it should be.
+    """Weights that give the residual of each sample of the block from its prediction by the other samples.
 
     Leave-one-out residuals of kriging in closed form [dubrule1983]: with the inverse B of the
-    kriging matrix, r_i = Σ_j B_ij y_j / B_ii. One output for each position of the block that has a sample.
+    kriging matrix, r_i = Σ_j B_ij y_j / B_ii. There is one output for each position of the block that has a sample.
     """
     block = np.array(tile)
     places = np.argwhere(block >= 0)
@@ -212,7 +216,9 @@ def bilinear_stencil(shape: tuple[int, int], centre: tuple[float, float]) -> NDA
 
 @dataclass(frozen=True)
 class Taps:
-    """A stencil made ready: where it reads (position, block row, block col), and weights [output, reading]."""
+    """A stencil prepared for use: positions it reads (position, block row, block col), and weights [output,
+    reading].
+    """
 
     reads: tuple[tuple[int, int, int], ...]
     matrix: NDArray[np.float32]

@@ -20,8 +20,13 @@ def black_level(
 
     Parameters
     ----------
-    raw : [row, col] DN.
-    row_map_dn, pixel_map_dn : [row] and [row, col], what rows and pixels have beyond the black level.
+    raw : [row, col], DN.
+    black_level_dn, white_level_dn : levels of black and of saturation, DN.
+    row_map_dn, pixel_map_dn : [row] and [row, col], offsets of rows and of pixels from the black level, DN.
+
+    Returns
+    -------
+    float32 [row, col].
     """
     span = white_level_dn - black_level_dn
     if span <= 0:
@@ -48,8 +53,9 @@ def cos4_illumination(
 
     Parameters
     ----------
+    shape : rows and columns.
     focal_length_px : image distance over pixel pitch.
-    centre_px : optical axis (row, col), pixel centres at whole numbers; default the middle of the image.
+    centre_px : optical axis (row, col), pixel centres at whole numbers; default the centre of the image.
     """
     if focal_length_px <= 0:
         raise RangeError("focal_length_px", focal_length_px, "more than 0")
@@ -59,7 +65,7 @@ def cos4_illumination(
 
 
 def lens_shading(image: NDArray[np.float32], illumination: ArrayLike) -> NDArray[np.float32]:
-    """An image as if it were lit evenly.
+    """An image corrected to uniform illumination.
 
     Parameters
     ----------

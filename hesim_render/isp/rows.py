@@ -1,8 +1,9 @@
-"""Offsets of rows that no map tells: found from the frame itself, by how each row differs from those around it.
+"""Row offsets without a map, estimated from the frame itself by comparing each row with the rows around it.
 
-Every sample is compared with the line between the nearest samples of its colour above and below it in its column. The
-mean of these differences over a row, robust against edges, says how far its offset is from its neighbours'; offsets of
-known spread are the most likely ones that explain all rows together (linear, banded, a Gaussian prior).
+Every sample is compared with the linear interpolation of the nearest samples of its colour above and below it in its
+column. The mean of these differences over a row, robust against edges, measures the offset of the row relative to its
+neighbours. Offsets with a known spread are then the most likely ones that explain all rows together (a banded linear
+system with a Gaussian prior).
 """
 
 from __future__ import annotations
@@ -15,18 +16,18 @@ from scipy.linalg import solveh_banded
 
 from hesim_render.isp.frame_noise import FrameNoise
 
-#: Differences of so many standard deviations of noise are an edge: a Cauchy weight's scale.
+#: Scale of a Cauchy weight, in standard deviations of noise: larger differences count as edges.
 _EDGE = 2.0
-#: Neighbouring samples over which picture is alike, so that its differences do not average out, px.
+#: Length over which picture content is correlated, so that its differences do not average out, px.
 _ALIKE_PX = 8.0
-#: A row that differs by more standard deviations of the prior than this shows picture.
+#: A row that differs by more than this many standard deviations of the prior shows picture, not an offset.
 _FAR = 4.0
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Rows against the rows `up` above and `down` below them, in columns of one position of the tile."""
+    """Comparison of rows with the rows `up` above and `down` below, in columns of one tile position."""
 
     rows: NDArray[np.int64]
     up: int
@@ -64,7 +65,7 @@ def row_offsets(
 
 
 def _nearest(column: NDArray, row: int, step: int) -> int:
-    """Rows to the next one of the same channel in a column of the tile; `step` is the direction."""
+    """Distance in rows to the next sample of the same channel in a column of the tile; `step` is the direction."""
     distance = 1
     while column[(row + step * distance) % len(column)] != column[row]:
         distance += 1
@@ -74,7 +75,7 @@ def _nearest(column: NDArray, row: int, step: int) -> int:
 def _compared(
     signal_dn: NDArray[np.float32], tile: NDArray, place: tuple[int, int], noise: FrameNoise, row_std_dn: float
 ) -> list[_Comparison]:
-    """What the samples at one position of the tile say of their rows."""
+    """Comparisons of rows from the samples at one position of the tile."""
     row, col = place
     up, down = (_nearest(tile[:, col], row, step) for step in (-1, 1))
     rows = np.arange(row, signal_dn.shape[0], tile.shape[0])
@@ -104,7 +105,7 @@ def _compared(
 
 
 def _likeliest(found: list[_Comparison], height: int, row_std_dn: float) -> NDArray[np.float64]:
-    """Offsets of least Σ (difference - what offsets explain)² / variance + Σ offset² / prior variance."""
+    """Offsets that minimise Σ (difference - predicted difference)² / variance + Σ offset² / prior variance."""
     reach = max((item.up + item.down for item in found), default=0)
     band = np.zeros((reach + 1, height))  # lower form of solveh_banded
     band[0] = 1 / row_std_dn**2

@@ -1,4 +1,4 @@
-"""Smoothing that keeps edges: the guided filter, and the noise reduction made of it."""
+"""Edge-preserving smoothing: the guided filter, and a noise reduction based on it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from hesim_render.spectral.transfer import ROOT_TOE
 def guided_filter(
     image: NDArray[np.float32], guide: NDArray[np.float32], radius_px: int, epsilon: float
 ) -> NDArray[np.float32]:
-    """An image as a local linear function of a guide ([he2013], Eqs. 5-8), boxes of 2·radius + 1.
+    """An image as a local linear function of a guide ([he2013], Eqs. 5-8), in boxes of 2·radius + 1.
 
     Parameters
     ----------
     image, guide : [row, col].
-    epsilon : variance of the guide that counts as flat.
+    radius_px : radius of the boxes, px.
+    epsilon : variance of the guide below which it counts as flat.
     """
     from scipy.ndimage import uniform_filter
 
@@ -26,7 +27,7 @@ def guided_filter(
 
     if radius_px < 1 or not epsilon > 0:
         raise RangeError("radius_px, epsilon", (radius_px, epsilon), "at least 1, more than 0")
-    # about the mean, so that float32 differences of squares keep their digits
+    # subtract the mean first, so that float32 differences of squares keep their digits
     centre = np.float32(guide.mean())
     guide = guide - centre
     mean_guide, mean_image = mean(guide), mean(image)
@@ -39,14 +40,15 @@ def guided_filter(
 def reduce_noise(
     image: NDArray[np.float32], luma: float = 0.005, chroma: float = 0.02, radius_px: int = 3
 ) -> NDArray[np.float32]:
-    """Balanced linear channels with less noise: brightness gently, colour differences more.
+    """Balanced linear channels with less noise: brightness is smoothed little, colour differences more.
 
-    Works on square roots: brightness is filtered with itself, differences to it with brightness as guide.
+    The filter works on square roots. Brightness is filtered with itself as guide, differences to it with brightness.
 
     Parameters
     ----------
     image : [row, col, channel].
-    luma, chroma : standard deviation of what is taken for noise, in square roots of white; 0 leaves it as it is.
+    luma, chroma : standard deviation that counts as noise, in square roots of white; 0 leaves the part unchanged.
+    radius_px : radius of the filter, px.
     """
     if min(luma, chroma) < 0:
         raise RangeError("luma, chroma", (luma, chroma), "0 or more")

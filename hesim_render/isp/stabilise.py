@@ -1,9 +1,10 @@
-"""A transform under which noise has the same variance everywhere, and the way back that keeps means.
+"""A variance-stabilising transform, and its unbiased inverse.
 
 With a variance v(I) = a + b I + c I², f(I) = ∫₀ᴵ dI / √(v + 3/8 b²) has a variance of 1 to first order; for a sum of
-Poisson and Gaussian noise it is the generalised Anscombe transform. Below 0 the variance stays that of 0, so that read
-noise around black is not bent. The mean of f over noise is not f of the mean: the way back is the inverse of
-I → E f(I + noise), as Mäkitalo and Foi have it [makitalo2013], for a Poisson count of gain b with Gaussian noise.
+Poisson and Gaussian noise it is the generalised Anscombe transform. Below 0 the variance of 0 is used, so that read
+noise around black is not distorted. The mean of f over the noise differs from f of the mean. The inverse is therefore
+that of I → E f(I + noise), as Mäkitalo and Foi have it [makitalo2013], for a Poisson count of gain b plus Gaussian
+noise.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from scipy.stats import poisson
 from hesim_render.core.bands import in_bands
 
 _ENTRIES = 1 << 13
-#: Nodes of the quadrature over the noise; more change nothing in the fourth digit.
+#: Nodes of the quadrature over the noise; more nodes do not change the fourth digit.
 _NODES = 15
-#: How far beyond its range noise is followed, standard deviations.
+#: Range of the quadrature beyond the signal range, standard deviations.
 _FAR = 8.0
-#: Mean counts from which a Poisson law is taken for a Gaussian one, and the largest count looked at below.
+#: Mean count above which a Gaussian replaces the Poisson law, and the largest count used below it.
 _MANY, _MOST = 40, 100
 
 
@@ -30,13 +31,13 @@ class Stabiliser:
 
     Parameters
     ----------
-    a, b, c : of the variance a + b I + c I², DN²; where it is below a thousandth of a, that counts.
+    a, b, c : coefficients of the variance a + b I + c I², DN²; the variance is at least a thousandth of a.
     top_dn : largest signal, DN.
     """
 
     def __init__(self, a: float, b: float, c: float, top_dn: float) -> None:
         self._a, self._b, self._c = a, b, c
-        # even steps in the square root of the signal: small where f bends
+        # even steps in the square root of the signal: small steps where f is strongly curved
         self._top = float(top_dn + _FAR * self.sigma(top_dn))
         signal = np.linspace(0, 1, _ENTRIES) ** 2 * self._top
         slope = 1 / self._scale(signal)
@@ -44,12 +45,12 @@ class Stabiliser:
         self._stable = np.concatenate([[0.0], np.cumsum((slope[1:] + slope[:-1]) / 2 * np.diff(signal))])
 
     def sigma(self, signal_dn: ArrayLike) -> NDArray[np.float64]:
-        """Standard deviation at a signal, DN; that of 0 below it."""
+        """Standard deviation at a signal, DN; below 0, that at 0."""
         signal = np.maximum(np.asarray(signal_dn, dtype=np.float64), 0)
         return np.sqrt(np.maximum(self._a + signal * (self._b + signal * self._c), 1e-3 * self._a))
 
     def _scale(self, signal_dn: ArrayLike) -> NDArray[np.float64]:
-        """What f is even in: the standard deviation, with Anscombe's 3/8 of a count where counts are few."""
+        """Reciprocal of the slope of f: the standard deviation, with Anscombe's 3/8 of a count for few counts."""
         return np.sqrt(self.sigma(signal_dn) ** 2 + 3 / 8 * self._b**2)
 
     def forward(self, signal_dn: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -65,7 +66,7 @@ class Stabiliser:
         return out
 
     def backward(self, stable: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The signal in DN of which the mean of f over noise is `stable`, [row, col]."""
+        """The signal in DN for which the mean of f over the noise is `stable`, [row, col]."""
         out = np.empty(stable.shape, dtype=np.float32)
         first, last, table = self._inverse
 
@@ -102,7 +103,7 @@ class Stabiliser:
 
 
 def _between(table: NDArray[np.float32], place: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Entries of a table at places 0 to 1, straight lines in between; held at its ends."""
+    """Linear interpolation in a table at places 0 to 1; constant beyond its ends."""
     index = np.clip(place, 0, 1) * np.float32(len(table) - 1)
     low = np.minimum(index.astype(np.int32), len(table) - 2)
     before = table[low]

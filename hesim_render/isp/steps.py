@@ -1,4 +1,4 @@
-"""The steps of a pipeline as a file has them: one model per step, which calls the step's function."""
+"""The steps of a pipeline file: one model per step, which calls the step's function."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Development:
     Parameters
     ----------
     image : [row, col] before the demosaic, [row, col, channel] after it.
-    camera : the camera that took it; steps without figures of their own take the camera's.
-    tile : channel numbers of the mosaic as it is now (holes get filled).
-    illumination : relative illumination of the lens [row, col], where it is known.
+    camera : the camera that took it; steps without parameters of their own use those of the camera.
+    tile : channel numbers of the current mosaic (holes get filled).
+    illumination : relative illumination of the lens [row, col], if it is known.
     exposure_gain : gain of an automatic exposure, kept so that all frames of a recording get the same.
-    noise : of the sensor at this frame's exposure, where it is known.
-    span_dn : white less black level of the image, once black is at 0 and white at 1.
-    report : what steps found out (gains, ΔE2000).
+    noise : noise of the sensor at this frame's exposure, if it is known.
+    span_dn : white minus black level, DN, once the image has black at 0 and white at 1.
+    report : results of the steps (gains, ΔE2000).
     """
 
     image: NDArray
@@ -84,7 +84,7 @@ class MapFile(Strict):
 
 
 class BlackLevel(Strict):
-    """`levels.black_level`; without figures those of the camera."""
+    """`levels.black_level`; by default with the levels of the camera."""
 
     step: Literal["black_level"]
     black_level_dn: float | None = None
@@ -101,7 +101,7 @@ class BlackLevel(Strict):
 
 
 class Fill(Strict):
-    """`fill`: bad pixels, and positions without a value unless the demosaic is to bridge them."""
+    """`fill`: bad pixels, and positions without a value unless the demosaic interpolates them."""
 
     step: Literal["fill"]
     event_pixels: bool = False
@@ -117,10 +117,11 @@ class Fill(Strict):
 
 
 class Denoise(Strict):
-    """The sensor's maps taken out, row offsets without a map estimated, and `denoise.denoise`, by its noise model.
+    """Correction by the sensor's maps, estimation of row offsets without a map, and `denoise.denoise` by its noise
+    model.
 
     `strength` multiplies the standard deviation of the noise; at 0 only maps and rows are corrected. `row_std_dn` is
-    the standard deviation over rows of offsets without a map, by default what the noise model says.
+    the standard deviation over rows of offsets without a map, by default that of the noise model.
     """
 
     step: Literal["denoise"]
@@ -142,12 +143,12 @@ class Denoise(Strict):
             signal -= offsets[:, None]
         if self.strength > 0 and not noise.is_clean:
             signal = denoise(signal, state.tile, noise.times(self.strength), span, state.camera.white_balance)
-        # what is clipped has no offset: it stays white
+        # a clipped sample has no offset and stays white
         state.image = np.where(saturated, np.maximum(signal / np.float32(span), 1), signal / np.float32(span))
 
 
 class LensShading(Strict):
-    """`levels.lens_shading` by the recording's own lens, a map, or cos⁴ of a focal length."""
+    """`levels.lens_shading` by the recording's own lens, by a map, or by cos⁴ of a focal length."""
 
     step: Literal["lens_shading"]
     map: MapFile | None = None
@@ -167,7 +168,7 @@ class LensShading(Strict):
 
 
 class WhiteBalance(Strict):
-    """`balance.white_balance` with the camera's gains, given ones, grey world, or a ColorChecker's grey patches."""
+    """`balance.white_balance` with gains of the camera, given gains, grey world, or a ColorChecker's grey patches."""
 
     step: Literal["white_balance"]
     method: Literal["camera", "given", "grey_world", "chart"] = "camera"
@@ -225,7 +226,7 @@ class NoiseReduction(Strict):
 
 
 class ColourMatrix(Strict):
-    """`colour.colour_matrix` with the camera's matrix, a given one, or one fitted from a ColorChecker in the image."""
+    """`colour.colour_matrix` with the camera's matrix, a given one, or one fitted to a ColorChecker in the image."""
 
     step: Literal["colour_matrix"]
     method: Literal["camera", "given", "chart"] = "camera"
@@ -288,7 +289,7 @@ class Tone(Strict):
 
 
 class Encode(Strict):
-    """`transfer.encode`; without a transfer the camera's."""
+    """`transfer.encode`; by default with the transfer of the camera."""
 
     step: Literal["encode"]
     transfer: Transfer | None = None
@@ -314,7 +315,7 @@ Step = Annotated[
     | Encode,
     Field(discriminator="step"),
 ]
-#: Where a step may stand: on the mosaic (before the demosaic) or on the picture (after it).
+#: Place of a step: on the mosaic (before the demosaic) or on the picture (after it).
 ON_MOSAIC = (BlackLevel, Fill, Denoise, LensShading, WhiteBalance)
-#: Steps between which and the RAW data the noise is what the sensor's model says.
+#: Steps that may precede denoise, because after them the sensor's noise model still holds.
 BEFORE_DENOISE = (BlackLevel, Fill)

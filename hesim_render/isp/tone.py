@@ -1,4 +1,4 @@
-"""Exposure and tone curves, on linear RGB; hues stay because all channels of a pixel get one factor."""
+"""Exposure and tone curves, on linear RGB. Hues are kept, because all channels of a pixel get one factor."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def exposure(image: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
 
 
 def auto_gain(image: NDArray[np.float32], percentile: float = 99.5, level: float = 0.95) -> float:
-    """The factor that brings this percentile of the pixels' largest channel to `level`; at most 50."""
+    """Factor that brings this percentile of the largest channel of the pixels to `level`; at most 50."""
     brightest = np.percentile(image[::2, ::2].max(axis=-1), percentile)
     return float(level / max(brightest, level / 50))
 
@@ -47,13 +47,14 @@ def tone_global(image: NDArray[np.float32], white: float = 4.0) -> NDArray[np.fl
 def tone_local(
     image: NDArray[np.float32], compression: float = 0.6, detail: float = 1.0, radius_px: int = 16
 ) -> NDArray[np.float32]:
-    """Large-scale contrast reduced, detail kept ([durand2002], with the guided filter for the base).
+    """Reduce large-scale contrast and keep detail ([durand2002], with the guided filter for the base).
 
     Parameters
     ----------
-    compression : factor of the base layer's log contrast; 1 changes nothing.
-    detail : factor of the detail layer's.
-    radius_px : what is larger belongs to the base.
+    image : linear RGB [row, col, 3].
+    compression : factor on the log contrast of the base layer; 1 changes nothing.
+    detail : factor on the detail layer.
+    radius_px : structures larger than this belong to the base, px.
     """
     if not 0 < compression <= 1 or not 0 <= detail <= 4:
         raise RangeError("compression, detail", (compression, detail), "0 to 1 and 0 to 4")

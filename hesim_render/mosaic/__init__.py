@@ -1,1 +1,1 @@
-"""Where each pixel sits, when it looks, and what a picture must know of its colours."""
+"""Pixel positions and roles, exposure times, and the colour description of a mosaic."""

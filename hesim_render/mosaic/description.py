@@ -1,6 +1,6 @@
-"""What a picture or a file must know of a sensor to show its RAW frames: tile, levels, colours.
+"""Description of a sensor's RAW frames for pictures and files: tile, levels, colours.
 
-A `Mosaic` is plain data. It travels in the manifest of a recording, so that a recording can be
+A `Mosaic` is plain data. The manifest of a recording contains it, so that a recording can be
 shown and exported without the sensor file it was made with.
 """
 
@@ -104,7 +104,7 @@ class Mosaic(BaseModel):
 
     @property
     def is_mono(self) -> bool:
-        """Whether all pixels of the tile look through the same filter."""
+        """True if all pixels of the tile have the same filter."""
         return len({name for row in self.tile_filter for name in row}) == 1
 
     def tiled(self, tile: NDArray, shape: tuple[int, ...]) -> NDArray:
@@ -173,7 +173,7 @@ def _colour_matrices(
     daylight = spectra.illuminant("D65")
     light = light or daylight
     neutral = responses_to(light, [constant(1.0)], responses)[0]
-    if neutral.max() <= 0:  # the light and the sensor share no wavelength: nothing to balance
+    if neutral.max() <= 0:  # light and sensor have no wavelength in common: nothing to balance
         light, neutral = daylight, responses_to(daylight, [constant(1.0)], responses)[0]
     patches = list(spectra.colorchecker().values())
     white_d65 = tristimulus(daylight, [constant(1.0)])[0]
@@ -183,7 +183,7 @@ def _colour_matrices(
     xyz = tristimulus(light, patches)
     white = tristimulus(light, [constant(1.0)])[0]
     target = xyz_to_linear_srgb(xyz, white)
-    # rows sum to 1, so that neutral stays neutral: fit the differences to the first channel
+    # fit differences to the first channel, so that rows sum to 1 and neutral stays neutral
     free, *_ = np.linalg.lstsq(camera[:, 1:] - camera[:, :1], target - camera[:, :1], rcond=None)
     to_srgb = np.vstack([1.0 - free.sum(axis=0), free]).T
     camera_d65 = responses_to(daylight, patches, responses)

@@ -1,4 +1,4 @@
-"""Where each pixel sits: the tile over the read-out region, its filters, roles and event grid."""
+"""Positions of pixels: the tile over the read-out region, its filters, roles and event grid."""
 
 from __future__ import annotations
 
@@ -35,10 +35,16 @@ class Layout(PlainState):
 
     @classmethod
     def full(cls, spec: SensorSpec) -> Layout:
+        """The whole sensor."""
         return cls(spec, 0, 0, spec.geometry.rows, spec.geometry.cols)
 
     def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> Layout:
-        """A region of this region; centred and snapped to the tile where `x`, `y` are not given.
+        """A region of this region, in whole tiles; centred where `x`, `y` are not given.
+
+        Parameters
+        ----------
+        width_px, height_px : size, px.
+        x, y : first column and row inside this region, px.
 
         Raises
         ------
@@ -93,7 +99,7 @@ class Layout(PlainState):
         return self.tiled(self._filter_tile())
 
     def has_role(self, role: Role) -> NDArray[np.bool_]:
-        """Which pixels have a role, [row, col]."""
+        """True for pixels that have a role, [row, col]."""
         tile = np.zeros(self.tile_shape, dtype=bool)
         for position in self.spec.positions(role):
             tile[position] = True
@@ -101,11 +107,12 @@ class Layout(PlainState):
 
     @cached_property
     def aps_mask(self) -> NDArray[np.bool_]:
+        """True for frame pixels, [row, col]."""
         return self.has_role("aps")
 
     @cached_property
     def full_index(self) -> NDArray[np.uint32]:
-        """Index of each pixel on the full sensor, row-major: what random numbers are keyed by, [row, col]."""
+        """Index of each pixel on the full sensor, row-major, [row, col]; it is the key of random numbers."""
         cols = self.spec.geometry.cols
         rows, columns = np.ogrid[self.row0 : self.row0 + self.rows, self.col0 : self.col0 + self.cols]
         return (rows * cols + columns).astype(np.uint32)

@@ -1,4 +1,4 @@
-"""When each row is exposed and when each event comparison is made, in µs from the start."""
+"""Times of row exposures and of event comparisons, in µs from the start."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from hesim_render.core.errors import RangeError
 from hesim_render.core.units import US_PER_S
 from hesim_render.specs.sensor import ApsSpec, EvsSpec
 
-#: Longest run with events, µs: their times are stored in 32 bit. Without events, and most frames and comparisons.
+#: Longest run with events, µs (times are stored in 32 bit); without events; and most frames and comparisons.
 _MOST_EVENT_US, _MOST_US = 2**32 - 1, 10**12
 _MOST_FRAMES, _MOST_TICKS = 2_000_000, 20_000_000
 
 
 def require_countable(aps: ApsSpec | None, evs: EvsSpec | None, duration_us: int) -> None:
-    """Refuse a run that is too long to be listed, before anything of it is.
+    """Refuse a run with too many frames or comparisons, before any of them is listed.
 
     Raises
     ------
     RangeError
-        With the longest duration that would do.
+        The message states the longest possible duration.
     """
     limits = {"a run": _MOST_US}
     if evs is not None:
@@ -44,9 +44,10 @@ class Exposure:
     Parameters
     ----------
     index : frame number, 0 first.
-    start_us : begin of row 0's exposure.
+    start_us : begin of row 0's exposure, µs.
+    exposure_us : exposure of every row, µs.
     rows : rows that are read out.
-    line_time_us : delay from row to row; 0 for a global shutter.
+    line_time_us : delay from row to row, µs; 0 for a global shutter.
     """
 
     index: int
@@ -57,12 +58,12 @@ class Exposure:
 
     @property
     def t_us(self) -> int:
-        """Time stamp: the end of row 0's exposure."""
+        """Time stamp: the end of row 0's exposure, µs."""
         return self.start_us + self.exposure_us
 
     @property
     def end_us(self) -> float:
-        """End of the last row's exposure."""
+        """End of the last row's exposure, µs."""
         return self.start_us + (self.rows - 1) * self.line_time_us + self.exposure_us
 
     def row_begin_us(self, row: NDArray) -> NDArray[np.float64]:
@@ -85,10 +86,10 @@ def exposures(spec: ApsSpec, rows: int, duration_us: int) -> list[Exposure]:
         found.append(exposure)
 
 
-#: Intervals between windows in a block: what is filled in lies between two windows of one.
+#: Number of intervals between windows in a block; interpolation never crosses the border of a block.
 BLOCK_INTERVALS = 16
-#: Sample times of sensors without a tick of their own are found cell by cell of this length, µs; cells begin at its
-#: multiples, which are sample times themselves.
+#: Sample times of sensors without a tick are computed in cells of this length, µs. Cells begin at its
+#: multiples, which are also sample times.
 CELL_US = 1000
 
 
@@ -96,13 +97,13 @@ CELL_US = 1000
 class Block:
     """Successive windows in which event pixels are sampled.
 
-    Blocks are cut at times of their own, whatever is asked for: so what a run gives at a time does not depend on when
-    it begins or ends. The last window of a block is the first of the next.
+    Blocks begin and end at fixed times, independent of the run. The flux at a time therefore does not depend on when
+    the run begins or ends. The last window of a block is the first of the next.
 
     Parameters
     ----------
-    begin_us, end_us : [w], in order of time.
-    wanted : [w], windows that the run asks for; the others are needed to fill in between.
+    begin_us, end_us : [w], in order of time, µs.
+    wanted : [w], True for windows that the run asks for; the others are needed for interpolation.
     """
 
     begin_us: NDArray[np.float64]
@@ -111,13 +112,13 @@ class Block:
 
 
 def tick_blocks(spec: EvsSpec, begin_us: float, end_us: float) -> Iterator[Block]:
-    """Windows of the fixed comparisons after one time and up to another: window k ends at k·tick_us."""
+    """Windows of the fixed comparisons after one time and up to another; window k ends at k·tick_us."""
     assert spec.tick_us is not None
     first, last = int(begin_us // spec.tick_us) + 1, int(end_us // spec.tick_us)
     for number in range((first - 1) // BLOCK_INTERVALS, -(-last // BLOCK_INTERVALS)):
         ticks = np.arange(BLOCK_INTERVALS * number, BLOCK_INTERVALS * (number + 1) + 1)
         wanted = (ticks >= first) & (ticks <= last)
-        wanted[0] = False  # it is the last one of the block before
+        wanted[0] = False  # it is the last window of the previous block
         ends = ticks.astype(np.float64) * spec.tick_us
         yield Block(ends - spec.window_us, ends, wanted)
 
@@ -127,11 +128,13 @@ def instant_blocks(
 ) -> Iterator[Block]:
     """Windows that end at the instants of a source, after one time and up to another.
 
-    Of every `BLOCK_INTERVALS` cells, the instants are cut into blocks of as many intervals.
+    The instants of every `BLOCK_INTERVALS` cells are cut into blocks of as many intervals.
 
     Parameters
     ----------
-    instants_us : whole µs from one time to another, both among them; multiples of `CELL_US` too.
+    instants_us : whole µs from one time to another, both included, with the multiples of `CELL_US`.
+    window_us : length of a window, µs.
+    begin_us, end_us : the times, µs.
     """
     length = BLOCK_INTERVALS * CELL_US
     for number in range(int(begin_us // length), -(-int(np.ceil(end_us)) // length)):
@@ -147,15 +150,17 @@ def instant_blocks(
 def blocks_of_run(
     instants_us: Callable[[float, float], NDArray[np.int64]], window_us: int, begin_us: int, end_us: int
 ) -> Iterator[Block]:
-    """Windows of a run in `instant_blocks`: a first one that begins with it, and one that ends with it or just after.
+    """Windows of a run as in `instant_blocks`: the first begins with the run, the last ends with it or just after.
 
     Parameters
     ----------
     instants_us : see `instant_blocks`.
+    window_us : length of a window, µs.
+    begin_us, end_us : begin and end of the run, µs.
     """
     first = begin_us + window_us
     yield Block(np.array([begin_us], np.float64), np.array([first], np.float64), np.ones(1, np.bool_))
-    # up to the first instant that is not before the end: events before the end come with it
+    # up to the first instant at or after the end, because events before the end need its sample
     cell = end_us // CELL_US * CELL_US
     instants = instants_us(cell, cell + CELL_US)
     beyond = int(instants[np.searchsorted(instants, end_us)])

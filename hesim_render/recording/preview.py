@@ -16,10 +16,7 @@ from hesim_render.spectral.colorimetry import encode_srgb
 ON_COLOUR = np.array([255, 150, 20], dtype=np.float32)
 OFF_COLOUR = np.array([30, 160, 255], dtype=np.float32)
 _BACKGROUND, _INK, _FAINT = (24, 24, 27), (235, 235, 235), (150, 150, 155)
-_PANEL_PX, _WIDEST_PX = (
-    640,
-    832,
-)  # small frames are magnified to about the first width; no panel is wider than the second
+_PANEL_PX, _WIDEST_PX = 640, 832  # magnify small frames to about the first; none is wider than the second
 #: Linear tint of each DNG colour code, red to white.
 _TINT = np.array(
     [[1, 0.08, 0.06], [0.1, 0.9, 0.12], [0.1, 0.2, 1], [0.1, 0.9, 1], [1, 0.2, 1], [1, 0.9, 0.1], [0.9, 0.9, 0.9]],

@@ -1,4 +1,4 @@
-"""A sensor ready to use: its file, the region read out, its lens and its pixel models."""
+"""A sensor ready to use: its specification, read-out region, lens and pixel models."""
 
 from hesim_render.sensor.sensor import Sensor, load_sensor
 

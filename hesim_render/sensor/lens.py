@@ -16,15 +16,15 @@ from hesim_render.spectral.spectrum import INTEGRATION_STEP_NM, Spectrum, consta
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens in use: everything that the pixel's flux needs beside the pixel itself.
+    """A lens in use: all optical parameters of a pixel's flux besides those of the pixel itself.
 
     Parameters
     ----------
     f_number : N.
-    focal_length_mm : f.
-    magnification : m (|m| counts); image distance is f (1 + |m|).
-    axis_mm : where the optical axis meets the chip, from the full sensor's centre: to the right and downwards in the
-        image (the principal point).
+    focal_length_mm : f, mm.
+    magnification : m (only |m| matters); the image distance is f (1 + |m|).
+    axis_mm : point where the optical axis meets the chip (the principal point), relative to the centre of the full
+        sensor, mm: to the right and downwards in the image.
     """
 
     f_number: float
@@ -41,7 +41,7 @@ class Lens:
         focal_length_mm: float | None = None,
         focus_distance_m: float | None = None,
     ) -> Lens:
-        """The sensor file's lens, with a scene's own f-number, focal length and focus distance.
+        """The lens of a sensor file, with a scene's own f-number, focal length and focus distance.
 
         A thin lens focused at distance d from its entrance pupil has |m| = f / (d − f).
         """
@@ -60,6 +60,7 @@ class Lens:
 
     @property
     def image_distance_mm(self) -> float:
+        """Image distance f (1 + |m|), mm."""
         return self.focal_length_mm * (1 + self.magnification)
 
 
@@ -109,7 +110,7 @@ def response(spec: SensorSpec, filter_name: str, lens: Lens) -> Spectrum:
     geometry = spec.geometry
     area_m2 = (geometry.pitch_um * M_PER_UM) ** 2
     electrons_per_photon = spec.filter_response(filter_name)
-    # multiplied by λ on the refined grid, not at the table's own points: a product is not linear
+    # multiply by λ on the refined grid, because the product is not linear between the table's own points
     grid = merged_grid(
         electrons_per_photon, constant(1.0, *electrons_per_photon.support_nm), step_nm=INTEGRATION_STEP_NM
     )

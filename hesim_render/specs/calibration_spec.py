@@ -1,7 +1,7 @@
-"""The model of ``calibration.yaml``: a file is checked by it before anything of it is used.
+"""The model of ``calibration.yaml``; a file is validated before any part of it is used.
 
-`calibrate` writes the file and a person may change it. What is read of it, by a sensor, the report, the ISP or a later
-calibration, is named here; sections hold more, which is for people.
+`calibrate` writes the file, and a person may change it. The model names every key that a sensor, the report, the ISP or
+a later calibration reads. Sections hold further keys for human readers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _Beta = Annotated[list[float | None], Field(min_length=6, max_length=6)]
 
 
 class _Section(Strict):
-    """A part that holds more than what is read of it."""
+    """A part that holds more keys than the program reads."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -59,7 +59,7 @@ class FullWell(Estimate):
 
 
 class Finding(_Section):
-    """What in the captures is not as the noise model supposes."""
+    """A deviation of the captures from the assumptions of the noise model."""
 
     check: str
     text: str
@@ -67,7 +67,7 @@ class Finding(_Section):
 
 
 class MapsFile(_Section):
-    """Where the maps of a section are: beside the calibration, held to by their hash."""
+    """The map file of a section, beside the calibration, identified by its hash."""
 
     file: str = Field(min_length=1)
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
@@ -80,7 +80,7 @@ class FrameGoodness(_Section):
 
 
 class FrameSection(_Section):
-    """``aps``: what dark and lit frames told."""
+    """``aps``: results from dark and lit frames."""
 
     beta: list[list[_Beta]] = Field(min_length=1)
     goodness: FrameGoodness
@@ -109,7 +109,7 @@ class EventParameters(_Section):
 
 
 class PositionParameters(EventParameters):
-    """Of one tile position (row, col)."""
+    """Parameters of one tile position (row, col)."""
 
     tile_position: tuple[NonNegativeInt, NonNegativeInt]
 
@@ -121,7 +121,7 @@ class EventGoodness(_Section):
 
 
 class EventSection(EventParameters):
-    """``evs``: what counts of events and contrast steps told."""
+    """``evs``: results from event counts and contrast steps."""
 
     theta_hardware_v: PositiveFloat | Estimate
     shot_law: Literal["linear", "sqrt"]

@@ -1,4 +1,4 @@
-"""``capture.yaml``: what a person says of the captures of a sensor."""
+"""``capture.yaml``: a person's description of the captures of a sensor."""
 
 from __future__ import annotations
 

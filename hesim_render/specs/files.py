@@ -23,7 +23,7 @@ from hesim_render.specs.yamlfile import read_yaml
 
 
 def _with_true_numbers(schema: Any) -> Any:
-    """A schema of pydantic's with what `_a_number` refuses refused wherever a number is expected."""
+    """A pydantic schema that applies `_a_number` wherever a number is expected."""
     if isinstance(schema, list | tuple):
         return type(schema)(_with_true_numbers(item) for item in schema)
     if not isinstance(schema, dict) or _is_checked(schema):
@@ -43,7 +43,7 @@ def _is_checked(schema: dict[str, Any]) -> bool:
 
 
 def _a_number(value: Any) -> Any:
-    """Refuses what pydantic would make a number of; other texts it refuses itself."""
+    """Refuse values that pydantic would convert to a number; pydantic refuses other text itself."""
     if isinstance(value, bool | np.bool_ | bytes):
         raise ValueError("expected a number, not true or false")
     if isinstance(value, str):
@@ -56,7 +56,7 @@ def _a_number(value: Any) -> Any:
 
 
 class Strict(BaseModel):
-    """Base of all file models: unknown keys are errors, and neither a text nor yes or no passes as a number."""
+    """Base of all file models: unknown keys are errors, and neither text nor booleans count as numbers."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=False, allow_inf_nan=False, arbitrary_types_allowed=True
@@ -83,7 +83,7 @@ def list_names(kind: str) -> list[str]:
 
 
 def locate(name_or_path: str | Path, kind: str) -> Path:
-    """The file meant by a shipped name or a path.
+    """The file of a shipped name or a path.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
             return given
         raise SpecError("no such file", file=given)
     shipped = data_folder(kind) / f"{name_or_path}.yaml"
-    if os.path.isfile(shipped):  # False also where the name is too long
+    if os.path.isfile(shipped):  # also False if the name is too long
         return shipped
     if os.path.isfile(given):
         return given
@@ -150,7 +150,7 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def validate(model: type[Model], data: dict[str, Any], file: Path | None, overrides: Mapping[str, Any]) -> Model:
-    """Apply overrides and build the model; what is wrong becomes one `SpecError`."""
+    """Apply overrides and build the model; all errors together become one `SpecError`."""
     apply_overrides(data, overrides)
     try:
         return model.model_validate(_plain(data), context={"folder": file.parent if file else Path()})

@@ -1,4 +1,4 @@
-"""Vectors, rigid poses and regions as files write them."""
+"""Vectors, rigid poses and regions in files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_v
 from hesim_render.core.guard import MOST_PIXELS
 from hesim_render.specs.files import Strict
 
-#: Largest coordinate, m, and largest and smallest size: beyond them squares leave the range of 32 bit.
+#: Largest coordinate, m, and largest and smallest size; squares of larger values exceed the range of float32.
 LARGEST_M, SMALLEST_M = 1e9, 1e-9
 Coordinate = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
 Size = Annotated[float, Field(ge=SMALLEST_M, le=LARGEST_M)]
@@ -20,7 +20,7 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Region(Strict):
-    """What part of a sensor was read out, in frame pixels."""
+    """The part of a sensor that was read out, in frame pixels."""
 
     x: NonNegativeInt
     y: NonNegativeInt
@@ -34,7 +34,7 @@ class Region(Strict):
         return self
 
 
-#: Largest departure of RᵀR from 1 that counts as rounding of the file's numbers.
+#: Largest deviation of RᵀR from 1 that counts as rounding of the file's numbers.
 _RIGID_TOLERANCE = 1e-4
 
 
@@ -48,7 +48,7 @@ Direction = Annotated[Vector, AfterValidator(_not_zero)]
 
 
 def _rigid(matrix: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
-    """Refuse what is not a rotation and a translation, and say why."""
+    """Refuse a matrix that is not a rotation and a translation, with the reason."""
     values = np.array(matrix, dtype=np.float64)
     if np.abs(values[3] - [0, 0, 0, 1]).max() > _RIGID_TOLERANCE:
         raise ValueError("the last row of a pose must be 0, 0, 0, 1")
@@ -76,7 +76,7 @@ def rotation_vector(matrix: tuple[Row, Row, Row, Row]) -> NDArray[np.float64]:
 
 
 def rotation_about(axis: ArrayLike, angle_deg: float) -> NDArray[np.float64]:
-    """Matrix [3, 3] of a right-handed turn by `angle_deg` about `axis` (any length but zero)."""
+    """Matrix [3, 3] of a right-handed rotation by `angle_deg` about `axis` (any length but zero)."""
     from scipy.spatial.transform import Rotation
 
     direction = np.asarray(axis, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""A light of a scene file: where it comes from, its spectrum, its level and how that changes with time."""
+"""A light of a scene file: its place, its spectrum, its level and its waveform."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:
 
 
 class LightSpec(Strict):
-    """Where the light comes from, its spectrum, and how much of it reaches a named plane.
+    """Place and spectrum of a light, and its level on a stated plane.
 
     Exactly one of `illuminance_lux` and `irradiance_w_m2` gives the level on the plane through
-    `plane_point_m` with normal `plane_normal` (default: the target's own), unshadowed and from
-    this light alone; of a light with a waveform it is the time mean.
+    `plane_point_m` with normal `plane_normal` (default: that of the target), without shadows and from
+    this light alone. For a light with a waveform the level is the time mean.
     """
 
     type: Literal["uniform", "point", "area", "directional", "none"]
@@ -63,13 +63,13 @@ class LightSpec(Strict):
         return self.type != "none" and bool(self.illuminance_lux or self.irradiance_w_m2)
 
     def unlit(self) -> LightSpec:
-        """The same light switched off; what there is of its geometry stays."""
+        """The same light switched off; its geometry stays."""
         off = {"waveform": None, "illuminance_lux": 0.0, "irradiance_w_m2": None}
         return self if self.type == "none" else self.model_copy(update=off)
 
 
 def irradiance(light: LightSpec) -> Spectrum | None:
-    """E(λ) on the light's plane, W m⁻² nm⁻¹, its time mean; None in darkness."""
+    """E(λ) on the light's plane, W m⁻² nm⁻¹, time mean; None in darkness."""
     if not light.is_lit:
         return None
     shape = light.illuminant.load()
@@ -80,10 +80,7 @@ def irradiance(light: LightSpec) -> Spectrum | None:
 
 
 def mixed_light(lights: Iterable[LightSpec]) -> Spectrum | None:
-    """Spectrum of all lights together, each as on its own plane: its shape is the light that white means there.
-
-    None in darkness.
-    """
+    """Spectrum of all lights together, each as on its own plane; its shape defines white. None in darkness."""
     given = list(lights)
     if len(given) == 1 and given[0].type != "none":
         return given[0].illuminant.load()

@@ -13,8 +13,8 @@ from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation
 class KeyframeSpec(Strict):
     """A rigid pose at one time: rotate about the track's pivot, then translate; or both as one matrix.
 
-    `matrix` takes the object from where the file places it to where it is then, whatever the pivot. It becomes
-    a rotation by the shortest way from the keyframe before, and a translation.
+    `matrix` maps the object from its place in the file to its place at this time, independent of the pivot. It is
+    converted to a translation and a rotation that takes the shortest way from the previous keyframe.
     """
 
     t_us: int = Field(ge=-(10**15), le=10**15, description="time, µs from the start")
@@ -43,9 +43,10 @@ class KeyframeSpec(Strict):
 
 
 def _turn(rotation: NDArray[np.float64], before: KeyframeSpec | None) -> tuple[Vector, float]:
-    """Axis and angle of a rotation vector, with the whole turns that bring it nearest to the keyframe before.
+    """Axis and angle of a rotation vector, with the number of whole turns that brings it nearest to the previous
+    keyframe.
 
-    Two keyframes about one axis are any number of turns apart; matrices do not count turns.
+    Two keyframes about one axis may be any number of turns apart, but matrices do not count turns.
     """
     angle = float(np.linalg.norm(rotation))
     angle_deg = float(np.degrees(angle))

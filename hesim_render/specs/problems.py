@@ -1,4 +1,4 @@
-"""What a validation found wrong, as errors that name file, line and key: all of it at once."""
+"""Validation errors as messages with file, line and key, all of a file at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from hesim_render.core.errors import SpecError, closest, did_you_mean
 
-#: Characters of a wrong value that a message repeats.
+#: Largest number of characters of a wrong value that a message quotes.
 _LONGEST = 60
 
 
@@ -25,13 +25,19 @@ def spec_error(
     file: str | Path | None = None,
     overrides: Iterable[str] = (),
 ) -> SpecError:
-    """All that is wrong, in order of lines.
+    """All errors of a validation, in order of lines.
 
     Parameters
     ----------
     error : from validating `data`, with the overrides already in it, as `model`.
-    file : `data` is from there.
+    model : the model.
+    data : the content.
+    file : the file that `data` is from.
     overrides : dotted keys that did not come from the file.
+
+    Returns
+    -------
+    One error with all problems.
     """
     found: dict[tuple[int, str, str], SpecError] = {}
     problems = _told_once(error.errors(include_url=False), data)
@@ -44,11 +50,11 @@ def spec_error(
             meant.add((*place[:-1], guess))
     for problem, place in zip(problems, places, strict=True):
         if problem["type"] == "missing" and tuple(place) in meant:
-            continue  # it is there, misspelt
+            continue  # the key exists, but is misspelt
         if problem["type"] == "too_short" and any(_is_inside(other, place) for other in places):
-            continue  # items that are wrong do not count
+            continue  # problems of single items are reported separately
         if _is_short_list(problem) and any(_is_inside(place, short) for short in short_lists):
-            continue  # rows of a matrix: of the whole it was said
+            continue  # rows of a matrix: the matrix as a whole was reported already
         for message in problem["msg"].removeprefix("Value error, ").splitlines():
             own = _one(problem, message, model, data, file, overrides)
             found.setdefault((own.line or 0, own.key or "", str(own)), own)
@@ -56,10 +62,10 @@ def spec_error(
 
 
 def _told_once(problems: Iterable[Any], data: Any) -> list[Any]:
-    """Each problem once: of a value that may be written in several ways, those of the way that was meant.
+    """Each problem once. If a value may be written in several ways, only the problems of the intended way are kept.
 
-    Pydantic reports such a value once for each alternative. An unknown key says most of what was meant, then what is
-    wrong inside the alternative that was written, the deeper the better.
+    Pydantic reports such a value once for each alternative. An unknown key is the best sign of the intended
+    alternative, then a problem inside one, the deeper the better.
     """
     groups: dict[Any, dict[Any, list[Any]]] = {}
     for number, problem in enumerate(problems):
@@ -73,7 +79,7 @@ def _told_once(problems: Iterable[Any], data: Any) -> list[Any]:
     for branches in groups.values():
         found += max(branches.values(), key=lambda branch: max(map(_telling, branch)))
     once: dict[tuple[Any, ...], Any] = {}
-    for problem in sorted(found, key=_telling):  # one value has one thing wrong with it, that which says most
+    for problem in sorted(found, key=_telling):  # keep one problem per value, the most informative one
         once[tuple(_keys_of(problem, data))] = problem
     return list(once.values())
 
@@ -132,7 +138,7 @@ def _known_keys(model: Any, location: Iterable[Any]) -> set[str]:
             field = each.model_fields.get(str(key))
             if field is not None:
                 inner |= _models_in(field.annotation)
-        models = inner or models  # a place in a list or a mapping: its items are of the same models
+        models = inner or models  # inside a list or a mapping the items have the same models
     return {name for each in models for name in each.model_fields}
 
 
@@ -160,7 +166,7 @@ def line_of(data: Any, location: Iterable[Any]) -> int | None:
                 line = node.lc.item(key)[0] + 1
                 node = node[key]
         except (AttributeError, KeyError, TypeError):
-            break  # set by an override: it has no line
+            break  # set by an override, which has no line
     return line
 
 
@@ -175,10 +181,10 @@ def _node_at(data: Any, location: Iterable[Any]) -> Any:
 
 
 def _key_in(message: str, node: Any) -> tuple[list[Any], str]:
-    """Which key below `node` a message of a model's own check is about, and the message without it.
+    """The key below `node` that the message of a model's own check is about, and the message without the key.
 
-    A check of a whole section (``tile: the letter 'X' is not defined``) is reported by pydantic for the
-    section; its text begins with the dotted key, says ``key is required``, or names keys on its way.
+    Pydantic reports a check of a whole section (``tile: the letter 'X' is not defined``) for the section.
+    The text of such a message begins with the dotted key, says ``key is required``, or contains names of keys.
     """
     if not isinstance(node, Mapping):
         return [], message
@@ -187,7 +193,7 @@ def _key_in(message: str, node: Any) -> tuple[list[Any], str]:
         path = _path_in(node, leading[1].split("."))
         return path, message[leading.end() :] if leading[2] == ": " else message
     named = [word for word in re.findall(r"[A-Za-z_]\w*", message) if word in node]
-    # a word with an underscore is surely meant as a key; a plain one may be just a word
+    # a word with an underscore is certainly a key; a plain word may be just a word
     return sorted(named, key=lambda word: "_" not in word)[:1], message
 
 

@@ -1,4 +1,4 @@
-"""The scene file: what is seen, how it is lit, from where, and how it moves.
+"""The scene file: geometry, lights, camera and motion.
 
 Lengths are in metres, y is up. A target lies in the plane z = 0, its centre at the origin, its
 face towards +z; the camera looks at it along −z with +x to the right of the image.
@@ -31,9 +31,9 @@ from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.target import ReflectanceSpec, TargetSpec
 from hesim_render.specs.waveform import WaveformSpec
 
-#: Of a file that a scene names.
+#: Path of a file that a scene names.
 OUTSIDE = "lies outside of the scene's folder; put it there, or let it (--allow-outside, allow_outside=True)"
-#: How often something repeats.
+#: Number of repetitions.
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
@@ -63,7 +63,8 @@ class ObjectSpec(Strict):
 
 
 class CameraSpec(Strict):
-    """Where the camera stands. `fit: target` ignores `origin_m` and backs off along +z until the target fills the view.
+    """Pose and lens of the camera. `fit: target` ignores `origin_m` and moves back along +z until the target fills the
+    view.
 
     Focal length, f-number and focus default to the sensor file's lens; a value here replaces them.
     """
@@ -90,12 +91,12 @@ class CameraSpec(Strict):
 
 
 class MitsubaSpec(Strict):
-    """A scene of Mitsuba's own: exactly one of an XML file, a built-in, or an inline dictionary.
+    """A scene in Mitsuba's own formats: exactly one of an XML file, a built-in scene, or an inline dictionary.
 
-    In an inline dictionary a 4×4 list of rows stands for a transform. Radiance is taken as
-    W m⁻² sr⁻¹ nm⁻¹ times `radiance_scale`; or it is scaled so that the plane through `plane_point_m`
-    with normal `plane_normal` gets `illuminance_lux` or `irradiance_w_m2`, from all light of the scene
-    together, what surfaces throw back included, at t = 0, flickering lights at their time means. The
+    In an inline dictionary a 4×4 list of rows is a transform. Radiance is taken as
+    W m⁻² sr⁻¹ nm⁻¹ times `radiance_scale`. Alternatively it is scaled so that the plane through `plane_point_m`
+    with normal `plane_normal` gets `illuminance_lux` or `irradiance_w_m2` from all light of the scene
+    together, interreflections included, at t = 0, with flickering lights at their time means. The
     first sensor is the camera unless the scene file has a `camera` section. Emitters are named by the
     id of their shape, or by their own.
     """
@@ -132,11 +133,11 @@ class MitsubaSpec(Strict):
 
     @property
     def has_level(self) -> bool:
-        """Whether its light is given by a level on a plane."""
+        """True if a level on a plane sets the light."""
         return self.illuminance_lux is not None or self.irradiance_w_m2 is not None
 
     def may_shine(self, emitter: str) -> bool:
-        """Whether an emitter of this name is left on."""
+        """True if an emitter with this name is left on."""
         return emitter not in self.unlit and (self.lit is None or emitter in self.lit)
 
     @field_serializer("inline", when_used="json")
@@ -239,16 +240,22 @@ class SceneSpec(Strict):
 def read_scene(
     name_or_path: str | Path, overrides: Mapping[str, Any] | None = None, allow_outside: bool = False
 ) -> SceneSpec:
-    """A scene file, by shipped name or path, with dotted `overrides` applied before validation.
+    """Read a scene file, by shipped name or path, with dotted `overrides` applied before validation.
 
     Parameters
     ----------
-    allow_outside : let the scene name files (spectra, meshes, textures, includes) outside of its folder.
+    name_or_path : name of a shipped scene, or path of a YAML file.
+    overrides : dotted keys and their values.
+    allow_outside : let the scene name files (spectra, meshes, textures, includes) outside its folder.
+
+    Returns
+    -------
+    The validated content.
 
     Raises
     ------
     SpecError
-        With file, line and key of the first thing wrong.
+        If the file is not valid; the message names file, line and key.
     """
     file = locate(name_or_path, "scenes")
     data, changes = load_yaml(file), overrides or {}

@@ -23,7 +23,7 @@ from hesim_render.spectral.spectrum import Spectrum, product
 
 Role = Literal["aps", "evs"]
 
-#: Smallest threshold where a change gives as many events as it has thresholds.
+#: Smallest threshold if a change gives one event per threshold that it contains.
 _LEAST_THRESHOLD = 1e-4
 
 
@@ -239,7 +239,7 @@ class EvsSpec(Strict):
         elif self.photoreceptor_cutoff_hz is None:
             raise ValueError("reference 'last_event' needs photoreceptor_cutoff_hz, the bandwidth of its noise")
         for key in ("contrast_threshold_on", "contrast_threshold_off"):
-            # a change of some thresholds is as many events there
+            # a change of several thresholds gives as many events in this mode
             if self.reference == "last_event" and getattr(self, key) < _LEAST_THRESHOLD:
                 raise ValueError(f"{key} must be at least {_LEAST_THRESHOLD:g} with reference 'last_event'")
         if self.refractory_period_us is not None and self.reference != "last_event":
@@ -339,10 +339,10 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
         data["noise"] = {**given, "folder": folder}
     spec = validate(SensorSpec, data, file, changes)
     if spec.noise is not None and calibration is not None:
-        spec.noise.keep_maps(calibration)  # now: the sensor needs no file afterwards
+        spec.noise.keep_maps(calibration)  # read the maps now: the sensor needs no file afterwards
     problems = [SpecError(text, file=file, line=line_of(data, key.split(".")), key=key) for key, text in unused(spec)]
     if problems and not changes:
         raise SpecError.together(problems)
-    for problem in problems:  # of an override that may be meant: what was replaced stays in the file
+    for problem in problems:  # after an override this may be intended: the replaced part stays in the file
         warnings.warn(str(problem), HesimWarning, stacklevel=3)
     return spec

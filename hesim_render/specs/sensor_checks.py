@@ -1,4 +1,4 @@
-"""What must fit together in a sensor file: tile, pixels, roles, filters and their wavelengths."""
+"""Consistency checks of a sensor file: tile, pixels, roles, filters and their wavelengths."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from hesim_render.spectral.spectrum import RENDERABLE_NM, Spectrum, constant, co
 if TYPE_CHECKING:
     from hesim_render.specs.sensor import SensorSpec
 
-#: Part of a response that may lie where nothing can be rendered.
+#: Largest part of a response outside the wavelengths that can be rendered.
 _LOST = 1e-3
 
 
 def sensor_problems(spec: SensorSpec) -> Iterator[str]:
-    """All that does not fit, each beginning with the dotted key where it stands."""
+    """All inconsistencies; each begins with its dotted key."""
     found = list(_tile(spec))
-    if not found:  # else who has which role is not known
+    if not found:  # otherwise the roles are not known
         found += _roles(spec)
     found += _filters(spec)
-    if found:  # a missing section is not to be reported again by who speaks of it
+    if found:  # a missing section is reported once, not again for each reference to it
         yield from found
         return
     for group in ("sources", "assumptions"):
@@ -96,7 +96,7 @@ def _filters(spec: SensorSpec) -> Iterator[str]:
         try:
             response = spec.filter_response(name)
         except SpecError as error:
-            if str(error) not in said:  # what all filters lack is one mistake
+            if str(error) not in said:  # the same error of all filters is reported once
                 yield f"filters.{name}: with quantum efficiency and lens, {error}"
             said.add(str(error))
             continue
@@ -107,7 +107,7 @@ def _filters(spec: SensorSpec) -> Iterator[str]:
 
 
 def unused(spec: SensorSpec) -> Iterator[tuple[str, str]]:
-    """Letters that are not in the tile and filters that no pixel has: their keys, and what is to be done."""
+    """Letters that are not in the tile and filters without a pixel: their keys, and how to correct the file."""
     drawn = set("".join(spec.tile_rows))
     for letter in spec.pixels:
         if letter not in drawn:
@@ -121,13 +121,13 @@ def unused(spec: SensorSpec) -> Iterator[tuple[str, str]]:
 
 
 def _outside(name: str, response: Spectrum) -> Iterator[str]:
-    """That too much of a response lies where nothing can be rendered, and on which side."""
+    """The problem that too much of a response lies outside the wavelengths that can be rendered, with the side."""
     (low, high), (first, last) = RENDERABLE_NM, response.support_nm
     if coverage(constant(1.0, low, high), response) >= 1 - _LOST:
         return
     below = 1 - coverage(constant(1.0, low, max(last, high)), response)
     above = 1 - coverage(constant(1.0, min(first, low), high), response)
-    # of both sides together it is more than `_LOST`
+    # both sides together exceed `_LOST`
     cuts = [cut for cut, share in (("an ultraviolet", below), ("an infrared", above)) if share > _LOST / 2]
     yield (
         f"filters.{name}: more than {_LOST:.1%} of the response lies outside {low:g}-{high:g} nm, which cannot be "

@@ -1,4 +1,4 @@
-"""How a spectrum is written in a file."""
+"""A spectrum in a file."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class SpectrumSpec(Strict):
     fwhm_nm: float | None = Field(None, gt=0, description="full width at half maximum of that Gaussian")
     scale: float = Field(1.0, description="multiplies all values")
     folder: Path = Field(Path(), exclude=True)
-    _table: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(None)  # of `csv`, read once
+    _table: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(None)  # the table of `csv`, read once
 
     @model_validator(mode="before")
     @classmethod

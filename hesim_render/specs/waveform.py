@@ -1,4 +1,4 @@
-"""How the waveform of a flickering light is written in a scene file."""
+"""The waveform of a flickering light in a scene file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from hesim_render.specs.files import Strict
 from hesim_render.spectral import waveform
 
-#: Times are whole µs downstream: a faster light is steady there.
+#: Times are whole µs in the sensor, where a faster light would be steady.
 _Frequency = Annotated[float, Field(gt=0, le=100_000)]
 
 

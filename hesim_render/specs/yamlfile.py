@@ -1,4 +1,4 @@
-"""Reading a YAML file without trust in its size, its depth or its aliases."""
+"""Reading of YAML files without trust in their size, depth or aliases."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import read_text, reading
 
-#: Values that a file may hold once every alias is written out; a calibration of a 16 x 16 tile has a few thousand.
+#: Largest number of values after all aliases are expanded; a calibration of a 16 x 16 tile has a few thousand.
 _MOST_VALUES = 1_000_000
 
 
@@ -22,12 +22,13 @@ def read_yaml(file: Path, with_lines: bool = True) -> Any:
 
     Parameters
     ----------
-    with_lines : keep line numbers (a `CommentedMap`), which takes longer; else plain dictionaries.
+    file : the file.
+    with_lines : keep line numbers (a `CommentedMap`), which is slower; otherwise plain dictionaries.
 
     Raises
     ------
     SpecError
-        If it is not one, or says little and means a lot.
+        If it is not a YAML mapping, or its aliases expand to too much.
     """
     text = read_text(file)
     with reading(file, "as YAML"):
@@ -48,7 +49,7 @@ def read_yaml(file: Path, with_lines: bool = True) -> Any:
 
 
 def _check_aliases(text: str, file: Path) -> None:
-    """Refuse a file whose aliases, written out, make it a thousand times as large, or for ever."""
+    """Refuse a file whose aliases expand it to a thousand times its size, or without end."""
     sizes: dict[str, int] = {}
     open_nodes: list[tuple[str | None, int]] = [(None, 0)]  # anchor, values so far
     for event in YAML(typ="rt").parse(text):
@@ -58,7 +59,7 @@ def _check_aliases(text: str, file: Path) -> None:
         if isinstance(event, AliasEvent):
             if any(anchor == event.anchor for anchor, _ in open_nodes):
                 raise SpecError(
-                    f"the alias *{event.anchor} stands inside of what it means", file=file, line=_line(event)
+                    f"the alias *{event.anchor} refers to a node that contains it", file=file, line=_line(event)
                 )
             size = sizes.get(event.anchor, 1)
         elif isinstance(event, ScalarEvent):

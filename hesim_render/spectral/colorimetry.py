@@ -1,4 +1,4 @@
-"""The little colorimetry that pictures need: tristimulus values and linear sRGB."""
+"""Colorimetry for pictures: tristimulus values and linear sRGB."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], 
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
 
-#: Grid of the sums below: pictures need no finer one (radiometry integrates in `spectrum`).
+#: Grid of the sums below, fine enough for pictures (radiometry integrates in `spectrum`).
 _GRID_NM = np.arange(360.0, 831.0, 1.0)
 
 
@@ -40,7 +40,7 @@ def tristimulus(light: Spectrum, surfaces: Sequence[Spectrum]) -> NDArray[np.flo
 
 
 def xyz_to_linear_srgb(xyz: ArrayLike, white_xyz: ArrayLike) -> NDArray[np.float64]:
-    """Linear sRGB of XYZ seen under a light whose white is `white_xyz`; that white becomes (1, 1, 1).
+    """Linear sRGB of XYZ values under a light with the white `white_xyz`, which becomes (1, 1, 1).
 
     Bradford adaptation to the white of the sRGB matrix itself, Y = 1 for white.
     """

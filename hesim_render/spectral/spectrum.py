@@ -22,7 +22,7 @@ from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 
 #: Largest step of the grid on which products are integrated, nm.
 INTEGRATION_STEP_NM = 1.0
-#: Share of a response that light and reflectance must cover (the rest would be lost silently).
+#: Share of a response that light and reflectance must cover; a smaller coverage would lose signal silently.
 REQUIRED_COVERAGE = 0.999
 #: Wavelengths the spectral renderer can carry, nm (Mitsuba 3's CIE range).
 RENDERABLE_NM = (360.0, 830.0)
@@ -135,7 +135,9 @@ def product(*spectra: Spectrum, step_nm: float = INTEGRATION_STEP_NM) -> Spectru
 
 
 def summed(*spectra: Spectrum) -> Spectrum:
-    """The sum over all tables together; where one of them ends off zero, the sum falls within 0.001 nm."""
+    """The sum over the union of all tables; where a table ends at a value other than 0, the sum drops within 0.001
+    nm.
+    """
     edges = np.array([s.support_nm for s in spectra])
     steps = np.concatenate([edges[:, 0] - 1e-3, edges[:, 1] + 1e-3])
     low, high = edges.min(), edges.max()
@@ -163,10 +165,10 @@ def require_coverage(spectrum: Spectrum, response: Spectrum, what: str, response
 
 @functools.cache
 def colour_science() -> Any:
-    """The module ``colour``. It sets NumPy's print options for the whole program: they are put back."""
+    """The module ``colour``. Its import sets NumPy's print options for the whole program; they are restored."""
     before = np.get_printoptions()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it tells which optional packages are not installed
+        warnings.simplefilter("ignore")  # it warns about optional packages that are not installed
         import colour
     np.set_printoptions(**before)
     return colour

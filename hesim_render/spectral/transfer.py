@@ -13,15 +13,15 @@ from hesim_render.core.errors import RangeError
 from hesim_render.spectral.spectrum import colour_science
 
 Transfer = Literal["srgb", "bt709", "gamma", "linear"]
-#: The transfers of pictures that come in: also those of high dynamic range.
+#: Transfers of input pictures, including those of high dynamic range.
 InputTransfer = Literal["srgb", "bt709", "gamma", "linear", "pq", "hlg"]
-#: Steps that work on square roots add this first, in units of white: shot noise becomes even, and read noise
-#: around black is not bent.
+#: Steps that use square roots add this first, in units of white: shot noise becomes uniform, and read noise
+#: around black is not distorted.
 ROOT_TOE = 0.01
 #: Constants of BT.709 to the digits of ITU-T H.273, with which the two branches of the curve meet. (colour-science
 #: has them rounded, which is 0.3 % off near the knee; its sRGB is the one below, but costs its import of 1.5 s.)
 _BT709_ALPHA, _BT709_BETA = 1.099296826809442, 0.018053968510807
-#: What counts as white, 1, in high dynamic range: this luminance and this HLG signal (ITU-R BT.2408).
+#: Luminance and HLG signal that count as white, 1, in high dynamic range (ITU-R BT.2408).
 _PQ_WHITE_CD_PER_M2, _HLG_WHITE = 203, 0.75
 Depth = Literal["float", 8, 16]
 

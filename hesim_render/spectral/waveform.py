@@ -1,7 +1,7 @@
-"""How a light's power goes up and down: waveforms of time mean 1, with the exact mean over any interval.
+"""Waveforms of a light's power, with time mean 1 and the exact mean over any interval.
 
-A waveform w multiplies a light's mean level, so its own time mean is 1: over a period, or over the table of one
-that does not repeat. All times are in µs; the functions take arrays, so that every row of a rolling shutter
+A waveform w multiplies a light's mean level, so its own time mean is 1: over a period, or over a table that
+does not repeat. All times are in µs. The functions take arrays, so that every row of a rolling shutter
 has its own interval.
 """
 
@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.units import US_PER_S
 
-#: Largest departure of ln w from straight lines between the times of `follow_us`.
+#: Largest deviation of ln w from straight lines between the times of `follow_us`.
 FOLLOW_TOLERANCE = 0.002
-#: Most and fewest steps in which a period of a smooth waveform, and most in which a stretch of a table, is followed.
+#: Largest and least number of steps in a period of a smooth waveform; largest number in a segment of a table.
 _MOST_STEPS, _LEAST_STEPS, _MOST_TABLE_STEPS = 512, 32, 64
-#: Power, over the mean, below which relative changes are no longer followed.
+#: Power over the mean below which relative changes are ignored.
 _FLOOR = 0.02
 
 
@@ -28,7 +28,7 @@ class Waveform(Protocol):
 
     @property
     def is_constant(self) -> bool:
-        """True where it is 1 at all times."""
+        """True if it is 1 at all times."""
         ...
 
     @property
@@ -37,11 +37,13 @@ class Waveform(Protocol):
         ...
 
     def mean(self, begin_us: ArrayLike, end_us: ArrayLike) -> NDArray[np.float64]:
-        """Mean over each interval in closed form, arrays of any shapes that fit; the value where begin is end."""
+        """Mean over each interval in closed form, arrays of any compatible shapes; the value at `begin_us` if it is
+        empty.
+        """
         ...
 
     def follow_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly inside an interval between which ln w is straight to `FOLLOW_TOLERANCE`, jumps among them."""
+        """Times strictly inside an interval between which ln w is linear to `FOLLOW_TOLERANCE`; jumps are included."""
         ...
 
     def jumps_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
@@ -66,14 +68,14 @@ def _every_period(
 class Mains:
     """A lamp on alternating current: w(t) = 1 + depth · cos(2π · 2 f t + phase), f the mains frequency.
 
-    Power goes with the square of the voltage, so at twice its frequency. The mean over [a, b] is
+    Power is proportional to the square of the voltage, so it has twice its frequency. The mean over [a, b] is
     1 + depth · sinc(2 f (b − a)) · cos(2π f (a + b) + phase), with sinc x = sin(πx)/(πx).
 
     Parameters
     ----------
-    frequency_hz : of the mains, 50 or 60.
+    frequency_hz : mains frequency, 50 or 60 Hz.
     depth : (max − min)/(max + min), 0 to 1.
-    phase_deg : of the light at t = 0.
+    phase_deg : phase of the light at t = 0, degrees.
     """
 
     frequency_hz: float
@@ -99,7 +101,7 @@ class Mains:
         """See `Waveform.follow_us`."""
         if self.is_constant:
             return np.empty(0)
-        # |d² ln w/dφ²| is largest in the minimum, d/(1 − d); a chord over h is h²/8 of that away
+        # |d² ln w/dφ²| is largest in the minimum, d/(1 − d); the deviation from a chord over h is h²/8 times that
         curvature = self.depth / max(1 - self.depth, _FLOOR)
         wanted = np.ceil(2 * np.pi * np.sqrt(curvature / (8 * FOLLOW_TOLERANCE)))
         steps = int(np.clip(wanted, _LEAST_STEPS, _MOST_STEPS))
@@ -107,7 +109,7 @@ class Mains:
         return _every_period(np.arange(steps) / steps, period_us, 0.0, begin_us, end_us)
 
     def jumps_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """None."""
+        """No jumps."""
         return np.empty(0)
 
 
@@ -117,9 +119,9 @@ class Pwm:
 
     Parameters
     ----------
-    frequency_hz : of the switching.
+    frequency_hz : switching frequency, Hz.
     duty : part of each period in which it is on, above 0 to 1.
-    phase_deg : how far into its period it is at t = 0; at 0 it has just been switched on.
+    phase_deg : phase at t = 0, degrees; at 0 it has just been switched on.
     """
 
     frequency_hz: float
@@ -135,7 +137,7 @@ class Pwm:
         return 1 / self.duty
 
     def _on(self, cycles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Time switched on since the start of a period, in periods."""
+        """Time switched on since the begin of a period, in periods."""
         whole = np.floor(cycles)
         return whole * self.duty + np.minimum(cycles - whole, self.duty)
 
@@ -198,7 +200,7 @@ class Table:
         return float(self._power.max())
 
     def _integral(self, local_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """∫ w from the first sample on, µs; `local_us` counts from there and may lie outside the table."""
+        """∫ w from the first sample on, µs; `local_us` is relative to that sample and may lie outside the table."""
         times, power = self._times, self._power
         place = np.clip(np.searchsorted(times, local_us, side="right") - 1, 0, times.size - 2)
         held = np.clip(local_us, 0.0, times[-1])
@@ -238,7 +240,7 @@ class Table:
         return _inside(times + self.t_us[0], begin_us, end_us)
 
     def jumps_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Where a table that repeats starts over at another value."""
+        """Times at which a repeating table starts again with another value."""
         if not self.repeat or self._power[0] == self._power[-1]:
             return np.empty(0)
         return _every_period(np.zeros(1), self._times[-1], self.t_us[0], begin_us, end_us)

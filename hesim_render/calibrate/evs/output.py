@@ -111,7 +111,7 @@ def _parameters(fit: EventFit) -> dict[str, Any]:
     return {
         name: estimated(fit.values[k], error[k], _UNITS[name])
         if fit.identified(name)
-        else not_identifiable(fit.reasons.get(name, "not told by the data"))
+        else not_identifiable(fit.reasons.get(name, "not determined by the data"))
         for k, name in enumerate("ABCD")
     }
 

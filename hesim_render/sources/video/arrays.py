@@ -41,9 +41,9 @@ def picture_bits(dtype: np.dtype, bit_depth: int | None, name: str) -> int:
 
 
 def without_alpha(image: NDArray, bits: int, where: str) -> NDArray:
-    """[row, col] or [row, col, 3] of an image that may have one channel more, which must be opaque.
+    """[row, col] or [row, col, 3] of an image, without its alpha channel, which must be opaque.
 
-    Floating-point pictures (EXR) hold colour times alpha: over black they are what they are.
+    Floating-point pictures (EXR) hold colour times alpha: over a black background they need no change.
 
     Raises
     ------

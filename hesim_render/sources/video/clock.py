@@ -1,4 +1,4 @@
-"""When each picture stands for the scene, in simulated µs."""
+"""Times of the pictures of a video, in simulated µs."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from hesim_render.sources.video.picture import Timing
 
 
 class Clock:
-    """The video's time stamps as simulated time.
+    """Time stamps of a video as simulated time.
 
-    Picture k is a mean of the scene over [t_k, t_k + duty·Δ_k]; t_0 = 0. Held, it stands for the time from the
-    middle of the dark gap before to the middle of the dark gap behind it; with duty 1 there is no gap. Interpolated,
-    the scene goes on a straight line from the middle of one exposure to the middle of the next.
+    Picture k is the mean of the scene over [t_k, t_k + duty·Δ_k], with t_0 = 0. A held picture stands for the time from
+    the middle of the dark gap before it to the middle of the dark gap after it; with duty 1 there is no gap. With
+    interpolation, the scene changes linearly from the middle of one exposure to the middle of the next.
 
     Parameters
     ----------
-    timing : of the video's own clock.
-    slow_motion : how much slower that clock runs than the scene did: a film of 3200 pictures/s stored at 25
+    timing : times of the video's own clock.
+    slow_motion : ratio of the speed of the scene to that of the video's clock: a film of 3200 pictures/s stored at 25
         has 128.
     duty : part of the picture period in which the shutter was open, above 0 to 1.
-    factor : pictures made of one between this and the next; they divide the time between the middles evenly.
+    factor : number of pictures made from each one; they divide the time to the next middle evenly.
     """
 
     def __init__(self, timing: Timing, slow_motion: float = 1.0, duty: float = 1.0, factor: int = 1) -> None:
@@ -33,7 +33,7 @@ class Clock:
         #: Middle of each exposure.
         self.middle_us = begin + duty / 2 * period
         gap = (1 - duty) * period
-        #: Begin of the time each picture stands for while held, and the end of the last one's.
+        #: Begin of the time that each picture is held, and the end of the last one.
         self.hold_us = np.append(begin, self.end_us)
         self.hold_us[1:-1] -= gap[:-1] / 2
         if factor > 1:
@@ -49,11 +49,11 @@ class Clock:
 
     @property
     def period_us(self) -> float:
-        """The usual time from one picture to the next."""
+        """The usual time from one picture to the next, µs."""
         edges = self.hold_us
         return float(np.median(np.diff(self.middle_us))) if self.count > 1 else float(edges[1] - edges[0])
 
     def inner(self, times_us: NDArray[np.float64], begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Those of sorted `times_us` strictly between two times."""
+        """The sorted `times_us` that lie strictly between two times, µs."""
         first, last = np.searchsorted(times_us, begin_us, side="right"), np.searchsorted(times_us, end_us, side="left")
         return times_us[first:last]

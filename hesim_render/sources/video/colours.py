@@ -1,4 +1,4 @@
-"""How a video's numbers stand for light: transfer, primaries, YUV matrix and range, tagged or given."""
+"""Meaning of a video's numbers: transfer, primaries, YUV matrix and range, from its tags or given."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ _GAMMA = 2.2
 
 @dataclass(frozen=True)
 class ColourTags:
-    """What is known of a video's colours; None is what nobody has said.
+    """Known properties of a video's colours; None is unknown.
 
     Parameters
     ----------
     transfer, gamma : from picture values to linear light, see `hesim_render.spectral.transfer.decode`.
-    primaries : of the RGB.
-    matrix : from YUV to RGB; ``rgb`` where the file holds RGB.
-    range : whether the codes use their full range, or 16 to 235 (of 8 bits).
+    primaries : primaries of the RGB values.
+    matrix : from YUV to RGB; ``rgb`` if the file holds RGB.
+    range : full range of the codes, or 16 to 235 (of 8 bits).
     """
 
     transfer: InputTransfer | None = None
@@ -64,12 +64,12 @@ class ColourTags:
 
     @classmethod
     def of_codes(cls, transfer: int, primaries: int, matrix: int, range: int, file: str) -> ColourTags:
-        """Tags from the codes of ITU-T H.273, with which video files are tagged.
+        """Tags from the codes of ITU-T H.273 that video files hold.
 
         Raises
         ------
         SpecError
-            For a code that this package has no formula for; the message says what can be given instead.
+            For a code without a formula here; the message says what can be given instead.
         """
         for name, code, known in (
             ("transfer", transfer, {*_TRANSFER_OF_CODE, 0, 2}),
@@ -85,7 +85,7 @@ class ColourTags:
         )
 
     def with_given(self, **given: Any) -> ColourTags:
-        """With what a person says instead of the file (None leaves the file's word)."""
+        """The tags with given values in place of the file's; None keeps the file's value."""
         changes = {name: value for name, value in given.items() if value is not None}
         if "transfer" in changes and "gamma" not in changes:
             changes["gamma"] = None

@@ -1,4 +1,4 @@
-"""SHA-256 of a video's data, made beside the run: nothing waits for it until the manifest is written."""
+"""SHA-256 of a video's data, computed in parallel to the run; the manifest waits for it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 
 class Digest:
-    """Hashes pieces of data in a thread of its own; hashing lets other threads of Python run.
+    """Hashes pieces of data in its own thread; hashing lets other threads of Python run.
 
     Parameters
     ----------
-    pieces : called in that thread; gives bytes, or arrays whose bytes lie one after another.
+    pieces : called in that thread; yields bytes, or arrays whose bytes are hashed in order.
     """
 
     def __init__(self, pieces: Callable[[], Iterable[Any]]) -> None:
@@ -33,12 +33,12 @@ class Digest:
             self._error = error
 
     def hexdigest(self) -> str:
-        """The hash, once all is read.
+        """The hash, after all data are read.
 
         Raises
         ------
         Exception
-            What reading the data raised.
+            Whatever reading the data raised.
         """
         self._thread.join()
         if self._error is not None:
@@ -46,13 +46,13 @@ class Digest:
         return self._hash.hexdigest()
 
     def stop(self) -> None:
-        """End soon: nobody wants the hash any more."""
+        """Stop early, because the hash is no longer needed."""
         self._is_stopped = True
         self._thread.join()
 
 
 class Hashed:
-    """An input whose data are hashed; `_pieces` gives them."""
+    """An input whose data are hashed; `_pieces` yields them."""
 
     _digest: Digest | None = None
 
@@ -60,11 +60,11 @@ class Hashed:
         raise NotImplementedError
 
     def start_digest(self) -> None:
-        """Begin to hash, beside what follows."""
+        """Start hashing in parallel to the run."""
         self._digest = Digest(self._pieces)
 
     def _sha256(self) -> str:
-        """The hash, in hexadecimal digits; waits for it."""
+        """The hash as hexadecimal digits; waits for it."""
         if self._digest is None:
             self.start_digest()
         assert self._digest is not None

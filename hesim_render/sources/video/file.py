@@ -20,10 +20,10 @@ _PIECE_BYTES = 1 << 20
 
 
 class FileVideo(Hashed):
-    """The first video stream of a file; a handful of pictures are in memory.
+    """The first video stream of a file; only a few pictures are in memory.
 
-    The file is read once through without decoding, for the time stamps of all its pictures; they are honoured, be
-    they regular or not. Pictures that a decoder calls damaged are errors, never shown half.
+    The file is first read once without decoding, for the time stamps of all its pictures, which may be regular or not.
+    Pictures that a decoder reports as damaged are errors; they are never used in part.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class FileVideo(Hashed):
     Raises
     ------
     SpecError
-        If the file is no video that can be used; also later in `read`, where a picture is damaged or missing.
+        If the file is not a usable video; also later in `read`, if a picture is damaged or missing.
     """
 
     def __init__(self, path: str | Path, fps: float | None = None) -> None:
@@ -68,7 +68,7 @@ class FileVideo(Hashed):
         self._stream = self._container.streams.video[0]
         if self._stream.codec_context is None:
             raise SpecError("has a video that no decoder here reads", file=self._path)
-        # frames decoded ahead would log their checksums when nobody listens, see _checksum_errors
+        # frames decoded ahead would log checksum errors before _checksum_errors listens
         self._stream.thread_type = "SLICE" if self._stream.codec_context.name == "ffv1" else "AUTO"
         self._stream.codec_context.options = {"err_detect": "crccheck+explode"}
         self._codec = self._stream.codec_context.name
@@ -80,7 +80,7 @@ class FileVideo(Hashed):
         self._next_frame = None
 
     def _scan(self) -> tuple[np.ndarray | None, Timing | None, int]:
-        """Time stamps in order and timing (None where they do not tell pictures apart), and the number of pictures."""
+        """Sorted time stamps and timing (None if they do not distinguish the pictures), and the number of pictures."""
         import av
 
         stamps = array("q")  # an hour at 3200 pictures/s has 11 million
@@ -106,7 +106,7 @@ class FileVideo(Hashed):
         unit = float(self._stream.time_base or 1)
         begin = (pts - pts[0]) * unit
         if np.any(np.diff(pts) <= 0):
-            # the clock is coarser than the pictures follow each other, as a high-speed video in Matroska
+            # the clock is coarser than the picture period, as for a high-speed video in Matroska
             return None, None, len(stamps)
         typical = float(np.median(np.diff(begin))) if pts.size > 1 else 0.0
         length = last_duration * unit or typical or 1 / float(self._stream.average_rate or 1)
@@ -116,7 +116,7 @@ class FileVideo(Hashed):
         return pts, timing, len(stamps)
 
     def _cut_short(self, count: int, end_s: float, typical_s: float, damaged: str) -> str:
-        """What tells that the file once held more pictures, if something does."""
+        """A description of the evidence that the file once held more pictures; empty without evidence."""
         if damaged:
             return damaged
         if self._stream.frames > count:
@@ -206,7 +206,7 @@ class FileVideo(Hashed):
 
 @contextlib.contextmanager
 def _checksum_errors() -> Iterator[list[str]]:
-    """What decoders say of checksums that are wrong: some (FFV1) only log it and hand out the picture."""
+    """Errors of checksums that decoders only log: some (FFV1) return the damaged picture anyway."""
     import av.logging
 
     found: list[str] = []

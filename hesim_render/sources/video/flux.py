@@ -1,4 +1,4 @@
-"""A video as a source of flux: Φ of any mosaic pixels over any stretch of time."""
+"""A video as a source of flux: Φ of any mosaic pixels over any time interval."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Source = str | Path | NDArray
 
 
 def open_video(source: Source, options: VideoOptions) -> Reader:
-    """The reader that fits: an array or ``.npy`` file, a folder of numbered pictures, or a video file.
+    """The reader for a source: an array or ``.npy`` file, a folder of numbered pictures, or a video file.
 
     Raises
     ------
     SpecError
-        If there is no such thing, or it is none of them.
+        If the source does not exist, or is none of these.
     """
     if isinstance(source, np.ndarray) or str(source).lower().endswith(".npy"):
         return ArrayVideo(source, options.bit_depth, options.fps)
@@ -52,26 +52,26 @@ def open_video(source: Source, options: VideoOptions) -> Reader:
 class VideoFlux(WindowByWindow):
     """Φ = V(x) · Σ_c M[filter, c] · (linear R, G, B averaged over the pixel's footprint); implements `FluxSource`.
 
-    M comes from `hesim_render.sources.video.inversion`; V is 1 unless `lens_shading` is asked for. Negative rates, of
-    colours outside the sensor's gamut, count as 0. Each picture is turned into the rates of all mosaic pixels once,
-    when it is first needed. Maps of a few pictures are kept, as many as an event window reaches back: pictures are read
+    M comes from `hesim_render.sources.video.inversion`; V is 1 unless `lens_shading` is set. Negative rates, of
+    colours outside the sensor's gamut, count as 0. Each picture is converted to the rates of all mosaic pixels once,
+    when it is first needed. The maps of as many pictures are kept as an event window reaches back, so pictures are read
     in order, each once.
 
     Parameters
     ----------
     source : path of a video file, a folder or a ``.npy`` file, or an array [time, row, col(, channel)].
-    sensor : region and lens.
+    sensor : the sensor, with region and lens.
     options : see `VideoOptions`.
 
     Attributes
     ----------
-    clock : the pictures' times.
-    cut_short : what tells that the file once was longer, else empty.
+    clock : times of the pictures.
+    cut_short : evidence that the file once was longer, else empty.
 
     Raises
     ------
     SpecError
-        If the video cannot be read, or lacks colour tags or a clock that nobody gave.
+        If the video cannot be read, or lacks colour tags or a clock that were not given either.
     RangeError
         If options do not fit the video or the sensor.
     """
@@ -120,7 +120,7 @@ class VideoFlux(WindowByWindow):
         self._maps: dict[int, Float] = {}
         self._edges = self.clock.hold_us[1:-1] if self._is_held else self.clock.middle_us
         window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 0
-        # so many pictures behind the latest one are asked for again: by frames, after an event window
+        # number of pictures before the latest one that may be asked for again: by frames, after an event window
         self._reach = 1 if self._is_held else 2
         if self._edges.size > 1:
             self._reach += int(window_us // np.diff(self._edges).min())
@@ -138,7 +138,7 @@ class VideoFlux(WindowByWindow):
         return camera_matrix(self.sensor, filters, light, self.white_lux, options.camera, options.others, options.luma)
 
     def notes(self) -> list[str]:
-        """What a person should know before trusting the result, in sentences."""
+        """Notes for the user about the reliability of the result, in sentences."""
         found = []
         scale = min(self.mapping.rows.scale, self.mapping.cols.scale)
         if scale < 1:
@@ -163,21 +163,21 @@ class VideoFlux(WindowByWindow):
         return self.clock.inner(self._edges, begin_us, end_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Middles of the exposures: times at which a picture is what the scene was, held or not.
+        """Middles of the exposures, µs: the times at which a picture equals the scene, whether it is held or not.
 
-        Who goes in a straight line from sample to sample follows the scene then. Sampled where a held picture ends, it
-        would come half a picture late.
+        Linear interpolation between these samples follows the scene. Samples at the end of a held picture would be half
+        a picture late.
         """
         return self.clock.inner(self.clock.middle_us, begin_us, end_us)
 
     def mean_flux(self, pixel: NDArray[np.uint32], begin_us: ArrayLike, end_us: ArrayLike) -> Halves:
         """Mean Φ of each listed pixel over its own interval, which may span several pictures.
 
-        Before the first and after the last picture's time these two are held.
+        The first picture is held before its time, the last one after its time.
 
         Returns
         -------
-        half_a, half_b : the same Dr.Jit Float [n], e⁻/s: a video has no Monte-Carlo error.
+        half_a, half_b : the same Dr.Jit Float [n], e⁻/s, because a video has no Monte-Carlo error.
 
         Raises
         ------
@@ -199,17 +199,17 @@ class VideoFlux(WindowByWindow):
         total: Float = 0.0
         for number, share in self._shares(begin, end).items():
             total = dr.fma(dr.gather(types.Float, self._flux_of(number), index), _device(share), total)
-            dr.eval(total)  # here, so that the pictures of a long interval can go one by one
+            dr.eval(total)  # evaluate here, so that the pictures of a long interval are freed one by one
         return total, total
 
     def _shares(self, begin: NDArray, end: NDArray) -> dict[int, NDArray[np.float64]]:
-        """By how much each picture counts in the means over intervals (one, or one per pixel), in order of time."""
+        """Weight of each picture in the means over intervals (one weight, or one per pixel), in order of time."""
         edges = self._edges
         first, last = float(begin.min()), float(end.max())
         cells = range(
             int(np.searchsorted(edges, first, side="right")), int(np.searchsorted(edges, last, side="left")) + 1
         )
-        if len(cells) <= 1:  # a point in time on an edge belongs to what begins there
+        if len(cells) <= 1:  # a point in time on an edge belongs to the picture that begins there
             cells = range(cells.start, cells.start + 1)
         bounds = np.concatenate([[-np.inf], edges, [np.inf]])
         found: dict[int, NDArray[np.float64]] = {}
@@ -220,7 +220,7 @@ class VideoFlux(WindowByWindow):
             if self._is_held:
                 found[cell] = share
                 continue
-            # cell k goes from the middle of picture k - 1 to that of picture k; the mean of a straight line is
+            # cell k extends from the middle of picture k - 1 to that of picture k; the mean of a straight line is
             # its value half-way
             before, after = max(cell - 1, 0), min(cell, edges.size - 1)
             part = np.zeros(())
@@ -255,11 +255,11 @@ class VideoFlux(WindowByWindow):
         return flux
 
     def start_digest(self) -> None:
-        """Hash the input beside what follows; `describe` waits for it."""
+        """Start hashing the input in parallel to the run; `describe` waits for it."""
         self._reader.start_digest()
 
     def describe(self) -> dict[str, Any]:
-        """What the manifest says of the video: the input and its hash, colours, scale, times, interpolation."""
+        """The manifest's entry for the video: input and hash, colours, scale, times, interpolation."""
         options = self.options
         return {
             **self._reader.describe(),
@@ -289,7 +289,7 @@ class VideoFlux(WindowByWindow):
         }
 
     def close(self) -> None:
-        """Let go of the file and of the device's memory."""
+        """Close the file and free the device memory."""
         self._maps.clear()
         self._reader.close()
 

@@ -1,4 +1,4 @@
-"""Video from a folder of numbered pictures: PNG, JPEG, TIFF, EXR and whatever else PyAV decodes."""
+"""Video from a folder of numbered pictures: PNG, JPEG, TIFF, EXR and other formats that PyAV decodes."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
 
 
 def numbered_pictures(folder: Path) -> list[Path]:
-    """The pictures of a folder in order of the last number in their names; other files are left alone.
+    """The pictures of a folder in order of the last number in their names; other files are ignored.
 
     Raises
     ------
     SpecError
-        If there are none, names have no number or differ otherwise, or a number is missing or comes twice.
+        If there are none, if names have no number or differ in other parts, or if a number is missing or occurs twice.
     """
     files = sorted(
         path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")

@@ -1,4 +1,4 @@
-"""Where on the picture each mosaic pixel looks, and its mean over the pixel's footprint."""
+"""Mapping from picture to mosaic: the footprint of each mosaic pixel in the picture, and the mean over it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Fit = Literal["cover", "stretch", "pixel"]
 
 @dataclass(frozen=True)
 class Axis:
-    """Rows or columns: which source pixels the sensor's pixels see, and with what share.
+    """Rows or columns: source pixels and their weights for each sensor pixel.
 
     Parameters
     ----------
     first : [pixel], first source pixel of each footprint.
-    weight : [pixel, tap], shares of the source pixels from there on; they sum to 1.
-    scale : source pixels to a sensor pixel.
-    begin : where the first sensor pixel begins, in source pixels.
+    weight : [pixel, tap], weights of the source pixels from `first` on; they sum to 1.
+    scale : source pixels per sensor pixel.
+    begin : begin of the first sensor pixel, in source pixels.
     """
 
     first: NDArray[np.uint32]
@@ -34,7 +34,7 @@ class Axis:
 
     @property
     def is_plain(self) -> bool:
-        """Whether each sensor pixel is one source pixel."""
+        """True if each sensor pixel is one source pixel."""
         return self.weight.shape[1] == 1
 
 
@@ -42,7 +42,7 @@ def axis(pixels: int, source: int, scale: float) -> Axis:
     """Footprints of `scale` source pixels each, centred on the source: exact overlaps with its square pixels."""
     begin = (source - pixels * scale) / 2
     if scale == 1:
-        begin = float(np.floor(begin))  # whole pixels stay whole where an odd number of them is cut off
+        begin = float(np.floor(begin))  # keeps whole pixels whole if an odd number of them is cut off
     edges = np.clip(begin + np.arange(pixels + 1) * scale, 0, source)
     edges = np.where(np.abs(edges - np.rint(edges)) < 1e-9 * source, np.rint(edges), edges)
     low, high = edges[:-1], edges[1:]
@@ -57,7 +57,7 @@ def axis(pixels: int, source: int, scale: float) -> Axis:
 
 @dataclass(frozen=True)
 class Mapping:
-    """From the picture to the read-out region; box footprints in linear light, so that no light is lost or made."""
+    """Mapping from the picture to the read-out region by box footprints in linear light, which conserve light."""
 
     rows: Axis
     cols: Axis
@@ -65,7 +65,7 @@ class Mapping:
 
     @property
     def is_identity(self) -> bool:
-        """Whether picture and region are the same pixels."""
+        """True if picture and region have the same pixels."""
         shape = (self.rows.first.size, self.cols.first.size)
         return shape == self.source_shape and self.rows.is_plain and self.cols.is_plain
 
@@ -80,8 +80,8 @@ class Mapping:
 def mapping(source_width: int, source_height: int, rows: int, cols: int, fit: Fit = "cover") -> Mapping:
     """How a picture fills a region of `rows` × `cols` sensor pixels.
 
-    ``cover``: one scale for both axes, the largest at which the picture covers the region; what stands out is cut
-    off evenly. ``stretch``: each axis its own. ``pixel``: one picture pixel to a sensor pixel, from the middle.
+    ``cover``: one scale for both axes, the largest at which the picture covers the region; the excess is cut
+    off evenly. ``stretch``: a scale for each axis. ``pixel``: one picture pixel per sensor pixel, from the centre.
 
     Raises
     ------

@@ -1,13 +1,14 @@
-"""From linear sRGB to the photo-electron rate behind each filter: one small matrix, made once.
+"""From linear sRGB to the photo-electron rate behind each filter: a small matrix, computed once.
 
-``matrix``, the route of the H-ESIM paper: the camera's colour matrix and white balance are undone, which gives
-camera RGB; its scale comes from the filter with the strongest white. Filters that are no colour of the camera
-(white event pixels) see a luma, or the spectral route, at the scale of their own white.
+``matrix``, the method of the H-ESIM paper: the camera's colour matrix and white balance are inverted, which gives
+camera RGB. The filter with the strongest white sets its scale. Filters that are not a colour of the camera
+(white event pixels) see a luma, or the spectral method, scaled to their own white.
 
 ``spectral``: a colour becomes the reflectance r·ρ_r(λ) + g·ρ_g(λ) + b·ρ_b(λ) with the basis of Mallett and Yuksel
 [mallett2019], which lies between 0 and 1, sums to 1 for white and has the colour's own tristimulus values under D65.
-Under the light it goes through Eq. 1 with the sensor's own curves. Any filter has a defined answer: that of one smooth
-surface of this colour, of the many that share it. The basis ends at 380 and 780 nm and is held constant beyond.
+This reflectance under the light goes through Eq. 1 with the sensor's own curves. Any filter thus has a defined
+response: that to one smooth surface among the many of this colour. The basis ends at 380 and 780 nm and is held
+constant beyond.
 """
 
 from __future__ import annotations
@@ -85,14 +86,16 @@ def camera_matrix(
 
     Parameters
     ----------
-    camera : its channels are filters of the sensor; default that of the sensor's mosaic under `light`.
-    others : what filters see that are no channel of the camera: ``luma`` or ``spectral``.
+    sensor, filters : the sensor, and names of its filters.
+    light, lux : spectrum of the light, and its illuminance on white, lx.
+    camera : its channels are filters of the sensor; default: the camera of the sensor's mosaic under `light`.
+    others : model of filters that are not channels of the camera: ``luma`` or ``spectral``.
     luma : weights of linear R, G, B; they are scaled to sum to 1.
 
     Raises
     ------
     RangeError
-        If the camera's matrix cannot be undone, its channels are no filters of the sensor, or the luma sums to 0.
+        If the camera's matrix cannot be inverted, its channels are not filters of the sensor, or the luma sums to 0.
     """
     white = white_flux(sensor, filters, light, lux)
     found = spectral_matrix(sensor, filters, light, lux) if others == "spectral" else white[:, None] * _unit(luma)

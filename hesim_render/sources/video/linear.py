@@ -1,4 +1,4 @@
-"""From a picture's codes to linear light, in one kernel over the picture."""
+"""From the codes of a picture to linear light, in one kernel over the picture."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from hesim_render.sources.video.colours import ColourTags, code_scale, yuv_to_rg
 from hesim_render.sources.video.picture import PictureFormat, Planes
 from hesim_render.spectral.transfer import decode
 
-#: Steps of the table of a transfer between 0 and 1; linear in between, 2e-6 off at most relative to white.
+#: Steps of a transfer table between 0 and 1. The error of linear interpolation is at most 2e-6 of white.
 _STEPS = 4096
 #: Highest picture value the table holds; limited-range video goes to 1.09, YUV with strong chroma higher.
 _TOP = 1.25
-#: Codes of RGB and grey of no more bits have a table of their own; the others interpolate in one that stays in cache.
+#: RGB and grey codes of at most this many bits have a table entry each; others interpolate in a table of cache size.
 _CODE_BITS = 12
 
 
 class Lineariser:
-    """Turns the planes of a picture into linear R, G, B (or one plane for grey), 1 being white.
+    """Converts the planes of a picture to linear R, G, B (or one plane for grey), with white at 1.
 
-    Values below black count as black, values above white are kept up to 1.25 of picture values (PQ and HLG: 1).
-    Linear pictures in floating point pass as they are. Chroma is interpolated linearly between its samples.
+    Values below black count as black. Values above white are kept up to 1.25 of picture values (PQ and HLG: 1).
+    Linear floating-point pictures are unchanged. Chroma is interpolated linearly between its samples.
 
     Parameters
     ----------
     shape : layout of the pictures.
-    tags : complete; primaries are left to who uses the result.
+    tags : complete tags; the caller handles the primaries.
     """
 
     def __init__(self, shape: PictureFormat, tags: ColourTags) -> None:
@@ -79,7 +79,7 @@ class Lineariser:
         return dr.gather(self._types.Float, table, index)
 
     def _interleaved(self, picture: NDArray) -> list[Float]:
-        """R, G and B of [row, col, 3]; bytes are taken out of whole words, which is three times as fast."""
+        """R, G and B of [row, col, 3]. Bytes are extracted from whole words, which is three times as fast."""
         import drjit as dr
 
         types = self._types
@@ -89,10 +89,10 @@ class Lineariser:
         words = types.UInt32(_words(picture))
         first = self._index * 3
         word, shift = first >> 2, (first & 3) << 3
-        # of the last word all three bytes of a pixel are in that word itself
+        # the last pixel has all three bytes in the last word itself
         last = dr.width(words) - 1
         low, high = dr.gather(types.UInt32, words, word), dr.gather(types.UInt32, words, dr.minimum(word + 1, last))
-        # a shift by 32 is undefined: two shifts that never reach it
+        # a shift by 32 is undefined, so use two smaller shifts
         both = (low >> shift) | ((high << 1) << (31 - shift))
         return [types.Float((both >> (8 * channel)) & 0xFF) for channel in range(3)]
 
@@ -155,7 +155,7 @@ class Lineariser:
         return found
 
     def _between(self, place: UInt32, shift: int, count: int, aligned: bool) -> tuple[UInt32, UInt32, Float | None]:
-        """Chroma samples before and after a luma position along one axis, and how far it is between them."""
+        """Chroma samples before and after a luma position along one axis, and the fraction of the way between them."""
         import drjit as dr
 
         types = self._types
@@ -169,9 +169,9 @@ class Lineariser:
 
 
 def _words(values: NDArray) -> NDArray[np.uint32]:
-    """The bytes of an array as 32-bit words (little-endian); filled up with zeros where the last is not full.
+    """The bytes of an array as 32-bit words (little-endian), padded with zeros to a whole word.
 
-    In place where they are whole words that lie on word boundaries.
+    The array is used in place if it consists of whole, aligned words.
     """
     flat = np.ascontiguousarray(values).reshape(-1)
     missing = -flat.size % (4 // flat.itemsize)

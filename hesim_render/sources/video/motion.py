@@ -18,15 +18,15 @@ _NAMES = {(0, 0): "yuv444p", (1, 0): "yuv422p", (1, 1): "yuv420p", (0, 1): "yuv4
 
 
 class MotionVideo:
-    """A video with `factor` - 1 pictures more between every two; the given ones stay as they are.
+    """A video with `factor` - 1 additional pictures between every two; the given ones are unchanged.
 
-    Blocks are followed in both directions and overlap (mi_mode=mci, mc_mode=aobmc, vsbmc=1). Motion is looked for in
-    luma or green, in picture values and not in light. Where the picture changes altogether it is repeated.
+    Blocks are tracked in both directions and overlap (mi_mode=mci, mc_mode=aobmc, vsbmc=1). Motion is estimated in
+    luma or green, in picture values and not in linear light. At a change of scene, pictures are repeated.
 
     Parameters
     ----------
-    reader : 8-bit pictures; minterpolate knows no others.
-    factor : see above.
+    reader : video of 8-bit pictures; minterpolate supports no others.
+    factor : pictures per given picture.
 
     Raises
     ------
@@ -78,7 +78,9 @@ class MotionVideo:
         return self._last
 
     def _feed(self) -> None:
-        """Give one picture (the last one twice: what is made ends one picture early) and take what comes out."""
+        """Feed one picture and take the output. The last picture is fed twice, because the output ends one picture
+        early.
+        """
         import av
 
         if self._given > self._reader.count:
@@ -102,7 +104,7 @@ class MotionVideo:
         if planes[0].ndim == 3:
             planes = tuple(planes[0][..., channel] for channel in range(3))
         if self.format.layout == "planar":
-            planes = planes[1], planes[0], planes[2]  # green is what motion is looked for in
+            planes = planes[1], planes[0], planes[2]  # motion is estimated in the first plane: green
         frame = av.VideoFrame(self.format.width, self.format.height, self._name)
         for plane, values in zip(frame.planes, planes, strict=True):
             lines = np.zeros((plane.height, plane.line_size), np.uint8)

@@ -1,4 +1,4 @@
-"""Everything a person can say about a video: one model, checked, that goes into the manifest as it is."""
+"""All options of a video: one validated model, which goes into the manifest as it is."""
 
 from __future__ import annotations
 
@@ -14,32 +14,33 @@ from hesim_render.specs.files import Strict
 from hesim_render.specs.problems import spec_error
 from hesim_render.spectral.transfer import InputTransfer
 
-#: Illuminance on a perfect diffuser of value 1 where nobody says: a bright studio.
+#: Default illuminance on a perfect diffuser of value 1: a bright studio.
 WHITE_LUX = 1000.0
 
 
 class VideoOptions(Strict):
-    """How a video stands for a scene in front of the sensor.
+    """How a video represents a scene in front of the sensor.
 
     Parameters
     ----------
-    fps : pictures per second of the video's clock. Needed for folders and arrays; for files instead of their own
+    fps : pictures per second of the video's clock. Required for folders and arrays; for files it replaces their own
         time stamps.
-    slow_motion : how much slower that clock runs than the scene did (3200 pictures/s stored at 25: 128).
+    slow_motion : ratio of the speed of the scene to that of the video's clock (3200 pictures/s stored at 25: 128).
     duty : part of the picture period in which the shutter was open.
-    interpolation : between pictures: ``none`` holds each, ``linear`` goes in a straight line from middle to middle,
-        ``motion`` does so after `motion_factor` - 1 motion-compensated pictures were put between every two.
-    motion_factor : see there.
+    interpolation : between pictures: ``none`` holds each picture, ``linear`` interpolates linearly from middle to
+        middle, ``motion`` does so after inserting `motion_factor` - 1 motion-compensated pictures between every two.
+    motion_factor : see `interpolation`.
     transfer, gamma, primaries, matrix, range : colour tags, where they are missing or wrong (`ColourTags`).
-    bit_depth : of integer values in arrays and TIFF, where it is not all bits of their type.
+    bit_depth : bits of integer values in arrays and TIFF; default: all bits of their type.
     mode : ``matrix`` or ``spectral``, see `hesim_render.sources.video.inversion`.
-    others, luma : what filters see in mode ``matrix`` that are no colour of the camera.
-    camera : whose matrix and white balance mode ``matrix`` undoes; default the sensor's own under the illuminant.
+    others, luma : model of filters that are not a colour of the camera, in mode ``matrix``.
+    camera : camera whose matrix and white balance mode ``matrix`` inverts; default: the sensor's own under the
+        illuminant.
     illuminant : light on the perfect diffuser.
-    white_lux : illuminance on a perfect diffuser of linear value 1.
-    white_e_per_s, white_filter : or its photo-electron rate behind a filter.
+    white_lux : illuminance on a perfect diffuser of linear value 1, lx.
+    white_e_per_s, white_filter : alternatively, its photo-electron rate behind a filter, e⁻/s.
     fit : how the picture fills the region, see `hesim_render.sources.video.geometry.mapping`.
-    lens_shading : whether the sensor's relative illumination applies; the video then is the scene, not the image.
+    lens_shading : apply the sensor's relative illumination; the video then is the scene, not the image.
     """
 
     fps: float | None = Field(None, ge=1e-4, le=1e9)
@@ -78,12 +79,12 @@ class VideoOptions(Strict):
 
     @classmethod
     def of(cls, **given: Any) -> VideoOptions:
-        """From keywords; those that are None count as not given.
+        """Options from keywords; those that are None count as not given.
 
         Raises
         ------
         SpecError
-            For an unknown name or a value out of range, with the name.
+            For an unknown name or a value out of range; the message has the name.
         """
         wanted = {name: value for name, value in given.items() if value is not None}
         try:

@@ -1,4 +1,4 @@
-"""How a picture lies in memory, and who hands out a video's pictures one after another."""
+"""Memory layout of a picture, and the reader interface that supplies a video's pictures in order."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.sources.video.colours import ColourTags
 
 PictureLayout = Literal["grey", "planar", "interleaved", "yuv"]
-#: The arrays of one picture, see `PictureFormat`; nobody writes into them.
+#: The arrays of one picture, see `PictureFormat`; they are read-only.
 Planes = tuple[NDArray, ...]
 
 
@@ -39,20 +39,20 @@ class PictureFormat:
 
     @property
     def chroma_size(self) -> tuple[int, int]:
-        """Width and height of Cb and Cr: an odd picture's last sample stands alone."""
+        """Width and height of Cb and Cr, rounded up for odd pictures."""
         x, y = self.chroma_shift
         return -(-self.width >> x), -(-self.height >> y)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When the pictures of a video begin, by its own clock.
+    """Begin times of the pictures of a video by its own clock.
 
     Parameters
     ----------
-    begin_s : [picture], increasing, the first 0.
-    end_s : of the last picture.
-    cut_short : what tells that the file once was longer, else empty.
+    begin_s : [picture], increasing, the first 0, s.
+    end_s : end of the last picture, s.
+    cut_short : evidence that the file once was longer, else empty.
     """
 
     begin_s: NDArray[np.float64]
@@ -65,12 +65,12 @@ class Timing:
 
 
 class Reader(Protocol):
-    """Hands out the pictures of a video; going forward is quick, going back may begin anew."""
+    """Supplies the pictures of a video. Forward reading is fast; a step back may restart the decoder."""
 
     name: str
     format: PictureFormat
     tags: ColourTags
-    #: None where the input has no clock and needs a frame rate.
+    #: None if the input has no clock and needs a frame rate.
     timing: Timing | None
     count: int
 
@@ -79,11 +79,11 @@ class Reader(Protocol):
         ...
 
     def start_digest(self) -> None:
-        """Begin to hash the input, beside what follows."""
+        """Start hashing the input in parallel to the run."""
         ...
 
     def describe(self) -> Mapping[str, Any]:
-        """What the manifest says of the input: name, hash, size, format; plain values. Waits for the hash."""
+        """The manifest's entry for the input: name, hash, size, format; plain values. Waits for the hash."""
         ...
 
     def close(self) -> None: ...
@@ -100,7 +100,7 @@ def check_values(planes: Planes, where: str) -> Planes:
     from hesim_render.core.errors import SpecError
 
     for plane in planes:
-        # a sum is finite if all are, and much quicker; it may overflow where they are
+        # a finite sum proves that all values are finite and is much faster; it may overflow, so check values then
         if plane.dtype.kind == "f" and not np.isfinite(plane.sum(dtype=np.float64)) and not np.isfinite(plane).all():
             raise SpecError("holds values that are not finite", file=where)
     return tuple(np.ascontiguousarray(plane) for plane in planes)

@@ -1,4 +1,4 @@
-"""Pictures and streams through PyAV: their own planes, untouched, in a few layouts that have formulas here."""
+"""Pictures and streams through PyAV: their own planes, unchanged, in the few layouts that have formulas here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hesim_render.sources.video.arrays import without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.picture import PictureFormat, Planes
 
-#: Formats that are another's numbers in another order: swscale only moves them.
+#: Formats that differ from a supported one only in the order of numbers: swscale only moves these.
 _REORDERED = {
     "rgb24": "gbrp", "bgr24": "gbrp", "rgba": "gbrap", "bgra": "gbrap", "argb": "gbrap", "abgr": "gbrap",
     "rgb0": "gbrp", "bgr0": "gbrp", "0rgb": "gbrp", "0bgr": "gbrp", "pal8": "gbrap",
@@ -28,12 +28,12 @@ _CENTRED = {"mjpeg", "mjpegb", "mpeg1video", "webp", "vp8"}
 
 
 def frame_format(frame: Any, codec: str, where: str) -> tuple[PictureFormat, str]:
-    """Layout of decoded frames, and the PyAV format they are brought into first (often their own).
+    """Layout of decoded frames, and the PyAV format they are converted to first (often their own).
 
     Raises
     ------
     SpecError
-        For formats that have no formula here, interlaced and rotated frames.
+        For formats without a formula here, and for interlaced and rotated frames.
     """
     if frame.interlaced_frame:
         raise SpecError("is interlaced: de-interlace it first (ffmpeg -vf bwdif)", file=where)
@@ -101,7 +101,7 @@ def tags_of(frame: Any, shape: PictureFormat, where: str) -> ColourTags:
 
 
 def decode_picture(path: Path) -> tuple[PictureFormat, ColourTags, Planes]:
-    """A picture file. Its tags hold what the file itself says; pictures have BT.709 primaries unless it does."""
+    """Decode a picture file. Its tags hold what the file states; the default primaries of pictures are BT.709."""
     import av
 
     try:

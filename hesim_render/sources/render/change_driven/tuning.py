@@ -29,7 +29,7 @@ class Tuning:
     Parameters
     ----------
     pilot_rays : rays, F. Pilot rays where the pixels of a role are direct neighbours; they decide whether a pixel
-        changes and how many rays it gets. With half as many, edges appear to move in steps of an eighth of a pixel.
+        changes and how many rays it gets. Half as many: edges appear to move in steps of 1/8 pixel.
     lone_pilot_rays : rays, F. Pilot rays where these pixels lie apart (event pixels of a hybrid tile). Without (as few
         as `pilot_rays`): changes are missed, because such pixels have no neighbours to show them.
     frame_pilot_rays : rays, H. Pilot rays of a frame pixel in an exposure. Without: objects that pass in a small part
