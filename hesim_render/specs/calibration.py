@@ -48,10 +48,16 @@ def read_calibration(file: str | Path) -> dict[str, Any]:
     return data
 
 
+#: Maps of pixels that misbehave.
+TELEGRAPH_MAPS = ("telegraph_amplitude_dn", "telegraph_high_share", "telegraph_correlation")
+DEFECT_MAPS = (
+    *("defect", "defect_on_per_trial", "defect_off_per_trial"),
+    *("defect_firing_share", "defect_correlation"),
+)
 #: Maps that a sensor takes from each section; thresholds are known only where contrast steps were captured.
 SENSOR_MAPS = {
-    "aps": ("n_row", "n_blc", "n_dp"),
-    "evs": ("bad_pixels", "threshold_on_relative", "threshold_off_relative"),
+    "aps": ("n_row", "n_blc", "n_dp", *TELEGRAPH_MAPS),
+    "evs": ("bad_pixels", "threshold_on_relative", "threshold_off_relative", *DEFECT_MAPS),
 }
 
 
