@@ -5,6 +5,10 @@ import pytest
 from scipy import stats
 
 import hesim_render as hr
+from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate.evs.flicker import dynamics, unsteady
+from hesim_render.calibrate.summary import summary_lines
+from hesim_render.capture.lab import write_captures
 from hesim_render.capture.loop import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
@@ -132,8 +136,7 @@ def test_shares_and_rates_are_the_files():
 def test_hot_and_flickering_pixels_fire_as_their_closed_forms(reference):
     """Mean and variance of counts over pixels, and no event elsewhere; 4 scores: false alarm 1e-4.
 
-    At a tick there is an event with 1 − e^(−rΔt); counts of hot pixels are binomial or Poisson. Those of flickering ones
-    have what `flicker_moments` says, checked against sums written out in the next test.
+    At a tick there is an event with 1 − e^(−rΔt); counts of hot pixels are binomial or Poisson.
     """
     ticks = 1000
     extra = {} if reference == "previous_sample" else {"evs__photoreceptor_cutoff_hz": 300.0}
@@ -320,3 +323,103 @@ def test_amplitudes_are_exponential():
     """Kolmogorov, false alarm 1e-5."""
     jumps = sensor(aps__telegraph={"share": 0.5, "amplitude_e": 40.0, "high_s": 0.05, "low_s": 0.2}).aps.telegraph
     assert stats.kstest(jumps.amplitude_dn / 8.0, "expon").pvalue > 1e-5
+
+
+# ---- from captures to a sensor that misbehaves alike ---------------------------------------------------
+
+BROKEN = {
+    "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.153, "evs.threshold_mismatch_std": 0.05,
+    "evs.defects": {
+        "stuck_share": 0.004, "hot_share": 0.006, "hot_rate_hz": 120.0, "hot_rate_spread_decades": 0.2,
+        "flickering_share": 0.006, "flickering_rate_hz": 150.0, "flickering_firing_s": 0.15, "flickering_quiet_s": 0.3,
+    },
+}  # fmt: skip
+EVS_SIDE, TICKS, PARTS = 128, 6400, 64
+
+
+@pytest.fixture(scope="module")
+def events_session(tmp_path_factory):
+    """(sensor, calibration file) of a session of eiger with defects, on a part of it; events alone are calibrated."""
+    folder = tmp_path_factory.mktemp("defects")
+    given = hr.load_sensor("eiger", BROKEN).crop(EVS_SIDE, EVS_SIDE)
+    write_captures(given, folder / "captures", frames=8, ticks=TICKS, parts=PARTS, seed=3)
+    calibrate_evs(folder / "captures", folder / "c.yaml", folder / "report.html")
+    return given, folder / "c.yaml"
+
+
+def test_defects_of_events_are_found_and_named(events_session):
+    given, file = events_session
+    true, maps, section = given.evs.defects, read_maps(file, "evs"), read_calibration(file)["evs"]
+    kind = maps["defect"].ravel()
+    steady = true.change_hz == 0
+    expected = np.zeros(kind.size, np.uint8)
+    expected[true.stuck], expected[true.place[steady]], expected[true.place[~steady]] = 1, 2, 3
+    assert min(np.sum(expected == k) for k in (1, 2, 3)) >= 10
+    np.testing.assert_array_equal(kind, expected)  # and no good pixel is called bad
+    assert section["defects"] == {
+        "stuck": np.sum(expected == 1), "hot": np.sum(expected == 2), "flickering": np.sum(expected == 3), "other": 0
+    }  # fmt: skip
+    text = f"{section['defects']['stuck']} stuck, {section['defects']['hot']} hot"
+    assert text in file.with_name("report.html").read_text() and any(
+        text in line for line in summary_lines({"evs": section}, "evs")
+    )
+    # the rate of a hot pixel to its counting error: both sessions, less what noise adds; false alarm 1e-4
+    tick_s = given.spec.evs.tick_us * 1e-6
+    chance = -np.expm1(-true.on_hz[steady] * tick_s)
+    error = np.sqrt(chance * (1 - chance) / (2 * TICKS))
+    score = (maps["defect_on_per_trial"].ravel()[true.place[steady]] - chance) / error
+    assert np.abs(score).max() < 4.8 and 0.5 < score.std() < 1.6
+    assert maps["defect_off_per_trial"].max() < 2e-3
+
+
+def test_a_calibrated_sensor_misbehaves_alike(events_session):
+    given, file = events_session
+    true = given.evs.defects
+    again = hr.load_sensor("eiger", {"noise": str(file)}).crop(EVS_SIDE, EVS_SIDE)
+    found = again.evs.defects
+    np.testing.assert_array_equal(found.stuck, true.stuck)
+    np.testing.assert_array_equal(np.sort(found.place), np.sort(true.place))
+    order = np.argsort(true.place)
+    steady = (true.change_hz == 0)[order]
+    np.testing.assert_array_equal(found.change_hz == 0, steady)
+    ratio = found.on_hz[steady] / true.on_hz[order][steady]
+    assert np.abs(ratio - 1).max() < 0.25 and abs(np.median(ratio) - 1) < 0.05
+    # times of flickering ones, each from 64 parts of 0.12 s: their median is right to a fifth
+    flicker = ~steady
+    for name, expected in (("on_hz", 150.0), ("change_hz", 10.0), ("firing_share", 1 / 3)):
+        assert np.median(getattr(found, name)[flicker]) == pytest.approx(expected, rel=0.25), name
+    # events in the dark: the sum over pixels of each kind is that of the captures
+    rows, cols = again.layout.evs_shape
+    dark = jit().Float(np.zeros(rows * cols, np.float32))
+    counts = np.zeros((2, rows * cols))
+    tick_us = given.spec.evs.tick_us
+    for k, one in enumerate((given, again)):
+        stage = EvsStage(one.evs, 11 + k)
+        for t in range(1500):
+            events = stage.step(dark, (t + 1) * tick_us)
+            counts[k] += np.bincount(events["y"].astype(int) * cols + events["x"], minlength=rows * cols)
+    assert not counts[:, true.stuck].any()
+    hot = true.place[true.change_hz == 0]
+    for where, tolerance in ((hot, 0.1), (true.place[true.change_hz > 0], 0.3)):
+        assert counts[1][where].sum() == pytest.approx(counts[0][where].sum(), rel=tolerance)
+    assert np.corrcoef(counts[0][hot], counts[1][hot])[0, 1] > 0.95
+    assert not again.evs.without("stuck", "hot", "flickering").defects
+
+
+def test_dynamics_of_flicker_from_parts():
+    """An independent generator: a Markov chain stepped trial by trial; medians over 400 pixels."""
+    rng = np.random.default_rng(4)
+    n, count, pixels, rate, share, correlation = 50, 128, 400, 0.4, 0.3, 0.98
+    state = rng.random(pixels) < share
+    parts = np.zeros((count, pixels))
+    for k in range(count * n):
+        fresh = rng.random(pixels) >= correlation
+        state = np.where(fresh, rng.random(pixels) < share, state)
+        parts[k // n] += state & (rng.random(pixels) < rate)
+    assert unsteady(parts, n).all()
+    p, c = dynamics(parts, n)
+    assert np.median(p) == pytest.approx(share, rel=0.07)
+    assert np.median(-1 / np.log(c)) == pytest.approx(-1 / np.log(correlation), rel=0.15)
+    # steady ones of all rates: none is called unsteady (chance 1e-6 each)
+    for rate in (0.002, 0.02, 0.4, 0.95):
+        assert unsteady(rng.binomial(n, rate, (count, 20_000)), n).sum() == 0

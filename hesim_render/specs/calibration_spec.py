@@ -78,6 +78,7 @@ class FrameSection(_Section):
     n_row_std_dn: float = Field(ge=0)
     row_noise_dn: Estimate | None = Field(None, description="calibrations of before it was measured lack it")
     bad_pixels: NonNegativeInt
+    telegraph_pixels: NonNegativeInt | None = Field(None, description="calibrations of before they were found lack it")
     K: Estimate
     read_noise_e: Estimate
     dark_current_e_per_s: Estimate
@@ -125,6 +126,9 @@ class EventSection(EventParameters):
     goodness: EventGoodness
     trials: PositiveInt
     bad_pixels: NonNegativeInt
+    defects: dict[Literal["stuck", "hot", "flickering", "other"], NonNegativeInt] | None = Field(
+        None, description="bad pixels by what they do; calibrations of before they were named lack it"
+    )
     findings: list[Finding] = []
     maps: MapsFile
 

@@ -211,8 +211,8 @@ class ApsNoise(PlainState):
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
         In the physical form K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr²; an image has telegraph noise too. Near
-        full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the variance
-        itself is above 0.24 DN².
+        full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the
+        variance itself is above 0.24 DN².
         """
         values = self._checked(electrons, exposure_us)
         value, _ = self._on_host(values, exposure_us, position)

@@ -103,7 +103,7 @@ def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32], spec: EvsSpec) 
     with np.errstate(divide="ignore"):
         change_hz = np.where(switching, -np.log(np.where(switching, correlation, 1.0)) / tick_s, 0.0)
     return EventDefects(
-        stuck=np.flatnonzero(maps["defect"].ravel() == formulas.STUCK),
+        stuck=np.flatnonzero(maps["defect"].ravel() == formulas.Defect.STUCK),
         place=place,
         key=key[place],
         on_hz=formulas.rate_hz(on, tick_s),

@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Literal
 
 import numpy as np
@@ -31,9 +32,15 @@ from hesim_render.core.namespace import Namespace
 
 ShotLaw = Literal["linear", "sqrt"]
 
-#: What a pixel does, in the maps of a calibration: it gives no event at all; events at a steady rate of its own; events
-#: at a rate that comes and goes; or something else that no threshold could give.
-GOOD, STUCK, HOT, FLICKERING, OTHER = range(5)
+
+class Defect(IntEnum):
+    """What a pixel does; values are those of the map ``defect`` of a calibration."""
+
+    NONE = 0
+    STUCK = 1  # gives no event at all
+    HOT = 2  # gives events at a steady rate of its own
+    FLICKERING = 3  # gives events at a rate that comes and goes
+    OTHER = 4  # its counts are unlike those of any threshold; nothing more is known
 
 
 @dataclass(frozen=True)
