@@ -138,13 +138,14 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     if not bad.any():
         return found
     silent = np.ones(int(bad.sum()), bool)
-    own, excess = [], []
+    own, excess, told = [], [], []
     for signal, on, off in static.sessions:
         both = np.stack([on[bad], off[bad]]).astype(np.float64)
-        usual = _of_like(signal, bad, {"on": on, "off": off, "most": on + off}, static.trials)
-        top = usual["most"]
-        excess.append(both.sum(axis=0) > top + _SIGMAS * np.sqrt(top + 1))
-        own.append([own_events(both[k] / static.trials, usual["on"], usual["off"], 1 - 2 * k) for k in (0, 1)])
+        usual, most = _of_like(signal, bad, (on, off), static.trials)
+        beyond = both > most + _SIGMAS * np.sqrt(most + 1)
+        excess.append(beyond.any(axis=0))
+        told.append(beyond)
+        own.append([own_events(both[k] / static.trials, *usual, 1 - 2 * k) for k in (0, 1)])
         silent &= both.sum(axis=0) == 0
     if steps is not None:
         silent &= (steps.on_total[bad] + steps.off_total[bad]) == 0
@@ -161,10 +162,11 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     named[over] = np.where(steady[over], np.uint8(Defect.HOT), np.uint8(Defect.FLICKERING))
     named[silent] = Defect.STUCK
     found.kind[bad] = named
-    chance = np.where(over, rates.mean(axis=0), 0.0)
+    # of a polarity in which the pixel gives no more than good ones nothing is taken: it may have a low threshold
+    chance = np.where(np.any(told, axis=0), rates.mean(axis=0), 0.0)
     flickers = np.flatnonzero(named == Defect.FLICKERING)
     if static.parts is not None and flickers.size:
-        share, correlation = dynamics(static.parts[:, bad][:, flickers], static.part_trials)
+        share, correlation = dynamics(static.parts[:, bad][:, flickers], static.part_trials, sum(usual)[flickers])
         for values, all_of_them in ((share, found.firing_share), (correlation, found.correlation)):
             all_of_them[tuple(axis[flickers] for axis in np.nonzero(bad))] = values
         chance[:, flickers] = np.minimum(chance[:, flickers] / share, 1.0)
@@ -173,19 +175,18 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
 
 
 def _of_like(
-    signal: NDArray, bad: NDArray[np.bool_], counts: dict[str, NDArray], trials: int
-) -> dict[str, NDArray[np.float64]]:
-    """For each bad pixel, of the good pixels of its brightness: mean chances of ON and of OFF, and the ``most`` events,
-    which only a thousandth of them exceed."""
+    signal: NDArray, bad: NDArray[np.bool_], both: tuple[NDArray, NDArray], trials: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """For each bad pixel, of the good pixels of its brightness: the mean chances of ON and of OFF, and the counts that
+    only a thousandth of them exceed; both [polarity, pixel]."""
     good = ~bad & np.isfinite(signal)
     group = like_brightness(signal[good])
     light = np.array([part.max() for part in by_group(signal[good], group)])
     # a pixel whose brightness is not known is compared with the busiest
     here = np.where(np.isfinite(signal[bad]), signal[bad], np.inf)
     place = np.minimum(np.searchsorted(light, here), light.size - 1)
-    found = {}
-    for name, values in counts.items():
-        parts = by_group(values[good], group)
-        usual = np.array([np.quantile(p, 0.999) if name == "most" else p.mean() / trials for p in parts])
-        found[name] = np.where(np.isfinite(here), usual[place], usual.max())
-    return found
+    found = []
+    for reduce in (lambda part: part.mean() / trials, lambda part: np.quantile(part, 0.999)):
+        usual = np.array([[reduce(part) for part in by_group(counts[good], group)] for counts in both])
+        found.append(np.where(np.isfinite(here), usual[:, place], usual.max(axis=1)[:, None]))
+    return found[0], found[1]

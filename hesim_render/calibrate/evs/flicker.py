@@ -30,7 +30,9 @@ def unsteady(parts: NDArray, trials: int) -> NDArray[np.bool_]:
     return (mean * parts.shape[0] >= 10) & (chi2.sf(freedom + (scatter - freedom) / heavier, freedom) < _CHANCE)
 
 
-def dynamics(parts: NDArray, trials: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def dynamics(
+    parts: NDArray, trials: int, usual: NDArray | float = 0.0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Part of the trials in which pixels fire, and how its state correlates from trial to trial, by moments.
 
     Of the counts the mean is n r p. Their excess of variance over one rate's is r² p (1 − p) times a sum that depends
@@ -40,6 +42,7 @@ def dynamics(parts: NDArray, trials: int) -> tuple[NDArray[np.float64], NDArray[
     Parameters
     ----------
     parts : [part, pixel], as of `unsteady`. trials : of a part.
+    usual : [pixel], events per trial of a good pixel's comparisons, which are in the mean as well.
     """
     count = parts.shape[0]
     mean = parts.mean(axis=0, dtype=np.float64)
@@ -47,6 +50,7 @@ def dynamics(parts: NDArray, trials: int) -> tuple[NDArray[np.float64], NDArray[
     variance = np.sum(off**2, axis=0) / (count - 1)
     neighbour = np.sum(off[1:] * off[:-1], axis=0) / (count - 1)
     excess = variance - mean * (1 - mean / trials)
+    own = mean / trials - usual
     correlation = np.exp(-1 / _TIMES)
     # at r = 1 and p = ½: spread·pairs and spread·product of `flicker_moments`, whose ratio holds for all r and p
     _, total, product = flicker_moments(1.0, 0.5, correlation, trials)
@@ -56,7 +60,7 @@ def dynamics(parts: NDArray, trials: int) -> tuple[NDArray[np.float64], NDArray[
     chosen = np.minimum(np.searchsorted(product / pairs, ratio), _TIMES.size - 1)
     sums = 4 * pairs[chosen]  # Σ_{i≠j} c^|i−j|
     with np.errstate(divide="ignore", invalid="ignore"):
-        odds = (excess / sums) / (mean / trials) ** 2  # (1 − p)/p
-    flickers = (excess > 0) & (mean > 0) & np.isfinite(odds)
+        odds = (excess / sums) / own**2  # (1 − p)/p
+    flickers = (excess > 0) & (own > 0) & np.isfinite(odds)
     share = np.where(flickers, 1 / (1 + np.where(flickers, odds, 0.0)), 1.0)
     return np.maximum(share, 1 / (count * trials)), np.where(flickers, correlation[chosen], 0.0)
