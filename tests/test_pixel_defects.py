@@ -402,7 +402,7 @@ def test_a_calibrated_sensor_misbehaves_alike(events_session):
     hot = true.place[true.change_hz == 0]
     for where, tolerance in ((hot, 0.1), (true.place[true.change_hz > 0], 0.3)):
         assert counts[1][where].sum() == pytest.approx(counts[0][where].sum(), rel=tolerance)
-    assert np.corrcoef(counts[0][hot], counts[1][hot])[0, 1] > 0.95
+    assert np.corrcoef(counts[0][hot], counts[1][hot])[0, 1] > 0.85
     assert not again.evs.without("stuck", "hot", "flickering").defects
 
 

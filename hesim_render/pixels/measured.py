@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.specs.calibration import DEFECT_MAPS, TELEGRAPH_MAPS, MeasuredMaps
+from hesim_render.specs.calibration_spec import Defect
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
 _EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "bad_pixels": ("b", 1.0)}
@@ -85,7 +86,7 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
     """Threshold of each event pixel relative to the mean, [y, x] over the region; None if not measured.
 
     Each pixel's measured value carries the noise of its estimate; deviations are scaled to `spread`, the
-    mismatch with that noise taken out.
+    mismatch with that noise taken out. Hot and flickering pixels have the mean.
 
     Parameters
     ----------
@@ -93,12 +94,14 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
     spread : relative standard deviation over pixels.
     """
     name = f"threshold_{polarity}_relative"
-    found = _read(layout, "evs", (name, "bad_pixels"))
+    found = _read(layout, "evs", (name, "bad_pixels", "defect"))
     if found is None or name not in found[0]:
         return None
     values = found[0][name].astype(np.float64)
     good = values[~found[0]["bad_pixels"]]
     scaled = 1 + (values - good.mean()) * (spread / max(float(good.std()), 1e-12))
+    if "defect" in found[0]:  # events of their own hide the threshold of these: they would count twice
+        scaled[np.isin(found[0]["defect"], (Defect.HOT, Defect.FLICKERING))] = 1.0
     return _event_region(layout, ({name: scaled}, found[1]), (name,))[name].astype(np.float32)
 
 

@@ -6,6 +6,7 @@ calibration, is named here; sections hold more, which is for people.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, NonNegativeInt, PositiveFloat, PositiveInt, field_validator, model_validator
@@ -17,6 +18,16 @@ SCHEMA_VERSION = 1
 SECTIONS = ("aps", "evs")
 
 _Beta = Annotated[list[float | None], Field(min_length=6, max_length=6)]
+
+
+class Defect(IntEnum):
+    """What a pixel does; values are those of the map ``defect`` of a calibration."""
+
+    NONE = 0
+    STUCK = 1  # gives no event at all
+    HOT = 2  # gives events at a steady rate of its own
+    FLICKERING = 3  # gives events at a rate that comes and goes
+    OTHER = 4  # its counts are unlike those of any threshold; nothing more is known
 
 
 class _Section(Strict):

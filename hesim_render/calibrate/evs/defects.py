@@ -21,7 +21,8 @@ from hesim_render.calibrate.evs.medians import (
 )
 from hesim_render.calibrate.evs.steps import Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, totals_of
-from hesim_render.pixels.evs.formulas import Defect, own_events
+from hesim_render.pixels.evs.formulas import own_events
+from hesim_render.specs.calibration_spec import Defect
 
 #: Chance with which a good pixel's count may be called bad, and the part of the spread allowed for.
 _CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06

@@ -15,8 +15,8 @@ from hesim_render.calibrate.evs.counts import StaticCapture
 from hesim_render.calibrate.evs.fitted import EventFit
 from hesim_render.calibrate.evs.model import both_probabilities
 from hesim_render.calibrate.evs.thresholds import curve
-from hesim_render.pixels.evs.formulas import Defect
 from hesim_render.recording.capture_set import CaptureSet
+from hesim_render.specs.calibration_spec import Defect
 
 _FIGURE_PX = 320
 #: Most bins of a histogram of counts.

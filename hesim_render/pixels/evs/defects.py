@@ -18,6 +18,7 @@ from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.measured import event_defects
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
+from hesim_render.specs.calibration_spec import Defect
 from hesim_render.specs.defects import EventDefectSpec
 from hesim_render.specs.sensor import EvsSpec
 
@@ -103,7 +104,7 @@ def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32], spec: EvsSpec) 
     with np.errstate(divide="ignore"):
         change_hz = np.where(switching, -np.log(np.where(switching, correlation, 1.0)) / tick_s, 0.0)
     return EventDefects(
-        stuck=np.flatnonzero(maps["defect"].ravel() == formulas.Defect.STUCK),
+        stuck=np.flatnonzero(maps["defect"].ravel() == Defect.STUCK),
         place=place,
         key=key[place],
         on_hz=formulas.rate_hz(on, tick_s),

@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Literal
 
 import numpy as np
@@ -31,16 +30,6 @@ from hesim_render.core.device_types import Values
 from hesim_render.core.namespace import Namespace
 
 ShotLaw = Literal["linear", "sqrt"]
-
-
-class Defect(IntEnum):
-    """What a pixel does; values are those of the map ``defect`` of a calibration."""
-
-    NONE = 0
-    STUCK = 1  # gives no event at all
-    HOT = 2  # gives events at a steady rate of its own
-    FLICKERING = 3  # gives events at a rate that comes and goes
-    OTHER = 4  # its counts are unlike those of any threshold; nothing more is known
 
 
 @dataclass(frozen=True)
