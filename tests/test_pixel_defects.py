@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 import hesim_render as hr
-from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate.aps.telegraph import fit_two_levels
 from hesim_render.calibrate.evs.flicker import dynamics, unsteady
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture.lab import write_captures
@@ -334,7 +335,7 @@ BROKEN = {
         "flickering_share": 0.006, "flickering_rate_hz": 150.0, "flickering_firing_s": 0.15, "flickering_quiet_s": 0.3,
     },
 }  # fmt: skip
-EVS_SIDE, TICKS, PARTS = 128, 6400, 64
+EVS_SIDE, TICKS, PARTS = 128, 4800, 64
 
 
 @pytest.fixture(scope="module")
@@ -423,3 +424,112 @@ def test_dynamics_of_flicker_from_parts():
     # steady ones of all rates: none is called unsteady (chance 1e-6 each)
     for rate in (0.002, 0.02, 0.4, 0.95):
         assert unsteady(rng.binomial(n, rate, (count, 20_000)), n).sum() == 0
+
+
+# ---- telegraph noise from dark frames ------------------------------------------------------------------
+
+EXPOSURES_S = np.array([1e-3, 5e-3, 20e-3, 50e-3, 80e-3])
+
+
+def dark_values(rng, pixels, amplitude=0.0, share=0.5, correlation=0.5, frames=64, width=1.2):
+    """[exposure, frame, pixel] of a Markov chain stepped frame by frame, whole DN; not our sampler."""
+    state = rng.random(pixels) < share
+    values = np.empty((EXPOSURES_S.size, frames, pixels))
+    for k in range(values.shape[0] * frames):
+        state = np.where(rng.random(pixels) >= correlation, rng.random(pixels) < share, state)
+        values.reshape(-1, pixels)[k] = amplitude * state
+    values += 64 + 30 * EXPOSURES_S[:, None, None] + width * rng.standard_normal(values.shape)
+    return np.rint(values)
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "share", "correlation"), [(6.0, 0.5, 0.9), (6.0, 0.2, 0.8), (5.0, 0.6, 0.0), (20.0, 0.1, 0.6)]
+)
+def test_two_levels_are_recovered(amplitude, share, correlation):
+    """Means over 150 pixels, from another generator; 3 scores at 4 σ: false alarm 2e-4 a case.
+
+    The variance over pixels is that of a mean over a chain of n = 320 frames, p (1 − p)/n·(1 + c)/(1 − c).
+    """
+    found = fit_two_levels(dark_values(np.random.default_rng(3), 150, amplitude, share, correlation), EXPOSURES_S)
+    assert found.is_telegraph.mean() > 0.97
+    spread = np.sqrt(share * (1 - share) / 320 * (1 + correlation) / (1 - correlation))
+    assert abs(found.high_share.mean() - share) < 4 * spread / np.sqrt(150)
+    assert 0.75 < found.high_share.std() / spread < 1.25
+    error = 1.2 / np.sqrt(320 * share * (1 - share))
+    assert abs(np.median(found.amplitude_dn) - amplitude) < 4 * 1.25 * 1.1 * error / np.sqrt(150) + 0.01
+    assert abs(found.correlation.mean() - correlation) < 0.035  # a chain's own correlation comes out low by 4/n
+    assert np.median(found.width_dn) == pytest.approx(np.hypot(1.2, 12**-0.5), rel=0.02)
+
+
+def test_noise_of_one_level_is_not_taken_for_two():
+    """Whatever its width. The gain that is asked for is 20; that of 3000 pixels stays below 16."""
+    for width in (0.9, 1.2, 4.0):
+        found = fit_two_levels(dark_values(np.random.default_rng(5), 1000, frames=32, width=width), EXPOSURES_S)
+        assert found.gain.max() < 16 and not found.is_telegraph.any()
+
+
+@pytest.fixture(scope="module")
+def frames_session(tmp_path_factory):
+    """(sensor, calibration file, captures) of frames of reference-mono with telegraph noise, at 30 frames a second."""
+    folder = tmp_path_factory.mktemp("telegraph")
+    noise = {"share": 0.01, "amplitude_e": 60.0, "high_s": 0.2, "low_s": 0.4}
+    given = hr.load_sensor("reference-mono", {
+        "aps.telegraph": noise, "aps.read_noise_e": 6.0, "aps.dark_current_e_per_s": 200.0,
+        "aps.dark_current_nonuniformity_rel": 0.5, "aps.prnu_rel": 0.01, "aps.dsnu_e": 10.0,
+    }).crop(SIDE, SIDE)  # fmt: skip
+    off = [f"evs.{term}" for term in EVS_TERMS]
+    write_captures(
+        given, folder / "c", frames=48, ticks=1, without=off, seed=5, dark_exposures_us=(1000, 5000, 20000, 30000),
+        lit_exposures_us=(1000, 5000, 20000),
+    )  # fmt: skip
+    calibrate_aps(folder / "c", folder / "c.yaml", folder / "report.html")
+    return given, folder / "c.yaml", folder / "c"
+
+
+def test_telegraph_pixels_of_frames_are_found(frames_session):
+    """All whose variance is above the limit that the docs state, and no good one: chance 1e-6 and less each."""
+    given, file, _ = frames_session
+    true, maps, section = given.aps.telegraph, read_maps(file, "aps"), read_calibration(file)["aps"]
+    found = np.flatnonzero(maps["telegraph_amplitude_dn"])
+    assert np.isin(found, true.place).all()
+    noise = given.aps.without("telegraph").variance_dn2(np.zeros((SIDE, SIDE)), 20_000, adc=True).ravel()[true.place]
+    plain = true.variance_dn2 > 1.2 * noise
+    assert plain.sum() > 40
+    assert np.isin(true.place[plain], found).mean() > 0.94  # some stay at one level for all of the dark frames
+    assert section["telegraph_pixels"] == found.size and section["bad_pixels"] >= found.size
+    assert f"<td>{found.size}</td>" in file.with_name("report.html").read_text()
+    assert any(
+        line.split() == ["telegraph", "pixels", str(found.size)] for line in summary_lines({"aps": section}, "aps")
+    )
+    # of those the two levels
+    mine = np.searchsorted(true.place, found)
+    ratio = maps["telegraph_amplitude_dn"].ravel()[found] / true.amplitude_dn[mine]
+    assert abs(np.median(ratio) - 1) < 0.03 and np.quantile(np.abs(ratio - 1), 0.9) < 0.15
+    assert np.median(maps["telegraph_high_share"].ravel()[found]) == pytest.approx(1 / 3, abs=0.05)
+    correlation = np.exp(-(5 + 2.5) / 30)
+    assert np.median(maps["telegraph_correlation"].ravel()[found]) == pytest.approx(correlation, abs=0.04)
+    # what is left is a good sensor: the noise of the others is the file's
+    assert section["read_noise_e"]["value"] == pytest.approx(6.0, rel=0.01)
+
+
+def test_a_calibrated_sensor_jumps_alike(frames_session):
+    given, file, captures = frames_session
+    again = hr.load_sensor("reference-mono", {"noise": str(file)}).crop(SIDE, SIDE)
+    jumps, true = again.aps.telegraph, given.aps.telegraph
+    assert np.isin(jumps.place, true.place).all() and jumps.place.size > 40
+    mine = np.searchsorted(true.place, jumps.place)
+    assert np.median(jumps.change_hz / true.change_hz[mine]) == pytest.approx(1, rel=0.15)
+    dark = np.stack([again.aps.sample(np.zeros((SIDE, SIDE)), 20_000, 9, k) for k in range(96)]).reshape(96, -1)
+    with np.load(captures / "aps_dark.npz") as data:
+        before = data["frames"][2].reshape(48, -1)
+    variances = [stack[:, jumps.place].astype(float).var(axis=0, ddof=1) for stack in (before, dark)]
+    assert np.median(variances[1] / variances[0]) == pytest.approx(1, rel=0.2)
+    assert variances[1].mean() == pytest.approx(variances[0].mean(), rel=0.2)
+    good = np.setdiff1d(np.arange(SIDE**2), true.place)
+    assert dark[:, good].astype(float).var(axis=0, ddof=1).mean() == pytest.approx(
+        before[:, good].astype(float).var(axis=0, ddof=1).mean(), rel=0.02
+    )
+    # the means are those of the captures: both levels lie about them
+    apart = dark[:, jumps.place].mean(axis=0) - before[:, jumps.place].mean(axis=0)
+    scale = np.sqrt(variances[0] * 10 * (1 / 48 + 1 / 96))
+    assert abs(np.mean(apart / scale)) < 0.6

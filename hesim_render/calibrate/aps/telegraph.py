@@ -142,10 +142,21 @@ def fit_two_levels(values: NDArray, exposures_s: NDArray[np.float64]) -> TwoLeve
     rest = y - line[0] - line[1] * t
     count = y.shape[0] * y.shape[1]
     one = -0.5 * count * (np.log(2 * np.pi * one_width**2) + 1)
-    # begin with what lies above and below the line, of each exposure's own median: its mean may hang on one level
-    rest = y - np.median(y, axis=1, keepdims=True)
+    # of two beginnings the likelier end is kept: above and below each exposure's own median, which many changes of
+    # level within an exposure suit, and above and below the straight line, which suits few
+    ends = [_climb(y, t, rest > 0), _climb(y, t, y > np.median(y, axis=1, keepdims=True))]
+    better = ends[1][-1] > ends[0][-1]
+    level, width, share, correlation, log_likelihood = (np.where(better, b, a) for a, b in zip(*ends, strict=True))
+    share = np.where(level[2] < 0, 1 - share, share)
+    visits = count * np.minimum(share, 1 - share)
+    return TwoLevels(np.abs(level[2]), share, correlation, width, log_likelihood - one, visits)
+
+
+def _climb(y: NDArray, t: NDArray, begin: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
+    """Expectation and maximisation from states `begin`: levels [3, pixel], and [pixel] width, share of the high state,
+    correlation, log-likelihood."""
     share, correlation = np.full(y.shape[2], 0.5), np.full(y.shape[2], 0.5)
-    high = (rest > 0).astype(np.float64)
+    high = begin.astype(np.float64)
     level, width = _line(y, np.broadcast_to(t, y.shape), high)
     for _ in range(_ROUNDS):
         log_likelihood, high, both = _chain(y, t, level, width, share, correlation)
@@ -153,11 +164,7 @@ def fit_two_levels(values: NDArray, exposures_s: NDArray[np.float64]) -> TwoLeve
         share = np.clip(high.mean(axis=(0, 1)), 1e-4, 1 - 1e-4)
         # of a chain with correlation c: P(high, high) = p² + p (1 − p) c
         correlation = np.clip((both - share**2) / (share * (1 - share)), 1e-4, 1 - 1e-4)
-    amplitude = level[2]
-    swap = amplitude < 0
-    share = np.where(swap, 1 - share, share)
-    visits = count * np.minimum(share, 1 - share)
-    return TwoLevels(np.abs(amplitude), share, correlation, width, log_likelihood - one, visits)
+    return level, width, share, correlation, log_likelihood
 
 
 def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

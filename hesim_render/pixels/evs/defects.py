@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream, device_normal, device_uniform
-from hesim_render.core.units import S_PER_US
+from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.measured import event_defects
@@ -24,6 +24,8 @@ from hesim_render.specs.sensor import EvsSpec
 
 #: Events of a defect per comparison at a fixed tick beyond which more change nothing: e⁻³⁰ is left.
 _MOST_PER_TICK = 30.0
+#: Events that are worked out at once, about.
+_AHEAD = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +133,11 @@ class DefectEvents:
         self._firing = np.flatnonzero(total > 0)
         key = defects.key[self._firing]
         self._events = PoissonPoints(seed, Stream.HOT_EVENTS, key, total[self._firing])
+        # events are worked out for many steps at once
+        ahead = max(_AHEAD, 4 * self._firing.size)
+        self._ahead_us = ahead / max(float(total.sum()), 1e-300) * US_PER_S
+        self._known_us = (0.0, 0.0)
+        self._known = (np.empty(0), np.empty(0, np.uint32), np.empty(0, np.int8))
         self._flickers = np.flatnonzero(defects.change_hz > 0)
         self._number = np.full(total.size, -1)
         self._number[self._flickers] = np.arange(self._flickers.size)
@@ -142,7 +149,17 @@ class DefectEvents:
     def between(
         self, begin_us: float, end_us: float
     ) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.int8]]:
-        """Times, places on the event grid and polarities of the events after `begin_us` up to `end_us`, unsorted."""
+        """Times, places on the event grid and polarities of the events after `begin_us` up to `end_us`, by time."""
+        if not (self._known_us[0] <= begin_us and end_us <= self._known_us[1]):
+            self._known_us = begin_us, max(end_us, begin_us + self._ahead_us)
+            self._known = self._events_of(*self._known_us)
+        first, last = np.searchsorted(self._known[0], (begin_us, end_us), side="right")
+        t_us, place, polarity = (values[first:last] for values in self._known)
+        return t_us, place, polarity
+
+    def _events_of(
+        self, begin_us: float, end_us: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.int8]]:
         which, t_us, mark = self._events.between(begin_us, end_us)
         which = self._firing[which]
         number = self._number[which]
@@ -150,13 +167,14 @@ class DefectEvents:
         gated = np.flatnonzero(number >= 0)
         kept[gated] = self._state.is_high(number[gated], t_us[gated])
         polarity = np.where(mark < self._on_part[which], 1, -1)[kept].astype(np.int8)
-        return t_us[kept], self._defects.place[which[kept]].astype(np.uint32), polarity
+        t_us, place = t_us[kept], self._defects.place[which[kept]].astype(np.uint32)
+        order = np.lexsort((place, t_us))
+        return t_us[order], place[order], polarity[order]
 
     def at_tick(self, polarity: NDArray[np.int8], begin_us: float, end_us: float) -> NDArray[np.int8]:
         """Polarity of each pixel at a comparison, 0 for none, with the events of defects where it has none itself."""
-        t_us, place, own = self.between(begin_us, end_us)
-        first = np.lexsort((t_us, place))[::-1]  # the earliest of a pixel is written last
-        place, own = place[first], own[first]
+        _, place, own = self.between(begin_us, end_us)
+        place, own = place[::-1], own[::-1]  # the earliest of a pixel is written last
         free = polarity[place] == 0
         polarity = polarity.copy()
         polarity[place[free]] = own[free]
