@@ -6,8 +6,10 @@ from scipy import stats
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
-from hesim_render.calibrate.aps.telegraph import fit_two_levels
+from hesim_render.calibrate.aps.telegraph import _suspects, fit_two_levels
+from hesim_render.calibrate.evs.counts import read_static
 from hesim_render.calibrate.evs.flicker import dynamics, unsteady
+from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture.lab import write_captures
 from hesim_render.capture.loop import noise_models
@@ -19,6 +21,7 @@ from hesim_render.pixels.evs import formulas as evs_formulas
 from hesim_render.pixels.evs.model import EVS_TERMS
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
+from hesim_render.recording.capture_set import read_captures
 
 SIDE = 96
 SILENT = [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.0, "beta5": 0.0}]
@@ -468,6 +471,24 @@ def test_noise_of_one_level_is_not_taken_for_two():
         assert found.gain.max() < 16 and not found.is_telegraph.any()
 
 
+def test_variances_of_good_pixels_are_not_looked_at():
+    """1e6 pixels of Gaussian noise and of dark current that varies: 1 is expected, 8 or more have a chance of 1e-5."""
+    rng, frames, side = np.random.default_rng(8), 32, 1000
+    dark = 4.0 * rng.gamma(2.0, 0.5, (side, side)) * EXPOSURES_S[:, None, None] * 20
+    true = 1.5 + 0.25 * dark
+    variance = true * rng.chisquare(frames - 1, true.shape) / (frames - 1)
+    mean = 64 + dark + np.sqrt(true / frames) * rng.standard_normal(true.shape)
+    level = np.full(true.shape, 64, np.uint16)
+    moments = Moments(
+        np.rint(EXPOSURES_S * 1e6).astype(np.int64), frames, mean.astype(np.float32), variance.astype(np.float32),
+        level, level, level, np.empty(0), np.empty(0), np.empty(0, np.int8),
+    )  # fmt: skip
+    used = np.ones((side, side), bool)
+    assert _suspects(moments, used, (2, 2), 1023).sum() < 8
+    moments.variance[:, 100:200, 100] *= 2.0
+    assert _suspects(moments, used, (2, 2), 1023)[100:200, 100].all()
+
+
 @pytest.fixture(scope="module")
 def frames_session(tmp_path_factory):
     """(sensor, calibration file, captures) of frames of reference-mono with telegraph noise, at 30 frames a second."""
@@ -533,3 +554,29 @@ def test_a_calibrated_sensor_jumps_alike(frames_session):
     apart = dark[:, jumps.place].mean(axis=0) - before[:, jumps.place].mean(axis=0)
     scale = np.sqrt(variances[0] * 10 * (1 / 48 + 1 / 96))
     assert abs(np.mean(apart / scale)) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda parts: parts[:7], "7 parts; expected 8 or more"),
+        (lambda parts: parts[:, :5], "must be whole numbers"),
+        (lambda parts: parts * 1.0, "must be whole numbers"),
+        (lambda parts: parts + 1, "does not add up"),
+    ],
+)
+def test_wrong_parts_are_told(tmp_path, change, text):
+    rng = np.random.default_rng(2)
+    parts = rng.binomial(100, 0.01, (10, 16, 16))
+    counts = {
+        "n_on": parts.sum(axis=0),
+        "n_off": 0 * parts[0],
+        "dark_n_on": parts.sum(axis=0),
+        "dark_n_off": 0 * parts[0],
+    }
+    (tmp_path / "capture.yaml").write_text("bit_depth: 10\ntile_rows: 1\ntile_cols: 1\n")
+    np.savez(
+        tmp_path / "evs_static.npz", signal_dn=np.ones((16, 16)), n_trials=1000, dark_parts=change(parts), **counts
+    )
+    with pytest.raises(SpecError, match=text):
+        read_static(read_captures(tmp_path))

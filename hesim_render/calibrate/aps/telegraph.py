@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from hesim_render.calibrate.moments import Moments
+from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import FrameStack
 
@@ -24,7 +25,8 @@ _CHANCE, _LEAST_GAIN = 1e-6, 20.0
 _LEAST_VISITS, _LEAST_DISTANCE = 5.0, 1.0
 #: Most pixels that are looked at, those of the largest variance first: what is read of them stays in memory.
 _MOST = 100_000
-_ROUNDS = 60
+#: Pixels that are fitted together, most rounds, and the change of log-likelihood below which they end.
+_TOGETHER, _ROUNDS, _SETTLED = 2000, 60, 1e-3
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,15 @@ def find_telegraph(
     place = np.flatnonzero(_suspects(moments, used, tile, full_scale_dn))
     if place.size == 0:
         return maps
-    values = np.empty((*stack.shape[:2], place.size), np.float32)
+    values = np.empty((*stack.shape[:2], place.size), np.uint16)
     for number, frame in enumerate(stack):
         values[divmod(number, stack.shape[1])] = frame.ravel()[place]
-    found = fit_two_levels(values, stack.exposures_us * 1e-6)
-    good = found.is_telegraph
-    for name in ("amplitude_dn", "high_share", "correlation"):
-        getattr(maps, name).ravel()[place[good]] = getattr(found, name)[good]
+    for first in range(0, place.size, _TOGETHER):
+        part = slice(first, first + _TOGETHER)
+        found = fit_two_levels(values[..., part], stack.exposures_us.astype(np.float64) * S_PER_US)
+        good = found.is_telegraph
+        for name in ("amplitude_dn", "high_share", "correlation"):
+            getattr(maps, name).ravel()[place[part][good]] = getattr(found, name)[good]
     return maps
 
 
@@ -158,8 +162,12 @@ def _climb(y: NDArray, t: NDArray, begin: NDArray[np.bool_]) -> tuple[NDArray[np
     share, correlation = np.full(y.shape[2], 0.5), np.full(y.shape[2], 0.5)
     high = begin.astype(np.float64)
     level, width = _line(y, np.broadcast_to(t, y.shape), high)
+    log_likelihood: NDArray = np.full(y.shape[2], -np.inf)
     for _ in range(_ROUNDS):
+        before = log_likelihood
         log_likelihood, high, both = _chain(y, t, level, width, share, correlation)
+        if np.all(log_likelihood - before < _SETTLED):
+            break
         level, width = _line(y, np.broadcast_to(t, y.shape), high)
         share = np.clip(high.mean(axis=(0, 1)), 1e-4, 1 - 1e-4)
         # of a chain with correlation c: P(high, high) = p² + p (1 − p) c
@@ -183,10 +191,10 @@ def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.floa
             product = terms[i] if high is not None and i == j == 2 else terms[i] * terms[j]
             normal[:, i, j] = np.sum(product, axis=axes)
     normal += 1e-9 * np.eye(size) * y.shape[0] * y.shape[1]
-    found = np.linalg.solve(normal, right[..., None])[..., 0].T
+    found: NDArray[np.float64] = np.linalg.solve(normal, right[..., None])[..., 0].T
     squares = np.sum(y * y, axis=axes) - np.sum(found * right.T, axis=0)
     width = np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2))
-    return found, width
+    return found, np.asarray(width, dtype=np.float64)
 
 
 def _chain(

@@ -133,8 +133,9 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     where counts of parts of a capture are known, in each part.
     """
     found = EventDefects(
-        bad, np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE)), *np.zeros((2, *bad.shape), np.float32),
-        np.ones(bad.shape, np.float32), np.zeros(bad.shape, np.float32),
+        bad=bad, kind=np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE)),
+        on=np.zeros(bad.shape, np.float32), off=np.zeros(bad.shape, np.float32),
+        firing_share=np.ones(bad.shape, np.float32), correlation=np.zeros(bad.shape, np.float32),
     )  # fmt: skip
     if not bad.any():
         return found
@@ -146,7 +147,7 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
         beyond = both > most + _SIGMAS * np.sqrt(most + 1)
         excess.append(beyond.any(axis=0))
         told.append(beyond)
-        own.append([own_events(both[k] / static.trials, *usual, 1 - 2 * k) for k in (0, 1)])
+        own.append([own_events(both[k] / static.trials, usual[0], usual[1], 1 - 2 * k) for k in (0, 1)])
         silent &= both.sum(axis=0) == 0
     if steps is not None:
         silent &= (steps.on_total[bad] + steps.off_total[bad]) == 0
@@ -167,7 +168,9 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     chance = np.where(np.any(told, axis=0), rates.mean(axis=0), 0.0)
     flickers = np.flatnonzero(named == Defect.FLICKERING)
     if static.parts is not None and flickers.size:
-        share, correlation = dynamics(static.parts[:, bad][:, flickers], static.part_trials, sum(usual)[flickers])
+        share, correlation = dynamics(
+            static.parts[:, bad][:, flickers], static.part_trials, (usual[0] + usual[1])[flickers]
+        )
         for values, all_of_them in ((share, found.firing_share), (correlation, found.correlation)):
             all_of_them[tuple(axis[flickers] for axis in np.nonzero(bad))] = values
         chance[:, flickers] = np.minimum(chance[:, flickers] / share, 1.0)

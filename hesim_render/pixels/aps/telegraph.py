@@ -80,10 +80,9 @@ def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> Telegra
         amplitude = np.full(place.size, spec.system_gain_dn_per_e * given.amplitude_e)
         if given.amplitude_law == "exponential":
             amplitude *= -np.log(device_uniform(device_seed, Stream.TELEGRAPH_AMPLITUDE, key[place]))
-        ones = np.ones(place.size)
-        share = given.high_s / (given.high_s + given.low_s)
-        change_hz = 1.0 / given.high_s + 1.0 / given.low_s
-        found = amplitude, share * ones, change_hz * ones
+        share = np.full(place.size, given.high_s / (given.high_s + given.low_s))
+        change_hz = np.full(place.size, 1.0 / given.high_s + 1.0 / given.low_s)
+        found = amplitude, share, change_hz
     else:
         return None
     return TelegraphPixels(place, layout.full_index.ravel()[place], *found, frame_us) if place.size else None

@@ -154,8 +154,8 @@ class DefectEvents:
             self._known_us = begin_us, max(end_us, begin_us + self._ahead_us)
             self._known = self._events_of(*self._known_us)
         first, last = np.searchsorted(self._known[0], (begin_us, end_us), side="right")
-        t_us, place, polarity = (values[first:last] for values in self._known)
-        return t_us, place, polarity
+        t_us, place, polarity = self._known
+        return t_us[first:last], place[first:last], polarity[first:last]
 
     def _events_of(
         self, begin_us: float, end_us: float

@@ -159,8 +159,9 @@ def own_events(counted: ArrayLike, own_on: ArrayLike, own_off: ArrayLike, polari
     counted : events per comparison, of the polarity. own_on, own_off : those of a good pixel's comparisons.
     polarity : +1 or −1.
     """
-    own = np.where(np.asarray(polarity) > 0, own_on, own_off)
-    return np.clip((counted - own) / np.maximum(1.0 - np.asarray(own_on) - own_off, 1e-9), 0.0, 1.0)
+    on, off = np.asarray(own_on), np.asarray(own_off)
+    own = np.where(np.asarray(polarity) > 0, on, off)
+    return np.clip((np.asarray(counted) - own) / np.maximum(1.0 - on - off, 1e-9), 0.0, 1.0)
 
 
 def firing_share(firing_s: Values, quiet_s: Values) -> Values:
