@@ -485,7 +485,7 @@ def test_variances_of_good_pixels_are_not_looked_at():
     )  # fmt: skip
     used = np.ones((side, side), bool)
     assert _suspects(moments, used, (2, 2), 1023).sum() < 8
-    moments.variance[:, 100:200, 100] *= 2.0
+    moments.variance[:, 100:200, 100] *= 2.5
     assert _suspects(moments, used, (2, 2), 1023)[100:200, 100].all()
 
 

@@ -80,27 +80,33 @@ def _suspects(
     """Pixels [row, col] whose variance over all exposures is beyond that of their kind, and of their dark current."""
     excess, freedom = np.zeros(used.shape), np.zeros(used.shape)
     clear = (moments.lowest > 0) & (moments.highest < full_scale_dn)
-    for k in range(moments.exposures_us.size):
+    t = moments.exposures_s
+    dark_dn_per_s = (moments.mean[-1] - moments.mean[0]) / (t[-1] - t[0])
+    for k in range(t.size):
         for i, j in np.ndindex(tile):
             cut = np.s_[i :: tile[0], j :: tile[1]]
             here = used[cut] & clear[k][cut]
-            if not here.any():
-                continue
-            variance = moments.variance[k][cut]
-            # dark current has shot noise: its gain is as variance and mean go together, over the brighter pixels
-            mean = moments.mean[k][cut] - np.median(moments.mean[k][cut][here])
-            usual = float(np.median(variance[here]))
-            bright = here & (mean > 10 * np.sqrt(usual))
-            gain = float(np.median((variance[bright] - usual) / mean[bright])) if bright.sum() >= 3 else 0.0
-            expected = np.maximum(usual + max(gain, 0.0) * np.maximum(mean, 0.0), ADC_VARIANCE_DN2)
-            excess[cut] += np.where(here, (moments.frames - 1) * variance / expected, 0.0)
-            freedom[cut] += np.where(here, moments.frames - 1, 0)
+            if here.any():
+                variance = moments.variance[k][cut]
+                expected = _usual_variance(variance, t[k] * dark_dn_per_s[cut], here)
+                excess[cut] += np.where(here, (moments.frames - 1) * variance / expected, 0.0)
+                freedom[cut] += np.where(here, moments.frames - 1, 0)
     limit = chi2.isf(_CHANCE, np.maximum(freedom, 1))
     beyond = np.where(freedom > 0, excess / limit, 0.0)
     suspects = beyond > 1
     if suspects.sum() > _MOST:
         suspects &= beyond >= np.partition(beyond.ravel(), -_MOST)[-_MOST]
     return suspects
+
+
+def _usual_variance(variance: NDArray, dark_dn: NDArray, here: NDArray[np.bool_]) -> NDArray:
+    """Variance of a good pixel with so much dark current, whose shot noise it holds: a straight line through the
+    medians of the pixels of least and of most dark current."""
+    low, high = np.quantile(dark_dn[here], (0.5, 0.95))
+    least, most = here & (dark_dn <= low), here & (dark_dn >= high)
+    x, y = ([float(np.median(values[part])) for part in (least, most)] for values in (dark_dn, variance))
+    slope = max((y[1] - y[0]) / (x[1] - x[0]), 0.0) if x[1] > x[0] else 0.0
+    return np.maximum(y[0] + slope * (dark_dn - x[0]), max(0.5 * y[0], ADC_VARIANCE_DN2))
 
 
 @dataclass(frozen=True)
@@ -193,8 +199,7 @@ def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.floa
     normal += 1e-9 * np.eye(size) * y.shape[0] * y.shape[1]
     found: NDArray[np.float64] = np.linalg.solve(normal, right[..., None])[..., 0].T
     squares = np.sum(y * y, axis=axes) - np.sum(found * right.T, axis=0)
-    width = np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2))
-    return found, np.asarray(width, dtype=np.float64)
+    return found, np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2)).astype(np.float64)
 
 
 def _chain(
