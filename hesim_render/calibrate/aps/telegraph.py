@@ -197,7 +197,7 @@ def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.floa
             product = terms[i] if high is not None and i == j == 2 else terms[i] * terms[j]
             normal[:, i, j] = np.sum(product, axis=axes)
     normal += 1e-9 * np.eye(size) * y.shape[0] * y.shape[1]
-    found: NDArray[np.float64] = np.linalg.solve(normal, right[..., None])[..., 0].T
+    found: NDArray = np.linalg.solve(normal, right[..., None])[..., 0].T
     squares = np.sum(y * y, axis=axes) - np.sum(found * right.T, axis=0)
     return found, np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2)).astype(np.float64)
 
