@@ -32,7 +32,7 @@ class StaticCapture:
     dark_n_off: NDArray[np.int64] | None
     trials: int
     tile: tuple[int, int]
-    parts: NDArray[np.int64] | None = None
+    parts: NDArray[np.integer] | None = None
 
     @property
     def part_trials(self) -> int:
@@ -119,7 +119,7 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
 
 def _parts(
     data: dict[str, NDArray], maps: dict[str, NDArray[np.int64]], trials: int, file: Path
-) -> NDArray[np.int64] | None:
+) -> NDArray[np.integer] | None:
     """``dark_parts``, checked against the counts of the whole; None where it is not given."""
     if "dark_parts" not in data:
         return None
@@ -133,8 +133,7 @@ def _parts(
         raise SpecError(
             f"dark_parts holds {parts.shape[0]} parts; expected 8 or more, a divisor of n_trials", file=file
         )
-    parts = parts.astype(np.int64)
-    if parts.min() < 0 or np.any(parts.sum(axis=0) != whole):
+    if parts.min() < 0 or np.any(parts.sum(axis=0, dtype=np.int64) != whole):
         raise SpecError("dark_parts does not add up to dark_n_on and dark_n_off", file=file)
     return parts
 
