@@ -43,7 +43,10 @@ def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
         lines.append(f"{'β, χ²/dof':<20} {min(values):.3f} to {max(values):.3f} over {len(values)} tile positions")
     else:
         lines.append(f"{'shot law':<20} {content['shot_law']}; χ²/dof {content['goodness']['chi2_per_dof']:.3f}")
-    lines.append(f"{'bad pixels':<20} {content['bad_pixels']}")
+    kinds = ", ".join(f"{count} {kind}" for kind, count in (content.get("defects") or {}).items())
+    lines.append(f"{'bad pixels':<20} {content['bad_pixels']}" + (f" ({kinds})" if kinds else ""))
+    if content.get("telegraph_pixels") is not None:
+        lines.append(f"{'telegraph pixels':<20} {content['telegraph_pixels']}")
     return lines + [f"look at: {finding['check']}: {finding['text']}" for finding in content.get("findings", [])]
 
 

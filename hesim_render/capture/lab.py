@@ -53,6 +53,7 @@ def write_captures(
     trials: int = 20,
     seed: int = 7,
     without: Sequence[str] = (),
+    parts: int = 0,
     dark_exposures_us: Sequence[int] = DARK_EXPOSURES_US,
     lit_exposures_us: Sequence[int] = LIT_EXPOSURES_US,
     illuminant: str = "D65",
@@ -74,6 +75,8 @@ def write_captures(
     seed : seed of the temporal noise. Every frame, tick and trial of a session has its own number, so noise never
         repeats.
     without : noise terms to switch off, as in `simulate`.
+    parts : number of equal parts of the dark ticks that are also counted separately (``dark_parts``). They distinguish
+        flickering event pixels from steady ones. A divisor of `ticks`, at least 8; or 0 for none.
     dark_exposures_us, lit_exposures_us : exposures of the dark and of the lit frames, µs.
     illuminant : name of the light's spectrum.
     overwrite : replace an existing capture set.
@@ -101,6 +104,8 @@ def write_captures(
         raise RangeError("ticks", ticks, "1 to 2^31 - 1")
     if not _FEWEST_TRIALS <= trials < 2**16:
         raise RangeError("trials", trials, f"{_FEWEST_TRIALS} to 65535")
+    if parts and (parts < _FEWEST_FRAMES or ticks % parts):
+        raise RangeError("parts", parts, f"0, or a divisor of the {ticks} ticks from {_FEWEST_FRAMES} on")
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
     bench = set_up(sensor, lit_exposures_us, illuminant, without)
@@ -123,7 +128,7 @@ def write_captures(
             if plans:
                 session.write_trials(folder.path, plans)
             elif bench.evs is not None:
-                session.write_static(folder.path / "evs_static.npz", ticks)
+                session.write_static(folder.path / "evs_static.npz", ticks, parts)
                 session.write_steps(folder.path / "evs_steps.npz", step_trials)
             _describe(bench, folder.path, illuminant, seed)
         return folder.commit()
@@ -169,14 +174,17 @@ class _Session:
             archive.add("exposures_us", np.array(exposures_us, dtype=np.int64))
             archive.add_pieces("frames", (len(exposures_us), frames, *layout.shape), np.uint16, shoot())
 
-    def write_static(self, file: Path, ticks: int) -> None:
+    def write_static(self, file: Path, ticks: int, parts: int = 0) -> None:
         signal = self.bench.event_signal_dn
         on, off = self._counts([self._electrons(signal)], ticks, "event counts, lit")
-        dark_on, dark_off = self._counts([self._electrons(0.0 * signal)], ticks, "event counts, dark")
+        by_part = np.zeros((parts, *signal.shape), dtype=np.min_scalar_type(ticks))
+        dark_on, dark_off = self._counts([self._electrons(0.0 * signal)], ticks, "event counts, dark", by_part)
         arrays: dict[str, NDArray] = {
             "signal_dn": signal, "n_on": on, "n_off": off, "n_trials": np.array(ticks),
             "dark_n_on": dark_on, "dark_n_off": dark_off,
         }  # fmt: skip
+        if parts:
+            arrays["dark_parts"] = by_part
         with NpzWriter(file) as archive:
             for name, array in arrays.items():
                 archive.add(name, array)
@@ -226,8 +234,13 @@ class _Session:
         seconds = self.bench.evs.spec.window_us * S_PER_US
         return jit().Float((signal_dn / self.bench.event_dn_per_e_per_s * seconds).astype(np.float32).ravel())
 
-    def _counts(self, levels: Sequence[Float], trials: int, what: str) -> tuple[NDArray, NDArray]:
-        """ON and OFF events [y, x] of `trials` steps to the last level; the levels are shown in turn."""
+    def _counts(
+        self, levels: Sequence[Float], trials: int, what: str, parts: NDArray | None = None
+    ) -> tuple[NDArray, NDArray]:
+        """ON and OFF events [y, x] of `trials` steps to the last level; the levels are shown in turn.
+
+        For a single level, events of successive parts of the trials are added to `parts` [part, y, x].
+        """
         evs = self.bench.evs
         assert evs is not None and evs.spec.tick_us is not None
         shape = self.bench.sensor.layout.evs_shape
@@ -242,6 +255,8 @@ class _Session:
                 pixel = events["y"].astype(np.int64) * shape[1] + events["x"]
                 on[pixel[events["polarity"] > 0]] += 1
                 off[pixel[events["polarity"] < 0]] += 1
+                if parts is not None and len(parts) and k > 0:
+                    parts[(k - 1) * len(parts) // trials].flat[pixel] += 1
             if k % 64 == 0:
                 self._advance(min(64, trials * period - k), what)
         return on.reshape(shape), off.reshape(shape)

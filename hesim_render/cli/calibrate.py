@@ -35,6 +35,9 @@ def lab(
     dark_ms: Annotated[str, typer.Option(help="dark exposures, ms")] = "1,5,20,50,80",
     lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
     illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
+    parts: Annotated[
+        int, typer.Option(help="parts of the dark ticks that are counted too: tells flickering pixels")
+    ] = 0,
     seed: Annotated[int, typer.Option(help="of all temporal noise")] = 7,
     set_: SensorKeys = None,
     without: Without = None,
@@ -43,7 +46,7 @@ def lab(
     """A virtual calibration session: dark and lit captures to calibrate from."""
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
-    exposures = {"dark_exposures_us": parse_exposures(dark_ms), "lit_exposures_us": parse_exposures(lit_ms)}
+    dark_us, lit_us = parse_exposures(dark_ms), parse_exposures(lit_ms)
     check_target(out, "capture.yaml", overwrite)
     from hesim_render.capture.lab import write_captures
     from hesim_render.sensor.sensor import load_sensor
@@ -51,8 +54,9 @@ def lab(
     loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
     with progress_report(f"lab {sensor}") as progress:
         folder = write_captures(
-            loaded, out, frames=frames, ticks=ticks, trials=trials, seed=seed, without=without or (),
-            illuminant=illuminant, overwrite=overwrite, progress=progress, **exposures,
+            loaded, out, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
+            illuminant=illuminant, overwrite=overwrite, progress=progress,
+            dark_exposures_us=dark_us, lit_exposures_us=lit_us,
         )  # fmt: skip
     for file in sorted(folder.iterdir()):
         say(f"{file.stat().st_size / 1e6:10.1f} MB  {out / file.name}")

@@ -37,6 +37,13 @@ class Stream(IntEnum):
     LIGHT_LEVEL = 43
     LIGHT_LEVEL_PILOT = 44
     ROW_NOISE = 45
+    EVENT_DEFECT = 46
+    EVENT_DEFECT_RATE = 47
+    HOT_EVENTS = 48
+    EVENT_FLICKER = 49
+    TELEGRAPH = 50
+    TELEGRAPH_SHARE = 51
+    TELEGRAPH_AMPLITUDE = 52
 
 
 def stream_key(seed: int, stream: Stream) -> int:
@@ -77,3 +84,25 @@ def device_normal(seed: int, stream: Stream, index: np.ndarray) -> np.ndarray:
     flat = np.ascontiguousarray(index, dtype=np.uint32).ravel()
     deviates = philox(seed, stream, types.UInt32(flat)).next_float32x4_normal()[0]
     return np.array(deviates, dtype=np.float32).reshape(index.shape)
+
+
+def device_uniform(seed: int, stream: Stream, index: np.ndarray) -> np.ndarray:
+    """Number in (0, 1) of every full-sensor index, float64, same shape as `index`; as `device_normal`."""
+    flat = np.ascontiguousarray(index, dtype=np.uint32).ravel()
+    none = np.zeros(flat.size, np.uint32)
+    return uniform(words(seed, stream, flat, none, none)[0]).reshape(index.shape)
+
+
+def words(seed: int, stream: Stream, pixel: np.ndarray, index: np.ndarray, draw: np.ndarray) -> np.ndarray:
+    """Four random words, uint32 [4, n], of each pixel with an index and a draw of its own, uint32 [n] each."""
+    import drjit as dr
+
+    types = jit()
+    key = dr.opaque(types.UInt64, stream_key(seed, stream))
+    counters = (types.UInt32(np.ascontiguousarray(values, np.uint32)) for values in (pixel, index, draw))
+    return np.array(types.Philox4x32(key, *counters).next_uint32x4(), dtype=np.uint32)
+
+
+def uniform(word: np.ndarray) -> np.ndarray:
+    """Random words as numbers in the open interval (0, 1), float64."""
+    return (word.astype(np.float64) + 0.5) * 2.0**-32

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs.calibration import MeasuredMaps
+from hesim_render.specs.calibration import ASYNCHRONOUS_DEFECT_MAPS, DEFECT_MAPS, TELEGRAPH_MAPS, MeasuredMaps
+from hesim_render.specs.calibration_spec import Defect
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
 _EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "bad_pixels": ("b", 1.0)}
+_EXPECTED |= {
+    "defect": ("u", 255.0), "defect_on_per_trial": ("f", 1.0), "defect_off_per_trial": ("f", 1.0),
+    "defect_firing_share": ("f", 1.0), "defect_correlation": ("f", 1.0),
+    "defect_on_hz": ("f", 1e9), "defect_off_hz": ("f", 1e9),
+    "telegraph_amplitude_dn": ("f", 65535.0), "telegraph_high_share": ("f", 1.0), "telegraph_correlation": ("f", 1.0),
+}  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
+#: Maps that a calibration may lack: thresholds where no steps were shown, the others in older ones.
+_MAY_LACK = ("threshold_", "defect", "telegraph_")
 
 
 def require_region(layout: Layout) -> None:
@@ -33,17 +42,57 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
     found = _read(layout, "aps", ("n_row", "n_blc", "n_dp"))
     if found is None:
         return None
-    maps, (row, col) = found
+    maps, (row, _) = found
     rows = slice(row, row + layout.rows)
-    cut = {name: maps[name][rows, col : col + layout.cols] for name in ("n_blc", "n_dp")}
+    cut = _frame_region(layout, found, ("n_blc", "n_dp"))
     return {name: values.astype(np.float32) for name, values in (cut | {"n_row": maps["n_row"][rows, None]}).items()}
+
+
+def telegraph_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
+    """``telegraph_amplitude_dn``, ``…_high_share`` and ``…_correlation`` [row, col] over the region, from one frame to
+    the next; None if not measured."""
+    return _if_there(layout, "aps", TELEGRAPH_MAPS, _frame_region)
+
+
+def event_defects(layout: Layout) -> dict[str, NDArray] | None:
+    """``defect`` (its kind) and its rates [y, x] over the region; None if not measured.
+
+    Rates are per comparison for sensors with fixed comparisons, in Hz for asynchronous ones.
+    """
+    evs = layout.spec.evs
+    names = ASYNCHRONOUS_DEFECT_MAPS if evs is not None and evs.tick_us is None else DEFECT_MAPS
+    return _if_there(layout, "evs", names, _event_region)
+
+
+def _if_there(layout: Layout, section: str, names: tuple[str, ...], cut: Callable) -> dict[str, NDArray] | None:
+    """Maps over the region, all of them or none."""
+    found = _read(layout, section, names)
+    return None if found is None or len(found[0]) < len(names) else cut(layout, found, names)
+
+
+_Found = tuple[Mapping[str, NDArray], tuple[int, int]]
+
+
+def _frame_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict[str, NDArray]:
+    maps, (row, col) = found
+    return {name: maps[name][row : row + layout.rows, col : col + layout.cols] for name in names}
+
+
+def _event_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict[str, NDArray]:
+    maps, (row, col) = found
+    grid = layout.spec.evs_grid
+    assert grid is not None
+    tile_rows, tile_cols = layout.tile_shape
+    y, x = row // tile_rows * grid.rows_per_tile, col // tile_cols * grid.cols_per_tile
+    height, width = layout.evs_shape
+    return {name: maps[name][y : y + height, x : x + width] for name in names}
 
 
 def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[np.float32] | None:
     """Threshold of each event pixel relative to the mean, [y, x] over the region; None if not measured.
 
     Each pixel's measured value carries the noise of its estimate; deviations are scaled to `spread`, the
-    mismatch with that noise taken out.
+    mismatch with that noise taken out. Hot and flickering pixels have the mean.
 
     Parameters
     ----------
@@ -51,19 +100,15 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
     spread : relative standard deviation over pixels.
     """
     name = f"threshold_{polarity}_relative"
-    found = _read(layout, "evs", (name, "bad_pixels"))
+    found = _read(layout, "evs", (name, "bad_pixels", "defect"))
     if found is None or name not in found[0]:
         return None
-    maps, (row, col) = found
-    values = maps[name].astype(np.float64)
-    good = values[~maps["bad_pixels"]]
+    values = found[0][name].astype(np.float64)
+    good = values[~found[0]["bad_pixels"]]
     scaled = 1 + (values - good.mean()) * (spread / max(float(good.std()), 1e-12))
-    grid = layout.spec.evs_grid
-    assert grid is not None
-    tile_rows, tile_cols = layout.tile_shape
-    y, x = row // tile_rows * grid.rows_per_tile, col // tile_cols * grid.cols_per_tile
-    height, width = layout.evs_shape
-    return scaled[y : y + height, x : x + width].astype(np.float32)
+    if "defect" in found[0]:  # events of their own hide the threshold of these: they would count twice
+        scaled[np.isin(found[0]["defect"], (Defect.HOT, Defect.FLICKERING))] = 1.0
+    return _event_region(layout, ({name: scaled}, found[1]), (name,))[name].astype(np.float32)
 
 
 def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping[str, NDArray], tuple[int, int]] | None:
@@ -82,7 +127,7 @@ def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping
         tile_rows, tile_cols = layout.tile_shape
         height, width = height // tile_rows * grid.rows_per_tile, width // tile_cols * grid.cols_per_tile
     for name in names:
-        if name not in maps and not name.startswith("threshold_"):  # thresholds are known only where steps were shown
+        if name not in maps and not name.startswith(_MAY_LACK):
             raise SpecError(f"its map file of {section!r} holds no {name!r}", file=measured.file)
     for name, values in maps.items():
         wanted = (height,) if values.ndim == 1 else (height, width)

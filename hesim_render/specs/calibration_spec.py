@@ -6,6 +6,7 @@ a later calibration reads. Sections hold further keys for human readers.
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -27,6 +28,16 @@ SCHEMA_VERSION = 1
 SECTIONS = ("aps", "evs")
 
 _Beta = Annotated[list[float | None], Field(min_length=6, max_length=6)]
+
+
+class Defect(IntEnum):
+    """What a pixel does; values are those of the map ``defect`` of a calibration."""
+
+    NONE = 0
+    STUCK = 1  # gives no event at all
+    HOT = 2  # gives events at a steady rate of its own
+    FLICKERING = 3  # gives events at a rate that comes and goes
+    OTHER = 4  # its counts are unlike those of any threshold; nothing more is known
 
 
 class _Section(Strict):
@@ -88,6 +99,7 @@ class FrameSection(_Section):
     n_row_std_dn: float = Field(ge=0)
     row_noise_dn: Estimate | None = Field(None, description="calibrations of before it was measured lack it")
     bad_pixels: NonNegativeInt
+    telegraph_pixels: NonNegativeInt | None = Field(None, description="calibrations of before they were found lack it")
     K: Estimate
     read_noise_e: Estimate
     dark_current_e_per_s: Estimate
@@ -135,6 +147,9 @@ class EventSection(EventParameters):
     goodness: EventGoodness
     trials: PositiveInt
     bad_pixels: NonNegativeInt
+    defects: dict[Literal["stuck", "hot", "flickering", "other"], NonNegativeInt] | None = Field(
+        None, description="bad pixels by what they do; calibrations of before they were named lack it"
+    )
     findings: list[Finding] = []
     maps: MapsFile
 

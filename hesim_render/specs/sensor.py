@@ -14,8 +14,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PositiveInt, field_validator, model_validator
 
 from hesim_render.core.errors import HesimWarning, SpecError
-from hesim_render.specs.calibration import NoiseFile, NoisePart, apply_calibration
+from hesim_render.specs.calibrated import apply_calibration
+from hesim_render.specs.calibration import NoiseFile, NoisePart
+from hesim_render.specs.defects import EventDefectSpec, TelegraphSpec
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor_checks import sensor_problems, unused
 from hesim_render.specs.spectrum import SpectrumSpec
@@ -108,6 +111,7 @@ class ApsSpec(Strict):
     row_offset_std_dn: float = Field(0.0, ge=0, le=65_535, description="std over rows of the fixed offset N_row")
     row_noise_dn: float = Field(0.0, ge=0, le=65_535, description="temporal: std of what a row gets anew in each frame")
     residual_noise_dn: float = Field(0.0, ge=0, le=65_535, description="N_res: extra Gaussian temporal noise")
+    telegraph: TelegraphSpec | None = Field(None, description="pixels that jump between two levels; default none")
     law: Literal["poisson", "gaussian"] = "poisson"
     exposure_us: PositiveInt
     frame_rate_hz: float = Field(ge=1e-4, le=1e6)
@@ -180,28 +184,6 @@ class EvsCoefficients(Strict):
     beta5: float = Field(0.0, ge=-1, le=1, description="correlation of the two")
 
 
-class PhotoreceptorSpec(Strict):
-    """Second-order low-pass of ln x before it is compared: two equal poles, −3 dB together at the corner."""
-
-    cutoff_hz: float = Field(
-        ge=1e-3, le=1e6, description="corner at signal_dn and above, where the bias current limits it"
-    )
-    follows_light: bool = Field(True, description="below signal_dn the corner is proportional to the signal")
-    signal_dn: float | None = Field(None, ge=1e-9, le=1e9, description="signal of which the corner is cutoff_hz")
-    min_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="corner in the dark")
-
-    @model_validator(mode="after")
-    def _check(self) -> PhotoreceptorSpec:
-        if self.follows_light:
-            if self.signal_dn is None or self.min_cutoff_hz is None:
-                raise ValueError("a corner that follows the light needs signal_dn and min_cutoff_hz")
-            if self.min_cutoff_hz > self.cutoff_hz:
-                raise ValueError(f"min_cutoff_hz {self.min_cutoff_hz:g} is above cutoff_hz {self.cutoff_hz:g}")
-        elif self.signal_dn is not None or self.min_cutoff_hz is not None:
-            raise ValueError("without follows_light the corner is cutoff_hz: leave signal_dn and min_cutoff_hz out")
-        return self
-
-
 class EvsSpec(Strict):
     """Events: compare ΔV = ln x₁/x₀ + noise with θ₊ and θ₋ (ln units)."""
 
@@ -219,6 +201,7 @@ class EvsSpec(Strict):
     leak_rate_hz: float = Field(0.0, ge=0, le=1e6, description="Poisson process of ON events, per pixel")
     photoreceptor_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="noise bandwidth (last_event)")
     photoreceptor: PhotoreceptorSpec | None = Field(None, description="bandwidth of the signal; default unlimited")
+    defects: EventDefectSpec | None = Field(None, description="stuck, hot and flickering pixels; default none")
     refractory_period_us: int | None = Field(
         None, ge=1, le=10**9, description="no event so long after a pixel's last one"
     )

@@ -10,9 +10,9 @@ from scipy.stats import binom
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.asynchronous.first_event import first_event
-from hesim_render.calibrate.defect import Defect
 from hesim_render.capture.lab import write_captures
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.specs.calibration_spec import Defect
 
 TRUTH = Pixels()
 
@@ -164,7 +164,7 @@ def test_stuck_hot_and_odd_pixels_are_found_and_no_other(tmp_path):
     def change(name, calm, on, off):
         on[..., 5] = off[..., 5] = 0  # stuck
         if name == "evs_noise_rate":
-            on[:, 0, 77] = calm[:, 77] // 2  # hot: 7 events a second
+            on[:, 0, 77] = calm[:, 77] // 2  # hot: half of the trials have a first event, so 10 events a second
             off[:, 0, 77] = 0
         else:
             lost = on[..., 300] // 2  # half of its events are lost
@@ -177,7 +177,7 @@ def test_stuck_hot_and_odd_pixels_are_found_and_no_other(tmp_path):
     assert np.flatnonzero(maps["bad_pixels"]).tolist() == [5, 77, 300]
     kinds = maps["defect"].ravel()
     assert (kinds[5], kinds[77], kinds[300]) == (Defect.STUCK, Defect.HOT, Defect.OTHER)
-    assert maps["defect_on_hz"].ravel()[77] == pytest.approx(0.5 / (20 / 300), rel=0.2)
+    assert maps["defect_on_hz"].ravel()[77] == pytest.approx(np.log(2) / (20 / 300), rel=0.2)
     assert max(abs(z) for z in scores(section, TRUTH).values()) < 4
 
 
@@ -372,3 +372,25 @@ def test_intervals_cover_the_truth(tmp_path):
         bad += section["bad_pixels"]
     assert np.sum(inside, axis=0).min() >= 19
     assert bad <= 2
+
+
+@pytest.mark.slow
+def test_a_session_with_stuck_and_hot_pixels_gives_a_sensor_that_has_them(tmp_path):
+    """Hot rates from 5 ON events/s (spread 0.3 decades), which first events tell to a counting error."""
+    changes = {
+        "evs.defects": {"stuck_share": 0.01, "hot_share": 0.02, "hot_rate_hz": 5, "hot_rate_spread_decades": 0.3}
+    }
+    given = hr.load_sensor("davis346", changes).crop(32, 32)
+    write_captures(
+        given, tmp_path / "c", frames=8, trials=6, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)
+    )
+    calibrate_evs(tmp_path / "c", tmp_path / "c.yaml")
+    again = hr.load_sensor("davis346", {"noise": str(tmp_path / "c.yaml")}).crop(32, 32)
+    truth, found = given.evs.defects, again.evs.defects
+    assert truth.stuck.size > 3 and truth.place.size > 8
+    assert np.array_equal(found.stuck, truth.stuck)
+    seen = np.isin(truth.place, found.place)
+    assert np.isin(found.place, truth.place).all() and seen.mean() > 0.8
+    rates = dict(zip(found.place, found.on_hz, strict=True))
+    ratio = np.array([rates[p] for p in truth.place[seen]]) / truth.on_hz[seen]
+    assert np.median(ratio) == pytest.approx(1, abs=0.25)

@@ -342,6 +342,7 @@ NOISY = {
     "aps__prnu_rel": 0.05, "aps__dsnu_e": 20.0, "aps__row_offset_std_dn": 5.0, "aps__dark_current_e_per_s": 4000.0,
     "aps__dark_current_nonuniformity_rel": 0.3, "aps__residual_noise_dn": 3.0, "aps__read_noise_e": 20.0,
     "aps__system_gain_dn_per_e": 1.0, "aps__row_noise_dn": 4.0,
+    "aps__telegraph": {"share": 0.25, "amplitude_e": 8.0, "amplitude_law": "equal", "high_s": 1e-3, "low_s": 1e-3},
 }  # fmt: skip
 
 
@@ -363,7 +364,8 @@ def test_each_term_can_be_switched_off():
     maps = noise.fixed_pattern
     electrons, t = 1000.0, EXPOSURE_US * 1e-6
     temporal = {"shot": maps.response.mean() * electrons, "dark_current": maps.dark_e_per_s.mean() * t,
-                "read": 400.0, "row_noise": 16.0, "residual": 9.0}  # fmt: skip
+                "read": 400.0, "row_noise": 16.0, "residual": 9.0,
+                "telegraph": noise.telegraph.place.size / 128**2 * 16.0}  # fmt: skip
     spatial = {"prnu": (electrons * maps.response).var(), "row": maps.offset_dn.mean(axis=1).var(),
                "dsnu": (maps.offset_dn - maps.offset_dn.mean(axis=1)[:, None]).var(),
                "dark_current": (maps.dark_e_per_s * t).var()}  # fmt: skip

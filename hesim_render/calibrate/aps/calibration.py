@@ -16,6 +16,7 @@ from hesim_render.calibrate.aps.dark import DarkModel, fit_dark
 from hesim_render.calibrate.aps.fitted import ApsCalibration, Position
 from hesim_render.calibrate.aps.output import content, maps
 from hesim_render.calibrate.aps.photon_transfer import linearity, photon_transfer
+from hesim_render.calibrate.aps.telegraph import TelegraphMaps, find_telegraph
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance, join, pool, variance_map
 from hesim_render.calibrate.moments import Moments, Progress, measure
 from hesim_render.calibrate.result import check_calibration, check_report, write_section
@@ -64,7 +65,9 @@ def calibrate_aps(
         raise SpecError(f"dark and lit frames are of different sizes, {sizes} pixels", file=captures.folder)
     used = used_pixels(captures, stacks[0].shape[2:])
     dark, lit = _read(stacks, used, captures.spec.full_scale_dn, progress)
-    result, dark, lit = analyse(captures, dark, lit, used)
+    tile = captures.spec.tile_rows, captures.spec.tile_cols
+    telegraph = find_telegraph(stacks[0], dark, used, tile, captures.spec.full_scale_dn)
+    result, dark, lit = analyse(captures, dark, lit, used, telegraph)
     write_section(
         out, "aps", describe(captures), content(captures, result, dark, lit), maps(captures, result, lit, dark)
     )
@@ -105,13 +108,14 @@ def used_pixels(captures: CaptureSet, shape: tuple[int, ...]) -> NDArray[np.bool
 
 
 def analyse(
-    captures: CaptureSet, dark_moments: Moments, lit: Moments, used: NDArray[np.bool_]
+    captures: CaptureSet, dark_moments: Moments, lit: Moments, used: NDArray[np.bool_], telegraph: TelegraphMaps
 ) -> tuple[ApsCalibration, Moments, Moments]:
     """Everything the frames' moments tell.
 
     Parameters
     ----------
     used : [row, col], pixels that have an APS value.
+    telegraph : pixels of two levels, which are left out.
 
     Returns
     -------
@@ -130,13 +134,13 @@ def analyse(
         dark_moments, lit = (without_rows(m, used, spec.full_scale_dn, row_variance) for m in (dark_moments, lit))
     dark = fit_dark(dark_moments, used, spec.full_scale_dn, row_variance)
     signals = np.stack([light_signal(lit, dark, k) for k in range(lit.exposures_s.size)])
-    good = used & ~dark.bad & ~dark.hot
+    good = used & ~dark.bad & ~dark.hot & ~telegraph.found
     _check_light(dark, lit, signals, good, spec.full_scale_dn)
     saturation = saturation_dn(lit, signals, good, spec.full_scale_dn)
     dark_clear = (dark_moments.lowest > 0) & (dark_moments.highest < spec.full_scale_dn)
 
     beta: NDArray | None = None
-    bad = used & dark.bad
+    bad = used & (dark.bad | telegraph.found)
     for _ in range(2):
         usable = np.stack(
             [
@@ -162,7 +166,8 @@ def analyse(
     reached = saturation is not None or bool(np.mean(lit.highest[:, used] >= spec.full_scale_dn) > 1e-4)
     linear = linearity(lit, signals, usable & good, composite, top)
     transfer = photon_transfer(spec, dark, composite, fits, bins, saturation, reached, linear)
-    return ApsCalibration(dark, composite, fits, bins, bad, signals, usable, transfer, rows), dark_moments, lit
+    result = ApsCalibration(dark, composite, fits, bins, bad, signals, usable, transfer, rows, telegraph)
+    return result, dark_moments, lit
 
 
 def _check_light(dark: DarkModel, lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.aps.common_mode import Shared
 from hesim_render.calibrate.aps.composite import Composite
 from hesim_render.calibrate.aps.dark import DarkModel
+from hesim_render.calibrate.aps.telegraph import TelegraphMaps
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit
 
 Position = tuple[int, int]
@@ -27,6 +28,7 @@ class ApsCalibration:
     signals : float32 [exposure, row, col], light above black, DN.
     usable : [exposure, row, col], lit values clear of clipping.
     rows : temporal row noise.
+    telegraph : pixels of two levels; they are among the bad ones.
     """
 
     dark: DarkModel
@@ -38,6 +40,7 @@ class ApsCalibration:
     usable: NDArray[np.bool_]
     transfer: dict[str, Any]
     rows: Shared
+    telegraph: TelegraphMaps
 
     def beta(self, tile: tuple[int, int]) -> NDArray[np.float64]:
         """[tile_row, tile_col, 6] with 0 for terms and positions without a number."""

@@ -69,6 +69,7 @@ def content(captures: CaptureSet, result: ApsCalibration, dark_moments: Moments,
         "hot_limit_dn_per_s": dark.hot_limit_dn_per_s,
         "hot_pixels": int(dark.hot.sum()),
         "bad_pixels": int(result.bad.sum()),
+        "telegraph_pixels": int(result.telegraph.found.sum()),
         "drift": {
             "black_dn_rms": {
                 name: max((d.black.rms if d.black.significant else 0.0 for d in drifts), default=0.0)
@@ -120,6 +121,9 @@ def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moment
         "n_dp": dark.n_dp,
         "bad_pixels": result.bad,
         "hot_pixels": dark.hot,
+        "telegraph_amplitude_dn": result.telegraph.amplitude_dn,
+        "telegraph_high_share": result.telegraph.high_share,
+        "telegraph_correlation": result.telegraph.correlation,
         "signal_dn_per_s": composite.rate_dn_per_s,
         "signal_standard_error_dn_per_s": composite.standard_error_dn_per_s,
         "beta_covariance": covariance,

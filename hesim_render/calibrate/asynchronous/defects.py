@@ -12,7 +12,7 @@ from scipy.stats import poisson
 from hesim_render.calibrate.asynchronous.fit import Fit
 from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
 from hesim_render.calibrate.asynchronous.trials import Trials
-from hesim_render.calibrate.defect import Defect
+from hesim_render.specs.calibration_spec import Defect
 
 #: Chance with which a good pixel's counts may be called bad.
 _CHANCE = 1e-7
@@ -110,5 +110,27 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
     hot = never_calm | excess[0] | excess[1]
     silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm
     kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
-    on_hz[some], off_hz[some] = (np.where(hot & e, r, 0) for e, r in zip(excess, rates, strict=True))
+    on_hz[some], off_hz[some] = _own_rates(ours, light, never_calm, float(steady.calm[light].max()))
+    on_hz[kind != Defect.HOT] = off_hz[kind != Defect.HOT] = 0
     return TrialDefects(bad, kind, on_hz, off_hz)
+
+
+def _own_rates(steady: Trials, light: int, never_calm: NDArray[np.bool_], most: float) -> NDArray[np.float64]:
+    """Rates of ON and OFF events [2, pixel] of pixels that fire at random, Hz.
+
+    Only first events are counted, so the rate is −ln(share of trials without one)/duration; where hardly a trial is
+    calm, that of the settling time before, with ON events unless OFF ones were seen.
+
+    Parameters
+    ----------
+    light : number of the kind of trials.
+    most : calm trials of a good pixel.
+    """
+    calm = steady.calm[light].astype(np.float64)
+    events = np.stack([n[light].sum(axis=0, dtype=np.float64) for n in (steady.on, steady.off)])
+    silent = np.maximum(calm - events.sum(axis=0), 0.5)
+    total = np.log(np.maximum(calm, 0.5) / silent) / steady.edges_s[-1]
+    total = np.where(never_calm, -np.log(np.maximum(calm, 0.5) / most) / steady.settle_s, np.maximum(total, 0))
+    seen = events.sum(axis=0)
+    on_share = np.where(seen > 0, events[0] / np.maximum(seen, 1), 1.0)
+    return np.stack([on_share, 1 - on_share]) * total

@@ -22,6 +22,7 @@ class StaticCapture:
     ----------
     signal_dn : clean signal. n_on, n_off : counts of the lit scene. dark_n_on, dark_n_off : in the dark, or None.
     position : number of each pixel's tile position. tile : event pixels of a tile, (rows, cols).
+    parts : [part, row, col], events of both polarities in parts of equal length of the dark capture, or None.
     """
 
     signal_dn: NDArray[np.float64]
@@ -31,6 +32,12 @@ class StaticCapture:
     dark_n_off: NDArray[np.int64] | None
     trials: int
     tile: tuple[int, int]
+    parts: NDArray[np.integer] | None = None
+
+    @property
+    def part_trials(self) -> int:
+        """Trials of one part."""
+        return self.trials if self.parts is None else self.trials // self.parts.shape[0]
 
     @property
     def position(self) -> NDArray[np.int64]:
@@ -98,7 +105,29 @@ def read_static(captures: CaptureSet, calibration: str | Path | None = None) -> 
         maps.get("dark_n_off"),
         trials,
         event_tile(captures, signal.shape),
+        _parts(data, maps, trials, file),
     )
+
+
+def _parts(
+    data: dict[str, NDArray], maps: dict[str, NDArray[np.int64]], trials: int, file: Path
+) -> NDArray[np.integer] | None:
+    """``dark_parts``, checked against the counts of the whole; None where it is not given."""
+    if "dark_parts" not in data:
+        return None
+    parts = data["dark_parts"]
+    if "dark_n_on" not in maps:
+        raise SpecError("dark_parts needs dark_n_on and dark_n_off, which it divides", file=file)
+    whole = maps["dark_n_on"] + maps["dark_n_off"]
+    if parts.ndim != 3 or parts.shape[1:] != whole.shape or parts.dtype.kind not in "ui":
+        raise SpecError(f"dark_parts must be whole numbers [part, row, col] of {whole.shape} pixels", file=file)
+    if parts.shape[0] < 8 or trials % parts.shape[0]:
+        raise SpecError(
+            f"dark_parts holds {parts.shape[0]} parts; expected 8 or more, a divisor of n_trials", file=file
+        )
+    if parts.min() < 0 or np.any(parts.sum(axis=0, dtype=np.int64) != whole):
+        raise SpecError("dark_parts does not add up to dark_n_on and dark_n_off", file=file)
+    return parts
 
 
 def _composite_signal(captures: CaptureSet, calibration: str | Path | None, file: Path) -> NDArray[np.float64]:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import binom, poisson
 
-from hesim_render.calibrate.defect import Defect
 from hesim_render.calibrate.evs.counts import StaticCapture
+from hesim_render.calibrate.evs.flicker import dynamics, unsteady
 from hesim_render.calibrate.evs.medians import (
     LEAST_EVENTS,
     by_group,
@@ -21,6 +21,8 @@ from hesim_render.calibrate.evs.medians import (
 )
 from hesim_render.calibrate.evs.steps import Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, totals_of
+from hesim_render.pixels.evs.formulas import own_events
+from hesim_render.specs.calibration_spec import Defect
 
 #: Chance with which a good pixel's count may be called bad, and the part of the spread allowed for.
 _CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06
@@ -37,13 +39,18 @@ class EventDefects:
     Attributes
     ----------
     bad : all of them. kind : uint8, `Defect`.
-    on, off : events per trial of hot and flickering ones beyond what a good pixel gives, 0 elsewhere.
+    on, off : chance per trial of an event of hot and flickering ones beyond what a good pixel gives, 0 elsewhere; of
+        flickering ones while they fire, where that is known, else in the mean.
+    firing_share, correlation : of flickering ones, the part of the trials in which they fire and the correlation of
+        that from trial to trial; 1 and 0 elsewhere, and where it is not known.
     """
 
     bad: NDArray[np.bool_]
     kind: NDArray[np.uint8]
     on: NDArray[np.float32]
     off: NDArray[np.float32]
+    firing_share: NDArray[np.float32]
+    correlation: NDArray[np.float32]
 
     def count(self, kind: Defect) -> int:
         return int(np.sum(self.kind == kind))
@@ -122,44 +129,68 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     """Name the bad pixels: stuck, hot, flickering, or nothing of that kind.
 
     A stuck pixel gives no event in any capture. A hot or a flickering one gives more than a thousandth of the good
-    pixels of its brightness ever do; the hot one as many per trial in the dark as in the light.
+    pixels of its brightness ever do. The hot one gives as many of its own per trial in the dark as in the light and,
+    where counts of parts of a capture are known, in each part.
     """
-    kind = np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE))
-    on_rate, off_rate = np.zeros((2, *bad.shape), np.float32)
+    found = EventDefects(
+        bad=bad, kind=np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE)),
+        on=np.zeros(bad.shape, np.float32), off=np.zeros(bad.shape, np.float32),
+        firing_share=np.ones(bad.shape, np.float32), correlation=np.zeros(bad.shape, np.float32),
+    )  # fmt: skip
     if not bad.any():
-        return EventDefects(bad, kind, on_rate, off_rate)
-    events = np.zeros(int(bad.sum()), np.int64)
-    rates, excess = [], []
+        return found
+    silent = np.ones(int(bad.sum()), bool)
+    own, excess, told = [], [], []
     for signal, on, off in static.sessions:
         both = np.stack([on[bad], off[bad]]).astype(np.float64)
-        top = _usual_most(signal, on + off, bad)
-        excess.append(both.sum(axis=0) > top + _SIGMAS * np.sqrt(top + 1))
-        rates.append(both / static.trials)
-        events += (on + off)[bad]
-    over, steady = np.any(excess, axis=0), np.all(excess, axis=0)
-    if len(rates) > 1:
-        # what its light gives comes on top of a hot pixel's own events: a tenth is allowed for that
-        apart = np.abs(rates[0] - rates[1]).sum(axis=0)
-        counting = np.sqrt((rates[0] + rates[1]).sum(axis=0) / static.trials)
-        steady &= apart < _SIGMAS * counting + 0.1 * np.minimum(rates[0], rates[1]).sum(axis=0)
-    silent = events == 0
+        usual, most = _of_like(signal, bad, (on, off), static.trials)
+        beyond = both > most + _SIGMAS * np.sqrt(most + 1)
+        excess.append(beyond.any(axis=0))
+        told.append(beyond)
+        own.append([own_events(both[k] / static.trials, usual[0], usual[1], 1 - 2 * k) for k in (0, 1)])
+        silent &= both.sum(axis=0) == 0
     if steps is not None:
         silent &= (steps.on_total[bad] + steps.off_total[bad]) == 0
-    named = np.full(events.shape, np.uint8(Defect.OTHER))
+    rates = np.array(own)  # [session, polarity, pixel]
+    over, steady = np.any(excess, axis=0), np.all(excess, axis=0)
+    if len(rates) > 1:
+        apart = np.abs(rates[0] - rates[1]).sum(axis=0)
+        counting = np.sqrt((rates[0] + rates[1]).sum(axis=0) / static.trials)
+        # what is taken for the comparisons' own events is as good as a tenth
+        steady &= apart < _SIGMAS * counting + 0.1 * np.minimum(rates[0], rates[1]).sum(axis=0)
+    if static.parts is not None:
+        steady &= ~unsteady(static.parts[:, bad], static.part_trials)
+    named = np.full(silent.shape, np.uint8(Defect.OTHER))
     named[over] = np.where(steady[over], np.uint8(Defect.HOT), np.uint8(Defect.FLICKERING))
     named[silent] = Defect.STUCK
-    kind[bad] = named
-    on_rate[bad], off_rate[bad] = np.where(over, np.mean(rates, axis=0), 0.0)
-    return EventDefects(bad, kind, on_rate, off_rate)
+    found.kind[bad] = named
+    # of a polarity in which the pixel gives no more than good ones nothing is taken: it may have a low threshold
+    chance = np.where(np.any(told, axis=0), rates.mean(axis=0), 0.0)
+    flickers = np.flatnonzero(named == Defect.FLICKERING)
+    if static.parts is not None and flickers.size:
+        share, correlation = dynamics(
+            static.parts[:, bad][:, flickers], static.part_trials, (usual[0] + usual[1])[flickers]
+        )
+        for values, all_of_them in ((share, found.firing_share), (correlation, found.correlation)):
+            all_of_them[tuple(axis[flickers] for axis in np.nonzero(bad))] = values
+        chance[:, flickers] = np.minimum(chance[:, flickers] / share, 1.0)
+    found.on[bad], found.off[bad] = chance
+    return found
 
 
-def _usual_most(signal: NDArray, counts: NDArray, bad: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """For each bad pixel, what only a thousandth of the good pixels of its brightness exceed."""
+def _of_like(
+    signal: NDArray, bad: NDArray[np.bool_], both: tuple[NDArray, NDArray], trials: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """For each bad pixel, of the good pixels of its brightness: the mean chances of ON and of OFF, and the counts that
+    only a thousandth of them exceed; both [polarity, pixel]."""
     good = ~bad & np.isfinite(signal)
     group = like_brightness(signal[good])
-    most = np.array([np.quantile(part, 0.999) for part in by_group(counts[good], group)])
     light = np.array([part.max() for part in by_group(signal[good], group)])
     # a pixel whose brightness is not known is compared with the busiest
     here = np.where(np.isfinite(signal[bad]), signal[bad], np.inf)
-    place = np.minimum(np.searchsorted(light, here), most.size - 1)
-    return np.where(np.isfinite(here), most[place], most.max())
+    place = np.minimum(np.searchsorted(light, here), light.size - 1)
+    found = []
+    for reduce in (lambda part: part.mean() / trials, lambda part: np.quantile(part, 0.999)):
+        usual = np.array([[reduce(part) for part in by_group(counts[good], group)] for counts in both])
+        found.append(np.where(np.isfinite(here), usual[:, place], usual.max(axis=1)[:, None]))
+    return found[0], found[1]

@@ -16,6 +16,7 @@ from hesim_render.calibrate.evs.fitted import EventFit
 from hesim_render.calibrate.evs.model import both_probabilities
 from hesim_render.calibrate.evs.thresholds import curve
 from hesim_render.recording.capture_set import CaptureSet
+from hesim_render.specs.calibration_spec import Defect
 
 _FIGURE_PX = 320
 #: Most bins of a histogram of counts.
@@ -94,6 +95,7 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     section["signal_range_dn"] = [float(np.nanmin(result.static.signal_dn)), float(np.nanmax(result.static.signal_dn))]
     section["trials"] = result.static.trials
     section["bad_pixels"] = int(result.bad.sum())
+    section["defects"] = {kind.name.lower(): result.defects.count(kind) for kind in Defect if kind is not Defect.NONE}
     scatter = np.ptp(result.starts, axis=0) / result.starts_standard_error
     section["multi_start"] = {
         "starts": len(result.starts),
@@ -152,7 +154,8 @@ def maps(result: EvsCalibration) -> dict[str, NDArray]:
     defects, static = result.defects, result.static
     arrays: dict[str, NDArray] = {
         "bad_pixels": result.bad, "defect": defects.kind, "defect_on_per_trial": defects.on,
-        "defect_off_per_trial": defects.off,
+        "defect_off_per_trial": defects.off, "defect_firing_share": defects.firing_share,
+        "defect_correlation": defects.correlation,
     }  # fmt: skip
     if result.thresholds is not None:
         arrays["threshold_on_relative"] = result.thresholds.pixel_on

@@ -189,7 +189,8 @@ def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
             f"{section['goodness']['dof']} degrees of freedom, p = {section['goodness']['p_value']:.2g}",
         )
     )
-    rows.append(("bad pixels", str(section["bad_pixels"]), "", ""))
+    kinds = ", ".join(f"{count} {kind}" for kind, count in (section.get("defects") or {}).items())
+    rows.append(("bad pixels", str(section["bad_pixels"]), "", kinds))
     return rows
 
 

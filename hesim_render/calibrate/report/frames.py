@@ -108,6 +108,8 @@ def _transfer_table(section: dict[str, Any]) -> str:
         ("std of N_row", number(section["n_row_std_dn"]), "", "DN"),
         ("hot / bad pixels", f"{section['hot_pixels']} / {section['bad_pixels']}", "", ""),
     ]
+    if section.get("telegraph_pixels") is not None:
+        rows.append(("pixels with telegraph noise", str(section["telegraph_pixels"]), "", "two levels"))
     return table(("parameter", "value", "95 % interval", "unit, or why not"), rows)
 
 

@@ -163,3 +163,19 @@ def noise_equivalent_e(
 def fourth_cumulant_dn4(gain_dn: Values, count_variance_dn2: Values) -> Values:
     """κ₄ of a Poisson count of `gain_dn` each whose variance is g² m: g⁴ m. It is 0 of a Gaussian."""
     return gain_dn * gain_dn * count_variance_dn2
+
+
+def telegraph_levels(amplitude: Values, high_share: Values) -> tuple[Values, Values]:
+    """Low and high level of random telegraph noise about its mean: −a p and a (1 − p), p the part of the time at the
+    high one."""
+    return -amplitude * high_share, amplitude * (1.0 - high_share)
+
+
+def telegraph_variance(amplitude: Values, high_share: Values) -> Values:
+    """Variance of random telegraph noise, a² p (1 − p), in the square of the amplitude's unit [machlup1954]."""
+    return amplitude * amplitude * high_share * (1.0 - high_share)
+
+
+def telegraph_correlation(high_s: Values, low_s: Values, interval_s: Values, xp: Namespace) -> Values:
+    """Autocovariance over an interval by variance, exp(−Δt (1/τ_high + 1/τ_low)) [machlup1954]."""
+    return xp.exp(-interval_s * (1.0 / high_s + 1.0 / low_s))

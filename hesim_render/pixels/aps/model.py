@@ -22,10 +22,11 @@ from hesim_render.pixels.aps import formulas
 from hesim_render.pixels.aps.fixed_pattern import FixedPattern
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, Pixels, PixelValue
 from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
+from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
 from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.sensor import ApsSpec
 
-APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk")
+APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk", "telegraph")
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,8 @@ class ApsNoise(PlainState):
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
         ``read`` is σ_r (β0), ``prnu``, ``dsnu`` and ``row`` are the fixed maps, ``row_noise`` is N_tr, ``residual``
-        N_res, ``crosstalk`` is what these pixels get of their neighbours' light.
+        N_res, ``crosstalk`` is what these pixels get of their neighbours' light, ``telegraph`` are jumps between two
+        levels.
 
         Raises
         ------
@@ -82,6 +84,11 @@ class ApsNoise(PlainState):
     def row_noise_dn(self) -> float:
         """Standard deviation of N_tr, DN."""
         return 0.0 if "row_noise" in self.off else self.spec.row_noise_dn
+
+    @cached_property
+    def telegraph(self) -> TelegraphPixels | None:
+        """Pixels of this device with random telegraph noise."""
+        return None if "telegraph" in self.off else telegraph_pixels(self.spec, self.layout, self.device_seed)
 
     @property
     def full_scale_dn(self) -> int:
@@ -203,13 +210,18 @@ class ApsNoise(PlainState):
     ) -> NDArray[np.float64]:
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
-        In the physical form K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr². Near full well and full scale
-        the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the variance
-        itself is above 0.24 DN².
+        In the physical form K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr²; an image has telegraph noise too. Near
+        full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the
+        variance itself is above 0.24 DN².
         """
-        value, _ = self._on_host(self._checked(electrons, exposure_us), exposure_us, position)
+        values = self._checked(electrons, exposure_us)
+        value, _ = self._on_host(values, exposure_us, position)
         shared = self.row_noise_dn**2 + (ADC_VARIANCE_DN2 if adc else 0.0)
-        return np.asarray(value.variance_dn2 + shared, dtype=np.float64)
+        variance = np.asarray(value.variance_dn2 + shared, dtype=np.float64)
+        if values.ndim and self.telegraph is not None:
+            variance = np.broadcast_to(variance, values.shape).copy()
+            variance.ravel()[self.telegraph.place] += self.telegraph.variance_dn2
+        return variance
 
     def noise_equivalent_e(self, electrons: NDArray, exposure_us: float) -> NDArray[np.float64]:
         """Standard deviation of a frame pixel in electrons at its input, PRNU included.

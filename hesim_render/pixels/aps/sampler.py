@@ -96,6 +96,8 @@ def draw_dn(
     full_well_dn = spec.full_well_e * spec.system_gain_dn_per_e
     level: Float = dr.minimum(dr.fma(value.gain_dn, counts, value.fixed_dn), full_well_dn) + pixels.offset_dn
     level = dr.fma(dr.sqrt(types.Float(value.gaussian_dn2)), deviate, level)
+    if noise.telegraph is not None:
+        level += noise.telegraph.added_dn(seed, frame, noise.layout.rows * noise.layout.cols, index)
     if noise.row_noise_dn > 0:
         # of the row on the full sensor: every pixel of it draws the same number
         row = key // dr.opaque(types.UInt32, noise.layout.spec.geometry.cols)

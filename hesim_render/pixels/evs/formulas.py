@@ -143,3 +143,55 @@ def over_thresholds(u: Values, relative: Values, spread: Values, xp: Namespace) 
 def leak_probability(rate_hz: float, interval_s: float) -> float:
     """Chance of a leak event, a Poisson process, in an interval: 1 − exp(−rate·Δt)."""
     return -math.expm1(-rate_hz * interval_s)
+
+
+def rate_hz(probability: ArrayLike, interval_s: float) -> NDArray[np.float64]:
+    """Rate of the Poisson process that gives an event in an interval with such a chance; `leak_probability` turned
+    round. A chance of 1 counts as one less 1e-9."""
+    return -np.log1p(-np.clip(probability, 0.0, 1.0 - 1e-9)) / interval_s
+
+
+def own_events(counted: ArrayLike, own_on: ArrayLike, own_off: ArrayLike, polarity: ArrayLike) -> NDArray[np.float64]:
+    """Chance of an event of a defect in a comparison, from all events: it shows where the comparison gave none.
+
+    Parameters
+    ----------
+    counted : events per comparison, of the polarity. own_on, own_off : those of a good pixel's comparisons.
+    polarity : +1 or −1.
+    """
+    on, off = np.asarray(own_on), np.asarray(own_off)
+    own = np.where(np.asarray(polarity) > 0, on, off)
+    return np.clip((np.asarray(counted) - own) / np.maximum(1.0 - on - off, 1e-9), 0.0, 1.0)
+
+
+def firing_share(firing_s: Values, quiet_s: Values) -> Values:
+    """Part of the time in which a flickering pixel fires, from the mean times of both states."""
+    return firing_s / (firing_s + quiet_s)
+
+
+def change_rate_hz(firing_s: Values, quiet_s: Values) -> Values:
+    """Rate at which a flickering pixel forgets its state: its states correlate as exp(−rate·Δt)."""
+    return 1.0 / firing_s + 1.0 / quiet_s
+
+
+def flicker_moments(
+    rate_per_trial: Values, share: Values, correlation: Values, trials: int
+) -> tuple[Values, Values, Values]:
+    """Of the counts of a flickering pixel in stretches of `trials` comparisons, one after the other.
+
+    Parameters
+    ----------
+    rate_per_trial : r, chance of an event while it fires. share : p, of the time. correlation : of its state from one
+        comparison to the next, c.
+
+    Returns
+    -------
+    mean, variance, covariance of neighbours : n r p; n r p (1 − r p) + r² p (1 − p) Σ_{i≠j} c^|i−j|; and
+        r² p (1 − p) Σ_i Σ_j c^(n + j − i) = r² p (1 − p) c ((1 − cⁿ)/(1 − c))².
+    """
+    n, c = trials, correlation
+    power = c**n
+    spread = rate_per_trial**2 * share * (1 - share)
+    pairs = 2 * c / (1 - c) * (n - (1 - power) / (1 - c))
+    own = n * rate_per_trial * share * (1 - rate_per_trial * share)
+    return n * rate_per_trial * share, own + spread * pairs, spread * c * ((1 - power) / (1 - c)) ** 2

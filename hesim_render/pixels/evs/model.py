@@ -21,13 +21,20 @@ from hesim_render.core.rng import Stream, device_normal
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
+from hesim_render.pixels.evs.defects import EventDefects, defects_of
 from hesim_render.pixels.evs.formulas import Coefficients
 from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
 from hesim_render.pixels.terms import switched_off
-from hesim_render.specs.sensor import EvsCoefficients, EvsSpec, PhotoreceptorSpec
+from hesim_render.specs.photoreceptor import PhotoreceptorSpec
+from hesim_render.specs.sensor import EvsCoefficients, EvsSpec
 
-EVS_TERMS = ("shot", "dark_current", "mismatch", "leak", "bandwidth", "refractory", "readout_limit", "crosstalk")
+#: Kinds of defects, each a term.
+_DEFECTS = ("stuck", "hot", "flickering")
+EVS_TERMS = (
+    *("shot", "dark_current", "mismatch", "leak", "bandwidth", "refractory", "readout_limit", "crosstalk"),
+    *_DEFECTS,
+)
 
 #: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
 LEAST_THRESHOLD_REL = 0.05
@@ -61,7 +68,7 @@ class EvsNoise(PlainState):
         ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread of thresholds,
         ``leak`` the leak events, ``bandwidth`` the photoreceptor's low-pass, ``refractory`` the dead time after
         an event, ``readout_limit`` the loss of events in the read-out, ``crosstalk`` what these pixels get of their
-        neighbours' light.
+        neighbours' light, ``stuck``, ``hot`` and ``flickering`` the defects of pixels.
 
         Raises
         ------
@@ -77,6 +84,14 @@ class EvsNoise(PlainState):
     @property
     def leak_rate_hz(self) -> float:
         return 0.0 if "leak" in self.off else self.spec.leak_rate_hz
+
+    @cached_property
+    def defects(self) -> EventDefects:
+        """Stuck, hot and flickering pixels of this device."""
+        found = defects_of(self.spec, self.layout, self.device_seed)
+        for term in self.off.intersection(_DEFECTS):
+            found = found.without(term)
+        return found
 
     @property
     def crosstalk(self) -> float:

@@ -18,6 +18,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.arrays import restore, saved, take
+from hesim_render.pixels.evs.defects import DefectEvents
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
 from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.model import EvsNoise
@@ -139,6 +140,8 @@ class _PreviousSample:
         self._cols = noise.layout.evs_shape[1]
         self._independent = noise.spec.noise_mode == "independent"
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
+        assert noise.spec.tick_us is not None
+        self._defects = DefectEvents(noise.defects, seed, noise.spec.tick_us * S_PER_US) if noise.defects else None
         self._t_us = 0
         self._level: Float = None  # ln x, with the noise of its instant where that is shared
         self._variance: Float = None  # s²/x² of the last sample, where noise is independent
@@ -165,10 +168,13 @@ class _PreviousSample:
         if self._noise.leak_rate_hz > 0:
             probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
             on |= ~off & (word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1)))
+        begin_us = self._t_us
         polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
         dr.schedule(polarity)
         self._keep(level, variance, t_us)
         found = polarity.numpy()
+        if self._defects is not None:
+            found = self._defects.at_tick(found, begin_us, t_us)
         pixel = np.flatnonzero(found != 0)  # in row-major order
         return _events(t_us, pixel, found[pixel], self._cols)
 
@@ -204,6 +210,7 @@ class _LastEvent:
         if noise.refractory_period_us is not None:
             self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
         self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
+        self._defects = DefectEvents(noise.defects, seed) if noise.defects else None
 
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
@@ -235,8 +242,13 @@ class _LastEvent:
             if self._leak and not self._refractory:
                 for due_us, pixel in self._leak.until(t_us):
                     parts.append(_events(self._stamp(due_us), pixel, 1, self._cols))
+            if self._defects and not self._refractory:
+                own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
+                parts.append(_events(self._stamp(own_us), pixel, polarity, self._cols))
         self._t_us, self._log, self._spread = t_us, log, spread
         events = np.concatenate(parts) if parts else no_events()
+        if self._defects:
+            events = self._defects.alive(events, self._cols)
         # stable: a pixel's own events stay in their order where they share a microsecond
         return events[np.lexsort((events["x"], events["y"], events["t_us"]))]
 
@@ -286,6 +298,8 @@ class _LastEvent:
     ) -> NDArray[np.void]:
         """The same where pixels rest after each event, a leak event too; both kinds come out together."""
         due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
+        if self._defects:  # of asynchronous sensors they are ON events, as those of leak
+            due.append(self._defects.between(begin_us, end_us)[:2])
         due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
         levels, thresholds = (self._level, level), self._noise.on_device.thresholds
         self._reference, t_us, pixel, polarity = refractory.crossings(

@@ -1,0 +1,88 @@
+"""Random telegraph noise: frame pixels whose value jumps between two levels from frame to frame.
+
+A single trap near the source follower's channel that is filled or empty makes two levels [wang2006]. A pixel's state in
+a frame is that of the instant frame / frame_rate_hz, when the frame begins, for all of its exposure. Both levels lie
+about the pixel's own mean, so that offset and dark current stay what they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.rng import Stream, device_uniform
+from hesim_render.core.units import US_PER_S
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps import formulas
+from hesim_render.pixels.measured import telegraph_maps
+from hesim_render.pixels.poisson_points import Telegraph
+from hesim_render.specs.sensor import ApsSpec
+
+
+@dataclass(frozen=True, eq=False)
+class TelegraphPixels:
+    """Pixels of a region that jump.
+
+    Attributes
+    ----------
+    place, key : [n], of each: in the region, row-major, and of the full sensor.
+    amplitude_dn : [n], high level less low one. high_share : [n], part of the time at the high level.
+    change_hz : [n], 1/(mean time high) + 1/(mean time low).
+    frame_us : from one frame to the next.
+    """
+
+    place: NDArray[np.intp]
+    key: NDArray[np.uint32]
+    amplitude_dn: NDArray[np.float64]
+    high_share: NDArray[np.float64]
+    change_hz: NDArray[np.float64]
+    frame_us: float
+
+    @property
+    def variance_dn2(self) -> NDArray[np.float64]:
+        """[n], temporal variance, DN²."""
+        return formulas.telegraph_variance(self.amplitude_dn, self.high_share)
+
+    def values_dn(self, seed: int, frame: int) -> NDArray[np.float64]:
+        """[n], DN about the mean in a frame: a pure function of seed, device and frame."""
+        every = np.arange(self.place.size)
+        signal = Telegraph(seed, Stream.TELEGRAPH, self.key, self.change_hz, self.high_share)
+        high = signal.is_high(every, np.full(every.size, frame * self.frame_us))
+        return np.where(high, *formulas.telegraph_levels(self.amplitude_dn, self.high_share)[::-1])
+
+    def added_dn(self, seed: int, frame: int, pixels: int, index: UInt32) -> Float:
+        """The same at the pixels `index` of a region of so many, 0 where nothing jumps."""
+        import drjit as dr
+
+        types = jit()
+        every = dr.zeros(types.Float, pixels)
+        values = types.Float(self.values_dn(seed, frame).astype(np.float32))
+        dr.scatter(every, values, types.UInt32(self.place.astype(np.uint32)))
+        return dr.gather(types.Float, every, index)
+
+
+def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> TelegraphPixels | None:
+    """Those of a device: measured where a calibration has them, else drawn from the device seed; None without any."""
+    frame_us, measured = US_PER_S / spec.frame_rate_hz, telegraph_maps(layout)
+    if measured is not None:
+        amplitude, share, correlation = (values.ravel().astype(np.float64) for values in measured.values())
+        place = np.flatnonzero(amplitude > 0)
+        change_hz = -np.log(np.clip(correlation[place], 1e-9, 1 - 1e-9)) * spec.frame_rate_hz
+        found = amplitude[place], share[place], change_hz
+    elif spec.telegraph is not None:
+        given = spec.telegraph
+        key = layout.full_index.ravel()
+        place = np.flatnonzero(device_uniform(device_seed, Stream.TELEGRAPH_SHARE, key) < given.share)
+        amplitude = np.full(place.size, spec.system_gain_dn_per_e * given.amplitude_e)
+        if given.amplitude_law == "exponential":
+            amplitude *= -np.log(device_uniform(device_seed, Stream.TELEGRAPH_AMPLITUDE, key[place]))
+        share = np.full(place.size, given.high_s / (given.high_s + given.low_s))
+        change_hz = np.full(place.size, 1.0 / given.high_s + 1.0 / given.low_s)
+        found = amplitude, share, change_hz
+    else:
+        return None
+    return TelegraphPixels(place, layout.full_index.ravel()[place], *found, frame_us) if place.size else None

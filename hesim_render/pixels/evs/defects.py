@@ -1,0 +1,194 @@
+"""Event pixels that are stuck, hot or flickering: which ones, at what rates, and the events that they give.
+
+A stuck pixel gives no event. A hot one gives events of its own at a steady rate, whatever the light, beside those of
+its comparisons; their rates spread over decades, as noise rates of event pixels do [hu2021]. A flickering one
+does so only while a random telegraph signal is high (`hesim_render.pixels.poisson_points`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.rng import Stream, device_normal, device_uniform
+from hesim_render.core.units import S_PER_US, US_PER_S
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs import formulas
+from hesim_render.pixels.measured import event_defects
+from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
+from hesim_render.specs.calibration_spec import Defect
+from hesim_render.specs.defects import EventDefectSpec
+from hesim_render.specs.sensor import EvsSpec
+
+#: Events of a defect per comparison at a fixed tick beyond which more change nothing: e⁻³⁰ is left.
+_MOST_PER_TICK = 30.0
+#: Events that are worked out at once, about.
+_AHEAD = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class EventDefects:
+    """Defects of the event pixels of a region.
+
+    Attributes
+    ----------
+    stuck : [k], places on the event grid, row-major.
+    place, key : [n], of hot and flickering pixels: on the event grid, and of the full sensor.
+    on_hz, off_hz : [n], rates of their own events while they fire.
+    firing_share : [n], part of the time in which they fire; 1 of hot ones.
+    change_hz : [n], 1/(mean time firing) + 1/(mean time quiet); 0 of hot ones.
+    """
+
+    stuck: NDArray[np.intp]
+    place: NDArray[np.intp]
+    key: NDArray[np.uint32]
+    on_hz: NDArray[np.float64]
+    off_hz: NDArray[np.float64]
+    firing_share: NDArray[np.float64]
+    change_hz: NDArray[np.float64]
+
+    def without(self, term: str) -> EventDefects:
+        """Without the stuck (``stuck``), hot (``hot``) or flickering (``flickering``) ones."""
+        if term == "stuck":
+            return replace(self, stuck=self.stuck[:0])
+        kept = self.change_hz > 0 if term == "hot" else self.change_hz == 0
+        names = ("place", "key", "on_hz", "off_hz", "firing_share", "change_hz")
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+
+    def __bool__(self) -> bool:
+        return self.stuck.size + self.place.size > 0
+
+
+def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
+    """Those of a device: measured where a calibration has them, else drawn from the device seed."""
+    key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
+    measured = event_defects(layout)
+    if measured is not None:
+        return _measured(measured, key, spec)
+    return _drawn(spec.defects or EventDefectSpec(), key, device_seed)
+
+
+def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> EventDefects:
+    if spec.stuck_share + spec.hot_share + spec.flickering_share == 0:
+        number = np.ones(key.size)
+    else:
+        number = device_uniform(device_seed, Stream.EVENT_DEFECT, key)
+    edges = np.cumsum([spec.stuck_share, spec.hot_share, spec.flickering_share])
+    stuck, hot, flickering = (np.flatnonzero(np.searchsorted(edges, number, "right") == k) for k in range(3))
+    decades = spec.hot_rate_spread_decades
+    spread = 10.0 ** (decades * device_normal(device_seed, Stream.EVENT_DEFECT_RATE, key[hot])) if decades else 1.0
+    firing, quiet = spec.flickering_firing_s or 1.0, spec.flickering_quiet_s or 1.0
+    ones = np.ones(flickering.size)
+    place = np.concatenate([hot, flickering])
+    return EventDefects(
+        stuck=stuck,
+        place=place,
+        key=key[place],
+        on_hz=np.concatenate(
+            [(spec.hot_rate_hz or 0.0) * spread * np.ones(hot.size), (spec.flickering_rate_hz or 0.0) * ones]
+        ),
+        off_hz=np.zeros(place.size),
+        firing_share=np.concatenate([np.ones(hot.size), formulas.firing_share(firing, quiet) * ones]),
+        change_hz=np.concatenate([np.zeros(hot.size), formulas.change_rate_hz(firing, quiet) * ones]),
+    )
+
+
+def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32], spec: EvsSpec) -> EventDefects:
+    stuck = np.flatnonzero(maps["defect"].ravel() == Defect.STUCK)
+    if spec.tick_us is None:
+        on, off = (maps[f"defect_{name}_hz"].ravel().astype(np.float64) for name in ("on", "off"))
+        place = np.flatnonzero((on > 0) | (off > 0))
+        steady = np.ones(place.size), np.zeros(place.size)
+        return EventDefects(stuck, place, key[place], on[place], off[place], *steady)
+    tick_s = spec.tick_us * S_PER_US
+    on, off = (maps[f"defect_{name}_per_trial"].ravel().astype(np.float64) for name in ("on", "off"))
+    share, correlation = (maps[f"defect_{name}"].ravel().astype(np.float64) for name in ("firing_share", "correlation"))
+    place = np.flatnonzero((on > 0) | (off > 0))
+    on, off, share, correlation = (values[place] for values in (on, off, share, correlation))
+    switching = (correlation > 0) & (share < 1)
+    with np.errstate(divide="ignore"):
+        change_hz = np.where(switching, -np.log(np.where(switching, correlation, 1.0)) / tick_s, 0.0)
+    return EventDefects(
+        stuck=stuck,
+        place=place,
+        key=key[place],
+        on_hz=formulas.rate_hz(on, tick_s),
+        off_hz=formulas.rate_hz(off, tick_s),
+        firing_share=np.where(switching, share, 1.0),
+        change_hz=change_hz,
+    )
+
+
+class DefectEvents:
+    """The events that hot and flickering pixels give of themselves: a pure function of seed, device and time.
+
+    Parameters
+    ----------
+    tick_s : where pixels are compared at fixed ticks, their period; rates beyond what a tick can tell are cut.
+    """
+
+    def __init__(self, defects: EventDefects, seed: int, tick_s: float | None = None) -> None:
+        self._defects = defects
+        total = defects.on_hz + defects.off_hz
+        self._on_part = defects.on_hz / np.maximum(total, 1e-300)
+        if tick_s is not None:
+            total = np.minimum(total, _MOST_PER_TICK / tick_s)
+        self._firing = np.flatnonzero(total > 0)
+        key = defects.key[self._firing]
+        self._events = PoissonPoints(seed, Stream.HOT_EVENTS, key, total[self._firing])
+        # events are worked out for many steps at once
+        ahead = max(_AHEAD, 4 * self._firing.size)
+        self._ahead_us = ahead / max(float(total.sum()), 1e-300) * US_PER_S
+        self._known_us = (0.0, 0.0)
+        self._known = (np.empty(0), np.empty(0, np.uint32), np.empty(0, np.int8))
+        self._flickers = np.flatnonzero(defects.change_hz > 0)
+        self._number = np.full(total.size, -1)
+        self._number[self._flickers] = np.arange(self._flickers.size)
+        self._state = Telegraph(
+            seed, Stream.EVENT_FLICKER, defects.key[self._flickers],
+            defects.change_hz[self._flickers], defects.firing_share[self._flickers],
+        )  # fmt: skip
+
+    def between(
+        self, begin_us: float, end_us: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.int8]]:
+        """Times, places on the event grid and polarities of the events after `begin_us` up to `end_us`, by time."""
+        if not (self._known_us[0] <= begin_us and end_us <= self._known_us[1]):
+            self._known_us = begin_us, max(end_us, begin_us + self._ahead_us)
+            self._known = self._events_of(*self._known_us)
+        first, last = np.searchsorted(self._known[0], (begin_us, end_us), side="right")
+        t_us, place, polarity = self._known
+        return t_us[first:last], place[first:last], polarity[first:last]
+
+    def _events_of(
+        self, begin_us: float, end_us: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.int8]]:
+        which, t_us, mark = self._events.between(begin_us, end_us)
+        which = self._firing[which]
+        number = self._number[which]
+        kept = np.ones(which.size, bool)
+        gated = np.flatnonzero(number >= 0)
+        kept[gated] = self._state.is_high(number[gated], t_us[gated])
+        polarity = np.where(mark < self._on_part[which], 1, -1)[kept].astype(np.int8)
+        t_us, place = t_us[kept], self._defects.place[which[kept]].astype(np.uint32)
+        order = np.lexsort((place, t_us))
+        return t_us[order], place[order], polarity[order]
+
+    def at_tick(self, polarity: NDArray[np.int8], begin_us: float, end_us: float) -> NDArray[np.int8]:
+        """Polarity of each pixel at a comparison, 0 for none, with the events of defects where it has none itself."""
+        _, place, own = self.between(begin_us, end_us)
+        place, own = place[::-1], own[::-1]  # the earliest of a pixel is written last
+        free = polarity[place] == 0
+        polarity = polarity.copy()
+        polarity[place[free]] = own[free]
+        polarity[self._defects.stuck] = 0
+        return polarity
+
+    def alive(self, events: NDArray[np.void], cols: int) -> NDArray[np.void]:
+        """Events without those of stuck pixels, on a grid `cols` wide."""
+        if self._defects.stuck.size == 0 or events.size == 0:
+            return events
+        place = events["y"].astype(np.int64) * cols + events["x"]
+        return events[~np.isin(place, self._defects.stuck)]
