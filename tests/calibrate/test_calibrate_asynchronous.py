@@ -376,13 +376,13 @@ def test_intervals_cover_the_truth(tmp_path):
 
 @pytest.mark.slow
 def test_a_session_with_stuck_and_hot_pixels_gives_a_sensor_that_has_them(tmp_path):
-    """Hot rates from 5 ON events/s (spread 0.3 decades), which first events tell to a counting error."""
+    """Hot pixels of 20 ON events/s (spread 0.1 decades): 12 trials of 67 ms in a light tell a rate to a third."""
     changes = {
-        "evs.defects": {"stuck_share": 0.01, "hot_share": 0.02, "hot_rate_hz": 5, "hot_rate_spread_decades": 0.3}
+        "evs.defects": {"stuck_share": 0.01, "hot_share": 0.02, "hot_rate_hz": 20, "hot_rate_spread_decades": 0.1}
     }
     given = hr.load_sensor("davis346", changes).crop(32, 32)
     write_captures(
-        given, tmp_path / "c", frames=8, trials=6, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)
+        given, tmp_path / "c", frames=8, trials=12, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)
     )
     calibrate_evs(tmp_path / "c", tmp_path / "c.yaml")
     again = hr.load_sensor("davis346", {"noise": str(tmp_path / "c.yaml")}).crop(32, 32)
