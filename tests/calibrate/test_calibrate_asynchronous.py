@@ -211,7 +211,7 @@ def late(name, calm, on, off, rng=np.random.default_rng(12)):  # noqa: B008
         pytest.param(ceiling, "S-curve ceiling", marks=pytest.mark.slow),
         pytest.param(floor, "S-curve floor", marks=pytest.mark.slow),
         pytest.param(flicker, "noise rate", marks=pytest.mark.slow),
-        (late, "fit"),
+        pytest.param(late, "fit", marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_what_breaks_the_model_is_named(tmp_path, change, wanted):

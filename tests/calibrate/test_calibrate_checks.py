@@ -175,7 +175,13 @@ def test_good_frames_give_false_alarms_at_the_stated_rate(tmp_path, monkeypatch,
     assert max(count.values()) < 16, count
 
 
-@pytest.mark.parametrize("keys", GOOD_FRAMES.values(), ids=GOOD_FRAMES.keys())
+@pytest.mark.parametrize(
+    "keys",
+    [
+        pytest.param(keys, id=name, marks=() if name in ("Poisson", "few electrons") else pytest.mark.slow)
+        for name, keys in GOOD_FRAMES.items()
+    ],
+)
 def test_good_frames_are_not_blamed(tmp_path, keys):
     """4 seeds, 9 checks of a chance of 1e-4: a false alarm in 0.4 % of changed seeds."""
     for seed in range(4):

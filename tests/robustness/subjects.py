@@ -9,6 +9,7 @@ from pathlib import Path
 import capture_sets
 import numpy as np
 import recordings
+import reset_captures
 from PIL import Image
 
 import hesim_render as hr
@@ -52,6 +53,10 @@ def captures_evs(folder):
     on = np.random.default_rng(1).binomial(200, (contrast[:, None, None] > 0) * 0.8 + np.zeros((7, 16, 16)) + 0.1)
     np.savez(folder / "set" / "evs_steps.npz", contrast=contrast, signal_dn=20.0, n_on=on, n_off=(200 - on) // 2,
              n_trials=200)  # fmt: skip
+
+
+def captures_trials(folder):
+    reset_captures.write(folder / "set", reset_captures.Pixels(), np.random.default_rng(2), (16, 16), steps=5)
 
 
 def calibrate_aps(folder):
@@ -223,6 +228,7 @@ SUBJECTS = {
     "developed": (recording, develop, "r/*.json r/frames/*.dng"),
     "aps": (captures_aps, calibrate_aps, "set/*"),
     "evs": (captures_evs, calibrate_evs, "set/*"),
+    "trials": (captures_trials, calibrate_evs, "set/*"),
     "calibration": (calibration, use_calibration, "c.yaml c_*.npz s.yaml"),
     "sensor": (sensor, use_sensor, "s.yaml curve.csv"),
     "scene": (scene, build_scene, "s.yaml plate.obj curve.csv"),

@@ -222,7 +222,11 @@ SURPRISES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SURPRISES)
+#: The others take a quarter of a minute each.
+QUICK = ("small fast object", "moving shadow")
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SURPRISES])
 def test_what_passes_meanwhile_is_found(name):
     """Every pair against 1024 rays of other random numbers."""
     shapes, (what, distance, time_us), depth = SURPRISES[name]

@@ -132,12 +132,8 @@ def assert_unbiased(name, illuminant, f_number, quality, seeds=range(10)):
     return z
 
 
-@pytest.mark.parametrize(
-    ("name", "illuminant", "f_number", "quality"),
-    [("reference-bayer", "A", 8.0, 0.5), ("eiger", "FL11", 1.4, 4.0)],
-)
-def test_chart(name, illuminant, f_number, quality):
-    assert_unbiased(name, illuminant, f_number, quality)
+def test_chart():
+    assert_unbiased("reference-bayer", "A", 8.0, 0.5)
 
 
 @pytest.mark.slow
