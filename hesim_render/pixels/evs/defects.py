@@ -196,8 +196,8 @@ class DefectEvents:
         return t_us[order], place[order], polarity[order]
 
     def at_tick(self, polarity: NDArray[np.int8], begin_us: float, end_us: float) -> NDArray[np.int8]:
-        """Polarity of each pixel at a comparison, 0 for no event. Pixels without an event of their comparison take
-        their own.
+        """Polarity of each pixel at a comparison, 0 for no event. Events of defects count where the comparison gave
+        none.
 
         Parameters
         ----------
