@@ -262,8 +262,7 @@ def totals_of(found: Thresholds, polarity: float, relative: NDArray, trials: int
 
 
 def _mismatch_square(theta: float, width: float, slope: float, signed: NDArray, variance: float, trials: int) -> float:
-    """m² that explains the scatter of the pixels' totals. It may be negative, so that its noise is symmetric about 0.
-    """
+    """m² that explains the scatter of the pixels' totals. It may be negative, so that its noise about 0 is even."""
 
     def expected(m2: float) -> float:
         mean, within = _totals(theta * (1 + np.sqrt(m2) * _NODES), theta, width, slope, signed, trials, m2)
