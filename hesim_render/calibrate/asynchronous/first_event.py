@@ -2,20 +2,20 @@
 
 A reset sets the pixel's reference to the level of that instant, including its noise σ₀ z. After the settling time the
 light steps by S (0 in steady light). From then on the first event is ON where S + σ₁ ν − σ₀ z passes θ₊ before it
-passes −θ₋. What the pixel does after that event, and in what state it was before the reset, does not matter.
+passes −θ₋. The state before the reset and the behaviour after that event have no influence.
 
 ν is white noise through two equal poles, −3 dB together at the cut-off f_c: correlation (1 + a τ) exp(−a τ),
-a = 2π f_c/√(√2 − 1). At the step it is above h with the chance Q(h), of a calm pixel less that of noise which
-passes the threshold before; it stays below h for a time w after it with the chance
+a = 2π f_c/√(√2 − 1). At the step it is above h with the probability Q(h); for a calm pixel, noise that would have
+passed the threshold before is excluded. It stays below h for a time w after the step with the probability
 
     Φ(h) exp(−λ(h) w),   λ(h) = (a/2π) exp(−h²/2) · κ(h)
 
-(a/2π) exp(−h²/2) is the rate of its crossings (Rice 1945). κ makes up for their coming in clumps, for high chances,
-and for what the event stage makes of the noise: 16 nodes in a period of the cut-off with straight lines between them,
-of the same variance on the average. So a simulated sensor has the rates that were measured. κ was counted on
-1.2 million such paths of 1.25/f_c up to h = 3.5; above, it is the closed form of such a line's crossings, a bivariate
-normal chance. Noise without nodes passes h = 0 to 2 by 5 % more often and h = 4 by 10 % less: by so much the f_c of a
-sensor with such noise is the one that gives its rates in a simulation, not its own.
+(a/2π) exp(−h²/2) is the rate of its crossings [rice1945]. κ corrects for crossings in clumps, for high probabilities
+and for the noise as the event stage generates it: 16 nodes per period of the cut-off, straight lines between them, and
+the same variance on average. A simulated sensor therefore has the measured rates. κ was counted on
+1.2 million such paths of length 1.25/f_c up to h = 3.5. Above, it is the closed form of such a line's crossings, a
+bivariate normal probability. Noise without nodes passes h = 0 to 2 by 5 % more often and h = 4 by 10 % less often. For
+a sensor with such noise, the fitted f_c differs from its own f_c accordingly: it gives the right rates in a simulation.
 """
 
 from __future__ import annotations
