@@ -1,6 +1,6 @@
 """Noise parameters of a real or simulated sensor from captures, with their uncertainty.
 
-Needs NumPy and SciPy only: neither the renderer nor the simulators, so that it runs on real captures.
+The package needs NumPy and SciPy only, and neither the renderer nor the simulators, so that it runs on real captures.
 """
 
 from hesim_render.calibrate.aps.calibration import calibrate_aps

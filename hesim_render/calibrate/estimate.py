@@ -12,7 +12,18 @@ Z_95 = 1.959963984540054
 
 
 def estimated(value: float, standard_error: float, unit: str = "") -> dict[str, Any]:
-    """A parameter with its 95 % interval; not identifiable where either number is not finite."""
+    """A parameter with its 95 % interval; it is not identifiable where either number is not finite.
+
+    Parameters
+    ----------
+    value : the estimate, in `unit`.
+    standard_error : its standard error, in `unit`.
+    unit : name of the unit, empty for a pure number.
+
+    Returns
+    -------
+    Entry of ``calibration.yaml``.
+    """
     if not (np.isfinite(value) and np.isfinite(standard_error)):
         return not_identifiable("the estimate is not finite")
     value, standard_error = float(value), float(standard_error)
@@ -25,18 +36,19 @@ def estimated(value: float, standard_error: float, unit: str = "") -> dict[str, 
 
 
 def not_identifiable(reason: str) -> dict[str, Any]:
-    """A parameter the data do not tell."""
+    """Entry of a parameter that the data do not determine, with the reason."""
     return {"value": None, "reason": reason}
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A relative standard deviation over pixels, such as the mismatch of thresholds.
+    """Relative standard deviation over pixels, such as the mismatch of thresholds.
 
     Attributes
     ----------
-    value : 0 where it is not significant. error : standard error, NaN where it is not.
-    limit : upper limit of 95 % where it is not.
+    value : relative standard deviation, 0 where it is not significant.
+    error : standard error, NaN where the value is not significant.
+    limit : upper limit of 95 % where the value is not significant.
     """
 
     value: float
@@ -45,7 +57,7 @@ class Spread:
 
     @property
     def relative_error(self) -> float:
-        """Of the value; 0 where that is 0."""
+        """Standard error over the value; 0 where the value is 0."""
         return self.error / self.value if self.value > 0 else 0.0
 
     def described(self) -> dict[str, Any]:

@@ -1,22 +1,23 @@
-"""A finding: a sign that captures are not as the model supposes, in one line that says what to look at."""
+"""A finding: a sign that captures do not follow the model, in one line that says what to look at."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-#: Chance with which one check gives a finding of captures that are as the model supposes.
+#: Probability that one check gives a finding for captures that follow the model.
 ALARM = 1e-4
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check saw.
+    """Result of a check that failed.
 
     Attributes
     ----------
-    check : its name. text : what was seen, what it spoils, and what to look at.
-    p_value : chance of it where all is as the model supposes; None where it is no matter of chance.
+    check : name of the check.
+    text : the deviation, the parameters that it affects, and what to look at.
+    p_value : probability of such a deviation if all follows the model; None where no probability applies.
     """
 
     check: str

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.recording.capture_set import FrameStack
 
 Progress = Callable[[str, float], None]
-#: Part of full scale up to which the first frame's value counts a pixel to the dim or to the bright half.
+#: Fraction of full scale below which the first frame's value assigns a pixel to the dim or to the bright half.
 _CLEAR = 0.9
 
 
@@ -24,12 +24,12 @@ class Moments:
     exposures_us : int64 [exposure].
     frames : frames per exposure.
     mean, variance : float32 [exposure, row, col], DN and DN² (ddof 1, the ADC's 1/12 still in).
-    lowest, highest : uint16 [exposure, row, col], extremes over the frames: they tell clipping.
+    lowest, highest : uint16 [exposure, row, col], extremes over the frames, which show clipping.
     first : uint16 [exposure, row, col], the first frame, for distributions of single values.
     row_means : float64 [exposure, frame, row], mean over the used pixels of a row; 0 where it has none.
     half_means : float64 [exposure, frame, 2], mean over the dimmer and over the brighter half of the used pixels, by
         the first frame of the exposure; without those near an end of the ADC's range.
-    half : int8 [exposure, row, col], 0 or 1 of a pixel of either half, −1 of others.
+    half : int8 [exposure, row, col], 0 for the dimmer half, 1 for the brighter half, −1 for other pixels.
     """
 
     exposures_us: NDArray[np.int64]
@@ -55,7 +55,10 @@ def measure(
 
     Parameters
     ----------
+    stack : the frames.
     used : [row, col], pixels that have an APS value.
+    full_scale_dn : largest value of the ADC, DN.
+    progress : called with a text and the fraction done.
     """
     exposures, frames, rows, cols = stack.shape
     place = np.argsort(np.argsort(stack.exposures_us))
@@ -105,7 +108,7 @@ def measure(
 
 
 def _halves(first: NDArray[np.uint16], used: NDArray[np.bool_], full_scale_dn: int) -> NDArray[np.int8]:
-    """Which half of the used pixels a pixel is of: 0 the dimmer, 1 the brighter, −1 neither."""
+    """Half of the used pixels to which a pixel belongs: 0 the dimmer, 1 the brighter, −1 neither."""
     clear = used & (first > 0) & (first < _CLEAR * full_scale_dn)
     middle = np.median(first[clear]) if clear.any() else 0.0
     return np.where(clear, (first > middle).astype(np.int8), np.int8(-1)).astype(np.int8)

@@ -1,4 +1,4 @@
-"""``calibration.yaml``, the map files beside it and the place of its report: written whole or not at all."""
+"""``calibration.yaml``, its map files and the place of its report. A file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def write_section(
 ) -> Path:
     """Add or replace a section of a calibration, with its maps in ``<name>_<section>_maps-<hash>.npz`` beside it.
 
-    The name of a map file goes with what is in it, and the calibration holds its hash: the one step in which the
-    calibration gets its name is also that in which new maps take the place of old ones.
+    The name of a map file contains a hash of its content, and the calibration holds that hash. New maps replace old
+    ones in the same step in which the new calibration gets its name.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Parameters that are one number, or one value per pixel, on the device; and what pixels remember, off it."""
+"""Device parameters that are one number or one value per pixel, and the state of an object as plain values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from hesim_render.core.device_types import DeviceArray, Float, UInt32
 
 
 def to_device(value: float | NDArray) -> Float:
-    """A number as an opaque Dr.Jit Float (a new one compiles nothing), an array as a flat Float."""
+    """Copy a value to the device: a number as an opaque Dr.Jit Float (a new one compiles nothing), an array as a flat
+    Float.
+    """
     import drjit as dr
 
     types = jit()
@@ -29,12 +31,12 @@ def take(value: DeviceArray, index: UInt32) -> DeviceArray:
 
 
 def saved(part: Any) -> dict[str, Any]:
-    """What an object remembers between two calls, as plain values and NumPy arrays: the attributes in its `STATE`."""
+    """State of an object between two calls, as plain values and NumPy arrays: the attributes named in its `STATE`."""
     return {name: _off_device(getattr(part, name)) for name in part.STATE}
 
 
 def restore(part: Any, state: dict[str, Any]) -> None:
-    """Put back what `saved` told, into an object made alike."""
+    """Put the result of `saved` back into an object made from the same parameters."""
     for name in part.STATE:
         own = getattr(part, name)
         if hasattr(own, "STATE"):

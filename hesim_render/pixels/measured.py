@@ -1,4 +1,4 @@
-"""Measured maps of the calibration a sensor file points at, cut to the region that is read out."""
+"""Measured maps of the calibration named in a sensor file, cut to the region that is read out."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _EXPECTED |= {
     "telegraph_amplitude_dn": ("f", 65535.0), "telegraph_high_share": ("f", 1.0), "telegraph_correlation": ("f", 1.0),
 }  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
-#: Maps that a calibration may lack: thresholds where no steps were shown, the others in older ones.
+#: Maps that a calibration may lack: thresholds if no steps were shown; the others in older calibrations.
 _MAY_LACK = ("threshold_", "defect", "telegraph_")
 
 
 def require_region(layout: Layout) -> None:
-    """Check that the calibration's maps cover the region read out.
+    """Check that the maps of the calibration cover the region read out.
 
     Raises
     ------
     SpecError
-        Where they do not; the message names the region they are of.
+        If they do not; the message names the region of the maps.
     """
     if layout.spec.noise is not None:
         _offset(layout, layout.spec.noise.measured)
@@ -49,8 +49,11 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
 
 
 def telegraph_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
-    """``telegraph_amplitude_dn``, ``…_high_share`` and ``…_correlation`` [row, col] over the region, from one frame to
-    the next; None if not measured."""
+    """``telegraph_amplitude_dn``, ``…_high_share`` and ``…_correlation`` [row, col] over the region; None if not
+    measured.
+
+    The correlation is that of the state from one frame to the next.
+    """
     return _if_there(layout, "aps", TELEGRAPH_MAPS, _frame_region)
 
 
@@ -91,8 +94,8 @@ def _event_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict
 def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[np.float32] | None:
     """Threshold of each event pixel relative to the mean, [y, x] over the region; None if not measured.
 
-    Each pixel's measured value carries the noise of its estimate; deviations are scaled to `spread`, the
-    mismatch with that noise taken out. Hot and flickering pixels have the mean.
+    The measured value of each pixel contains the noise of its estimate. Deviations are scaled to `spread`, the
+    mismatch without that noise. Hot and flickering pixels have the mean.
 
     Parameters
     ----------
@@ -112,7 +115,7 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
 
 
 def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping[str, NDArray], tuple[int, int]] | None:
-    """Maps of a section, whole, and where the region read out begins in them (row, col of the mosaic)."""
+    """Whole maps of a section, and the row and column of the mosaic in them where the region read out begins."""
     if layout.spec.noise is None:
         return None
     measured = layout.spec.noise.measured
@@ -146,7 +149,7 @@ def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping
 
 
 def _region(layout: Layout, measured: MeasuredMaps) -> tuple[int, int, int, int]:
-    """Row, column, rows and columns that were captured."""
+    """Row, column, rows and columns of the captured region."""
     roi = measured.roi
     if roi is None:
         return 0, 0, layout.spec.geometry.rows, layout.spec.geometry.cols

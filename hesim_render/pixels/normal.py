@@ -9,11 +9,15 @@ from hesim_render.core.device_types import Float, UInt32
 
 
 def normal_pair(radius_word: UInt32, angle_word: UInt32) -> tuple[Float, Float]:
-    """Two independent N(0, 1) deviates of two UInt32 words [box1958].
+    """Two independent N(0, 1) deviates from two UInt32 words [box1958].
 
-    Dr.Jit's own normal generator uses 23 bits for the radius, which makes its tail coarse beyond
-    5 standard deviations: event thresholds sit there. All 32 bits are used here, and the radius word
-    is mapped to the open interval (0, 1), where floats are densest at 0: the tail ends at 6.66.
+    Dr.Jit's own normal generator uses 23 bits for the radius, which makes its tail coarse beyond 5 standard deviations.
+    Event thresholds lie there. All 32 bits are used here. The radius word is mapped to the open interval (0, 1), where
+    floats are densest at 0: the tail ends at 6.66.
+
+    Parameters
+    ----------
+    radius_word, angle_word : UInt32, random words.
 
     Returns
     -------

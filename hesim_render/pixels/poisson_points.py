@@ -1,8 +1,8 @@
-"""Points of a Poisson process, and a random telegraph signal made of them, as pure functions of time.
+"""Points of a Poisson process, and a random telegraph signal made from them, as pure functions of time.
 
-Time is cut into cells in which a process has 4 points in the mean. In each cell waiting times begin anew, which changes
-nothing of a process that has no memory. So the points of any stretch of time are known without those before it: they
-do not depend on where a run begins, how it is split, or how often it is asked.
+Time is cut into cells in which a process has 4 points on average. In each cell the waiting times begin anew, which does
+not change a process without memory. The points of any stretch of time are therefore known without earlier points: they
+do not depend on the start of a run, on how it is split or on how often it is asked.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hesim_render.core.rng import Stream, uniform, words
 from hesim_render.core.units import US_PER_S
 
 _PER_CELL = 4.0
-#: Draws of one block of words, and where those begin that say what a point does.
+#: Draws of one block of words, and the first counter of the words that decide what a point does.
 _BLOCK, _MARK = 4, np.uint32(1 << 31)
 
 
@@ -25,7 +25,7 @@ class PoissonPoints:
 
     Parameters
     ----------
-    seed, stream : the points are a pure function of them, the pixel and time.
+    seed, stream : the points are a pure function of `seed`, `stream`, the pixel and time.
     pixel : uint32 [n], index on the full sensor.
     rate_hz : [n], above 0.
     """
@@ -38,8 +38,16 @@ class PoissonPoints:
     def between(
         self, begin_us: float, end_us: float
     ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-        """Places (of `pixel`) and times of all points after `begin_us` up to `end_us`, in no order, and a number in
-        (0, 1) that belongs to each."""
+        """All points after `begin_us` and up to `end_us`, in no order.
+
+        Parameters
+        ----------
+        begin_us, end_us : bounds, µs.
+
+        Returns
+        -------
+        place, t_us, mark : [point], index into `pixel`, time in µs, and a number in (0, 1) that belongs to the point.
+        """
         first, last = (np.floor(t / self._cell_us).astype(np.int64) for t in (begin_us, end_us))
         count = last - first + 1
         which = np.repeat(np.arange(count.size), count)
@@ -53,7 +61,7 @@ class PoissonPoints:
         return which[here], t_us, self._mark(which[here], cell[here], order)
 
     def last_mark(self, which: NDArray[np.intp], t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A number in (0, 1) that belongs to the last point of the processes `which` at or before `t_us` [m]."""
+        """Number in (0, 1) that belongs to the last point of the processes `which` [m] at or before `t_us` [m], µs."""
         cell = np.floor(t_us / self._cell_us[which]).astype(np.int64)
         until = np.asarray(t_us, np.float64)
         number, open_ = np.full(which.size, -1, np.int64), np.arange(which.size)
@@ -75,7 +83,12 @@ class PoissonPoints:
     def _points(
         self, which: NDArray[np.intp], cell: NDArray[np.int64]
     ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.float64]]]:
-        """Points of cells, in rounds: entries of `which`, number in the cell, µs after its begin; in order of time."""
+        """Points of cells in order of time, one round at a time.
+
+        Yields
+        ------
+        Entries of `which`, number of the point in its cell, and time after the begin of the cell, µs.
+        """
         here, elapsed, block = np.arange(which.size), np.zeros(which.size), 0
         while here.size:
             draw = np.full(here.size, block, np.uint32)
@@ -93,11 +106,11 @@ class Telegraph:
     """A random telegraph signal for each of a few pixels: a Markov process that is high or low [machlup1954].
 
     The state is drawn anew, high with the stationary share, at the points of a Poisson process whose rate is the sum of
-    both rates of change: that is the same Markov process, with correlation exp(−rate·Δt).
+    both rates of change. This is the same Markov process, with correlation exp(−rate·Δt).
 
     Parameters
     ----------
-    seed, stream, pixel : as of `PoissonPoints`.
+    seed, stream, pixel : as in `PoissonPoints`.
     rate_hz : [n], 1/(mean time high) + 1/(mean time low).
     high_share : [n], part of the time at the high level.
     """
@@ -114,10 +127,10 @@ class Telegraph:
         self._share = np.asarray(high_share, np.float64)
 
     def is_high(self, which: NDArray[np.intp], t_us: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether the processes `which` (places in `pixel`) are at their high level at `t_us`, both [m]."""
+        """Whether the processes `which` [m] (indices into `pixel`) are at their high level at `t_us` [m], µs."""
         return self._points.last_mark(which, t_us) < self._share[which]
 
 
 def _counter(cell: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Cells as counters; those before time 0 are the last."""
+    """Cell numbers as counters; cells before time 0 are the last counters."""
     return (cell & 0xFFFFFFFF).astype(np.uint32)

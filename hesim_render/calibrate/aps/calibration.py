@@ -40,8 +40,8 @@ def calibrate_aps(
     ----------
     folder : capture set with ``capture.yaml``, ``aps_dark.npz`` and ``aps_lit.npz``.
     out : the calibration; its section ``aps`` is written, others are kept.
-    report : HTML file, if one is wanted; it covers every section of `out`, and a report of `out` is replaced.
-    progress : called with what is being done and the fraction done.
+    report : HTML file, if wanted; it covers every section of `out`, and an earlier report of `out` is replaced.
+    progress : called with a text that names the current work and the fraction done.
     overwrite : replace a report of another calibration.
 
     Returns
@@ -79,20 +79,20 @@ def calibrate_aps(
 
 
 def describe(captures: CaptureSet) -> dict[str, Any]:
-    """What a calibration says of its captures."""
+    """Description of the captures for a calibration."""
     return captures.spec.model_dump(exclude_none=True, mode="json")
 
 
 def _read(
     stacks: tuple[FrameStack, FrameStack], used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None
 ) -> list[Moments]:
-    """Both stacks at once: inflating, which releases Python's lock, takes most of the time."""
+    """Read both stacks in parallel. Decompression takes most of the time and releases Python's lock."""
     with ThreadPoolExecutor(2) as pool_of_two:
         return list(pool_of_two.map(lambda stack: measure(stack, used, full_scale_dn, progress), stacks))
 
 
 def frame_positions(captures: CaptureSet) -> list[Position]:
-    """Tile positions that have an APS value: all, where no sensor is named."""
+    """Tile positions that have an APS value; all positions where no sensor is named."""
     spec = captures.spec
     if captures.sensor is not None:
         return captures.sensor.positions("aps")
@@ -224,7 +224,19 @@ def _unlike_their_kind(
     dark_clear: NDArray[np.bool_],
     usable: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Pixels whose variance, over all their exposures, is not the polynomial's: flicker, stuck values, dead ones."""
+    """Pixels whose variance over all exposures is not that of the polynomial: flickering, stuck or dead pixels.
+
+    Parameters
+    ----------
+    beta : [tile_row, tile_col, 6], in DN and s.
+    dark, lit : moments of the frames.
+    signals : [exposure, row, col], light above black, DN.
+    dark_clear, usable : [exposure, row, col], dark and lit values clear of clipping.
+
+    Returns
+    -------
+    [row, col].
+    """
     ratio = np.zeros(lit.mean.shape[1:])
     freedom = np.zeros_like(ratio)
     for moments, mask, signal in ((dark, dark_clear, None), (lit, usable, signals)):
@@ -235,13 +247,13 @@ def _unlike_their_kind(
             freedom += np.where(mask[k], moments.frames - 1, 0)
     spread = np.sqrt(2 * np.maximum(freedom, 1))
     scaled = ratio / spread
-    # A polynomial that fits poorly somewhere must not condemn the pixels there: measure against the real spread.
+    # A polynomial that fits poorly somewhere must not make the pixels there bad: compare with the actual spread.
     width = max(1.0, 1.4826 * float(np.median(np.abs(scaled - np.median(scaled)))))
     return np.abs(scaled) > _POOR_FIT_SIGMAS * width
 
 
 def _unresponsive(composite: Composite, tile: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels that see less than a fiftieth of what all but two of the 3×3 pixels of their position see."""
+    """Pixels whose signal is below a fiftieth of that of all but two of the 3×3 nearest pixels of their position."""
     unresponsive = np.zeros(composite.rate_dn_per_s.shape, bool)
     for i, j in np.ndindex(tile):
         rate = composite.rate_dn_per_s[i :: tile[0], j :: tile[1]]

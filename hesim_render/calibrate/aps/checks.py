@@ -1,7 +1,8 @@
-"""Whether frames are as their noise model supposes: one light, one black level, a variance of second degree.
+"""Checks whether frames follow their noise model: one light, one black level, a variance of second degree.
 
-Each check has a chance of `finding.ALARM` to speak of frames that are. What is significant but too small to move a
-parameter by half its standard error, or the variance by a thousandth, is not told.
+Each check gives a finding with the probability `finding.ALARM` for frames that follow the model. A deviation that is
+significant but changes a parameter by less than half its standard error, or the variance by less than a thousandth, is
+not reported.
 """
 
 from __future__ import annotations
@@ -18,26 +19,26 @@ from hesim_render.calibrate.finding import ALARM, Finding
 from hesim_render.calibrate.moments import Moments
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 
-#: Part of the temporal variance, and of a parameter's standard error, below which a drift does no harm.
+#: Fractions of the temporal variance and of a parameter's standard error below which a drift is harmless.
 _LEAST_PART, _LEAST_ERRORS = 1e-3, 0.5
 #: Shift of the black level between captures, in standard deviations of the dark noise, and deviation of the light from
-#: proportionality, from which they are told.
+#: proportionality, from which they are reported.
 _LEAST_SHIFT, _LEAST_DEVIATION = 0.05, 3e-3
-#: χ²/dof of the sample variances from which they scatter more than Gaussian noise makes them.
+#: χ²/dof of the sample variances above which they scatter more than under Gaussian noise.
 _WIDE = 1.05
 _FEWEST = 50
-#: Pixels from which the weights of an exposure are taken.
+#: Number of pixels from which the weights of an exposure are taken.
 _SAMPLE = 20_000
 
 
 @dataclass(frozen=True)
 class Proportion:
-    """How the lit frames of an exposure differ from rate · exposure, with standard errors.
+    """Deviation of the lit frames of an exposure from rate · exposure, with standard errors.
 
     Attributes
     ----------
-    shift_dn : the same for all pixels: of the black level. deviation : in proportion to the signal: of the light, of
-        the exposure time or of the response.
+    shift_dn : part that is the same for all pixels, DN: a shift of the black level.
+    deviation : part in proportion to the signal: a deviation of the light, the exposure time or the response.
     """
 
     exposure_us: int
@@ -49,7 +50,7 @@ class Proportion:
 
 @dataclass(frozen=True)
 class FrameChecks:
-    """What was looked at, for the calibration's file, and what was found."""
+    """Results of the checks for the calibration's file, and the findings."""
 
     dark: list[FrameDrift]
     lit: list[FrameDrift]
@@ -58,7 +59,13 @@ class FrameChecks:
 
 
 def check_frames(result: ApsCalibration, dark: Moments, lit: Moments) -> FrameChecks:
-    """Every check of the frames; the moments are those without what rows share."""
+    """Every check of the frames.
+
+    Parameters
+    ----------
+    result : the calibration.
+    dark, lit : moments of the frames without temporal row noise.
+    """
     rows = result.rows.variance if result.rows.significant else 0.0
     in_dark = [frame_drift(dark, k, rows, None) for k in range(dark.exposures_us.size)]
     in_light = [frame_drift(lit, k, rows, result.signals[k]) for k in range(lit.exposures_us.size)]
@@ -134,7 +141,7 @@ def _light(result: ApsCalibration, drifts: list[FrameDrift]) -> Finding | None:
 
 
 def _worst(drifts: list[tuple[FrameDrift, Shared]], least: float) -> tuple[FrameDrift, float] | None:
-    """The exposure of the clearest significant variance above `least`, and its chance among them all."""
+    """The exposure with the most significant variance above `least`, and its p-value among all exposures."""
     found = [
         (shared.ratio, drift, min(1.0, shared.p_value * len(drifts)))
         for drift, shared in drifts
@@ -173,7 +180,15 @@ def _line(result: ApsCalibration, dark: Moments, rows: float) -> Finding | None:
 
 
 def _proportions(result: ApsCalibration, lit: Moments, rows: float) -> list[Proportion]:
-    """Least squares of signal − rate · exposure over the usable pixels of each exposure: a shift and a part of it."""
+    """Least squares of signal − rate · exposure over the usable pixels of each exposure: a shift and a proportional
+    part.
+
+    Parameters
+    ----------
+    result : the calibration.
+    lit : moments of the lit frames.
+    rows : variance of the temporal row noise, DN².
+    """
     found = []
     good = ~result.bad & ~result.dark.bad & ~result.dark.hot
     for k, t in enumerate(lit.exposures_s):
@@ -184,7 +199,7 @@ def _proportions(result: ApsCalibration, lit: Moments, rows: float) -> list[Prop
         residual = result.signals[k][use] - expected
         noise = np.maximum(lit.variance[k][use].astype(np.float64), ADC_VARIANCE_DN2) / lit.frames
         noise += result.dark.mean_variance(t)
-        # from the light, not from a pixel's own sample
+        # the weight follows from the light, not from a pixel's own sample
         few = slice(None, None, max(1, expected.size // _SAMPLE))
         line = np.polynomial.Polynomial.fit(expected[few], noise[few], 1)
         weight = 1 / line(expected).clip(min=0.1 * noise.mean())
@@ -194,7 +209,7 @@ def _proportions(result: ApsCalibration, lit: Moments, rows: float) -> list[Prop
             continue
         inverse = np.linalg.inv(matrix)
         value = inverse @ ((design * weight) @ residual)
-        # what a row adds, to the lit mean and to the dark one that was taken off, is the same for all its pixels
+        # the row noise in the lit mean and in the subtracted dark mean is the same for all pixels of a row
         row = np.nonzero(use)[0]
         scores = np.stack([np.bincount(row, weight * x) for x in design])
         shared = rows / lit.frames + result.dark.mean_variance(t) * rows / (_dark_variance(result) + rows)
@@ -244,7 +259,7 @@ def _largest(
 
 
 def _curvature(result: ApsCalibration) -> Finding | None:
-    """A term in I³ that the data ask for, all positions together."""
+    """Finding of a significant term in I³, all positions together."""
     known = {p: f.cubic for p, f in result.fits.items() if f.cubic is not None}
     if not known:
         return None
@@ -268,7 +283,7 @@ def _curvature(result: ApsCalibration) -> Finding | None:
 
 
 def _scatter(result: ApsCalibration) -> Finding | None:
-    """Sample variances that scatter more than those of electrons counted and Gaussian noise."""
+    """Finding of sample variances that scatter more than those of an electron count with Gaussian noise."""
     wide = {p: f for p, f in result.fits.items() if f.chi2_per_dof > _WIDE * f.expected_chi2}
     if not wide:
         return None

@@ -1,8 +1,8 @@
-"""What pixels do together from frame to frame: rows (temporal row noise), and whole frames (black level, light).
+"""Noise that pixels share from frame to frame: rows (temporal row noise), and whole frames (black level, light).
 
-The variance of a mean over n pixels that share nothing is Σ s²/n², with their own sample variances. What it is
-above that is the mean covariance of two of them. A row's mean tells that of the row, after each frame's own mean was
-taken off; the frame's mean tells that of the frame.
+The variance of a mean over n pixels that share nothing is Σ s²/n², with their own sample variances s². The excess over
+it is the mean covariance of two pixels. The mean of a row, minus the mean of its frame, gives that of the row. The mean
+of the frame gives that of the frame.
 """
 
 from __future__ import annotations
@@ -16,25 +16,26 @@ from scipy.stats import f as f_law
 from hesim_render.calibrate.finding import ALARM
 from hesim_render.calibrate.moments import Moments
 
-#: Least part of a row that is not clipped, where the row's own sample of its noise is taken.
+#: Least fraction of a row that is not clipped for which the row's own sample of its noise is used.
 _LEAST_CLEAR = 0.2
-#: Of a row's mean: frames that are all alike have none.
+#: Least variance of the mean of a row, DN²: identical frames have none.
 _LEAST_NOISE_DN2 = 1e-12
-#: Times the median noise of a row from which it counts less.
+#: Ratio to the median noise of the rows above which a row has a smaller weight.
 _BUSY = 2.0
-#: Difference of the halves' light, as a part of the brighter, that tells light from black.
+#: Least difference of the halves' light, relative to the brighter half, that separates light from black level.
 _LEAST_BETWEEN = 0.2
 
 
 @dataclass(frozen=True)
 class Shared:
-    """A variance that pixels share.
+    """Variance that pixels share.
 
     Attributes
     ----------
-    variance : its unbiased estimate, which noise may bring below 0. error : standard error.
-    ratio : of the variance of the mean to that of its noise, 1 where nothing is shared.
-    p_value : chance of one as large where nothing is shared.
+    variance : unbiased estimate, which noise may make negative.
+    error : standard error.
+    ratio : variance of the mean over that of its noise, 1 where nothing is shared.
+    p_value : probability of a ratio as large where nothing is shared.
     """
 
     variance: float
@@ -54,7 +55,12 @@ class Shared:
 def row_noise(dark: Moments, used: NDArray[np.bool_]) -> Shared:
     """Temporal row noise in DN² of the dark frames, all exposures together.
 
-    Lit frames would not do: light that flickers moves bright rows more than dim ones.
+    Lit frames are not suitable: flickering light changes bright rows more than dim ones.
+
+    Parameters
+    ----------
+    dark : moments of the dark frames.
+    used : [row, col], pixels that have an APS value.
     """
     rows = used.any(axis=1)
     count = int(rows.sum())
@@ -65,7 +71,7 @@ def row_noise(dark: Moments, used: NDArray[np.bool_]) -> Shared:
     own = np.maximum([noise[rows] for _, noise in parts], _LEAST_NOISE_DN2)
     found = np.stack([np.sum(change[:, rows] ** 2, axis=0) for change, _ in parts]) / (dark.frames - 1)
     found *= count / (count - 1)
-    # a row with a pixel that flickers tells less; weights that follow the rows' own samples would bend the sum
+    # a row with a flickering pixel has less information; weights from the rows' own samples would bias the sum
     weight = 1 / np.maximum(own, _BUSY * np.median(own, axis=1)[:, None]) ** 2
     level, total = weight * own, float(np.sum(weight * own))
     ratio = float(np.sum(weight * found)) / total
@@ -77,14 +83,17 @@ def row_noise(dark: Moments, used: NDArray[np.bool_]) -> Shared:
 
 
 def without_rows(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, typical: float) -> Moments:
-    """The same with temporal row noise taken out of the sample variances.
+    """The moments with temporal row noise subtracted from the sample variances.
 
-    What is taken off is the rows' own sample of it in these frames: the expected value would leave the scatter of
-    that sample, which all pixels of a row share, in the variance polynomial.
+    The subtracted value is the rows' own sample of the noise in these frames. Subtracting the expected value would
+    leave the scatter of that sample, which all pixels of a row share, in the variance polynomial.
 
     Parameters
     ----------
-    typical : variance of the row noise, DN²; taken where a row is all but clipped.
+    moments : of the frames.
+    used : [row, col], pixels that have an APS value.
+    full_scale_dn : largest value of the ADC, DN.
+    typical : variance of the row noise, DN²; used where nearly the whole row is clipped.
     """
     variance = moments.variance.copy()
     for k in range(moments.exposures_us.size):
@@ -99,14 +108,25 @@ def without_rows(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, 
 
 
 def _row_changes(moments: Moments, k: int, used: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of each row, the change of its mean from frame to frame beyond its frame's [frame, row], and what its pixels'
-    own noise makes of its variance [row]."""
+    """Changes of the rows' means from frame to frame, and the part of their variance due to the pixels' own noise.
+
+    Parameters
+    ----------
+    moments : of the frames.
+    k : number of the exposure.
+    used : [row, col], pixels that have an APS value.
+
+    Returns
+    -------
+    change : [frame, row], DN, without the change of the whole frame.
+    own : [row], DN².
+    """
     rows = used.any(axis=1)
     change = moments.row_means[k] - moments.row_means[k].mean(axis=0)
     change = change - change[:, rows].mean(axis=1)[:, None]
     total = np.sum(np.where(used, moments.variance[k], 0.0), axis=1, dtype=np.float64)
     pixels = np.maximum(used.sum(axis=1), 2)
-    # a pixel's own variance holds what the row shares: Σ (s² − R)/n² with R = (variance of the row − Σ s²/n²)·n/(n − 1)
+    # a pixel's variance includes the row noise R: Σ (s² − R)/n² with R = (variance of the row − Σ s²/n²)·n/(n − 1)
     of_row = np.sum(change**2, axis=0) / (moments.frames - 1) * rows.sum() / max(int(rows.sum()) - 1, 1)
     shared = (of_row - total / pixels**2) * pixels / (pixels - 1)
     return change, (total - pixels * shared) / pixels**2
@@ -114,13 +134,14 @@ def _row_changes(moments: Moments, k: int, used: NDArray[np.bool_]) -> tuple[NDA
 
 @dataclass(frozen=True)
 class FrameDrift:
-    """What whole frames do together, of one exposure.
+    """Drift of whole frames of one exposure.
 
     Attributes
     ----------
-    black : variance of the level that all pixels share, DN². light : relative variance of the light; None where the
-        frames are dark, or too even to tell light from black.
-    black_range_dn, light_range : from the lowest to the highest frame.
+    black : variance of the level that all pixels share, DN².
+    light : relative variance of the light; None where the frames are dark, or too even to separate light from black
+        level.
+    black_range_dn, light_range : range from the lowest to the highest frame.
     """
 
     exposure_us: int
@@ -131,19 +152,24 @@ class FrameDrift:
 
 
 def frame_drift(moments: Moments, k: int, row_variance: float, signal_dn: NDArray | None) -> FrameDrift:
-    """Drift of the frames of an exposure: of the black level in the dark; in the light of black and of light, apart.
+    """Drift of the frames of an exposure: of the black level in the dark; of black level and light separately in the
+    light.
 
-    A shift of black moves dim and bright pixels alike, light moves them in proportion to their signal: the means of
-    the dimmer and of the brighter half tell one from the other. The first frame, which sorts them, takes no part.
+    A shift of the black level changes dim and bright pixels equally, the light changes them in proportion to their
+    signal. The means of the dimmer and of the brighter half separate the two. The first frame, which sorts the pixels,
+    is not used.
 
     Parameters
     ----------
-    row_variance : of temporal row noise, DN². signal_dn : [row, col], light above black; None in the dark.
+    moments : of the frames.
+    k : number of the exposure.
+    row_variance : variance of the temporal row noise, DN².
+    signal_dn : [row, col], light above black, DN; None in the dark.
     """
     halves = [moments.half[k] == side for side in (0, 1)]
     pixels = np.array([max(int(mask.sum()), 1) for mask in halves])
     own = np.array([float(np.sum(moments.variance[k][m], dtype=np.float64)) for m in halves]) / pixels**2
-    # halves may lie in different rows: what rows add does not cancel in their difference
+    # the halves may lie in different rows: row noise does not cancel in their difference
     part = np.stack([mask.sum(axis=1) for mask in halves]) / pixels[:, None]
     covariance = np.diag(own) + row_variance * (part @ part.T)
     change = moments.half_means[k, 1:] - moments.half_means[k, 1:].mean(axis=0)
@@ -162,13 +188,20 @@ def frame_drift(moments: Moments, k: int, row_variance: float, signal_dn: NDArra
     if between < _LEAST_BETWEEN * max(levels[1], 1e-9) or between <= 0:
         return alone
     light, of_light = series(np.array([-1.0, 1.0]) / between)
-    # the dim half's change less the light's part of it
+    # change of the dim half minus the contribution of the light
     black, of_black = series(np.array([1 + levels[0] / between, -levels[0] / between]))
     return FrameDrift(exposure, of_black, of_light, float(np.ptp(black)), float(np.ptp(light)))
 
 
 def _excess(change: NDArray, noise: float, pixels: float) -> Shared:
-    """Variance of a series beyond that of its noise, which is known from many pixels."""
+    """Variance of a series beyond that of its noise.
+
+    Parameters
+    ----------
+    change : [frame], the series.
+    noise : variance of its noise, known from many pixels.
+    pixels : number of these pixels.
+    """
     freedom = change.size - 1
     noise = max(noise, 1e-30)
     ratio = float(change @ change) / freedom / noise

@@ -1,4 +1,4 @@
-"""The clean signal of the scene from all exposures: a rate in DN/s of light, per pixel."""
+"""The noise-free signal of the scene from all exposures: a rate of light per pixel, DN/s."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from hesim_render.specs.sensor import SensorSpec
 from hesim_render.spectral import spectrum as spectra
 
 _CLEAR_SIGMAS = 6.0
-#: Relative standard deviation of the frame pixels around an event pixel from which they do not tell its signal.
+#: Relative standard deviation of the frame pixels around an event pixel above which its signal is uncertain.
 _UNEVEN = 0.1
-#: Times their noise variance that a few of them may scatter.
+#: Factor of their noise variance by which a few of them may scatter.
 _NOISE_MARGIN = 3.0
 
 
@@ -41,10 +41,17 @@ def light_signal(lit: Moments, dark: DarkModel, k: int) -> NDArray[np.float32]:
 
 
 def saturation_dn(lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int) -> float | None:
-    """Light signal at which the full well clips below the ADC's full scale, or None where it does not.
+    """Light signal in DN at which the full well clips below the ADC's full scale, or None where it does not.
 
-    A pixel is over full well where a shorter exposure predicts over 1.15 times what it shows though it
-    stays clear of full scale; a full well shows as many of them at one level.
+    A pixel is over full well if a shorter exposure predicts more than 1.15 times its signal while its value stays below
+    full scale. Full well shows as many such pixels at one level.
+
+    Parameters
+    ----------
+    lit : moments of the lit frames.
+    signals : [exposure, row, col], light above black, DN.
+    good : [row, col], pixels that are used.
+    full_scale_dn : largest value of the ADC, DN.
     """
     t = lit.exposures_s
     levels = []
@@ -70,8 +77,18 @@ def clear_of_clipping(
 ) -> NDArray[np.bool_]:
     """Pixels [row, col] of exposure k whose values stay clear of 0, full scale and full well.
 
-    With `beta` [tile_row, tile_col, 6] the margin is 6σ of the fitted variance, which does not depend on the sample
-    variance of the pixel: leaving pixels out by their own extremes would bias the variance of the rest.
+    With `beta` the margin is 6σ of the fitted variance, which does not depend on the sample variance of the pixel. To
+    leave pixels out by their own extremes would bias the variance of the rest.
+
+    Parameters
+    ----------
+    lit : moments of the frames.
+    signal : [row, col], light above black, DN.
+    k : number of the exposure.
+    beta : [tile_row, tile_col, 6], in DN and s, or None.
+    full_scale_dn : largest value of the ADC, DN.
+    saturation : light signal at full well, DN, or None.
+    row_variance_dn2 : variance of the temporal row noise, DN².
     """
     if beta is None:
         margin = _CLEAR_SIGMAS * np.sqrt(np.maximum(lit.variance[k], ADC_VARIANCE_DN2))
@@ -151,7 +168,7 @@ def signal_at_event_pixels(
 
 
 def _like_it(sensor: SensorSpec, name: str, illuminant: str | None) -> dict[tuple[int, int], float]:
-    """Frame positions that tell the signal through filter `name`, and its ratio to theirs."""
+    """Frame positions from which the signal through filter `name` follows, and the ratio of that signal to theirs."""
     filters = {p: sensor.pixels[sensor.tile_rows[p[0]][p[1]]].filter for p in sensor.positions("aps")}
     same = {p: 1.0 for p, other in filters.items() if other == name}
     if same or illuminant is None:

@@ -1,4 +1,4 @@
-"""What the frames show without light: N_DP, N_FP, rows, black level, hot pixels."""
+"""Parameters of the dark frames: N_DP, N_FP, rows, black level, hot pixels."""
 
 from __future__ import annotations
 
@@ -14,16 +14,19 @@ from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_D
 
 @dataclass(frozen=True)
 class DarkModel:
-    """mean = N_FP + t · N_DP in the dark, N_FP = black + N_row + N_BLC.
+    """Dark mean = N_FP + t · N_DP, with N_FP = black + N_row + N_BLC.
 
     Attributes
     ----------
     n_dp : float32 [row, col], DN/s.
-    black : DN, mean of the row offsets. n_row : float64 [row], mean 0. n_blc : float32 [row, col], row means 0.
+    black : mean of the row offsets, DN.
+    n_row : float64 [row], DN, mean 0.
+    n_blc : float32 [row, col], DN, row means 0.
     covariance : [2, 2] of a pixel's (N_FP, N_DP), DN², DN²/s, DN²/s².
     chi2_per_dof : of the straight line, over all good pixels; None with 2 exposures.
-    bad : pixels without two unclipped dark exposures, or without an APS value. hot : pixels whose N_DP stands out.
-    hot_limit_dn_per_s : where a pixel counts as hot.
+    bad : [row, col], pixels without two unclipped dark exposures, or without an APS value.
+    hot : [row, col], pixels with an outlying N_DP.
+    hot_limit_dn_per_s : N_DP above which a pixel counts as hot, DN/s.
     """
 
     n_dp: NDArray[np.float32]
@@ -41,7 +44,7 @@ class DarkModel:
         return (self.n_blc + (self.black + self.n_row)[:, None]).astype(np.float32)
 
     def mean_variance(self, exposure_s: float) -> float:
-        """Variance of the estimate of a pixel's dark mean at an exposure, DN²."""
+        """Variance of the estimate of a pixel's dark mean at an exposure in s, DN²."""
         line = np.array([1.0, exposure_s])
         return float(line @ self.covariance @ line)
 
@@ -52,7 +55,7 @@ def fit_dark(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, row_
     Parameters
     ----------
     used : [row, col], pixels that have an APS value.
-    row_variance_dn2 : of temporal row noise, which was taken out of the moments' variances.
+    row_variance_dn2 : variance of the temporal row noise, DN², already subtracted from the moments' variances.
 
     Raises
     ------
@@ -75,7 +78,7 @@ def fit_dark(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, row_
             for v, ok in zip(moments.variance, valid, strict=True)
         ]
     )
-    # The means of exposures whose noise is hidden are biased by up to half a step: they take no part.
+    # The means of exposures whose noise is hidden are biased by up to half a step: they are not used.
     hidden = ~(spread - ADC_VARIANCE_DN2 >= HIDDEN_VARIANCE_DN2)
     if np.sum(~hidden) < 2:
         measured = max(np.nanmax(spread) - ADC_VARIANCE_DN2, 0)
@@ -123,7 +126,7 @@ def split_fixed_pattern(
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """black, N_row and N_BLC of N_FP, with mean(N_row) = 0 and every row mean of N_BLC = 0.
 
-    Pixels that are not `good` take N_BLC = 0 and no part in the means.
+    Pixels that are not `good` have N_BLC = 0 and are not part of the means.
     """
     count = good.sum(axis=1)
     rows = np.where(count > 0, np.where(good, n_fp, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)

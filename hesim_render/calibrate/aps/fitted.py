@@ -1,4 +1,4 @@
-"""What the frames of a capture set tell, before it is written."""
+"""Results of the frames of a capture set before they are written."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Position = tuple[int, int]
 
 @dataclass(frozen=True)
 class ApsCalibration:
-    """What the frames tell.
+    """Results of the frames.
 
     Attributes
     ----------
-    fits, bins : of each tile position with an APS value.
+    fits, bins : fit and pooled variances of each tile position with an APS value.
     bad : pixels [row, col] left out: clipped in the dark, dead, stuck, or of a variance unlike their kind's.
     signals : float32 [exposure, row, col], light above black, DN.
     usable : [exposure, row, col], lit values clear of clipping.
     rows : temporal row noise.
-    telegraph : pixels of two levels; they are among the bad ones.
+    telegraph : pixels with two levels; they are among the bad ones.
     """
 
     dark: DarkModel
@@ -43,7 +43,7 @@ class ApsCalibration:
     telegraph: TelegraphMaps
 
     def beta(self, tile: tuple[int, int]) -> NDArray[np.float64]:
-        """[tile_row, tile_col, 6] with 0 for terms and positions without a number."""
+        """β0 … β5 in DN and s, [tile_row, tile_col, 6]; 0 for terms and positions without a number."""
         beta = np.zeros((*tile, 6))
         for position, fit in self.fits.items():
             beta[position] = fit.beta

@@ -1,4 +1,4 @@
-"""What an APS calibration writes: the section of ``calibration.yaml``, its maps and what the report draws."""
+"""Output of an APS calibration: its section of ``calibration.yaml``, its maps and the data of the report's figures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet
 
 _FIGURE_PX = 320
-#: Points of pooled variances that are drawn of a position, about.
+#: Number of points of pooled variances drawn per position, approximately.
 _POINTS = 240
 
 
@@ -87,7 +87,7 @@ def content(captures: CaptureSet, result: ApsCalibration, dark_moments: Moments,
 
 
 def _row_noise(result: ApsCalibration) -> dict[str, Any]:
-    """Temporal row noise; 0 with a limit where rows share nothing that is significant."""
+    """Temporal row noise; 0 with a limit where it is not significant."""
     rows = result.rows
     if rows.significant:
         return estimated(rows.rms, rows.error / (2 * rows.rms), "DN")
@@ -136,7 +136,7 @@ def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moment
 
 
 def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[int, int]) -> dict[str, NDArray]:
-    """What the report draws, kept small: thinned maps, pooled variances, histograms of single values."""
+    """Data of the report's figures, kept small: thinned maps, pooled variances, histograms of single values."""
     beta = result.beta(tile)
     step = max(1, -(-max(lit.mean.shape[1:]) // _FIGURE_PX))
     middle = len(lit.exposures_us) // 2
@@ -149,7 +149,7 @@ def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[in
         size = bins.pixels.sum() / _POINTS
         for t, is_lit in sorted({(t, lit_) for t, lit_ in zip(bins.exposure_s, bins.lit, strict=True)}):
             of = np.flatnonzero((bins.exposure_s == t) & (bins.lit == is_lit))
-            # as many pixels a point; what is left at the end joins the point before, as a few would scatter widely
+            # equal numbers of pixels per point; the rest at the end joins the previous point, as a few scatter widely
             total = np.cumsum(bins.pixels[of])
             group = np.minimum(np.floor((total - bins.pixels[of]) / size), max(np.floor(total[-1] / size) - 1, 0))
             for g in np.unique(group):

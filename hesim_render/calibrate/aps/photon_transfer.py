@@ -18,10 +18,18 @@ _FLAT_SPREAD = 0.1
 
 
 def system_gain(bins: Pooled, top_dn: float) -> tuple[float, float]:
-    """K in DN/e⁻ and its standard error: slope through the origin of lit less dark variance against light.
+    """K in DN/e⁻ and its standard error: slope through the origin of the lit minus the dark variance against the light.
 
-    EMVA 1288 fits from 0 to 70 % of saturation; `top_dn` is that limit. The dark variance is that of the
-    same exposure where there is one. NaN where no lit data lie below the limit.
+    EMVA 1288 fits from 0 to 70 % of saturation. The dark variance is that of the same exposure where there is one.
+
+    Parameters
+    ----------
+    bins : pooled variances.
+    top_dn : upper limit of the fit, DN.
+
+    Returns
+    -------
+    K and its standard error, DN/e⁻; NaN where no lit data lie below the limit.
     """
     lit = bins.lit & (bins.signal_dn <= top_dn)
     dark = {t: i for i, t in enumerate(bins.exposure_s) if not bins.lit[i]}
@@ -33,7 +41,7 @@ def system_gain(bins: Pooled, top_dn: float) -> tuple[float, float]:
     above = bins.products[lit, 1] - bins.variance_dn2[base] * bins.powers[lit, 1]
     gain = float(above.sum()) / max(float(x2.sum()), 1e-30)
     for _ in range(4):
-        # Weights from the line, not from the bins' own variances: those would favour the low ones.
+        # Weights follow from the line. Weights from the bins' own variances would favour low variances.
         expected = bins.variance_dn2[base] + gain * bins.signal_dn[lit]
         expected = np.maximum(expected, 0.1)
         weight = bins.freedom[lit] / (2 * (expected**2 + 2 * expected * bins.row_variance[lit]))
@@ -41,7 +49,7 @@ def system_gain(bins: Pooled, top_dn: float) -> tuple[float, float]:
         if bottom <= 0:
             return float("nan"), float("nan")
         gain = float(weight @ above) / bottom
-    # Errors: the lit variances, and the dark ones, each shared by all lit bins of its exposure.
+    # Errors come from the lit variances and from the dark ones; all lit bins of an exposure share a dark variance.
     shared = np.bincount(base, weights=weight * bins.powers[lit, 1], minlength=bins.pixels.size)
     dark_error = 2 * bins.variance_dn2**2 / (bins.freedom * bins.pixels)
     return gain, float(np.sqrt(bottom + np.sum(shared**2 * dark_error)) / bottom)
@@ -78,13 +86,17 @@ def photon_transfer(
     reached: bool,
     linear: dict[str, Any],
 ) -> dict[str, Any]:
-    """Every photon-transfer figure, or why it cannot be had.
+    """Every photon-transfer quantity, or the reason why it cannot be determined.
 
     Parameters
     ----------
-    fits, bins : of each tile position that has an APS value.
+    spec : description of the captures.
+    dark : parameters of the dark frames.
+    composite : signal of the scene.
+    fits, bins : fit and pooled variances of each tile position that has an APS value.
     saturation : light signal of a full well below full scale, DN, if one was seen.
     reached : whether any exposure saturates anywhere.
+    linear : result of `linearity`.
     """
     range_dn = spec.full_scale_dn - dark.black if saturation is None else saturation
     gains = {p: system_gain(b, 0.7 * range_dn) for p, b in bins.items()}
@@ -154,7 +166,7 @@ def _dark_current(
 
 
 def _dsnu(dark: DarkModel, k: float, relative: float) -> dict[str, Any]:
-    """Spatial standard deviation of N_FP without the rows' and the estimate's own noise."""
+    """Spatial standard deviation of N_FP without row offsets and without the noise of the estimate."""
     values = dark.n_blc[~dark.bad].astype(np.float64)
     variance = float(values.var()) - float(dark.covariance[0, 0])
     if variance <= 0:
@@ -168,7 +180,7 @@ def _dsnu(dark: DarkModel, k: float, relative: float) -> dict[str, Any]:
 
 
 def _prnu(composite: Composite, dark: DarkModel, spec: CaptureSpec) -> dict[str, Any]:
-    """Spatial spread of the light rate per tile position; only a flat field tells it."""
+    """Spatial spread of the light rate per tile position; only a flat field gives it."""
     parts = []
     for i in range(spec.tile_rows):
         for j in range(spec.tile_cols):

@@ -1,9 +1,9 @@
 """Frame pixels with random telegraph noise: found in dark frames by their variance, then by the two levels themselves.
 
-A pixel is looked at where its dark variance is one that its kind has with a chance of 1e-6. Its values are read once
+A pixel is examined if its dark variance has a probability of 1e-6 for a good pixel. Its values are read once
 more, and two models are fitted to them: one level, and two with a Markov chain between them (a hidden Markov model,
-by expectation and maximisation [baum1970]), each with a Gaussian of its own width and dark current. Two levels it must
-be by a likelihood that noise of one level, of whatever width, does not reach.
+by expectation maximisation [baum1970]), each with a Gaussian of its own width and dark current. Two levels are accepted
+if their likelihood is larger than noise of one level, of any width, can reach.
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import FrameStack
 
-#: Chance with which a good pixel's variance is looked at, and log-likelihood by which two levels must win.
+#: Probability that a good pixel is examined, and least gain of log-likelihood of two levels.
 _CHANCE, _LEAST_GAIN = 1e-6, 20.0
-#: Least visits of each level, in frames, and least distance of the levels in widths.
+#: Least number of frames at each level, and least distance of the levels in widths.
 _LEAST_VISITS, _LEAST_DISTANCE = 5.0, 1.0
-#: Most pixels that are looked at, those of the largest variance first: what is read of them stays in memory.
+#: Most pixels that are examined, largest variance first: their values stay in memory.
 _MOST = 100_000
-#: Pixels that are fitted together, most rounds, and the change of log-likelihood below which they end.
+#: Pixels fitted together, most rounds, and the change of log-likelihood below which the rounds end.
 _TOGETHER, _ROUNDS, _SETTLED = 2000, 60, 1e-3
 
 
 @dataclass(frozen=True)
 class TelegraphMaps:
-    """Two levels of pixels [row, col]; 0 where a pixel has one.
+    """Two levels of pixels [row, col]; 0 where a pixel has one level.
 
     Attributes
     ----------
-    amplitude_dn : high level less low one. high_share : part of the frames at the high one. correlation : of the state
-        from one frame to the next.
+    amplitude_dn : high level minus low level, DN.
+    high_share : fraction of the frames at the high level.
+    correlation : correlation of the state from one frame to the next.
     """
 
     amplitude_dn: NDArray[np.float32]
@@ -51,12 +52,15 @@ class TelegraphMaps:
 def find_telegraph(
     stack: FrameStack, moments: Moments, used: NDArray[np.bool_], tile: tuple[int, int], full_scale_dn: int
 ) -> TelegraphMaps:
-    """Pixels of two levels in dark frames.
+    """Pixels with two levels in dark frames.
 
     Parameters
     ----------
-    stack : the dark frames. moments : of them.
+    stack : the dark frames.
+    moments : their moments.
     used : [row, col], pixels that have a frame value.
+    tile : (rows, cols) of a tile.
+    full_scale_dn : largest value of the ADC, DN.
     """
     maps = TelegraphMaps(*np.zeros((3, *used.shape), np.float32))
     place = np.flatnonzero(_suspects(moments, used, tile, full_scale_dn))
@@ -77,7 +81,7 @@ def find_telegraph(
 def _suspects(
     moments: Moments, used: NDArray[np.bool_], tile: tuple[int, int], full_scale_dn: int
 ) -> NDArray[np.bool_]:
-    """Pixels [row, col] whose variance over all exposures is beyond that of their kind, and of their dark current."""
+    """Pixels [row, col] whose variance over all exposures is above that of good pixels with the same dark current."""
     excess, freedom = np.zeros(used.shape), np.zeros(used.shape)
     clear = (moments.lowest > 0) & (moments.highest < full_scale_dn)
     t = moments.exposures_s
@@ -100,8 +104,16 @@ def _suspects(
 
 
 def _usual_variance(variance: NDArray, dark_dn: NDArray, here: NDArray[np.bool_]) -> NDArray:
-    """Variance of a good pixel with so much dark current, whose shot noise it holds: a straight line through the
-    medians of the pixels of least and of most dark current."""
+    """Variance of a good pixel as a function of its dark current, including the shot noise of the dark current.
+
+    It is a straight line through the medians of the pixels with the least and with the most dark current.
+
+    Parameters
+    ----------
+    variance : [row, col], DN².
+    dark_dn : [row, col], signal of the dark current, DN.
+    here : [row, col], pixels of the position.
+    """
     low, high = np.quantile(dark_dn[here], (0.5, 0.95))
     least, most = here & (dark_dn <= low), here & (dark_dn >= high)
     x, y = ([float(np.median(values[part])) for part in (least, most)] for values in (dark_dn, variance))
@@ -152,8 +164,8 @@ def fit_two_levels(values: NDArray, exposures_s: NDArray[np.float64]) -> TwoLeve
     rest = y - line[0] - line[1] * t
     count = y.shape[0] * y.shape[1]
     one = -0.5 * count * (np.log(2 * np.pi * one_width**2) + 1)
-    # of two beginnings the likelier end is kept: above and below each exposure's own median, which many changes of
-    # level within an exposure suit, and above and below the straight line, which suits few
+    # The fit begins twice, and the likelier result is kept. States above and below the median of each exposure suit
+    # many changes of level within an exposure, states above and below the straight line suit few changes.
     ends = [_climb(y, t, rest > 0), _climb(y, t, y > np.median(y, axis=1, keepdims=True))]
     better = ends[1][-1] > ends[0][-1]
     level, width, share, correlation, log_likelihood = (np.where(better, b, a) for a, b in zip(*ends, strict=True))
@@ -163,8 +175,18 @@ def fit_two_levels(values: NDArray, exposures_s: NDArray[np.float64]) -> TwoLeve
 
 
 def _climb(y: NDArray, t: NDArray, begin: NDArray[np.bool_]) -> tuple[NDArray[np.float64], ...]:
-    """Expectation and maximisation from states `begin`: levels [3, pixel], and [pixel] width, share of the high state,
-    correlation, log-likelihood."""
+    """Expectation maximisation from the states `begin`.
+
+    Parameters
+    ----------
+    y : [exposure, frame, pixel], DN.
+    t : exposure, s, that broadcasts against `y`.
+    begin : [exposure, frame, pixel], True for the high state.
+
+    Returns
+    -------
+    Levels [3, pixel], and [pixel] width, share of the high state, correlation and log-likelihood.
+    """
     share, correlation = np.full(y.shape[2], 0.5), np.full(y.shape[2], 0.5)
     high = begin.astype(np.float64)
     level, width = _line(y, np.broadcast_to(t, y.shape), high)
@@ -182,9 +204,13 @@ def _climb(y: NDArray, t: NDArray, begin: NDArray[np.bool_]) -> tuple[NDArray[np
 
 
 def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least squares of y on 1, t and the state: coefficients [2 or 3, pixel], and the width of the rest [pixel].
+    """Least squares of y on 1, t and the state.
 
-    `high` is the chance of the high state: y is of either level with its chance.
+    `high` is the probability of the high state: y belongs to either level with its probability.
+
+    Returns
+    -------
+    Coefficients [2 or 3, pixel], and standard deviation of the residual [pixel].
     """
     axes = (0, 1)
     terms = [np.ones_like(y), t] if high is None else [np.ones_like(y), t, high]
@@ -205,8 +231,13 @@ def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.floa
 def _chain(
     y: NDArray, t: NDArray, level: NDArray, width: NDArray, share: NDArray, correlation: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Log-likelihood [pixel], chance of the high state [exposure, frame, pixel], and the mean chance of it twice
-    running [pixel]: the forward and backward passes, over the frames of all exposures at once."""
+    """Forward and backward passes of the Markov chain, over the frames of all exposures at once.
+
+    Returns
+    -------
+    Log-likelihood [pixel], probability of the high state [exposure, frame, pixel], and the mean probability that it
+    occurs in two successive frames [pixel].
+    """
     exposures, frames, pixels = y.shape
     rest = (y - level[0] - level[1] * t) / width
     emission = np.stack([-0.5 * rest**2, -0.5 * (rest - level[2] / width) ** 2])

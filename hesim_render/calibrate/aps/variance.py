@@ -24,22 +24,29 @@ from hesim_render.pixels.aps.formulas import (
 )
 
 TERMS = ("1", "I", "t", "I^2", "I*t", "t^2")
-#: The order in which terms go where the data cannot tell them apart.
+#: Order in which terms are dropped where the data cannot separate them.
 _DROP_ORDER = (5, 4, 3, 2, 1)
-#: Powers of light and of time of the terms, and of I³, which tells whether the polynomial bends enough.
+#: Powers of light and of time of the terms, and of I³, which tests for curvature beyond the polynomial.
 _LIGHT, _TIME = np.array([0, 1, 0, 2, 1, 0, 3]), np.array([0, 0, 1, 0, 1, 2, 0])
 _POWERS, _PRODUCTS = 7, 4
-#: Least eigenvalue of the scaled normal matrix at which terms are told apart.
+#: Least eigenvalue of the scaled normal matrix at which terms can be separated.
 _SINGULAR = 1e-7
 _BINS = 256
 _FLOOR_DN2 = 0.05
 _USELESS = 0.25
-#: Rounds after which a term that is not told stays out.
+#: Rounds after which a dropped term stays out.
 _SETTLED = 3
 
 
 def variance_map(beta: NDArray, signal_dn: NDArray, exposure_s: float) -> NDArray[np.float64]:
-    """The polynomial of each pixel's own position; `beta` [tile_row, tile_col, 6], signal [row, col] (≥ 0 is used)."""
+    """The polynomial of each pixel's own position, DN² [row, col].
+
+    Parameters
+    ----------
+    beta : [tile_row, tile_col, 6], in DN and s.
+    signal_dn : [row, col], light, DN; negative values count as 0.
+    exposure_s : exposure, s.
+    """
     tile_rows, tile_cols, _ = beta.shape
     rows, cols = signal_dn.shape
     tiled = np.maximum(signal_dn, 0).reshape(rows // tile_rows, tile_rows, cols // tile_cols, tile_cols)
@@ -84,7 +91,7 @@ class Pooled:
     def weight(self, expected_dn2: NDArray) -> NDArray[np.float64]:
         """Inverse variance [bin] of a pixel's y where its variance is `expected_dn2`, the ADC's in it.
 
-        Of a Gaussian, 2 V²/(n − 1). Row noise of variance R, of which the rows' own sample was taken out, leaves its
+        For a Gaussian it is 2 V²/(n − 1). Row noise of variance R, after its own sample was subtracted, leaves its
         product with the pixel's noise: 2 (V² + 2 V R)/(n − 1).
         """
         return self.freedom / (2 * (expected_dn2**2 + 2 * expected_dn2 * self.row_variance))
@@ -130,7 +137,7 @@ def pool(
     kept = powers[:, 0] > 0
     powers, products, squares = powers[kept], products[kept], squares[kept]
     size = len(squares)
-    # Light or not, the error of the signal's estimate is that of a mean over the frames and of the dark line.
+    # Dark or lit, the error of the signal is that of a mean over the frames and of the dark line.
     noise = (
         np.maximum(products[:, 0] / powers[:, 0] + ADC_VARIANCE_DN2 + row_variance, 0) / frames + mean_variance
         if lit
@@ -194,7 +201,7 @@ def fit_variance(bins: Pooled) -> VarianceFit:
     limit = _USELESS * float(bins.variance_dn2[bins.pixels >= np.median(bins.pixels)].max())
     while True:
         solved = beta, keep, covariance, chi2, dof = _solve(bins, units, equations, dropped)
-        # A term whose error alone could make up a good part of the largest variance is no estimate: fit without it.
+        # A term whose error could be a large part of the largest variance is no estimate: fit without it.
         # (in scaled units every term is 1 at the largest signal and the longest exposure)
         useless = [j for j in _DROP_ORDER if keep[j] and covariance[j, j] > limit**2]
         if not useless:
@@ -211,13 +218,13 @@ def fit_variance(bins: Pooled) -> VarianceFit:
 
 
 def _p_value(bins: Pooled, chi2: float, dof: int) -> float:
-    """Chance of a larger χ² of that many sample variances: each square scatters by 2 + 12/(n − 1) (Gaussian noise)."""
+    """Probability of a larger χ² of the sample variances: each square scatters by 2 + 12/(n − 1) (Gaussian noise)."""
     each = float(np.average(2 + 12 / bins.freedom, weights=bins.pixels))
     return float(ndtr(-(chi2 - 1) * np.sqrt(dof / each)))
 
 
 def _expected_chi2(bins: Pooled, beta: NDArray) -> float:
-    """χ²/dof where light and dark current are counts of gain K = β1: s² scatters by κ₄/n more, κ₄ = K³ (I + D t)/K."""
+    """χ²/dof if light and dark current are counts with gain K = β1: s² scatters by κ₄/n more, κ₄ = K³ (I + D t)/K."""
     predicted = np.maximum(polynomial(beta, bins.signal_dn, bins.exposure_s), _FLOOR_DN2)
     fourth = fourth_cumulant_dn4(max(beta[1], 0.0), np.maximum(predicted - max(beta[0], 0.0), 0.0))
     more = bins.weight(predicted + ADC_VARIANCE_DN2) * fourth / (bins.freedom + 1)
@@ -225,7 +232,9 @@ def _expected_chi2(bins: Pooled, beta: NDArray) -> float:
 
 
 def _cubic(bins: Pooled, units: NDArray, equations: tuple, solved: tuple) -> tuple[float, float] | None:
-    """Coefficient of I³ beside the terms kept, and its standard error; None where it cannot be told from them."""
+    """Coefficient of I³ fitted with the kept terms, and its standard error; None where it cannot be separated from
+    them.
+    """
     beta, keep, _, chi2, _ = solved
     products, exact, noisy = equations
     predicted = np.maximum(polynomial(beta / units[:6], bins.signal_dn, bins.exposure_s), _FLOOR_DN2)
@@ -254,7 +263,7 @@ def _solve(
         matrix = np.tensordot(weight, exact, 1)
         keep = _identifiable(matrix, dropped)
         if turn >= _SETTLED:
-            # one that is told with one round's weights and not with the next's would come and go for ever
+            # a term identified with the weights of one round and not of the next would alternate without end
             dropped = list(np.flatnonzero(~keep))
         previous, beta = beta, np.zeros(6)
         beta[keep] = np.linalg.solve(matrix[np.ix_(keep, keep)], np.tensordot(weight, products, 1)[keep])

@@ -1,1 +1,1 @@
-"""From the first events of asynchronous pixels after a reset to thresholds, noise, bandwidth and leak."""
+"""Thresholds, noise, bandwidth and leak from the first events of asynchronous pixels after a reset."""

@@ -1,4 +1,4 @@
-"""What trials after a reset tell of an asynchronous sensor, and maps of its pixels."""
+"""Analysis of trials after a reset of an asynchronous sensor, and maps of its pixels."""
 
 from __future__ import annotations
 
@@ -19,28 +19,29 @@ from hesim_render.calibrate.finding import Finding
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.capture_set import CaptureSet
 
-#: A difference of log-likelihood that decides between the shot laws; below it the paper's stands.
+#: Difference of log-likelihood that decides between the shot laws; below it the law of the paper is used.
 DECISIVE = 5.0
-#: One that leaves no doubt after this many rounds of either fit.
+#: Difference of log-likelihood that decides after `_GLANCE` rounds of either fit.
 _BEYOND_DOUBT, _GLANCE = 500.0, 4
-#: Pixels the shot law is chosen on, and fewest good ones.
+#: Number of pixels for the choice of the shot law, and least number of good pixels.
 _FEW, _FEWEST = 1024, 64
 _CHUNK = 8192
-#: Standard errors from which a mismatch is significant.
+#: Number of standard errors above which a mismatch is significant.
 _SIGMAS = 4.0
 _LAWS: tuple[Law, Law] = ("linear", "sqrt")
 
 
 @dataclass(frozen=True)
 class AsynchronousCalibration:
-    """Everything the trials tell.
+    """Results of the trials.
 
     Attributes
     ----------
-    fit : parameters; its pixels are `fitted`. advantage : ln L of its shot law above the other's, on `_FEW` pixels.
-    mismatch : of both polarities together.
-    relative : [polarity (ON, OFF)][pixel], threshold of each pixel over the mean; not measured is 1.
-    noise : the same, standard error of each.
+    fit : parameters; its pixels are `fitted`.
+    advantage : ln L of its shot law minus that of the other, on `_FEW` pixels.
+    mismatch : mismatch of both polarities together.
+    relative : [polarity (ON, OFF)][pixel], threshold of each pixel over the mean; 1 where not measured.
+    noise : [polarity][pixel], standard error of each.
     """
 
     steady: Trials
@@ -59,11 +60,13 @@ class AsynchronousCalibration:
 def analyse_trials(
     captures: CaptureSet, seed: int = 0, progress: Callable[[str, float], None] | None = None
 ) -> AsynchronousCalibration:
-    """Everything the trials tell.
+    """Analyse the trials.
 
     Parameters
     ----------
-    seed : of which pixels are fitted, where there are more than `MOST_PIXELS`.
+    captures : capture set.
+    seed : seed of the choice of fitted pixels, where there are more than `MOST_PIXELS`.
+    progress : called with a text and the fraction done.
 
     Raises
     ------
@@ -120,7 +123,7 @@ def analyse_trials(
 
 
 def _mismatch(fit: Fit) -> Spread:
-    """Of both polarities, each with the weight of how well it is known."""
+    """Mismatch of both polarities, weighted by their inverse variances."""
     k = [NAMES.index(name) for name in ("mismatch_on", "mismatch_off")]
     values, covariance = fit.values[k], fit.covariance[np.ix_(k, k)]
     if not (np.all(np.isfinite(covariance)) and np.linalg.det(covariance) > 0):
@@ -136,7 +139,7 @@ def _mismatch(fit: Fit) -> Spread:
 def _pixel_thresholds(
     fit: Fit, steady: Trials, steps: Trials, polarity: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and standard deviation of what each pixel's threshold may be, given its counts, over the mean threshold."""
+    """Posterior mean and standard deviation of each pixel's threshold given its counts, over the mean threshold."""
     k = 0 if polarity > 0 else 1
     grid = fit.likelihood.grids[k]
     prior = log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)

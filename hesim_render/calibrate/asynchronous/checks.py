@@ -1,7 +1,7 @@
-"""Whether first events are as their law supposes: how many of each kind of trial, when, and what must not come.
+"""Checks whether first events follow their law: their number per kind of trial, their times, and forbidden events.
 
 A test of moments (Newey 1985; Tauchen 1985): the mean over pixels of what was counted less what the fit expects, with
-what the pixels scatter, is normal; what the fit itself took out of it is taken into account by the pixels' scores.
+its scatter over pixels, is normal. The part that the fit itself removed is taken into account by the pixels' scores.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from hesim_render.calibrate.asynchronous.likelihood import LEAK, MISMATCH, THETA
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.finding import ALARM, Finding
 
-#: Events, and trials without one, that a column needs to be judged; and pixels it needs of its own.
+#: Least number of events, and of trials without one, in a tested column; and number of pixels per column.
 _FEWEST, _PIXELS_PER_COLUMN = 25.0, 10
-#: Directions of less variance than this part of a column's are those the fit took out.
+#: Directions with less variance than this fraction of a column's are those that the fit removed.
 _LEAST_VARIANCE = 1e-4
-#: Relative error that the law of times after a step, and of steady light, is allowed: its rates are approximations.
+#: Allowed relative error of the law of times after a step and in steady light: its rates are approximations.
 _LAW_ERROR = 0.03
-#: The same right after a step.
+#: Allowed relative error of the law right after a step.
 _STEP_ERROR = 0.002
-#: Loss of events and events the wrong way, per trial, from which they are told.
+#: Loss of events, and events of the wrong polarity, per trial, above which they are reported.
 _LEAST_LOSS, _LEAST_FLOOR = 1e-3, 1e-4
-#: Spreads of the pixels' thresholds beyond which a step surely gives an event.
+#: Number of spreads of the pixels' thresholds beyond which a step certainly gives an event.
 _FAR = 4.0
-#: Squared standard errors from the best fit beyond which the search is told to have failed.
+#: Squared distance from the best fit, in standard errors, above which the search is reported as failed.
 _UNDONE = 16.0
 _FAMILIES = ("steps", "times", "steady")
 
 
 @dataclass(frozen=True)
 class Goodness:
-    """Of one family of columns, or of all: a χ², its degrees of freedom, and the chance of more."""
+    """χ² of one family of columns, or of all, its degrees of freedom, and the probability of a larger one."""
 
     chi2: float
     dof: int
@@ -47,7 +47,7 @@ class Goodness:
 
 @dataclass(frozen=True)
 class Columns:
-    """What is compared, [pixel, column]; `family` counts in `_FAMILIES`."""
+    """Compared numbers, [pixel, column]; `family` is an index into `_FAMILIES`."""
 
     residual: NDArray[np.float64]
     expected: NDArray[np.float64]  # [column], of all pixels
@@ -71,7 +71,7 @@ def _columns(fit: Fit) -> Columns:
         grid = fit.likelihood.grids[k]
         log = counts.log_likelihood(fit.values, grid, fit.law)
         log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
-        # over what each pixel's threshold may be: pixels of low thresholds are calm less often, and count less
+        # mean over each pixel's possible thresholds: pixels with low thresholds are calm less often, and count less
         weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
         at = at_kind = 0
         for trials in counts.sets:
@@ -96,14 +96,14 @@ def _columns(fit: Fit) -> Columns:
             )  # fmt: skip
             at, at_kind = at + kinds * bins, at_kind + kinds
     residual, expected, silent, family = (np.concatenate(v, axis=-1) for v in zip(*parts, strict=True))
-    # what comes though it is not expected counts as well
+    # unexpected events count as well
     seen = residual.sum(axis=0)
     enough = (np.maximum(expected, expected + seen) >= _FEWEST) & (np.maximum(silent, silent - seen) >= _FEWEST)
     return Columns(residual[:, enough], expected[enough], silent[enough], family[enough])
 
 
 def _judge(columns: Columns, some: NDArray[np.intp], fit: Fit) -> Goodness:
-    """The test of some columns; neighbours are added up where there are many for the pixels."""
+    """Test of some columns. Neighbouring columns are added where there are many in relation to the pixels."""
     count = columns.residual.shape[0]
     group = np.arange(some.size) * min(1.0, count / _PIXELS_PER_COLUMN / max(some.size, 1))
     group = np.unique(np.floor(group).astype(int), return_inverse=True)[1]
@@ -115,7 +115,7 @@ def _judge(columns: Columns, some: NDArray[np.intp], fit: Fit) -> Goodness:
     error = np.where(columns.family[some] == 0, _STEP_ERROR, _LAW_ERROR) * columns.expected[some]
     error *= columns.silent[some] / (columns.expected[some] + columns.silent[some])
     scores = fit.scores[:, fit.free]
-    # the pixels' scores take out what the fit fitted, and what it left undone where it stopped short of its end
+    # the pixels' scores remove what the fit fitted, and the remainder where it stopped before convergence
     left = residual - scores @ np.linalg.lstsq(scores, residual, rcond=None)[0]
     total = left.sum(axis=0)
     left = left - left.mean(axis=0)
@@ -160,7 +160,7 @@ def _family(name: str, goodness: Goodness) -> Finding | None:
 
 
 def _ended(fit: Fit) -> Finding | None:
-    """A search that stopped far from its end: the other tests have taken out what is left undone."""
+    """Finding of a search that stopped far from its end. The other tests have removed the remaining deviation."""
     scores = fit.scores[:, fit.free]
     total = scores.sum(axis=0)
     left = float(total @ np.linalg.pinv(scores.T @ scores, hermitian=True) @ total)
@@ -177,7 +177,7 @@ def _ended(fit: Fit) -> Finding | None:
 
 
 def _ceiling(steps: Trials) -> Finding | None:
-    """Steps that surely give an event, and do not: those beyond four spreads of the pixels' own middle contrasts."""
+    """Finding of missing events at steps beyond four spreads of the pixels' own middle contrasts."""
     lost, total = np.zeros(steps.calm.shape[1]), 0.0
     for polarity in (1, -1):
         middle, spread = middle_and_spread(pixel_thresholds(steps, polarity))
@@ -204,7 +204,7 @@ def _ceiling(steps: Trials) -> Finding | None:
 
 
 def _floor(fit: Fit, steps: Trials) -> Finding | None:
-    """Events of the polarity that the step leads away from, beyond leak."""
+    """Finding of events with the polarity opposite to the step, beyond leak."""
     step = step_of(fit.values, steps)
     found = []
     for name, polarity, leak in (("ON", 1, fit.values[LEAK]), ("OFF", -1, 0.0)):

@@ -1,4 +1,4 @@
-"""Asynchronous event pixels unlike the others: found by what no threshold they may have could give."""
+"""Outlying asynchronous event pixels: detected where no possible threshold explains the counts."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Coun
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.specs.calibration_spec import Defect
 
-#: Chance with which a good pixel's counts may be called bad.
+#: Probability that a good pixel's counts are called bad.
 _CHANCE = 1e-7
-#: Where more pixels than this part fail one test, the model is wrong and not the pixels: the checks tell it.
+#: If more pixels than this fraction fail one test, the model is wrong and not the pixels. The checks report it.
 _MOST_BAD = 0.02
-#: Part of the trials in the brightest light in which a good pixel is calm while settling.
+#: Least fraction of the trials in the brightest light in which a good pixel is calm while settling.
 _CALM = 0.5
-#: Chances beyond which an event is surely there, or surely not.
+#: Distance of a probability from 0 or 1 below which an event is certain or excluded.
 _SURE = 0.02
-#: Pixels looked at together.
+#: Number of pixels processed together.
 _CHUNK = 8192
 
 
 @dataclass(frozen=True)
 class TrialDefects:
-    """Bad pixels, flat arrays: all of them, `Defect` of each, and events per second of hot ones, 0 elsewhere."""
+    """Bad pixels, flat arrays: mask of all bad pixels, `Defect` of each, and events per second of hot pixels, 0
+    elsewhere.
+    """
 
     bad: NDArray[np.bool_]
     kind: NDArray[np.uint8]
@@ -53,8 +55,8 @@ def plainly_bad(steady: Trials, steps: Trials) -> NDArray[np.bool_]:
 def unlike(fit: Fit, steady: Trials, steps: Trials, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Good pixels [pixel] whose counts no threshold that their S-curve allows could give.
 
-    Three tests of each polarity: too many events in steady light, events lost of steps that surely give one, and
-    events of steps that surely give none.
+    Three tests of each polarity: too many events in steady light, events missing at steps that certainly give one, and
+    events at steps that certainly give none.
     """
     found = np.zeros((6, good.size), bool)
     pixels = np.flatnonzero(good)
@@ -94,7 +96,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
 
 
 def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefects:
-    """Name what bad pixels do."""
+    """Classify the bad pixels."""
     kind = np.zeros(bad.size, np.uint8)
     on_hz, off_hz = np.zeros((2, bad.size), np.float32)
     some = np.flatnonzero(bad)
@@ -118,12 +120,14 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
 def _own_rates(steady: Trials, light: int, never_calm: NDArray[np.bool_], most: float) -> NDArray[np.float64]:
     """Rates of ON and OFF events [2, pixel] of pixels that fire at random, Hz.
 
-    Only first events are counted, so the rate is −ln(share of trials without one)/duration; where hardly a trial is
-    calm, that of the settling time before, with ON events unless OFF ones were seen.
+    Only first events are counted, so the rate is −ln(fraction of trials without one)/duration. Where hardly a trial is
+    calm, the rate is that of the preceding settling time, with ON events unless OFF events were seen.
 
     Parameters
     ----------
+    steady : trials in steady light.
     light : number of the kind of trials.
+    never_calm : [pixel], pixels of which hardly a trial is calm.
     most : calm trials of a good pixel.
     """
     calm = steady.calm[light].astype(np.float64)

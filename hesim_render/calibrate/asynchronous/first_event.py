@@ -1,21 +1,21 @@
-"""When the first event of an asynchronous pixel after a reset comes, and of which polarity.
+"""Time and polarity of the first event of an asynchronous pixel after a reset.
 
-A reset makes the pixel's reference the level of that instant, its noise σ₀ z included. After the settling time the
+A reset sets the pixel's reference to the level of that instant, including its noise σ₀ z. After the settling time the
 light steps by S (0 in steady light). From then on the first event is ON where S + σ₁ ν − σ₀ z passes θ₊ before it
-passes −θ₋. What the pixel does after that event, and in what state it was before the reset, does not matter.
+passes −θ₋. The state before the reset and the behaviour after that event have no influence.
 
 ν is white noise through two equal poles, −3 dB together at the cut-off f_c: correlation (1 + a τ) exp(−a τ),
-a = 2π f_c/√(√2 − 1). At the step it is above h with the chance Q(h), of a calm pixel less that of noise which
-passes the threshold before; it stays below h for a time w after it with the chance
+a = 2π f_c/√(√2 − 1). At the step it is above h with the probability Q(h); for a calm pixel, noise that would have
+passed the threshold before is excluded. It stays below h for a time w after the step with the probability
 
     Φ(h) exp(−λ(h) w),   λ(h) = (a/2π) exp(−h²/2) · κ(h)
 
-(a/2π) exp(−h²/2) is the rate of its crossings (Rice 1945). κ makes up for their coming in clumps, for high chances,
-and for what the event stage makes of the noise: 16 nodes in a period of the cut-off with straight lines between them,
-of the same variance on the average. So a simulated sensor has the rates that were measured. κ was counted on
-1.2 million such paths of 1.25/f_c up to h = 3.5; above, it is the closed form of such a line's crossings, a bivariate
-normal chance. Noise without nodes passes h = 0 to 2 by 5 % more often and h = 4 by 10 % less: by so much the f_c of a
-sensor with such noise is the one that gives its rates in a simulation, not its own.
+(a/2π) exp(−h²/2) is the rate of its crossings [rice1945]. κ corrects for crossings in clumps, for high probabilities
+and for the noise as the event stage generates it: 16 nodes per period of the cut-off, straight lines between them, and
+the same variance on average. A simulated sensor therefore has the measured rates. κ was counted on
+1.2 million such paths of length 1.25/f_c up to h = 3.5. Above, it is the closed form of such a line's crossings, a
+bivariate normal probability. Noise without nodes passes h = 0 to 2 by 5 % more often and h = 4 by 10 % less often. For
+a sensor with such noise, the fitted f_c differs from its own f_c accordingly: it gives the right rates in a simulation.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ _LOG_KAPPA = (-3.1165e-05, 3.6215e-04, -4.6413e-04, -4.4709e-03, -0.027395, 0.34
 _LOWEST, _HIGHEST, _SLOPE = -1.5, 6.0, -2.112  # below, ln κ goes on along its slope there
 #: (a/2π)/f_c.
 _CROSSINGS = 1 / math.sqrt(math.sqrt(2.0) - 1.0)
-#: Part of a period of the cut-off in which noise still is what it was at the reset, and cannot pass a threshold.
+#: Fraction of a period of the cut-off in which the noise stays as at the reset and cannot pass a threshold.
 _REMEMBERED = 0.15
-#: Noise at the reset: Gauss–Hermite, in standard deviations.
+#: Gauss–Hermite nodes and weights of the noise at the reset, in standard deviations.
 _Z, _Z_WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 _Z_WEIGHTS = _Z_WEIGHTS / _Z_WEIGHTS.sum()
-#: Beyond such a level noise does not come.
+#: Level that noise never reaches, in standard deviations.
 _FAR = 30.0
 
 
 def passage_rate(level: NDArray) -> NDArray[np.float64]:
-    """λ/f_c of unit noise past a level."""
+    """Rate λ/f_c at which unit noise passes a level, in standard deviations."""
     h = np.clip(level, -_FAR, _FAR)
     inside = np.clip(h, _LOWEST, _HIGHEST)
     log_kappa = np.full(np.shape(h), _LOG_KAPPA[0])
@@ -52,7 +52,13 @@ def passage_rate(level: NDArray) -> NDArray[np.float64]:
 
 
 def correlation(cutoff_hz: float, elapsed_s: float) -> float:
-    """Of the noise with itself after a time."""
+    """Autocorrelation of the noise.
+
+    Parameters
+    ----------
+    cutoff_hz : cut-off frequency, Hz.
+    elapsed_s : time difference, s.
+    """
     h = math.tau * _CROSSINGS * cutoff_hz * elapsed_s
     return (1.0 + h) * math.exp(-h)
 
@@ -67,20 +73,24 @@ def first_event(
     edges_s: NDArray,
     leak_hz: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Chance that the first event comes in each time bin and is of one polarity, given none while settling.
+    """Probability that the first event falls in each time bin with one polarity, given no event while settling.
+
+    Thresholds, step and noise are broadcast against each other to a shape (…).
 
     Parameters
     ----------
     theta, theta_other : thresholds of this polarity and of the other, ln units.
-    step : change of ln x towards this polarity (S for ON, −S for OFF); 0 is steady light.
+    step : change of ln x towards this polarity (S for ON, −S for OFF); 0 in steady light.
     noise : σ₀ and σ₁ before and after the step, ln units, above 0.
-    edges_s : [bin + 1], bounds of the time bins, the first of them 0, the time of the step.
-    leak_hz : rates of events of this polarity, and of the other, that come by themselves.
-    Thresholds, step and noise are broadcast against each other to a shape (…).
+    cutoff_hz : cut-off frequency of the noise, Hz.
+    settle_s : time from the reset to the step, s.
+    edges_s : [bin + 1], bounds of the time bins, s; the first is 0, the time of the step.
+    leak_hz : rates of spontaneous events of this polarity and of the other, Hz.
 
     Returns
     -------
-    own : [bin, …], of this polarity. other : [bin, …], of the other.
+    own : [bin, …], probability of this polarity.
+    other : [bin, …], probability of the other.
     """
     before, after = noise
     shape = np.broadcast_shapes(*(np.shape(v) for v in (theta, theta_other, step, before, after)))
@@ -94,7 +104,7 @@ def first_event(
         lost = cutoff_hz * (passage_rate(high) + passage_rate(low)) + sum(leak_hz)
         kept = weight * np.exp(-np.minimum(lost * settling, 500.0))
         up, down = theta - step + before * z, theta_other + step - before * z
-        # at the step a calm pixel's noise lies within both thresholds, and has not quite forgotten the reset
+        # at the step a calm pixel's noise lies within both thresholds and still correlates with that at the reset
         within, below = ndtr((high - rho * z) / fresh), ndtr((low + rho * z) / fresh)
         calm = np.maximum(within + below - 1.0, 1e-12)
         at_once = np.maximum(within - ndtr((up / after - rho * z) / fresh), 0.0) / calm

@@ -1,4 +1,4 @@
-"""Maximum likelihood of thresholds, mismatch, noise, bandwidth and leak, and the covariance of what it gives.
+"""Maximum likelihood of thresholds, mismatch, noise, bandwidth and leak, and the covariance of the parameters.
 
 Scoring with the outer product of the pixels' own scores [berndt1974], which is at the same
 time the information: each pixel, with thresholds of its own, is one independent draw.
@@ -29,18 +29,18 @@ from hesim_render.calibrate.asynchronous.likelihood import (
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.core.errors import SpecError
 
-#: Most pixels the parameters are fitted to, drawn at random; maps have all of them.
+#: Largest number of pixels in the fit of the parameters, drawn at random. Maps contain all pixels.
 MOST_PIXELS = 16384
 _ROUNDS, _TRIES, _ENOUGH = 40, 8, 0.02
-#: Pixels that a rough start is found on.
+#: Number of pixels for the rough start.
 _FEW = 300
-#: Step of numerical derivatives, of ln of a parameter; largest change of it in a round.
+#: Step of numerical derivatives and largest change in a round, of the ln of a parameter.
 _H, _LARGEST = 1e-5, 0.7
 #: Relative error of the law itself, in the order of `NAMES`: what sessions of davis346 with seeds 1 to 3 were off on
 #: the average (r 0.3 %, β4² 1.5 %, f_c 1.5 %), with a margin. Judged on other seeds, and on trials written out in the
 #: tests.
 _LAW_ERROR = np.array([0.0, 0.0, 0.0, 0.0, 0.004, 0.01, 0.015, 0.02, 0.0])
-#: Parameters that may be 0, and what they may be 0 below, of the start's.
+#: Parameters that may be 0, and the fraction of the start value below which they are 0.
 _MAY_VANISH = (SHOT, DARK, LEAK)
 _FLOOR = 1e-6
 
@@ -51,11 +51,11 @@ class Fit:
 
     Attributes
     ----------
-    values, covariance : of them; rows of what is at its bound of 0 are NaN.
-    scores : [pixel, parameter], derivative of each pixel's ln L by each ln of a parameter.
-    free : which are not at their bound.
-    likelihood : of the pixels they were fitted to.
-    log_likelihood : of all of these.
+    values, covariance : values and covariance; rows of parameters at their bound of 0 are NaN.
+    scores : [pixel, parameter], derivative of each pixel's ln L by the ln of each parameter.
+    free : parameters that are not at their bound.
+    likelihood : likelihood of the fitted pixels.
+    log_likelihood : ln L of all fitted pixels.
     """
 
     law: Law
@@ -115,7 +115,7 @@ def _climb(likelihood: Likelihood, start: NDArray, rounds: int) -> tuple[NDArray
         free = np.ones(len(NAMES), bool)
         for k in _MAY_VANISH:
             free[k] = values[k] > 2 * least[k] or gradient[k] > 0
-        # far from the maximum scores are large because they all point one way: what they scatter is the curvature
+        # far from the maximum scores are large because all point one way: the curvature follows from their scatter
         centred = scores[:, free] - scores[:, free].mean(axis=0)
         information = centred.T @ centred
         ridge = 1e-9 * np.trace(information) * np.eye(int(free.sum()))
@@ -134,7 +134,7 @@ def _climb(likelihood: Likelihood, start: NDArray, rounds: int) -> tuple[NDArray
 def _along(
     likelihood: Likelihood, values: NDArray, change: NDArray, least: NDArray, best: float
 ) -> NDArray[np.float64] | None:
-    """The best point found on the way that `change` of ln of the parameters points, None where none is better."""
+    """The best point in the direction `change` of ln of the parameters; None where none is better."""
     found, scale = None, 1.0
     for _ in range(_TRIES):
         there = values * np.exp(scale * change)
@@ -199,7 +199,7 @@ def _pooled_curves(steps: Trials, polarity: int) -> list[tuple[int, float, float
         rate = steps.events(polarity)[kinds, 0].sum(axis=1) / np.maximum(steps.calm[kinds].sum(axis=1), 1)
         if kinds.size < 3 or rate[0] > 0.4 or rate[-1] < 0.6:
             continue
-        # where even the last step lacks events, a start is had from those that come; the checks tell it
+        # where even the last step lacks events, the start follows from the existing ones; the checks report it
         contrast, missing = np.abs(steps.contrast[kinds]), 1 - rate / rate[-1]
         first = np.trapezoid(missing, contrast)
         second = 2 * np.trapezoid(missing * (contrast - contrast[0]), contrast)
@@ -226,7 +226,8 @@ def _leak_start(steady: Trials) -> float:
 def pixel_thresholds(steps: Trials, polarity: int) -> NDArray[np.float64]:
     """A rough threshold of each pixel, ln I₁/I₀: where half the trials from the brightest light have an event.
 
-    The S-curve's own mean (Spearman and Kärber): the least contrast plus what the chance of no event integrates to.
+    It is the mean of the S-curve (Spearman and Kärber): the least contrast plus the integral of the probability of no
+    event.
     """
     bright = steps.signal_dn[np.sign(steps.contrast) == polarity].max()
     kinds = np.flatnonzero((np.sign(steps.contrast) == polarity) & (steps.signal_dn >= 0.999 * bright))
@@ -238,6 +239,6 @@ def pixel_thresholds(steps: Trials, polarity: int) -> NDArray[np.float64]:
 
 
 def middle_and_spread(values: NDArray) -> tuple[float, float]:
-    """Median, and relative spread by quartiles, which a few bad pixels leave alone."""
+    """Median, and relative spread by quartiles, which a few bad pixels do not change."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     return float(middle), float((high - low) / 1.349 / max(middle, 1e-12))

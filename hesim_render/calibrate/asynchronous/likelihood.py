@@ -26,20 +26,20 @@ Law = Literal["linear", "sqrt"]
 #: Order of the parameters: means and relative spreads of the thresholds, r, β3², β4², f_c and leak.
 NAMES = ("theta_on", "theta_off", "mismatch_on", "mismatch_off", "response", "shot", "dark", "cutoff_hz", "leak_hz")
 THETA, MISMATCH, RESPONSE, SHOT, DARK, CUTOFF, LEAK = (0, 1), (2, 3), 4, 5, 6, 7, 8
-#: Thresholds a pixel may have: this many, over so many spreads and at least such a part of the mean.
+#: Grid of thresholds: number of nodes, reach in spreads, and least reach as a fraction of the mean.
 _NODES, _SPREADS, _LEAST_REACH = 97, 6.0, 0.05
-#: Least chance of an outcome, so that no single trial rules out a threshold, and least noise in thresholds.
+#: Least probability of an outcome, so that no single trial excludes a threshold, and least noise in thresholds.
 _LEAST_CHANCE, _LEAST_NOISE = 1e-9, 1e-3
 
 
 def threshold_grid(theta: float, mismatch: float) -> NDArray[np.float64]:
-    """Thresholds at which the likelihood of a pixel is taken, ln units, evenly spaced."""
+    """Evenly spaced thresholds, ln units, at which the likelihood of a pixel is computed."""
     reach = max(_SPREADS * mismatch, _LEAST_REACH)
     return theta * np.linspace(max(1 - reach, 0.03), 1 + reach, _NODES)
 
 
 def noise_of(values: NDArray, signal_dn: NDArray, law: Law) -> NDArray[np.float64]:
-    """σ of ln x in a light."""
+    """Standard deviation σ of ln x in a light of `signal_dn`, DN."""
     power = signal_dn if law == "sqrt" else signal_dn**2
     own = (values[SHOT] * power + values[DARK]) / (1 + values[RESPONSE] * signal_dn) ** 2
     return np.sqrt(own + (_LEAST_NOISE * values[0]) ** 2)
@@ -52,7 +52,16 @@ def step_of(values: NDArray, trials: Trials) -> NDArray[np.float64]:
 
 
 def chances(values: NDArray, trials: Trials, polarity: int, thresholds: NDArray, law: Law) -> NDArray[np.float64]:
-    """Chance [kind, bin, threshold] of a first event of one polarity, among trials the other has not ended."""
+    """Probability [kind, bin, threshold] of a first event of one polarity, among trials that the other has not ended.
+
+    Parameters
+    ----------
+    values : parameters in the order of `NAMES`.
+    trials : kinds of trial.
+    polarity : +1 or −1.
+    thresholds : [threshold], ln units.
+    law : shot law.
+    """
     other = THETA[1] if polarity > 0 else THETA[0]
     step = polarity * step_of(values, trials)[:, None]
     after_dn = trials.signal_dn * np.exp(trials.contrast)
@@ -71,7 +80,7 @@ class Counts:
 
     Attributes
     ----------
-    sets : the trials this polarity is judged by.
+    sets : the trials used for this polarity.
     events : [pixel, column], first events of this polarity; a column is a bin of a kind of trial.
     silent : [pixel, kind], trials with no event at all.
     """
@@ -99,8 +108,15 @@ class Counts:
 
 
 def log_prior(theta: float, mismatch: float, grid: NDArray) -> NDArray[np.float64]:
-    """ln of how common each threshold of the grid is."""
-    # never narrower than the grid, so that the mean is told where thresholds hardly spread
+    """Log of the prior probability of each threshold of the grid.
+
+    Parameters
+    ----------
+    theta : mean threshold, ln units.
+    mismatch : relative spread.
+    grid : [threshold], ln units.
+    """
+    # never narrower than the grid, so that the mean is determined where thresholds hardly spread
     spread = np.hypot(mismatch, (grid[1] - grid[0]) / theta)
     weight = -0.5 * ((grid / theta - 1) / spread) ** 2
     return weight - logsumexp(weight)
@@ -126,7 +142,7 @@ class Likelihood:
         return on, off
 
     def of_pixels(self, values: NDArray, given: tuple[NDArray, NDArray] | None = None) -> NDArray[np.float64]:
-        """ln L [pixel]; `given` spares what does not change with the spread and mean of thresholds."""
+        """ln L [pixel]. `given` holds the terms that do not depend on the spread and the mean of thresholds."""
         given = self.given_thresholds(values) if given is None else given
         return sum(
             logsumexp(g + log_prior(values[THETA[k]], values[MISMATCH[k]], self.grids[k]), axis=1)

@@ -1,4 +1,4 @@
-"""What the calibration of an asynchronous sensor writes: its section of ``calibration.yaml``, maps and figures."""
+"""Output of the calibration of an asynchronous sensor: its section of ``calibration.yaml``, maps and figures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NO_LEAK = "no event that only leak explains: the model without it is kept"
 
 
 def content(result: AsynchronousCalibration) -> dict[str, Any]:
-    """The section ``evs``; a parameter the data do not tell is null, with its reason."""
+    """The section ``evs``; a parameter that the data do not determine is null, with the reason."""
     fit = result.fit
     theta = estimated(
         (fit.value("theta_on") + fit.value("theta_off")) / 2,
@@ -100,7 +100,7 @@ def _beta(fit: Fit) -> tuple[list[float | None], list[float | None]]:
 
 
 def _noise(fit: Fit, signal_dn: float) -> dict[str, Any]:
-    """σ of ln x in a light, its error by the delta method."""
+    """σ of ln x in a light of `signal_dn`, DN, with its error by the delta method."""
     light = np.array([signal_dn])
     value = float(noise_of(fit.values, light, fit.law)[0])
     slope = np.zeros(len(NAMES))
@@ -130,7 +130,7 @@ def maps(result: AsynchronousCalibration) -> dict[str, NDArray]:
 
 
 def _figures(fit: Fit, steady: Trials, steps: Trials) -> dict[str, NDArray]:
-    """Rows of what was counted and what the fit expects.
+    """Rows of counts and of the numbers expected by the fit.
 
     ``figure_s_curves``: polarity, light, S, time bin, events, trials, chance by the fit, for the steps towards each
     polarity. ``figure_noise_rate``: light, ON and OFF events, seconds, and the two rates by the fit.

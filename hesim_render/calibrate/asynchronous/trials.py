@@ -23,20 +23,21 @@ NOISE_RATE, S_CURVE = "evs_noise_rate", "evs_s_curve"
 _ARRAYS = ("signal_dn", "settle_us", "edges_us", "n_calm", "n_on", "n_off")
 #: Largest |ln I₁/I₀| of a step.
 _LARGEST_CONTRAST = 20.0
-#: Part of all trials that must be calm.
+#: Least fraction of all trials that must be calm.
 _LEAST_CALM = 0.2
 
 
 @dataclass(frozen=True)
 class Trials:
-    """Trials of one file; kinds differ in light and step, pixels are in row-major order.
+    """Trials of one file. Kinds differ in light and step; pixels are in row-major order.
 
     Attributes
     ----------
-    signal_dn, contrast : [kind], light before the step and ln I₁/I₀; 0 in steady light.
-    settle_s : from reset to step. edges_s : [bin + 1], bounds of the time bins after the step, the first 0.
-    calm : [kind, pixel], trials without an event while settling.
-    on, off : [kind, bin, pixel], those of them whose first event after it is of this polarity and in this bin.
+    signal_dn, contrast : [kind], light before the step in DN, and ln I₁/I₀, 0 in steady light.
+    settle_s : time from reset to step, s.
+    edges_s : [bin + 1], bounds of the time bins after the step, s; the first is 0.
+    calm : [kind, pixel], number of trials without an event while settling.
+    on, off : [kind, bin, pixel], number of calm trials whose first event has this polarity and falls in this bin.
     shape : (rows, cols) of the event grid.
     """
 
@@ -50,14 +51,14 @@ class Trials:
     shape: tuple[int, int]
 
     def of(self, pixels: NDArray) -> Trials:
-        """Of some pixels: indices or a mask."""
+        """Trials of some pixels, given by indices or a mask."""
         return Trials(
             self.signal_dn, self.contrast, self.settle_s, self.edges_s, self.calm[:, pixels], self.on[..., pixels],
             self.off[..., pixels], self.shape,
         )  # fmt: skip
 
     def towards(self, polarity: int) -> Trials:
-        """Without steps towards the other polarity."""
+        """The trials without steps towards the other polarity."""
         kinds = np.flatnonzero(np.sign(self.contrast) != -polarity)
         return Trials(
             self.signal_dn[kinds], self.contrast[kinds], self.settle_s, self.edges_s, self.calm[kinds], self.on[kinds],
@@ -74,7 +75,7 @@ def is_asynchronous(captures: CaptureSet) -> bool:
     Raises
     ------
     SpecError
-        If they are not what the sensor needs.
+        If the captures do not suit the sensor.
     """
     found = captures.has(S_CURVE) or captures.has(NOISE_RATE)
     evs = captures.sensor.evs if captures.sensor is not None else None
@@ -100,7 +101,7 @@ def read_trials(captures: CaptureSet) -> tuple[Trials, Trials]:
     Raises
     ------
     SpecError
-        If a file is missing, damaged or not as it must be; the message says what to capture instead.
+        If a file is missing, damaged or invalid; the message says what to capture instead.
     """
     for name, what in (
         (NOISE_RATE, "trials after a reset in steady light, from dark to bright"),

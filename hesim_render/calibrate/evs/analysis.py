@@ -1,4 +1,4 @@
-"""What the event counts of a sensor of fixed comparisons tell: A, B, C, D, thresholds and their mismatch."""
+"""Analysis of the event counts of a sensor with fixed comparisons: A, B, C, D, thresholds and their mismatch."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.formulas import voltage
 from hesim_render.recording.capture_set import CaptureSet
 
-#: A difference of log-likelihood that decides between the shot laws; below it the paper's stands.
+#: Difference of log-likelihood that decides between the shot laws; below it the law of the paper is used.
 DECISIVE = 5.0
-#: One that leaves no doubt: the other law is not looked at any more.
+#: Difference of log-likelihood above which the other law is not examined further.
 _BEYOND_DOUBT = 500.0
-#: ρ and λ of a start are 0: whether they are needed is tested anew.
+#: ρ and λ of a start are 0: each fit tests again whether they are needed.
 _SYMMETRIC = np.array([1, 1, 1, 1, 0, 0])
 _LAWS: tuple[Law, Law] = ("linear", "sqrt")
 
 
 @dataclass(frozen=True)
 class EvsCalibration:
-    """What the counts tell; `fits` are per tile position, `together` pools them all.
+    """Results of the counts. `fits` are per tile position, `together` is the fit of all positions.
 
     Attributes
     ----------
-    known : each pixel's thresholds as far as they were measured.
-    plain : counts of all positions, without that.
-    advantage : ln L of the shot law over the other's, in units of the scatter of the counts.
+    known : thresholds of each pixel as far as they were measured.
+    plain : counts of all positions, without known thresholds.
+    advantage : ln L of the shot law minus that of the other, in units of the scatter of the counts.
     mismatch : relative spread of the threshold of one polarity.
     """
 
@@ -68,7 +68,14 @@ class EvsCalibration:
 def analyse(
     captures: CaptureSet, static: StaticCapture, seed: int = 0, progress: Progress | None = None
 ) -> EvsCalibration:
-    """Everything the counts tell.
+    """Analyse the counts.
+
+    Parameters
+    ----------
+    captures : capture set.
+    static : counts of the static scene.
+    seed : seed of the multi-start study.
+    progress : called with a text and the fraction done.
 
     Raises
     ------
@@ -88,7 +95,7 @@ def analyse(
     typical = Typical.of(static, good)
     begun = {law: best_start(typical.cells, theta_v, law) for law in _LAWS}
     starts = {law: parameters for law, (parameters, _, _) in begun.items()}
-    # of the laws, the one that medians are nearer to: means of counts that spread widely tell less
+    # start from the law that is nearer to the medians: means of widely spread counts have less information
     lead = (begun["sqrt"][1] - begun["linear"][1]) / min(begun["sqrt"][2], begun["linear"][2])
     by_medians: Law = "sqrt" if lead > DECISIVE else "linear"
     wanted = (by_medians,) if abs(lead) > _BEYOND_DOUBT else _LAWS
@@ -160,7 +167,7 @@ def analyse(
 def _measured_thresholds(
     captures: CaptureSet, steps: Steps, fit: EventFit, good: NDArray[np.bool_]
 ) -> tuple[Thresholds | None, str]:
-    """Thresholds from the steps, or why they do not tell them."""
+    """Thresholds from the steps, or the reason why the steps do not determine them."""
     step = step_in_ln(captures, steps, fit)
     if step is None:
         return None, "contrast is of the signal, and the static data do not tell the A/B that turns it into voltage"
@@ -169,14 +176,14 @@ def _measured_thresholds(
 
 
 def _likelier(laws: dict[Law, EventFit]) -> Law:
-    """The sqrt law where it describes the counts decisively better; else the paper's."""
+    """The sqrt law where it describes the counts decisively better, else the law of the paper."""
     if len(laws) == 1:
         return next(iter(laws))
     return "sqrt" if _advantage(laws["sqrt"], laws["linear"]) > DECISIVE else "linear"
 
 
 def _advantage(one: EventFit, other: EventFit) -> float:
-    """Log-likelihood of one fit above another's, in units of the scatter of the counts."""
+    """Log-likelihood of one fit minus that of the other, in units of the scatter of the counts."""
     return (one.log_likelihood - other.log_likelihood) / min(max(one.design_effect, other.design_effect), 1e3)
 
 
@@ -199,7 +206,7 @@ def _check_brightness(static: StaticCapture, good: NDArray[np.bool_], captures: 
 
 
 def _check_fit(fit: EventFit, captures: CaptureSet) -> None:
-    """No parameters are given where they mean nothing."""
+    """Refuse a fit whose parameters have no meaning."""
     if fit.goodness.per_dof > NO_FIT:
         raise SpecError(
             f"neither shot law describes these counts (χ²/dof is {fit.goodness.per_dof:.3g} at best); check that "
@@ -211,7 +218,7 @@ def _check_fit(fit: EventFit, captures: CaptureSet) -> None:
 def _with_sampling_error(fit: EventFit, thresholds: Thresholds, good: NDArray[np.bool_]) -> EventFit:
     """Adds what the mean of the measured thresholds lacks: they are relative to that of these pixels, not of all such.
 
-    A and B go with the mean of both polarities, ρ with their difference.
+    A and B depend on the mean of both polarities, ρ on their difference.
     """
     on, off = (values[good].astype(np.float64) for values in (thresholds.pixel_on, thresholds.pixel_off))
     scale = thresholds.spread.value**2 / max((on.var() + off.var()) / 2, 1e-30)  # without the estimates' own noise
@@ -239,7 +246,9 @@ def _with_conversion_error(thresholds: Thresholds, signal_dn: float, fit: EventF
 
 
 def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.float64] | None:
-    """S = ln x₁/x₀ of each contrast; a contrast of the signal needs A/B, None where they are not identified."""
+    """S = ln x₁/x₀ of each contrast. A contrast of the signal needs A/B; the result is None where A/B is not
+    identified.
+    """
     if captures.spec.contrast_of == "voltage":
         return steps.contrast
     if not (fit.identified("A") and fit.identified("B")):
@@ -249,7 +258,14 @@ def step_in_ln(captures: CaptureSet, steps: Steps, fit: EventFit) -> NDArray[np.
 
 
 def bootstrap_errors(result: EvsCalibration, samples: int, seed: int) -> NDArray[np.float64]:
-    """Standard errors [4] of A, B, C, D from resampling the pixels (Poisson bootstrap); that of θ is not in them."""
+    """Standard errors [4] of A, B, C, D from resampling the pixels (Poisson bootstrap), without the error of θ.
+
+    Parameters
+    ----------
+    result : the calibration.
+    samples : number of resamplings.
+    seed : seed of the random numbers.
+    """
     rng = np.random.default_rng(seed + 1)
     good, fit = ~result.bad, result.together
     values = []

@@ -34,11 +34,11 @@ def calibrate_evs(
         sensor ``evs_noise_rate.npz`` and ``evs_s_curve.npz``.
     out : the calibration; its section ``evs`` is written, others are kept. Where ``evs_static.npz`` has no
         ``signal_dn``, the composite in its section ``aps`` is the signal: frames of the same scene.
-    report : HTML file, if one is wanted; it covers every section of `out`, and a report of `out` is replaced.
-    progress : called with what is being done and the fraction done.
+    report : HTML file, if wanted; it covers every section of `out`, and an earlier report of `out` is replaced.
+    progress : called with a text that names the current work and the fraction done.
     bootstrap : number of resamplings of the pixels for a second opinion on the standard errors; of sensors with fixed
         comparisons only.
-    seed : of the multi-start study and the bootstrap.
+    seed : seed of the multi-start study and the bootstrap.
     overwrite : replace a report of another calibration.
 
     Returns
@@ -83,7 +83,7 @@ def calibrate_evs(
 def _fixed_ticks(
     captures: CaptureSet, out: str | Path, tell: Progress, bootstrap: int, seed: int
 ) -> tuple[dict[str, Any], dict[str, NDArray]]:
-    """Section and maps of a sensor of fixed comparisons."""
+    """Section and maps of a sensor with fixed comparisons."""
     from hesim_render.calibrate.evs.output import content, maps
 
     static = read_static(captures, out)

@@ -1,4 +1,4 @@
-"""Event counts of pixels that are alike: in brightness, in polarity and in threshold where that was measured."""
+"""Event counts pooled over pixels that are alike in brightness, polarity and, where it was measured, threshold."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.evs.counts import StaticCapture
 
-#: Bins even in brightness and, down to `_LEAST_SIGNAL` of the brightest, in its logarithm.
+#: Number of bins of equal width in brightness and, down to `_LEAST_SIGNAL` of the brightest, in its logarithm.
 _BINS, _LOG_BINS, _LEAST_SIGNAL = 192, 480, 1e-4
-#: Width of a bin of relative thresholds; what they vary within a bin counts as spread.
+#: Width of a bin of relative thresholds. Their variation within a bin counts as spread.
 _THRESHOLD_STEP = 0.01
 
 
 @dataclass(frozen=True)
 class PixelThresholds:
-    """What is known of each pixel's thresholds; arrays [row, col].
+    """Known thresholds of each pixel; arrays [row, col].
 
     Attributes
     ----------
     on, off : expected threshold relative to the mean of all pixels.
-    on_spread, off_spread : relative standard deviation that is left about it (the mismatch where nothing is known).
+    on_spread, off_spread : relative standard deviation about it; the mismatch where nothing is known.
     """
 
     on: NDArray[np.float64]
@@ -42,9 +42,12 @@ class Cells:
 
     Attributes
     ----------
-    signal_dn : mean signal. polarity : +1 ON, −1 OFF.
-    relative, spread : mean of the pixels' relative thresholds, and the rms of what is left about it.
-    pixels : how many they are. events : of that polarity, of all of them. trials : of one pixel.
+    signal_dn : mean signal, DN.
+    polarity : +1 ON, −1 OFF.
+    relative, spread : mean of the pixels' relative thresholds, and rms of the deviations about it.
+    pixels : number of pixels.
+    events : events of that polarity, of all pixels.
+    trials : trials of one pixel.
     """
 
     signal_dn: NDArray[np.float64]
@@ -61,7 +64,7 @@ class Cells:
         return self.pixels * self.trials
 
     def coarser(self, most: int = 150) -> Cells:
-        """At most so many cells of each polarity: neighbours in brightness together. For searches, not for results."""
+        """At most `most` cells of each polarity, by pooling neighbours in brightness. For searches, not for results."""
         order = np.lexsort((self.signal_dn, self.polarity))
         pixels = self.pixels[order]
         rank = np.concatenate(
@@ -79,21 +82,23 @@ class Cells:
         return Cells(mean(self.signal_dn), mean(self.polarity), relative, spread, total, events, self.trials)
 
     def with_spread(self, factor: float) -> Cells:
-        """The same with the spread of thresholds scaled."""
+        """The same cells with the spread of thresholds scaled."""
         return replace(self, spread=self.spread * factor)
 
 
 @dataclass(frozen=True)
 class PixelCounts:
-    """Good pixels in flat arrays, with the cell each of their counts is a part of.
+    """Good pixels in flat arrays, with the cell of each of their counts.
 
     Attributes
     ----------
-    signal_dn, position : [pixel]. weight : [pixel], how often a pixel counts, None for once.
-    counts, polarity, is_dark : [count, pixel], [count], [count]; ON and OFF of the lit scene and of the dark.
-    relative, spread : [count, pixel], of the thresholds, as in `PixelThresholds`.
+    signal_dn, position : [pixel], signal in DN and number of the tile position.
+    weight : [pixel], number of times that a pixel counts, None for once.
+    counts : [count, pixel], ON and OFF events of the lit scene and of the dark.
+    polarity, is_dark : [count].
+    relative, spread : [count, pixel], thresholds as in `PixelThresholds`.
     cell : [count, pixel], number of the cell.
-    cells : what they sum up to.
+    cells : sums over the cells.
     """
 
     signal_dn: NDArray[np.float64]
@@ -108,7 +113,7 @@ class PixelCounts:
     cells: Cells
 
     def single(self, count: int) -> Cells:
-        """One of the counts with every pixel a cell of its own."""
+        """One of the counts, with one cell per pixel."""
         one = np.ones(self.signal_dn.shape)
         return Cells(
             signal_dn=np.zeros_like(one) if self.is_dark[count] else self.signal_dn,
@@ -124,7 +129,7 @@ class PixelCounts:
 def brightness_edges(signal_dn: NDArray) -> NDArray[np.float64]:
     """Inner edges of bins of brightness: 0.5 % of the range, 2 % of the brightness, 1 % of the pixels at most.
 
-    P at a bin's mean brightness is the mean of P to 1 in a thousand even where it changes fastest with brightness.
+    P at a bin's mean brightness equals the mean of P to 1 in a thousand, even where P changes fastest with brightness.
     """
     low, high = float(signal_dn.min()), float(signal_dn.max())
     sample = signal_dn[:: max(1, signal_dn.size // 20000)]
@@ -140,12 +145,15 @@ def pool_events(
     position: int | None = None,
     weight: NDArray | None = None,
 ) -> PixelCounts:
-    """Sort the counts of good pixels into cells; the dark is a brightness of its own.
+    """Sort the counts of good pixels into cells. The dark capture is a brightness of its own.
 
     Parameters
     ----------
-    position : number of the tile position whose pixels are taken; None for all.
-    weight : [row, col], how often a pixel counts (bootstrap).
+    static : counts of the static scene.
+    good : [row, col], pixels that are used.
+    thresholds : known thresholds of the pixels.
+    position : number of the tile position whose pixels are used; None for all.
+    weight : [row, col], number of times that a pixel counts (bootstrap).
     """
     edges = brightness_edges(static.signal_dn[good])
     take = good if position is None else good & (static.position == position)

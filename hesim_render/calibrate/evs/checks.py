@@ -1,7 +1,7 @@
-"""Whether counts of events are as their model supposes: one law of noise in static counts and in steps alike.
+"""Checks whether event counts follow their model: one noise law for static counts and for steps.
 
-Each check has a chance of `finding.ALARM` to speak of counts that are. What is significant but too small to matter is
-not told.
+Each check gives a finding with the probability `finding.ALARM` for counts that follow the model. A deviation that is
+significant but too small to matter is not reported.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from hesim_render.calibrate.evs.curve_levels import CurveLevels, curve_levels
 from hesim_render.calibrate.evs.model import threshold_over_noise
 from hesim_render.calibrate.finding import ALARM, Finding
 
-#: Floor (chance per trial) and loss of events from which they are told.
+#: Floor (probability per trial) and loss of events from which they are reported.
 _LEAST_FLOOR, _LEAST_LOSS = 1e-5, 1e-3
 #: Relative error of the width of the S-curve beside its own: the curve is taken as one normal law whose width changes
 #: in proportion to the step, which is off by 1.5 % at θ = 0.2.
 _MODEL_ERROR = 0.02
-#: Standard errors apart from which two searches end at different points.
+#: Distance in standard errors above which two searches end at different points.
 _APART = 0.3
 
 
@@ -49,7 +49,7 @@ def _counts(result: EvsCalibration) -> Finding | None:
 
 
 def _starts(result: EvsCalibration) -> Finding | None:
-    """Searches from other starts that end elsewhere: several fits describe the counts about as well."""
+    """Finding of searches from other starts that end elsewhere: several fits describe the counts about equally well."""
     free = np.array(result.together.free[:4]) & (result.starts_standard_error > 0)
     away = np.abs(result.starts - np.median(result.starts, axis=0))[:, free] / result.starts_standard_error[free]
     apart = np.any(away > _APART, axis=1)
@@ -78,7 +78,7 @@ def _ceiling(levels: CurveLevels) -> Finding | None:
 
 
 def _floor(result: EvsCalibration, levels: CurveLevels) -> Finding | None:
-    """Events of steps the other way; ON beyond what leaks."""
+    """Finding of events of steps in the other direction, and of ON events beyond leak."""
     fit = result.together
     leak, leak_error = (fit.values[5], np.sqrt(max(fit.covariance[5, 5], 0.0))) if fit.free[5] else (0.0, 0.0)
     found = []
@@ -101,16 +101,16 @@ def _floor(result: EvsCalibration, levels: CurveLevels) -> Finding | None:
 
 
 def _width(result: EvsCalibration, contrast_of: str) -> Finding | None:
-    """Noise by the width of the S-curve against noise by the static counts."""
+    """Compare the noise from the width of the S-curve with the noise from the static counts."""
     thresholds, steps, fit = result.thresholds, result.steps, result.together
-    # without C the static counts do not tell the noise in the light of the steps
+    # without C the static counts do not give the noise in the light of the steps
     if thresholds is None or steps is None or not all(fit.identified(name) for name in "ABC"):
         return None
     theta = thresholds.theta
     measured, error = thresholds.noise
     signals = np.array([steps.signal_dn])
     if contrast_of == "signal":
-        # σ_n² = s₀²/x₀² + s₁²/x₁² at the steps that reach θ₊ and −θ₋, of which static counts at I₀ and I₁ tell 2 s²/x²
+        # σ_n² = s₀²/x₀² + s₁²/x₁² at the steps that reach θ₊ and −θ₋; static counts at I₀ and I₁ give 2 s²/x² there
         a, b = fit.values[:2]
         reach = np.exp([thresholds.theta_on, -thresholds.theta_off])
         after = np.maximum(((a * steps.signal_dn + b) * reach - b) / a, 0.0)

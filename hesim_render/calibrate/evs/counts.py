@@ -20,8 +20,11 @@ class StaticCapture:
 
     Attributes
     ----------
-    signal_dn : clean signal. n_on, n_off : counts of the lit scene. dark_n_on, dark_n_off : in the dark, or None.
-    position : number of each pixel's tile position. tile : event pixels of a tile, (rows, cols).
+    signal_dn : noise-free signal, DN.
+    n_on, n_off : counts of the lit scene.
+    dark_n_on, dark_n_off : counts in the dark, or None.
+    position : number of each pixel's tile position.
+    tile : event pixels of a tile, (rows, cols).
     parts : [part, row, col], events of both polarities in parts of equal length of the dark capture, or None.
     """
 
@@ -133,12 +136,13 @@ def _parts(
 def _composite_signal(captures: CaptureSet, calibration: str | Path | None, file: Path) -> NDArray[np.float64]:
     """Signal [row, col] at the event pixels from the frames' composite, in DN of each pixel's own filter.
 
-    It is a rate times the exposure of the signal reference; NaN at edges of the scene, where it is interpolated badly.
+    It is a rate times the exposure of the signal reference. It is NaN at edges of the scene, where the interpolation
+    is inaccurate.
 
     Raises
     ------
     SpecError
-        If it cannot be had.
+        If the signal cannot be determined.
     """
     rate = None
     if calibration is not None and Path(calibration).exists() and "aps" in read_calibration(calibration):
@@ -166,12 +170,12 @@ def _composite_signal(captures: CaptureSet, calibration: str | Path | None, file
             file=captures.folder / "capture.yaml",
             key="signal_reference",
         )
-    # below 0 is the noise of a dark patch
+    # values below 0 are noise of a dark patch
     return np.maximum(rate.astype(np.float64), 0.0) * reference.t_ref_us * S_PER_US
 
 
 def event_tile(captures: CaptureSet, shape: tuple[int, ...]) -> tuple[int, int]:
-    """Event pixels of a tile: as the sensor or capture.yaml says, else from the sizes of the two grids.
+    """Event pixels of a tile: from the sensor or capture.yaml, else from the sizes of the two grids.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Where the S-curves begin and end: events that come by themselves, and events that are lost.
+"""Floor and ceiling of the S-curves: spontaneous events and lost events.
 
     P₊(S) = f₊ + (c − f₊) Q((θ₊ − S)/s),   P₋(S) = f₋ + (c − f₋) Q((θ₋ + S)/s)
 
-θ₊, θ₋, s and its slope are fitted again with the floors f₊, f₋ and the ceiling c; errors are those of a jackknife over
+θ₊, θ₋, s and its slope are fitted again with the floors f₊, f₋ and the ceiling c. The errors are from a jackknife over
 groups of pixels, as in `thresholds`.
 """
 
@@ -18,13 +18,13 @@ from hesim_render.calibrate.evs.thresholds import Thresholds, curve, curve_slope
 
 #: Rounds, and the part of a parameter below which a change ends them.
 _ROUNDS, _ENOUGH = 30, 1e-7
-#: Variance of a rate that even steps without any event are taken to have: no single event decides.
+#: Least variance of a rate, also of steps without any event, so that no single event decides.
 _LEAST_VARIANCE = 1e-5
 
 
 @dataclass(frozen=True)
 class CurveLevels:
-    """Floors and ceiling with standard errors; chances per trial."""
+    """Floors and ceiling with standard errors; probabilities per trial."""
 
     floor_on: tuple[float, float]
     floor_off: tuple[float, float]

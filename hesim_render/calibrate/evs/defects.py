@@ -1,4 +1,4 @@
-"""Event pixels unlike the others: found by what no threshold within their spread could give, and named by how."""
+"""Outlying event pixels: detected where no threshold within the spread explains the counts, then classified."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from hesim_render.calibrate.evs.thresholds import Thresholds, totals_of
 from hesim_render.pixels.evs.formulas import own_events
 from hesim_render.specs.calibration_spec import Defect
 
-#: Chance with which a good pixel's count may be called bad, and the part of the spread allowed for.
+#: Probability that a good pixel's count is called bad, number of spreads allowed, and least allowance.
 _CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06
-#: Fewest pixels from which the spread of a difference is taken.
+#: Least number of pixels for an estimate of the spread of a difference.
 _FEWEST = 200
-#: Standard errors by which counts of one pixel differ where it does not stay as it is.
+#: Difference in standard errors above which the counts of one pixel are not constant.
 _SIGMAS = 6.0
 
 
@@ -38,11 +38,13 @@ class EventDefects:
 
     Attributes
     ----------
-    bad : all of them. kind : uint8, `Defect`.
-    on, off : chance per trial of an event of hot and flickering ones beyond what a good pixel gives, 0 elsewhere; of
-        flickering ones while they fire, where that is known, else in the mean.
-    firing_share, correlation : of flickering ones, the part of the trials in which they fire and the correlation of
-        that from trial to trial; 1 and 0 elsewhere, and where it is not known.
+    bad : all bad pixels.
+    kind : uint8, `Defect`.
+    on, off : events per trial of hot and flickering pixels beyond those of a good pixel, 0 elsewhere. For a flickering
+        pixel it is the value while it fires where that is known, else the mean.
+    firing_share, correlation : for flickering pixels, the fraction of the trials in which they fire and the correlation
+        of
+        that state from trial to trial; 1 and 0 elsewhere, and where they are not known.
     """
 
     bad: NDArray[np.bool_]
@@ -57,9 +59,9 @@ class EventDefects:
 
 
 def bad_event_pixels(static: StaticCapture) -> NDArray[np.bool_]:
-    """Pixels [row, col] whose counts no threshold within the spread of the others could give.
+    """Pixels [row, col] whose counts no threshold within the spread of the others explains.
 
-    Pixels are compared with those of like brightness. The spread of thresholds is taken from quartiles, so that bad
+    Pixels are compared with those of similar brightness. The spread of thresholds is taken from quartiles, so that bad
     pixels do not widen it. A pixel is bad where a threshold 6 spreads (6 % at least) away would give its count with
     a chance below 1e-7, or where its two thresholds differ by so much.
     """
@@ -89,7 +91,7 @@ def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reac
 
 
 def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArray]) -> NDArray[np.bool_]:
-    """Pixels whose thresholds of ON and OFF differ from each other as those of no other do."""
+    """Pixels whose ON and OFF thresholds differ by more than those of the other pixels."""
     found = np.zeros(group.shape, bool)
     enough = np.all([counts >= LEAST_EVENTS for counts in both], axis=0)
     rate = [(counts[enough] + 0.5) / (trials + 1) for counts in both]
@@ -109,13 +111,13 @@ def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArra
 
 
 def bad_in_steps(steps: Steps, thresholds: Thresholds, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Good pixels [row, col] whose events over all steps no threshold within the spread could give."""
+    """Good pixels [row, col] whose events over all steps no threshold within the spread explains."""
     found = np.zeros(good.shape, bool)
     for polarity, total, mismatch in (
         (1.0, steps.on_total, thresholds.mismatch_on), (-1.0, steps.off_total, thresholds.mismatch_off),
     ):  # fmt: skip
         reach = max(_LEAST_REACH, _SPREADS * mismatch)
-        # the sum of binomial counts scatters less than a Poisson one of its mean
+        # the sum of binomial counts scatters less than a Poisson count with the same mean
         most, least = totals_of(thresholds, polarity, np.array([1 - reach, 1 + reach]), steps.trials)
         found |= good & ((poisson.sf(total - 1, most) < _CHANCE) | (poisson.cdf(total, least) < _CHANCE))
     apart = (thresholds.pixel_on - thresholds.pixel_off).astype(np.float64)
@@ -126,11 +128,11 @@ def bad_in_steps(steps: Steps, thresholds: Thresholds, good: NDArray[np.bool_]) 
 
 
 def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None) -> EventDefects:
-    """Name the bad pixels: stuck, hot, flickering, or nothing of that kind.
+    """Classify the bad pixels: stuck, hot, flickering or other.
 
-    A stuck pixel gives no event in any capture. A hot or a flickering one gives more than a thousandth of the good
-    pixels of its brightness ever do. The hot one gives as many of its own per trial in the dark as in the light and,
-    where counts of parts of a capture are known, in each part.
+    A stuck pixel gives no event in any capture. A hot or flickering pixel gives more events than all but a thousandth
+    of the good pixels of its brightness. A hot pixel gives equal numbers of its own events per trial in the dark and in
+    the light and, where counts of parts of a capture are known, in each part.
     """
     found = EventDefects(
         bad=bad, kind=np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE)),
@@ -164,7 +166,7 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     named[over] = np.where(steady[over], np.uint8(Defect.HOT), np.uint8(Defect.FLICKERING))
     named[silent] = Defect.STUCK
     found.kind[bad] = named
-    # of a polarity in which the pixel gives no more than good ones nothing is taken: it may have a low threshold
+    # a polarity with no more events than good pixels have does not count: its threshold may be low
     chance = np.where(np.any(told, axis=0), rates.mean(axis=0), 0.0)
     flickers = np.flatnonzero(named == Defect.FLICKERING)
     if static.parts is not None and flickers.size:
@@ -181,12 +183,16 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
 def _of_like(
     signal: NDArray, bad: NDArray[np.bool_], both: tuple[NDArray, NDArray], trials: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """For each bad pixel, of the good pixels of its brightness: the mean chances of ON and of OFF, and the counts that
-    only a thousandth of them exceed; both [polarity, pixel]."""
+    """For each bad pixel, statistics of the good pixels of its brightness.
+
+    Returns
+    -------
+    mean, limit : [polarity, pixel], mean probability of ON and of OFF, and the count that only a thousandth exceed.
+    """
     good = ~bad & np.isfinite(signal)
     group = like_brightness(signal[good])
     light = np.array([part.max() for part in by_group(signal[good], group)])
-    # a pixel whose brightness is not known is compared with the busiest
+    # a pixel of unknown brightness is compared with the pixels that have the most events
     here = np.where(np.isfinite(signal[bad]), signal[bad], np.inf)
     place = np.minimum(np.searchsorted(light, here), light.size - 1)
     found = []

@@ -1,4 +1,4 @@
-"""How much more event counts scatter than counting makes them: over pixels (thresholds), and in time (noise)."""
+"""Scatter of event counts beyond counting statistics: over pixels (thresholds), and in time (noise)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from hesim_render.calibrate.evs.fitted import EventFit
 from hesim_render.calibrate.evs.medians import Typical
 from hesim_render.calibrate.evs.model import log_probability, probability_variance, threshold_over_noise
 
-#: Largest scatter of thresholds, as a part of that of counting, beside which the scatter in time is seen.
+#: Largest scatter of thresholds, relative to that of counting, with which the scatter in time can be measured.
 _CLEAR = 0.3
-#: Counts looked at for the mismatch, and the fewest that tell it.
+#: Largest and least number of counts for an estimate of the mismatch.
 _MOST_COUNTS, _FEWEST_COUNTS = 12_000, 200
-#: Of the quadrature over thresholds.
+#: Nodes and weights of the quadrature over thresholds.
 _NODES, _WEIGHTS = np.polynomial.hermite.hermgauss(15)
 _NO_MISMATCH, _LARGEST_MISMATCH = 1e-4, 0.6
-#: Relative step of a numerical slope; deviation in ln of a group's middle threshold that is held against nothing.
+#: Relative step of a numerical slope; standard deviation of the weak prior of a group's middle threshold, in ln.
 _STEP, _HOLD = 1e-4, 0.3
-#: Twice the gain of ln L from which a mismatch is significant (a chance of 6e-5).
+#: Twice the gain of ln L above which a mismatch is significant (a probability of 6e-5).
 _SIGNIFICANT = 16.0
 
 
@@ -34,7 +34,7 @@ class Dispersion:
 
     Attributes
     ----------
-    total, total_error : of ON + OFF. Noise drawn once a tick and differenced makes an ON the likelier after an OFF,
+    total, total_error : of ON + OFF. Noise drawn once per tick and differenced makes an ON more likely after an OFF,
         so it is above 1 there ...
     difference, difference_error : ... and below 1 for ON − OFF.
     """
@@ -46,7 +46,14 @@ class Dispersion:
 
 
 def dispersion_in_time(pixels: PixelCounts, fit: EventFit, theta_v: float) -> Dispersion:
-    """Mean squares about the fit, less what thresholds add, over counting; never below 0."""
+    """Mean squares about the fit, minus the scatter of thresholds, over counting statistics; never below 0.
+
+    Parameters
+    ----------
+    pixels : counts.
+    fit : the fit.
+    theta_v : Θ, threshold in V.
+    """
     cells = pixels.cells
     p = np.exp(log_probability(fit.parameters, cells, theta_v, fit.law)[0])
     u, _ = threshold_over_noise(fit.parameters, cells.signal_dn, theta_v, fit.law)
@@ -80,10 +87,10 @@ def _ratio(residual: NDArray, counting: NDArray, thresholds: NDArray) -> tuple[f
 
 
 def static_mismatch(pixels: PixelCounts, typical: Typical) -> Spread:
-    """Relative spread of thresholds from how counts of pixels of one brightness are distributed.
+    """Relative spread of thresholds from the distribution of the counts of pixels of one brightness.
 
-    Maximum likelihood over the mixture of binomial laws that normal thresholds give, of m and of the middle threshold
-    of each group of counts alike; the error is taken from how the pixels' efficient scores scatter.
+    It is the maximum likelihood of the mixture of binomial laws that normal thresholds give, as a function of m and of
+    the middle threshold of each group. The error is from the scatter of the pixels' efficient scores.
     """
     mixture = _Mixture.of(pixels, typical)
     if mixture.pixel.size < _FEWEST_COUNTS:
@@ -126,9 +133,9 @@ class _Mixture:
         return cls(u[rows, pixel], pixels.counts[rows, pixel], group, pixel, pixels.cells.trials)
 
     def log_likelihood(self, m: float, scale: NDArray) -> NDArray[np.float64]:
-        """Of each count, without the constant: the mean over thresholds by Gauss–Hermite about the likeliest one.
+        """ln L of each count, without the constant: the mean over thresholds by Gauss–Hermite about the likeliest one.
 
-        Nodes at fixed thresholds would not do: the count of a low threshold is known far better than they are apart.
+        Nodes at fixed thresholds would be too far apart: the count of a low threshold determines it far more precisely.
         """
         u, k, n = self.u * scale[self.group], self.events, self.trials
         own = (k + 0.5) / (n + 1)
@@ -151,7 +158,7 @@ class _Mixture:
         return top + np.log(_WEIGHTS @ np.exp(terms - top)) + np.log(width)
 
     def maximum(self, m: float, fixed: bool = False) -> tuple[float, float, NDArray[np.float64]]:
-        """Largest ln L, and where: m and the scale of each group's middle threshold."""
+        """Largest ln L, and its arguments: m and the scale of each group's middle threshold."""
         size = int(self.group.max()) + 1
 
         def negative(values: NDArray) -> tuple[float, NDArray]:
@@ -159,7 +166,7 @@ class _Mixture:
             here = self.log_likelihood(m, scale)
             of_m = 0.0 if fixed else float(np.sum(self.log_likelihood(m * (1 + _STEP), scale) - here)) / _STEP
             of_s = np.bincount(self.group, self.log_likelihood(m, scale * (1 + _STEP)) - here, size) / _STEP
-            # a weak hold on groups of few counts
+            # a weak prior for groups of few counts
             slope = np.concatenate([[of_m], of_s - values[1:] / _HOLD**2])
             return float(-here.sum() + 0.5 * np.sum((values[1:] / _HOLD) ** 2)), -slope
 
@@ -169,7 +176,7 @@ class _Mixture:
         return -float(found.fun), float(np.exp(found.x[0])), np.exp(found.x[1:])
 
     def information(self, m: float, scale: NDArray) -> tuple[float, float]:
-        """Information of m, the groups' thresholds being fitted, and the standard error of m."""
+        """Information of m with the groups' thresholds fitted, and the standard error of m."""
         h, k = 0.02 * m, 0.01
         table = {
             (i, j): self.log_likelihood(m + i * h, scale * (1 + j * k))
@@ -182,6 +189,6 @@ class _Mixture:
         cross, own = (np.bincount(self.group, v) for v in (-(mm * h / k + ss * k / h + both) / 2, ss))
         part = cross / (np.maximum(own, 0.0) + 1 / _HOLD**2)
         information = float(mm.sum() - part @ cross)
-        # all counts of a pixel together: its two thresholds may go together
+        # all counts of a pixel together: its two thresholds may be correlated
         of_pixel = np.bincount(self.pixel, of_m - part[self.group] * of_s)
         return information, float(np.sqrt(of_pixel @ of_pixel)) / max(information, 1e-9)

@@ -1,7 +1,7 @@
-"""Maximum likelihood of the event model, many fits at once, and the covariance of what it gives.
+"""Maximum likelihood of the event model, many fits at once, and the covariance of the parameters.
 
-Fisher scoring with Levenberg–Marquardt damping; parameters carry a leading axis of fits (starts), so that
-200 starts cost little more than one.
+Fisher scoring with Levenberg–Marquardt damping. Parameters carry a leading axis of fits (starts), so that 200 starts
+cost little more than one.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from hesim_render.calibrate.evs.cells import Cells, PixelCounts
 from hesim_render.calibrate.evs.model import Law, coefficients, log_likelihood, log_probability, relative_variance
 
 _ROUNDS = 300
-#: A search whose ln L rises by less in so many rounds has come to where it will.
+#: A search ends when ln L rises by less than `_PROGRESS` in `_PATIENCE` rounds.
 _PATIENCE, _PROGRESS = 25, 1e-4
 #: ln of the factors of C that a search tries first.
 _REACH_OF_C = np.linspace(-3.0, 3.0, 25)
 _LEAST = np.array([0.0, -30.0, 0.0, -np.inf, -0.95, 0.0])
 _LARGEST = np.array([np.inf, 60.0, np.inf, np.inf, 0.95, 0.5])
-#: Pixels whose scores are summed up at a time.
+#: Number of pixels whose scores are summed at once.
 _CHUNK = 1 << 16
 
 
 def start_values(cells: Cells, theta_v: float, law: Law) -> NDArray[np.float64]:
-    """Rough starts [start, 6] that agree with the dimmest and the brightest cells, for many strengths of C."""
+    """Rough starts [start, 6] that agree with the dimmest and the brightest cells, for many values of C."""
     order = np.argsort(cells.signal_dn)
     few = max(2, len(order) // 10)
     bright = max(float(cells.signal_dn[order[-few:]].mean()), 1e-6)
@@ -52,9 +52,9 @@ def search(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """`maximise` from starts that may be far off.
 
-    Far off, P is 0 or ½ in most cells, and the likelihood sends A and C, of which only the ratio then counts, away
-    for good. So least squares of u, the Q⁻¹ of each cell's rate, comes first: it is linear in A and B, and C is the
-    best of many about the start's; D stays.
+    Far from the maximum, P is 0 or ½ in most cells. Then only the ratio of A and C counts, and the search makes both
+    grow without limit. So least squares of u, Q⁻¹ of each cell's rate, comes first: it is linear in A and B, C is the
+    best of many values around that of the start, and D stays.
     """
     return maximise(cells, _approach(cells, start, theta_v, law, free), theta_v, law, free, variance)
 
@@ -97,7 +97,7 @@ def maximise(
     Parameters
     ----------
     start : [fit, 6] in the order of `event_model.PARAMETERS`; parameters that are not `free` stay there.
-    variance : [cell], of a cell's number of events; the estimating equation then weighs with it instead of the
+    variance : [cell], of a cell's number of events; the estimating equation then uses it as weight instead of the
         binomial's own (quasi-likelihood of over-dispersed counts).
 
     Returns
@@ -149,7 +149,7 @@ def maximise(
 
 
 def _solve(eta: NDArray, score: NDArray, information: NDArray, damping: NDArray | float) -> NDArray[np.float64]:
-    """Steps [fit, 6]. Parameters at a bound that they would leave are held; scaled so that units do not matter."""
+    """Steps [fit, 6], scaled so that units do not matter. Parameters that would leave a bound are held at it."""
     held = ((eta <= _LEAST) & (score < 0)) | ((eta >= _LARGEST) & (score > 0))
     scale = np.sqrt(np.maximum(np.einsum("fii->fi", information), 1e-250))
     matrix = information / (scale[:, :, None] * scale[:, None, :])
@@ -176,7 +176,7 @@ def _evaluate(
         rest = np.maximum(1 - p, 1e-12)
         influence, weight = residual / rest, n * p / rest
         if searching:
-            # Far off, where P underflows, the expected information vanishes; the curvature of n ln Q does not.
+            # Where P underflows, the expected information vanishes; the curvature of n ln Q does not.
             weight = np.maximum(weight, cells.events / (1 - 2 * log_p))
     else:
         value = -0.5 * np.sum(residual**2 / variance, axis=-1)
@@ -191,8 +191,8 @@ def pixel_scores(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Covariance [6, 6] of the score of one fit `eta` [6], from how the pixels' own scatter, and the information.
 
-    All counts of a pixel, ON and OFF, lit and dark, are taken together, whatever makes them scatter or vary alike:
-    its thresholds, noise correlated from tick to tick, changes in time.
+    All counts of a pixel, ON and OFF, lit and dark, are taken together. This includes every cause of common scatter:
+    thresholds, noise correlated from tick to tick, changes in time.
     """
     cells = pixels.cells
     log_p, slope = log_probability(eta, cells, theta_v, law)
@@ -215,7 +215,7 @@ def pixel_scores(
 def sandwich(
     pixels: PixelCounts, eta: NDArray, theta_v: float, law: Law, free: Sequence[bool], variance: NDArray | None
 ) -> NDArray[np.float64]:
-    """Covariance [6, 6] of one fit, from how the pixels' scores scatter; 0 for what is not free."""
+    """Covariance [6, 6] of one fit, from the scatter of the pixels' scores; 0 for parameters that are not free."""
     mask = np.asarray(free, bool)
     meat, information = pixel_scores(pixels, eta, theta_v, law, free, variance)
     bread = np.linalg.pinv(information, hermitian=True) * mask[:, None] * mask

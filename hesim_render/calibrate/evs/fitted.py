@@ -1,4 +1,4 @@
-"""The event model fitted to pooled counts: what is identified, what is not, and with which error."""
+"""The event model fitted to pooled counts: the identified parameters and their errors."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from hesim_render.calibrate.evs.model import (
     threshold_over_noise,
 )
 
-#: Least eigenvalue of a scaled information matrix that tells all its parameters apart.
+#: Least eigenvalue of a scaled information matrix at which all its parameters can be separated.
 _SINGULAR = 1e-9
-#: Times that the scatter and the fit follow from each other.
+#: Number of iterations between the scatter and the fit.
 _REWEIGHTED = 4
 #: Cells of a polarity in which counts of widely spread thresholds are compared with a law.
 _NORMAL = 24
-#: χ²/dof above which standard errors are widened by its root.
+#: χ²/dof above which standard errors are multiplied by its root.
 POOR_FIT = 2.0
 #: χ²/dof above which the model does not describe the counts at all.
 NO_FIT = 100.0
@@ -65,7 +65,7 @@ class EventFit:
     goodness: Goodness
 
     def identified(self, name: str) -> bool:
-        """Whether the data tell A, B, C or D."""
+        """Whether the data determine A, B, C or D."""
         return self.free["ABCD".index(name)] and name not in self.reasons
 
 
@@ -78,9 +78,9 @@ def fit_events(
 ) -> EventFit:
     """Fit A, B, C, D (and ρ, λ where the counts call for them).
 
-    Parameters that the data do not tell are dropped in the order D, C, A; the rest is fitted again.
+    Parameters that the data do not determine are dropped in the order D, C, A, and the others are fitted again.
     ρ and λ are kept where a likelihood-ratio test rejects their absence at 1e-3. Where thresholds spread, the
-    counts are weighed with the scatter that follows (quasi-likelihood), else the likelihood is binomial.
+    counts are weighted by the resulting scatter (quasi-likelihood), else the likelihood is binomial.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def fit_events(
         if asymmetry is None:
             eta, fisher, free = _test_asymmetry(pixels, eta, fisher, theta_v, law, free, variance)
         covariance, mixed = _covariance(fisher)
-        # Where the data tell only a combination, none of its members is identified, though some stay in the fit.
+        # If the data determine only a combination, none of its members is identified, though some stay in the fit.
         reasons |= {
             "ABCD"[k]: "the static capture tells only a combination of parameters; " + _CAPTURE[k] for k in mixed
         }
@@ -120,7 +120,7 @@ def fit_events(
     effect = float(np.mean(np.diag(measured)[used] / np.maximum(np.diag(covariance)[used], 1e-300))) if used.size else 1
     fit = goodness(pixels, eta, theta_v, law, int(mask.sum()))
     if fit.per_dof > POOR_FIT:
-        # The counts scatter about the model more than they should: no error may be smaller than that scatter.
+        # The counts scatter about the model more than expected: no error may be smaller than that scatter.
         natural_covariance = natural_covariance * fit.per_dof
     likelihood = _log_likelihood(cells, eta, theta_v, law, variance)
     return EventFit(
@@ -152,7 +152,8 @@ def _log_likelihood(cells: Cells, eta: NDArray, theta_v: float, law: Law, varian
 
 
 def best_start(typical: Cells, theta_v: float, law: Law) -> tuple[NDArray[np.float64], float, float]:
-    """Where the likeliest of several searches for A, B, C and D ends: from one start alone it may be a side hill.
+    """Likeliest end point of several searches for A, B, C and D. A search from one start alone may end at a local
+    maximum.
 
     Returns
     -------
@@ -198,14 +199,14 @@ def _test_asymmetry(
 
 
 def _weakest(eta: NDArray, covariance: NDArray, free: list[bool], cells: Cells) -> tuple[str, int, str] | None:
-    """The next parameter to give up, or None where all that are left are identified."""
+    """The next parameter to drop, or None where all that are left are identified."""
     values, natural_covariance = natural(eta, covariance * np.outer(free, free))
     error = np.sqrt(np.maximum(np.diag(natural_covariance), 0))
     narrow = np.ptp(cells.signal_dn) < 0.2 * cells.signal_dn.max()
     span = "the static capture holds too narrow a range of brightness" if narrow else "its error exceeds its value"
     if free[3] and abs(values[3]) > 0.99:
         return "D", 3, f"it ends at the edge of its range; {_CAPTURE[3]}"
-    # D lies in [-1, 1]: an interval of 95 % that is as wide says nothing
+    # D lies in [-1, 1]: a 95 % interval of that width has no information
     for name, index, largest in (("D", 3, 0.5), ("C", 2, values[2]), ("A", 0, values[0]), ("B", 1, values[1])):
         if free[index] and not error[index] < largest:
             return name, index, f"{span}; {_CAPTURE[index]}"
@@ -213,7 +214,7 @@ def _weakest(eta: NDArray, covariance: NDArray, free: list[bool], cells: Cells) 
 
 
 def _without(eta: NDArray, index: int) -> NDArray[np.float64]:
-    """The parameters with one of them set to what leaves it out: A, C or D of 0."""
+    """The parameters with one of them set to the value that removes it: A, C or D to 0."""
     changed = eta.copy()
     if index == 3:
         changed[2] += changed[3] ** 2
@@ -234,7 +235,7 @@ def _better_without(
 
 
 def _covariance(information: NDArray) -> tuple[NDArray[np.float64], list[int]]:
-    """Inverse of the information, and the parameters (of A, B, C, D) that it tells only in combination."""
+    """Inverse of the information, and the parameters (of A, B, C, D) that are determined only in combination."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-250))
     value, vector = np.linalg.eigh(information / np.outer(scale, scale))
     lost = value < _SINGULAR
@@ -255,11 +256,14 @@ def cell_variance(cells: Cells, eta: NDArray, theta_v: float, law: Law) -> NDArr
 
 
 def with_mismatch_error(fit: EventFit, pixels: PixelCounts, theta_v: float, relative_error: float) -> EventFit:
-    """Add what the mismatch's own error does to A … D (its effect on them by a finite difference).
+    """Add the effect of the mismatch's error on A … D, by a finite difference.
 
     Parameters
     ----------
-    relative_error : of the spread of thresholds that the cells have.
+    fit : the fit.
+    pixels : counts.
+    theta_v : Θ, threshold in V.
+    relative_error : relative error of the spread of thresholds in the cells.
     """
     if not relative_error > 0:
         return fit

@@ -1,4 +1,4 @@
-"""Event pixels that fire now and then: how long they do, from counts of successive parts of a capture."""
+"""Event pixels that fire intermittently: their mean times, from counts of successive parts of a capture."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from scipy.stats import chi2
 
 from hesim_render.pixels.evs.formulas import flicker_moments
 
-#: Chance with which the counts of a steady pixel may be called unsteady.
+#: Probability that the counts of a steady pixel are called unsteady.
 _CHANCE = 1e-6
 #: Correlations of the state from trial to trial that are tried, as mean times of 1/8 trial up to 1e7 trials.
 _TIMES = np.geomspace(0.125, 1e7, 400)
 
 
 def unsteady(parts: NDArray, trials: int) -> NDArray[np.bool_]:
-    """Pixels whose events scatter from part to part as those of one rate do with a chance below 1e-6.
+    """Pixels whose scatter of events from part to part has a probability below 1e-6 under a constant rate.
 
     Parameters
     ----------
-    parts : [part, pixel], events of parts of equal length, one after the other. trials : of a part.
+    parts : [part, pixel], events of successive parts of equal length.
+    trials : trials of a part.
     """
     mean = parts.mean(axis=0, dtype=np.float64)
     own = np.maximum(mean * (1 - mean / trials), 1e-12)

@@ -1,4 +1,4 @@
-"""Whether the event model describes the counts: χ² by brightness, with the scatter measured over pixels."""
+"""Test whether the event model describes the counts: χ² by brightness, with the scatter measured over pixels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FEWEST_EVENTS = 10.0
 
 @dataclass(frozen=True)
 class Goodness:
-    """χ² of the groups' residuals (ON, OFF), and the chance of a larger one."""
+    """χ² of the groups' residuals (ON, OFF), and the probability of a larger one."""
 
     chi2: float
     dof: int
@@ -37,7 +37,7 @@ class Goodness:
 def goodness(pixels: PixelCounts, parameters: NDArray, theta_v: float, law: Law, fitted: int) -> Goodness:
     """Residuals of pixels alike in brightness, ON and OFF, against their own scatter over those pixels.
 
-    That scatter holds whatever makes counts of a pixel vary or correlate (thresholds, noise from tick to tick), so
+    That scatter includes every cause of variation or correlation (thresholds, noise from tick to tick), so
     that the sum of squares has a χ² law of two degrees of freedom a group, less the parameters `fitted`.
     """
     chi2, groups = 0.0, 0
@@ -45,7 +45,7 @@ def goodness(pixels: PixelCounts, parameters: NDArray, theta_v: float, law: Law,
         on, off = np.flatnonzero(pixels.is_dark == session)
         means = [pixels.cells.trials * probability(parameters, pixels.single(int(k)), theta_v, law) for k in (on, off)]
         residual = [pixels.counts[k] - mean for k, mean in zip((on, off), means, strict=True)]
-        # counts that scatter more than by counting tell as little as fewer that do not
+        # counts that scatter more than by counting have the information of fewer counts
         effect = max(
             1.0, *(float(r @ r) / max(float(mean.sum()), 1e-9) for r, mean in zip(residual, means, strict=True))
         )
@@ -57,7 +57,7 @@ def goodness(pixels: PixelCounts, parameters: NDArray, theta_v: float, law: Law,
             return np.bincount(group, values if pixels.weight is None else values * pixels.weight).astype(np.float64)
 
         expected = [np.maximum(total(mean), 1e-9) for mean in means]
-        # the scatter relative to counting is that of several groups together: a few events do not tell it
+        # the scatter relative to counting is that of several groups together: a few events do not determine it
         wide = _wider(np.minimum(*expected) / effect)
         squares = [
             np.bincount(wide, total(x * y))[wide] / np.sqrt(np.bincount(wide, p)[wide] * np.bincount(wide, q)[wide])
@@ -95,7 +95,7 @@ def _groups(signal_dn: NDArray, events: NDArray) -> NDArray[np.intp]:
             break
         ends.append(end)
         start, before = end, float(events[end - 1])
-    # what is left at the end joins the group before
+    # the rest at the end joins the previous group
     group = np.empty(order.size, np.intp)
     group[order] = np.searchsorted(np.array(ends[:-1], np.intp), np.arange(order.size), side="right")
     return group

@@ -1,4 +1,4 @@
-"""What the pixel in the middle does: thresholds over noise from medians, which bad pixels leave alone."""
+"""Thresholds over noise from medians of counts, which bad pixels hardly affect."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from scipy.special import ndtr, ndtri
 from hesim_render.calibrate.evs.cells import Cells
 from hesim_render.calibrate.evs.counts import StaticCapture
 
-#: Pixels of like brightness that are taken together.
+#: Number of pixels of similar brightness in a group.
 _GROUP = 200
-#: Groups that the lines of a typical pixel go through.
+#: Number of groups that define the lines of a typical pixel.
 _LINE = 40
-#: Quantiles of counts, and the deviate of the threshold that each is of: the least events are of the highest.
+#: Quantiles of counts, and the deviate of the threshold of each: the highest threshold has the fewest events.
 QUANTILES = {0.16: 0.9945, 0.5: 0.0, 0.84: -0.9945, 0.975: -1.96}
-#: Least events of a count whose threshold is taken from it.
+#: Least number of events of a count that gives a threshold.
 LEAST_EVENTS = 10.0
 
 
@@ -51,9 +51,9 @@ def middle_and_spread(
     levels = np.array([QUANTILES[q] for q in QUANTILES])
     quantiles = []
     for counts in both:
-        # whole numbers spread evenly over their step, so that a quantile is not one of a few
+        # integers are spread evenly over their step, so that quantiles are not limited to a few values
         parts = by_group(counts + np.random.default_rng(0).uniform(-0.5, 0.5, counts.shape), group)
-        # without the highest hundredth, where the bad ones are, in place of a further quantile
+        # mean without the highest hundredth, which contains the bad pixels, in place of a further quantile
         quantiles.append(np.array([[*np.quantile(part, list(QUANTILES)), _trimmed_mean(part)] for part in parts]))
     enough = np.min([q[:, :-1] for q in quantiles], axis=0) >= LEAST_EVENTS
     first = np.where(enough.any(axis=1), np.argmax(enough, axis=1), levels.size - 1)
@@ -86,7 +86,7 @@ def middle_and_spread(
     for q in quantiles:
         rate = np.maximum(q[row, first] + 0.5, 0.5) / (trials + 1)
         here = -ndtri(rate)
-        # the quantile is one of thresholds and of counting together
+        # the spread of the quantile is that of thresholds and of counting together
         counting = rate * (1 - rate) / trials / density(here) ** 2
         wide = np.sqrt(spread**2 + counting / np.maximum(here, 0.05) ** 2)
         from_quantile = here / np.maximum(1 + wide * levels[first], 0.1)
@@ -113,7 +113,7 @@ def _spread_of_few_events(both: list[NDArray], group: NDArray, means: list[NDArr
 
 
 def spread_of_thresholds(static: StaticCapture, good: NDArray[np.bool_]) -> float:
-    """Relative spread of thresholds; of the lit scene and the dark, the larger: where events are few it is not seen."""
+    """Relative spread of thresholds: the larger of the lit scene and the dark, because few events do not show it."""
     return max(
         middle_and_spread([counts[good] for counts in both], like_brightness(signal[good]), static.trials)[1]
         for signal, *both in static.sessions
@@ -122,13 +122,13 @@ def spread_of_thresholds(static: StaticCapture, good: NDArray[np.bool_]) -> floa
 
 @dataclass(frozen=True)
 class Typical:
-    """What a pixel of the median threshold does.
+    """Behaviour of a pixel with the median threshold.
 
     Attributes
     ----------
-    cells : as if all pixels were such ones, where a search for the parameters begins.
+    cells : cells as if all pixels were such pixels; a search for the parameters begins with them.
     spread : relative spread of thresholds.
-    lines : signal and u of each group, of each count of `PixelCounts` (ON and OFF, lit and dark).
+    lines : signal in DN and u of each group, for each count of `PixelCounts` (ON and OFF, lit and dark).
     """
 
     cells: Cells

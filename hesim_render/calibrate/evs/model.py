@@ -4,8 +4,8 @@
     P₊ = Q((1 − ρ) r u / √(1 + m² u²)) + λ,     P₋ = Q((1 + ρ) r u / √(1 + m² u²))
 
 A = β0β1/β4, B = β0β2/β4, C = β3/β4, D = β5; u = θ/σ_n, ρ = (θ₋ − θ₊)/(θ₋ + θ₊), λ leak events per trial.
-r is what is known of a pixel's threshold, relative to the mean of all, and m the relative standard deviation of
-what is not known: the mean of Q(u (r + m z)) over a normal z is exactly Q(r u / √(1 + m² u²)).
+r is the known threshold of a pixel relative to the mean of all, and m the relative standard deviation of the
+unknown part: the mean of Q(u (r + m z)) over a normal z is exactly Q(r u / √(1 + m² u²)).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Law = ShotLaw
 #: the singularity of (C, D) at C = 0 nor, as C √(1 − D²) would, a slope that vanishes at |D| = 1 and traps a search.
 PARAMETERS = ("A", "ln B", "w", "e", "rho", "leak")
 _SMALLEST = 1e-300
-#: Least g, so that a search that runs far off meets no division by 0.
+#: Least g, so that a search far from the maximum has no division by 0.
 _LEAST_VARIANCE = 1e-12
 _LARGEST_U = 1e6
 _HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
@@ -43,7 +43,7 @@ def threshold_over_noise(parameters: NDArray, signal_dn: NDArray, theta_v: float
     k = coefficients(parameters)
     shot, e = shot_root(signal_dn, law, NUMPY), parameters[..., 3, None]
     x, g = voltage(k, signal_dn), relative_variance(k, signal_dn, law)
-    # a search may run far off; beyond this, P is 0 in double precision all the same
+    # limit for a search far from the maximum; above it, P is 0 in double precision
     u = np.minimum(static_threshold_over_noise(theta_v, x, g, NUMPY), _LARGEST_U)
     slopes = np.stack([signal_dn / x, k.base / x, -0.5 * shot**2 / g, -shot * (1 + e * shot) / g], axis=-1)
     return u, slopes

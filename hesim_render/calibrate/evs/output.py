@@ -1,4 +1,4 @@
-"""What an EVS calibration writes: the section of ``calibration.yaml``, its maps and what the report draws."""
+"""Output of an EVS calibration: its section of ``calibration.yaml``, its maps and the data of the report's figures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MODEL = (
 
 
 def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | None) -> dict[str, Any]:
-    """The section ``evs``; a parameter the data do not tell is null, with its reason."""
+    """The section ``evs``; a parameter that the data do not determine is null, with the reason."""
     fit, spread, thresholds = result.together, result.dispersion, result.thresholds
     other = "sqrt" if fit.law == "linear" else "linear"
     tile = result.static.tile
@@ -190,7 +190,7 @@ def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, 
     )
     for name, (_, on_map, off_map) in zip(("lit", "dark"), static.sessions, strict=False):
         most = max(4, int(np.quantile(np.maximum(on_map, off_map)[good], 0.999) * 1.15))
-        # bins of whole counts, so that every bin can hold as many of them
+        # bins of whole counts, so that every bin covers the same number of counts
         wide = -(-(most + 1) // _BINS)
         edges = np.arange(-(-(most + 1) // wide) + 1) * wide - 0.5
         top = float(edges[-1])

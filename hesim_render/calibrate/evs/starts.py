@@ -16,11 +16,19 @@ _STARTS = 200
 def multi_start(
     pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, starts: int = _STARTS
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Maximum likelihood from many starts: A, B, C spread by e² either way, D over (−0.9, 0.9).
+    """Maximum likelihood from many starts: A, B, C vary by e² in either direction, D over (−0.9, 0.9).
+
+    Parameters
+    ----------
+    pixels : counts.
+    fit : the fit whose parameters the starts surround.
+    theta_v : Θ, threshold in V.
+    seed : seed of the starts.
+    starts : number of starts.
 
     Returns
     -------
-    (A, B, C, D) [start, 4] each start ended at, and their standard errors [4] from the Fisher information.
+    (A, B, C, D) [start, 4] at the end of each search, and their standard errors [4] from the Fisher information.
     """
     rng = np.random.default_rng(seed)
     begin = np.tile(fit.values, (starts, 1))

@@ -11,21 +11,23 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.npz import read_arrays
 from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, count_maps, number
 
-#: Groups of pixels whose sums are kept apart, so that they can be left out in turn (jackknife).
+#: Number of groups of pixels with separate sums; each group is left out in turn (jackknife).
 GROUPS = 100
 
 
 @dataclass(frozen=True)
 class Steps:
-    """``evs_steps.npz`` summed up.
+    """Sums over ``evs_steps.npz``.
 
     Attributes
     ----------
-    contrast : [step], as in the file. signal_dn : of I₀, one number.
-    on, off : [step, group], events of the good pixels of each of `GROUPS` groups. pixels : [group], how many they are.
-    trials : of one pixel and step.
+    contrast : [step], as in the file.
+    signal_dn : signal of I₀, one number, DN.
+    on, off : [step, group], events of the good pixels of each of `GROUPS` groups.
+    pixels : [group], number of good pixels.
+    trials : trials of one pixel and step.
     on_total, off_total : [row, col], events of a pixel over all steps.
-    group : [row, col], of each pixel.
+    group : [row, col], group of each pixel.
     """
 
     contrast: NDArray[np.float64]
@@ -45,7 +47,7 @@ class Steps:
 
 
 def pixel_groups(shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """One of `GROUPS` for every pixel [row, col], drawn at random but always the same: neighbours are apart."""
+    """Group of every pixel [row, col], drawn at random with a fixed seed, so that neighbours are rarely together."""
     return np.random.default_rng(20).integers(0, GROUPS, shape)
 
 

@@ -2,8 +2,8 @@
 
     P₊(S) = Q((θ₊ − S)/s),   P₋(S) = Q((θ₋ + S)/s),   s² = σ_n² + m² θ²
 
-pooled over pixels whose thresholds spread by m θ. s may change linearly with S (σ_n does, as x₁ does).
-The mismatch itself is what the sum of a pixel's counts over the steps scatters beyond counting. Errors are those of
+The curve is pooled over pixels whose thresholds spread by m θ. s may change linearly with S, as σ_n does through x₁.
+The mismatch is the scatter of the pixels' summed counts over the steps beyond counting. The errors are from
 a jackknife over groups of pixels: the counts of a pixel share its threshold, at all steps.
 """
 
@@ -21,12 +21,12 @@ from hesim_render.calibrate.evs.steps import GROUPS, Steps
 from hesim_render.pixels.evs.formulas import exceedance
 
 _ROUNDS = 100
-#: Thresholds of pixels, in standard deviations, over which a mean is taken; and their weights.
+#: Thresholds of pixels for means over them, in standard deviations, and their weights.
 _NODES = np.linspace(-5.0, 5.0, 101)
 _WEIGHTS = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
-#: Thresholds relative to the mean that a pixel's counts are looked up in.
+#: Thresholds relative to the mean, for the look-up of a pixel's threshold from its counts.
 _GRID = np.linspace(0.02, 3.0, 1491)
-#: Standard errors from which a mismatch is significant.
+#: Number of standard errors above which a mismatch is significant.
 _SIGMAS = 4.0
 
 
@@ -75,7 +75,7 @@ class Thresholds:
         return np.array([self.theta_on, self.theta_off, self.width, self.slope])
 
     def of_pixels(self) -> PixelThresholds:
-        """What is known of each pixel's thresholds: its estimate, drawn towards the mean by the estimate's noise."""
+        """Known thresholds of each pixel: its estimate, shrunk towards the mean by the noise of the estimate."""
         found = []
         for estimate, noise, mismatch in (
             (self.pixel_on, self.noise_on, self.mismatch_on), (self.pixel_off, self.noise_off, self.mismatch_off),
@@ -88,7 +88,7 @@ class Thresholds:
 
 
 def why_not(steps: Steps) -> str | None:
-    """Why the steps cannot tell the thresholds, or None where they can."""
+    """The reason why the steps cannot determine the thresholds, or None where they can."""
     n = steps.trials_of_all
     for name, events in (("ON", steps.on), ("OFF", steps.off)):
         rate = events.sum(axis=1) / n
@@ -147,7 +147,7 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
 
 @dataclass(frozen=True)
 class _Sums:
-    """What the fit takes from the counts, apart for each group of pixels: arrays [..., group]."""
+    """Sums of the counts for the fit, separate for each group of pixels: arrays [..., group]."""
 
     on: NDArray[np.float64]
     off: NDArray[np.float64]
@@ -262,7 +262,7 @@ def totals_of(found: Thresholds, polarity: float, relative: NDArray, trials: int
 
 
 def _mismatch_square(theta: float, width: float, slope: float, signed: NDArray, variance: float, trials: int) -> float:
-    """m² at which the pixels' totals scatter as they do; may fall below 0, so that its noise about 0 is even."""
+    """m² that explains the scatter of the pixels' totals. It may be negative, so that its noise about 0 is even."""
 
     def expected(m2: float) -> float:
         mean, within = _totals(theta * (1 + np.sqrt(m2) * _NODES), theta, width, slope, signed, trials, m2)
@@ -286,7 +286,7 @@ def _of_pixel(
     """Threshold of each pixel relative to the mean, and its standard error, from its total of events."""
     theta = values[0] if sign > 0 else values[1]
     mean, variance = _totals(theta * _GRID, theta, values[2], values[3] * sign, signed, trials, mismatch**2)
-    # where no step tells thresholds apart the slope vanishes: such a pixel is as well known as any, to the mismatch
+    # where no step separates thresholds the slope vanishes: the threshold is then known to within the mismatch only
     slope = np.maximum(-np.gradient(mean, _GRID), 1e-3 * trials)
     error = np.sqrt(variance + 0.25) / slope
     falling = -np.minimum.accumulate(mean) + 1e-9 * np.arange(_GRID.size)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.report.drawing import COLOURS, legend_below, panel, picture, points, svg
 from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, table
 
-#: Mean number of events of which a chance of 5 % is left that none is counted: −ln 0.05.
+#: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
 _UPPER_OF_NONE = 3.0
 
 
@@ -33,7 +33,7 @@ def asynchronous_section(section: dict[str, Any], maps: dict[str, NDArray]) -> s
 
 
 def _s_curves(maps: dict[str, NDArray], polarity: int) -> str:
-    """Chance of an event against S of every light."""
+    """Probability of an event against S, for every light."""
     rows = maps["figure_s_curves"]
     rows = rows[rows[:, 0] == polarity]
     title = "S-curves, ON" if polarity > 0 else "S-curves, OFF"
@@ -78,7 +78,7 @@ def _noise_rate(maps: dict[str, NDArray]) -> str:
 
 
 def _pixels(maps: dict[str, NDArray]) -> str:
-    """How thresholds spread over the good pixels."""
+    """Distribution of thresholds over the good pixels."""
     good = ~maps["bad_pixels"]
     values = [maps[f"threshold_{name}_relative"][good] for name in ("on", "off")]
     low, high = (float(v) for v in np.quantile(np.concatenate(values), [0.001, 0.999]))

@@ -1,4 +1,4 @@
-"""Figures of the calibration report: drawn by matplotlib, written as SVG that stands inside an HTML page.
+"""Figures of the calibration report: drawn by matplotlib and written as SVG inside an HTML page.
 
 Matplotlib is imported when a report is drawn, not before. Figures are built without ``pyplot``, so that no state of
 the process changes and no display is needed.
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Colours told apart with any colour vision (Okabe and Ito).
+#: Colours that can be distinguished with any colour vision (Okabe and Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6b6b6b", "#000000")
 _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 #: One unit of the drawing is one pixel of the page, and one point of matplotlib.
@@ -41,7 +41,7 @@ _SETTINGS: dict[Any, Any] = {
 
 @contextmanager
 def report_style() -> Iterator[None]:
-    """Settings under which the figures of a report are built and written; those of before come back."""
+    """Settings for building and writing the figures of a report. The previous settings are restored afterwards."""
     import matplotlib
 
     with matplotlib.rc_context():
@@ -51,7 +51,7 @@ def report_style() -> Iterator[None]:
 
 
 def new_figure(size_px: tuple[int, int]) -> Figure:
-    """An empty figure whose parts are laid out so that no text lies on another."""
+    """An empty figure of `size_px` (width, height) whose parts are laid out so that texts do not overlap."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(size_px[0] / _PER_INCH, size_px[1] / _PER_INCH), layout="constrained")
@@ -66,12 +66,20 @@ def panel(title: str, x_label: str, y_label: str, size_px: tuple[int, int] = (42
 
 
 def points(axes: Axes, x: NDArray, y: NDArray, colour: str, label: str = "", size: float = 3.4) -> None:
-    """Dots, one for each pair of numbers, half transparent where many lie on each other; `size` in px."""
+    """Draw one dot per pair of numbers, half transparent where many overlap.
+
+    Parameters
+    ----------
+    axes : where the dots are drawn.
+    x, y : coordinates.
+    colour, label : of the dots.
+    size : diameter, px.
+    """
     axes.plot(x, y, linestyle="none", marker="o", markersize=size, color=colour, alpha=0.55, label=label)
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
-    """The labelled artists of the axes, below them, where they hide nothing; the figure grows by their height."""
+    """Legend of the labelled artists below the axes, where it covers nothing; the figure grows by its height."""
     handles, labels = axes.get_legend_handles_labels()
     lines = -(-len(labels) // columns)
     figure.set_figheight(figure.get_figheight() + lines * _LEGEND_LINE / _PER_INCH)
@@ -102,9 +110,9 @@ def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> str:
 
 
 def svg(figure: Figure) -> str:
-    """The figure as an SVG element for an HTML page: no prologue, no metadata, no date, no styles of its own.
+    """The figure as an SVG element for an HTML page, without prologue, metadata, date or styles of its own.
 
-    It needs nothing but the page. Call it, as everything that draws, within `report_style`.
+    The element needs no other file. Call this function within `report_style`, as all drawing functions.
     """
     stream = io.BytesIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))

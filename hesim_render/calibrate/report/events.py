@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Mean number of events of which a chance of 5 % is left that none is counted: −ln 0.05.
+#: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
 _UPPER_OF_NONE = 3.0
 
 
@@ -25,7 +25,7 @@ def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     Parameters
     ----------
     section : ``evs`` of a ``calibration.yaml``.
-    maps : its arrays, see `read_maps`; those called ``figure_…`` are drawn.
+    maps : its arrays, see `read_maps`; the arrays called ``figure_…`` are drawn.
     """
     parts = [
         "<h2>Events (EVS)</h2>",
@@ -64,7 +64,9 @@ def _number(value: float, _: float) -> str:
 
 
 def _end_of_axis(axes: Axes, counted: float, fitted: float) -> None:
-    """All that was counted is seen, and fits to a hundredth of it; a short axis has more numbers."""
+    """End the axis so that all counts are visible, and the fit down to a hundredth of them. A short axis has more
+    numbers.
+    """
     from matplotlib.ticker import LogLocator
 
     axes.set_ylim(bottom=max(0.8 * min(counted, fitted), 0.01 * counted))
@@ -103,7 +105,9 @@ def _position_rates(maps: dict[str, NDArray]) -> str:
 def _counted(
     axes: Axes, x: NDArray, events: NDArray, trials: NDArray, colour: str, label: str = "", size: float = 3.4
 ) -> None:
-    """Rates as points; where nothing was counted, a triangle down from the 95 % limit: no logarithmic axis has 0."""
+    """Rates as points. Where nothing was counted, a triangle points down from the 95 % limit: a logarithmic axis has no
+    0.
+    """
     some = events > 0
     points(axes, x[some], events[some] / trials[some], colour, label, size)
     axes.plot(
@@ -113,7 +117,7 @@ def _counted(
 
 
 def _lowest(events: NDArray, trials: NDArray) -> float:
-    """Lowest of what `_counted` draws."""
+    """Lowest value that `_counted` draws."""
     return float((np.where(events > 0, events, _UPPER_OF_NONE) / trials).min())
 
 

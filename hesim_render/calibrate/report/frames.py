@@ -77,7 +77,7 @@ def _variance_panels(section: dict[str, Any], pooled: NDArray) -> str:
 
 
 def _variance_panel(title: str, beta: NDArray, here: NDArray) -> str:
-    """Variances of one tile position against light, and what the polynomial `beta` leaves of them."""
+    """Variances of one tile position against light, and their residuals from the polynomial `beta`."""
     exposure_s, x, y = here[:, 2], here[:, 4], here[:, 5]
     relative = 100 * (y / polynomial(beta, x, exposure_s) - 1)
     reach = max(3.0, 1.08 * float(np.abs(relative).max()))

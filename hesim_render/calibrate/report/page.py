@@ -1,4 +1,4 @@
-"""The calibration report: one HTML file that needs nothing else."""
+"""The calibration report: one HTML file that needs no other file."""
 
 from __future__ import annotations
 

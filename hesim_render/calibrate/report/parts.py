@@ -1,4 +1,4 @@
-"""What both sections of the calibration report are made of: rows of figures, lines of tables, findings."""
+"""Common parts of the sections of the calibration report: rows of figures, lines of tables, findings."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def findings(section: Mapping[str, Any]) -> str:
-    """What in the captures is not as the model supposes, one line each; nothing of a calibration without checks."""
+    """The findings of a section, one line each; empty for a calibration without checks."""
     if "findings" not in section:
         return ""
     found = section["findings"]
@@ -40,7 +40,7 @@ def p_text(p_value: float | None) -> str:
 
 
 def row_of(*figures: str) -> str:
-    """Drawings side by side, as many as there is room for; empty ones are left out."""
+    """Drawings side by side, as many as fit in a row; empty ones are left out."""
     return '<div class="row">' + "".join(f"<figure>{f}</figure>" for f in figures if f) + "</div>"
 
 
@@ -62,7 +62,7 @@ def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
 
 
 def number(value: float) -> str:
-    """A number in few digits."""
+    """A number with few digits."""
     if value == 0:
         return "0"
     if 1e3 <= abs(value) < 1e5:

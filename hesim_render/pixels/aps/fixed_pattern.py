@@ -1,4 +1,4 @@
-"""Fixed maps of a device's frame pixels: PRNU, offset and dark current; from the device seed alone, or measured."""
+"""Fixed maps of a device's frame pixels: PRNU, offset and dark current, from the device seed or measured."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from hesim_render.specs.sensor import ApsSpec
 
 Map = float | NDArray[np.float32]
 
-#: A relative spread below this is none in 32 bit, and its gamma law would have a shape beyond all figures.
+#: Least relative spread of the dark current. A smaller one is lost in 32-bit numbers, and the shape parameter of its
+#: gamma law would be too large to compute.
 _LEAST_SPREAD_REL = 1e-6
 
 
@@ -57,9 +58,9 @@ class FixedPattern(PlainState):
     def offset_dn(self) -> Map:
         """N_FP = black + N_row + N_BLC in DN, [row, col]; a number where there is no spread.
 
-        N_BLC = K·dsnu_e·z per pixel; N_row is drawn per row of the full sensor. They are independent
-        draws, so the gauge of a calibration (row means of N_BLC are 0) gives slightly other parts of
-        the same sum. Measured maps take the place of both.
+        N_BLC = K·dsnu_e·z is drawn per pixel, N_row per row of the full sensor. The draws are independent. A
+        calibration uses the gauge in which the row means of N_BLC are 0, so it splits the same sum slightly
+        differently. Measured maps replace both draws.
         """
         spec = self.spec
         if self._measured is not None:
@@ -78,18 +79,20 @@ class FixedPattern(PlainState):
 
     @cached_property
     def dark_e_per_s(self) -> Map:
-        """D of each pixel, e⁻/s, [row, col]: a gamma law over pixels, or measured; a number where there is no
-        spread."""
+        """Dark current D of each pixel, e⁻/s, [row, col]: from a gamma law over pixels, or measured.
+
+        It is a number where there is no spread.
+        """
         spec = self.spec
         if "dark_current" in self.off:
             return 0.0
         if self._measured is not None:
             rate = self._measured["n_dp"] / np.float32(spec.system_gain_dn_per_e) * np.float32(spec.dark_current_growth)
-            # an estimate near 0 may lie below it; a count of the physical form may not
+            # an estimate near 0 may be negative, but the mean of a count in the physical form may not
             return rate if spec.beta is not None else np.maximum(rate, np.float32(0.0))
         if spec.dark_current_nonuniformity_rel < _LEAST_SPREAD_REL or spec.dark_current_now_e_per_s == 0:
             return spec.dark_current_now_e_per_s
-        # the quantile function, tabulated over the normal deviate: linear in between it is good to 1e-6
+        # the quantile function is tabulated over the normal deviate; linear interpolation is accurate to 1e-6
         shape = spec.dark_current_nonuniformity_rel**-2.0
         z = np.linspace(-7.0, 7.0, 28001)
         lower, upper = special.gammaincinv(shape, special.ndtr(z)), special.gammainccinv(shape, special.ndtr(-z))

@@ -10,10 +10,10 @@ Polynomial form (``aps.beta`` given), I = K·(1 + PRNU)·I_e in DN, per tile pos
     mean = I + t·N_DP + N_FP
     Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC, without N_tr
 
-Both are one model (`PixelValue`): a count of mean m, Poisson or Gaussian with variance m, is worth a gain in DN each
-and sits on fixed DN; a Gaussian is added to the sum. N_FP = black + N_row + N_BLC. N_tr is one Gaussian number of
-every row of a frame, shared by its pixels (temporal row noise). The ADC rounds once: no uniform noise is added, and
-every variance here leaves out its q²/12.
+Both forms are cases of one model (`PixelValue`). A count with mean m is Poisson, or Gaussian with variance m. It is
+multiplied by a gain in DN and added to fixed DN and a Gaussian. N_FP = black + N_row + N_BLC. N_tr is one Gaussian
+number per row of a frame, shared by the pixels of the row (temporal row noise). The ADC rounds once: no uniform noise
+is added, and every variance here excludes its q²/12.
 
 Arrays are NumPy's or Dr.Jit's (`hesim_render.core.namespace`); nothing here draws a random number.
 """
@@ -32,22 +32,24 @@ from hesim_render.core.namespace import Namespace
 #: Error variance of rounding with a step of q = 1 DN, q²/12.
 ADC_VARIANCE_DN2 = 1.0 / 12.0
 
-#: Below this temporal variance (the ADC's taken out) rounding hides the noise and biases the means: Sheppard's
+#: Below this temporal variance (without that of the ADC) rounding hides the noise and biases the means: Sheppard's
 #: correction q²/12 fails.
 HIDDEN_VARIANCE_DN2 = 0.24
 
-#: The noise term that each of β0 … β5 belongs to; 0 where that is switched off.
+#: The noise term of each of β0 … β5. A coefficient is 0 where its term is switched off.
 BETA_TERMS = ("read", "shot", "dark_current", "shot", "shot", "dark_current")
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """What the formulas need of each pixel: numbers or arrays.
+    """Properties of each pixel that the formulas need; numbers or arrays.
 
     Attributes
     ----------
-    response : 1 + PRNU. dark_e_per_s : D. offset_dn : N_FP.
-    beta : the six of the polynomial form, or None in the physical one.
+    response : 1 + PRNU.
+    dark_e_per_s : dark current D, e⁻/s.
+    offset_dn : N_FP, DN.
+    beta : β0 … β5 of the polynomial form, in DN and s; None in the physical form.
     """
 
     response: Values
@@ -62,8 +64,10 @@ class PixelValue:
 
     Attributes
     ----------
-    fixed_dn : without noise. count : mean of the count. gain_dn : DN for each of it. gaussian_dn2 : variance of the
-        Gaussian part, DN².
+    fixed_dn : part without noise, DN.
+    gain_dn : DN per unit of the count.
+    count : mean of the count.
+    gaussian_dn2 : variance of the Gaussian part, DN².
     """
 
     fixed_dn: Values
@@ -82,17 +86,33 @@ class PixelValue:
 
 
 def light_gain_dn(beta: Sequence[Values] | NDArray, signal_dn: Values, exposure_s: Values) -> Values:
-    """g = β1 + β3 I + β4 t in DN: the part of the variance that goes with the light, over the signal I.
+    """g = β1 + β3 I + β4 t in DN: the part of the variance that depends on the light, divided by the signal I.
 
     Parameters
     ----------
-    beta : β0 … β5 on the first axis.
+    beta : β0 … β5 on the first axis, in DN and s.
+    signal_dn : light signal I, DN.
+    exposure_s : exposure t, s.
+
+    Returns
+    -------
+    g, DN.
     """
     return beta[1] + beta[3] * signal_dn + beta[4] * exposure_s
 
 
 def dark_variance_dn2(beta: Sequence[Values] | NDArray, exposure_s: Values) -> Values:
-    """β0 + β2 t + β5 t² in DN²: the variance without light; `beta` as in `light_gain_dn`."""
+    """Variance without light, β0 + β2 t + β5 t².
+
+    Parameters
+    ----------
+    beta : β0 … β5 on the first axis, in DN and s.
+    exposure_s : exposure t, s.
+
+    Returns
+    -------
+    Variance, DN².
+    """
     return beta[0] + (beta[2] * exposure_s + beta[5] * exposure_s * exposure_s)
 
 
@@ -101,14 +121,31 @@ def polynomial(beta: ArrayLike, signal_dn: Values, exposure_s: Values) -> NDArra
 
     Parameters
     ----------
-    beta : [..., 6]. signal_dn, exposure_s : that fit it without its last axis.
+    beta : [..., 6], in DN and s.
+    signal_dn : light signal I, DN; it must broadcast against `beta` without its last axis.
+    exposure_s : exposure t, s; it must broadcast likewise.
+
+    Returns
+    -------
+    Variance, DN².
     """
     b = np.moveaxis(np.asarray(beta), -1, 0)
     return dark_variance_dn2(b, exposure_s) + signal_dn * light_gain_dn(b, signal_dn, exposure_s)
 
 
 def physical_beta(system_gain_dn_per_e: float, read_noise_e: float, dark_e_per_s: float) -> list[float]:
-    """β0 … β5 of the physical form, exactly: K²σ_r², K, K²D and 0. PRNU is spatial and never enters β3."""
+    """β0 … β5 of the physical form: K²σ_r², K, K²D and 0, exactly. PRNU is spatial and does not contribute to β3.
+
+    Parameters
+    ----------
+    system_gain_dn_per_e : K, DN/e⁻.
+    read_noise_e : σ_r, e⁻.
+    dark_e_per_s : D, e⁻/s.
+
+    Returns
+    -------
+    The six coefficients, in DN and s.
+    """
     gain = system_gain_dn_per_e
     return [(gain * read_noise_e) ** 2, gain, gain**2 * dark_e_per_s, 0.0, 0.0, 0.0]
 
@@ -116,12 +153,20 @@ def physical_beta(system_gain_dn_per_e: float, read_noise_e: float, dark_e_per_s
 def physical_value(
     electrons: Values, exposure_s: Values, pixels: Pixels, system_gain_dn_per_e: float, read_noise_e: float, shot: bool
 ) -> PixelValue:
-    """Value of a pixel in the physical form: light and dark current are one count of K DN each.
+    """Value of a pixel in the physical form. Light and dark current together are one count of K DN per electron.
 
     Parameters
     ----------
     electrons : I_e, mean photo-electrons of the exposure.
-    shot : whether the light has shot noise; without it that of the dark current remains.
+    exposure_s : exposure, s.
+    pixels : properties of the pixels.
+    system_gain_dn_per_e : K, DN/e⁻.
+    read_noise_e : σ_r, e⁻.
+    shot : whether the light has shot noise. Without it, the shot noise of the dark current remains.
+
+    Returns
+    -------
+    Law of the value.
     """
     light, dark = pixels.response * electrons, pixels.dark_e_per_s * exposure_s
     read_dn2 = (system_gain_dn_per_e * read_noise_e) ** 2
@@ -138,10 +183,23 @@ def calibrated_value(
     full_scale_dn: float,
     xp: Namespace,
 ) -> PixelValue:
-    """Value of a pixel in the polynomial form: the light is a count of g = β1 + β3 I + β4 t DN each.
+    """Value of a pixel in the polynomial form. The light is a count of g = β1 + β3 I + β4 t DN per unit.
 
-    So its variance is g·I; the rest of the polynomial, below 0 where it cannot be one, counts as Gaussian. In g, I is
-    taken up to full scale, beyond which the polynomial was not measured. Where g is 0 the light has no noise.
+    The variance of that count is g·I. The rest of the polynomial is the variance of the Gaussian part, at least 0.
+    In g, I is limited to full scale, above which the polynomial was not measured. Where g is 0 the light has no noise.
+
+    Parameters
+    ----------
+    electrons : I_e, mean photo-electrons of the exposure.
+    exposure_s : exposure, s.
+    pixels : properties of the pixels, with `beta`.
+    system_gain_dn_per_e : K, DN/e⁻.
+    full_scale_dn : largest value of the ADC, DN.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    Law of the value.
     """
     assert pixels.beta is not None
     signal = system_gain_dn_per_e * (pixels.response * electrons)
@@ -155,19 +213,51 @@ def calibrated_value(
 def noise_equivalent_e(
     variance_dn2: Values, system_gain_dn_per_e: float, prnu_rel: float, electrons: Values, xp: Namespace
 ) -> Values:
-    """Noise of a pixel in electrons at its input: √(Var/K² + (PRNU·I_e)²)."""
+    """Noise of a pixel in electrons at its input: √(Var/K² + (PRNU·I_e)²).
+
+    Parameters
+    ----------
+    variance_dn2 : temporal variance, DN².
+    system_gain_dn_per_e : K, DN/e⁻.
+    prnu_rel : relative standard deviation of the response.
+    electrons : I_e, mean photo-electrons.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    Standard deviation, e⁻.
+    """
     fixed_e = prnu_rel * electrons
     return xp.sqrt(variance_dn2 / system_gain_dn_per_e**2 + fixed_e * fixed_e)
 
 
 def fourth_cumulant_dn4(gain_dn: Values, count_variance_dn2: Values) -> Values:
-    """κ₄ of a Poisson count of `gain_dn` each whose variance is g² m: g⁴ m. It is 0 of a Gaussian."""
+    """Fourth cumulant κ₄ = g⁴ m of a Poisson count with g DN per unit and the variance g² m. A Gaussian has κ₄ = 0.
+
+    Parameters
+    ----------
+    gain_dn : g, DN.
+    count_variance_dn2 : g² m, DN².
+
+    Returns
+    -------
+    κ₄, DN⁴.
+    """
     return gain_dn * gain_dn * count_variance_dn2
 
 
 def telegraph_levels(amplitude: Values, high_share: Values) -> tuple[Values, Values]:
-    """Low and high level of random telegraph noise about its mean: −a p and a (1 − p), p the part of the time at the
-    high one."""
+    """Low and high level of random telegraph noise relative to its mean: −a p and a (1 − p).
+
+    Parameters
+    ----------
+    amplitude : a, high level minus low level, in any unit.
+    high_share : p, fraction of the time at the high level.
+
+    Returns
+    -------
+    low, high : levels in the unit of the amplitude.
+    """
     return -amplitude * high_share, amplitude * (1.0 - high_share)
 
 
@@ -177,5 +267,16 @@ def telegraph_variance(amplitude: Values, high_share: Values) -> Values:
 
 
 def telegraph_correlation(high_s: Values, low_s: Values, interval_s: Values, xp: Namespace) -> Values:
-    """Autocovariance over an interval by variance, exp(−Δt (1/τ_high + 1/τ_low)) [machlup1954]."""
+    """Autocorrelation of random telegraph noise at an interval, exp(−Δt (1/τ_high + 1/τ_low)) [machlup1954].
+
+    Parameters
+    ----------
+    high_s, low_s : mean times τ_high and τ_low in each state, s.
+    interval_s : Δt, s.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    Correlation, 0 to 1.
+    """
     return xp.exp(-interval_s * (1.0 / high_s + 1.0 / low_s))

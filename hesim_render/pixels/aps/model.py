@@ -37,7 +37,7 @@ class ApsNoise(PlainState):
     ----------
     spec : the ``aps`` section of the sensor file.
     layout : region read out; maps and random numbers are keyed by the full sensor's pixels.
-    device_seed : which device of this kind: all fixed-pattern maps follow from it alone.
+    device_seed : which device of this kind. It alone determines all fixed-pattern maps.
     off : terms that are switched off, see `without`.
 
     Raises
@@ -61,8 +61,8 @@ class ApsNoise(PlainState):
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
         ``read`` is σ_r (β0), ``prnu``, ``dsnu`` and ``row`` are the fixed maps, ``row_noise`` is N_tr, ``residual``
-        N_res, ``crosstalk`` is what these pixels get of their neighbours' light, ``telegraph`` are jumps between two
-        levels.
+        is N_res, ``crosstalk`` is the light that these pixels get from their neighbours, ``telegraph`` is the random
+        telegraph noise.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class ApsNoise(PlainState):
 
     @property
     def crosstalk(self) -> float:
-        """Part of the electrons that comes from the four neighbours, not from the pixel itself."""
+        """Fraction of the electrons that comes from the four neighbours and not from the pixel itself."""
         return 0.0 if "crosstalk" in self.off else self.layout.spec.geometry.crosstalk
 
     @property
@@ -108,13 +108,15 @@ class ApsNoise(PlainState):
 
     @property
     def pixels(self) -> Pixels:
-        """What the formulas need of each pixel over the region: maps [row, col], or numbers where all are alike."""
+        """Properties of each pixel that the formulas need: maps [row, col] of the region, or numbers where all are
+        equal.
+        """
         beta = None if self.beta is None else tuple(np.moveaxis(self.layout.tiled(self.beta), -1, 0))
         maps = self.fixed_pattern
         return Pixels(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
 
     def _nominal_pixel(self, position: tuple[int, int] | None) -> Pixels:
-        """A pixel of a position without any fixed pattern."""
+        """A pixel at a tile position, without any fixed pattern."""
         known = self.layout.spec.positions("aps")
         chosen = known[0] if position is None else tuple(position)
         if chosen not in known:
@@ -125,7 +127,7 @@ class ApsNoise(PlainState):
     # ---- the model --------------------------------------------------------------------------------
 
     def _refused(self, exposure_us: float) -> str:
-        """Why the polynomial cannot be a variance at this exposure, or nothing."""
+        """The reason why the polynomial cannot be a variance at this exposure, µs; empty where it can."""
         if self.beta is None:
             return ""
         t = exposure_us * S_PER_US
@@ -147,6 +149,13 @@ class ApsNoise(PlainState):
         Parameters
         ----------
         electrons : mean photo-electrons I_e of the exposure, numbers or arrays like those of `pixels`.
+        exposure_s : exposure, s.
+        pixels : properties of the pixels.
+        xp : functions of the arrays' library.
+
+        Returns
+        -------
+        Law of the values, DN.
         """
         gain = self.spec.system_gain_dn_per_e
         if pixels.beta is None:
@@ -161,7 +170,14 @@ class ApsNoise(PlainState):
     def _on_host(
         self, electrons: NDArray[np.float64], exposure_us: float, position: tuple[int, int] | None
     ) -> tuple[PixelValue, Pixels]:
-        """Law of the values of an image, or of a number at one position."""
+        """Law of the values of an image, or of a number at one position; and the properties of the pixels.
+
+        Parameters
+        ----------
+        electrons : mean photo-electrons, an image [row, col] or a number.
+        exposure_us : exposure, µs.
+        position : (tile_row, tile_col) of a number, None for the first frame position.
+        """
         if electrons.ndim and position is not None:
             raise RangeError("position", position, "none, as an image has the position of each pixel")
         pixels = self.pixels if electrons.ndim else self._nominal_pixel(position)
@@ -193,12 +209,12 @@ class ApsNoise(PlainState):
         ----------
         electrons : mean photo-electrons I_e of the exposure; a number, or an image [row, col].
         exposure_us : exposure in µs.
-        position : (tile_row, tile_col) a number belongs to, default the first frame position; it then has
+        position : (tile_row, tile_col) of a number, default the first frame position. The number then has
             the nominal dark current and black level. An image uses each pixel's own maps.
 
         Returns
         -------
-        DN, of the shape of `electrons`. Full well and the ADC's range are left out: near them the mean
+        DN, in the shape of `electrons`. Full well and the ADC's range are not included: near them the mean
         of samples is lower.
         """
         values = self._checked(electrons, exposure_us)
@@ -210,9 +226,9 @@ class ApsNoise(PlainState):
     ) -> NDArray[np.float64]:
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
-        In the physical form K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr²; an image has telegraph noise too. Near
-        full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, good where the
-        variance itself is above 0.24 DN².
+        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr². An image also has telegraph
+        noise. Near full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, which
+        is accurate where the variance itself is above 0.24 DN².
         """
         values = self._checked(electrons, exposure_us)
         value, _ = self._on_host(values, exposure_us, position)
@@ -226,8 +242,8 @@ class ApsNoise(PlainState):
     def noise_equivalent_e(self, electrons: NDArray, exposure_us: float) -> NDArray[np.float64]:
         """Standard deviation of a frame pixel in electrons at its input, PRNU included.
 
-        What an error of the clean signal is measured against; a render's error is a fixed pattern, as
-        PRNU is. Nominal values of the first frame position; rounding counts with 1/12 DN².
+        An error of the clean signal is compared with it. The error of a render is a fixed pattern, as is PRNU. The
+        values are those of the first frame position without fixed pattern; rounding adds 1/12 DN².
 
         Parameters
         ----------
@@ -246,7 +262,8 @@ class ApsNoise(PlainState):
     def to_polynomial(self) -> list[list[list[float]]]:
         """The variance as [tile_row][tile_col][β0 … β5] in DN and s; exact for the physical form.
 
-        β0 = K²σ_r², β1 = K, β2 = K²D, the others 0: PRNU is spatial and never enters β3. N_res and N_tr are not in it.
+        β0 = K²σ_r², β1 = K, β2 = K²D, the others are 0: PRNU is spatial and does not contribute to β3. N_res and N_tr
+        are not included.
         """
         if self.beta is not None:
             return self.beta.tolist()
@@ -265,11 +282,11 @@ class ApsNoise(PlainState):
         ----------
         electrons : mean photo-electrons: a number, an image [row, col], or a flat Dr.Jit array.
         exposure_us : exposure in µs.
-        seed, frame : the result is a pure function of them, the device seed and `electrons`.
+        seed, frame : the result is a pure function of `seed`, `frame`, the device seed and `electrons`.
 
         Returns
         -------
-        DN, uint16 [row, col]. Pixels without the frame role get a value too; `layout.aps_mask` tells them.
+        DN, uint16 [row, col]. Pixels without the frame role get a value too; `layout.aps_mask` is False there.
 
         Raises
         ------

@@ -7,7 +7,7 @@ import math
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Float64, Generator, Mask, UInt32
 
-#: From this mean on transformed rejection is used; its hat holds for means of 10 and more.
+#: Transformed rejection is used from this mean on. Its hat function is valid for means of 10 and more.
 _REJECTION_FROM = 10.0
 #: P(k ≥ 100) at mean 10 is 1e-63.
 _SEARCH_LIMIT = 100
@@ -16,10 +16,10 @@ _SEARCH_LIMIT = 100
 def poisson(mean: Float, generator: Generator, words: tuple[UInt32, UInt32] | None = None) -> Float:
     """Poisson deviates, exact to the accuracy of single precision at every mean up to 1e7.
 
-    Below a mean of 10: inversion by sequential search in double precision, from a 64-bit uniform. From 10 on:
-    transformed rejection PTRS [hormann1993], without its quick accept step, which cannot save work in SIMD lanes. The
-    probabilities it compares with are in the saddle-point form of Loader [loader2000], as ln k! in single precision
-    would lose all digits of the result to cancellation.
+    Below a mean of 10, inversion by sequential search is used, in double precision and with a 64-bit uniform number.
+    From 10 on, transformed rejection PTRS [hormann1993] is used without its quick accept step, which cannot save work
+    in SIMD lanes. The probabilities of the acceptance test have the saddle-point form of Loader [loader2000], because
+    ln k! in single precision would lose all digits of the result to cancellation.
 
     Parameters
     ----------
@@ -40,10 +40,19 @@ def poisson(mean: Float, generator: Generator, words: tuple[UInt32, UInt32] | No
 
 
 def _search(mean: Float, high: UInt32, low: UInt32) -> Float:
-    """Smallest k with P(K ≤ k) > u, u = (high, low) as a 64-bit fraction; for means below 10.
+    """Smallest k with P(K ≤ k) > u, for means below 10; 0 elsewhere.
 
-    The distance of u from the cumulated probability is kept in units of the next term μᵏ/k!: one
-    subtraction and one product a step, and no division.
+    The distance of u from the cumulative probability is kept in units of the next term μᵏ/k!. A step therefore needs
+    one subtraction and one product, and no division.
+
+    Parameters
+    ----------
+    mean : expected count.
+    high, low : words of u, a 64-bit fraction.
+
+    Returns
+    -------
+    Float, whole numbers.
     """
     import drjit as dr
 
@@ -74,7 +83,7 @@ def _transformed_rejection(mean: Float, generator: Generator, u_word: UInt32, v_
     mean = dr.maximum(mean, _REJECTION_FROM)
     count, accepted = _propose(mean, u_word, v_word)
 
-    # Philox4x32 objects do not work as loop state in Dr.Jit 1.5: a fresh one is made of its parts
+    # Philox4x32 objects do not work as loop state in Dr.Jit 1.5: a new one is made from its parts
     key = (types.UInt64(generator.seed[0]) << 32) | types.UInt64(generator.seed[1])
     pixel, low, high = (generator.counter[k] for k in range(3))
 
@@ -101,14 +110,14 @@ def _propose(mean: Float, u_word: UInt32, v_word: UInt32) -> tuple[Float, Mask]:
     b = dr.fma(dr.sqrt(mean), 2.53, 0.931)
     a = dr.fma(b, 0.02483, -0.059)
     inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
-    # u in (-1/2, 1/2) and its distance to the nearer end, each exact where it is small
+    # u in (-1/2, 1/2) and the distance of u to the nearer end; each is exact where it is small
     signed = types.Int32(u_word)
     to_end = types.UInt32(0x7FFFFFFF) - types.UInt32(dr.select(signed < 0, ~signed, signed))
     u = dr.fma(types.Float(signed), 2.0**-32, 2.0**-33)
     distance = dr.fma(types.Float(to_end), 2.0**-32, 2.0**-33)
     v = dr.fma(types.Float(v_word), 2.0**-32, 2.0**-33)
     a_over_distance = a / distance
-    # the whole part of the mean stays out of the float sum, whose rounding would make cells uneven
+    # the integer part of the mean is not part of the float sum, whose rounding would make the cells uneven
     whole = dr.floor(mean)
     count = whole + dr.floor(dr.fma(dr.fma(2.0, a_over_distance, b), u, mean - whole + 0.43))
     hat = a_over_distance / distance + b
@@ -119,7 +128,7 @@ def _propose(mean: Float, u_word: UInt32, v_word: UInt32) -> tuple[Float, Mask]:
 
 
 def _log_probability(count: Float, mean: Float) -> tuple[Float, Float]:
-    """Poisson probability as exp(−deviance) / scale [loader2000]: bd0 + Stirling error, and √(2πk)."""
+    """Poisson probability as exp(−deviance)/scale [loader2000]: bd0 plus the Stirling error, and √(2πk)."""
     import drjit as dr
 
     empty = count == 0.0
@@ -127,7 +136,7 @@ def _log_probability(count: Float, mean: Float) -> tuple[Float, Float]:
     inverse_square = 1.0 / (k * k)
     # ln k! − Stirling's formula, times k: a fit in 1/k² to 3e-7 for every whole k ≥ 1
     stirling_error = dr.fma(dr.fma(4.3781e-4, inverse_square, -2.70597e-3), inverse_square, 0.08332993) / k
-    # k ln(k/μ) + μ − k, near k = μ by 2 artanh(v) with v = (k − μ)/(k + μ): no cancellation
+    # k ln(k/μ) + μ − k; near k = μ it is computed from 2 artanh(v), v = (k − μ)/(k + μ), without cancellation
     difference = k - mean
     v = difference / (k + mean)
     square = v * v

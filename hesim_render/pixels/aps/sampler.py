@@ -1,4 +1,4 @@
-"""Sampler of frame pixels: values drawn from the law of `hesim_render.pixels.aps.formulas`, on Dr.Jit."""
+"""Sampler of frame pixels on Dr.Jit. Values are drawn from the law of `hesim_render.pixels.aps.formulas`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class DeviceMaps:
-    """What the sampler needs of each pixel of a region, on the device.
+    """Maps over the pixels of a region on the device, for the sampler.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class DeviceMaps:
         )  # fmt: skip
 
     def pixels(self, index: UInt32) -> Pixels:
-        """Of the pixels `index` of the region; all of them are in their order where there are so many."""
+        """Properties of the pixels `index` of the region. As many indices as pixels means all pixels in their order."""
         import drjit as dr
 
         if dr.width(index) == self._layout.rows * self._layout.cols:
@@ -64,7 +64,7 @@ class DeviceMaps:
         return jit().UInt32(self._layout.full_index.ravel())
 
     def keys(self, index: UInt32) -> UInt32:
-        """Full-sensor index of pixels of the region: rows as wide as the sensor's need no table."""
+        """Full-sensor index of pixels of the region. A region as wide as the sensor needs no table."""
         import drjit as dr
 
         types, sensor_cols = jit(), self._layout.spec.geometry.cols
@@ -76,7 +76,21 @@ class DeviceMaps:
 def draw_dn(
     noise: ApsNoise, maps: DeviceMaps, electrons: Float, exposure_us: float, seed: int, frame: int, first_pixel: int
 ) -> UInt32:
-    """`ApsNoise.sample_dn`: values of the pixels `first_pixel` … of a frame."""
+    """Values of the pixels of a frame from `first_pixel` on; see `ApsNoise.sample_dn`.
+
+    Parameters
+    ----------
+    noise : noise model.
+    maps : maps of the region on the device.
+    electrons : Float [n], mean photo-electrons of the exposure.
+    exposure_us : exposure, µs.
+    seed, frame : seed of the noise and number of the frame.
+    first_pixel : index of the first pixel in the region, row-major.
+
+    Returns
+    -------
+    UInt32 [n], DN.
+    """
     import drjit as dr
 
     types, spec = jit(), noise.spec
@@ -99,9 +113,9 @@ def draw_dn(
     if noise.telegraph is not None:
         level += noise.telegraph.added_dn(seed, frame, noise.layout.rows * noise.layout.cols, index)
     if noise.row_noise_dn > 0:
-        # of the row on the full sensor: every pixel of it draws the same number
+        # row of the full sensor: all pixels of the row draw the same number
         row = key // dr.opaque(types.UInt32, noise.layout.spec.geometry.cols)
         word = philox(seed, Stream.ROW_NOISE, row, frame).next_uint32x4()
         level = dr.fma(dr.opaque(types.Float, noise.row_noise_dn), normal_pair(word[0], word[1])[0], level)
-    # not clip: of a level that is no number it makes the largest integer, which no ADC of fewer bits gives
+    # not clip: it would turn NaN into the largest integer, which is above the full scale of the ADC
     return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(noise.full_scale_dn)), 0.0))

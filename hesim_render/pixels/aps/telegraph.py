@@ -1,8 +1,8 @@
 """Random telegraph noise: frame pixels whose value jumps between two levels from frame to frame.
 
-A single trap near the source follower's channel that is filled or empty makes two levels [wang2006]. A pixel's state in
-a frame is that of the instant frame / frame_rate_hz, when the frame begins, for all of its exposure. Both levels lie
-about the pixel's own mean, so that offset and dark current stay what they are.
+A single trap near the channel of the source follower that is filled or empty produces two levels [wang2006]. The state
+of a pixel is taken when a frame begins, at frame / frame_rate_hz, and holds for its whole exposure. The mean of the
+levels over time is the pixel's own mean: offset and dark current do not change.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from hesim_render.specs.sensor import ApsSpec
 
 @dataclass(frozen=True, eq=False)
 class TelegraphPixels:
-    """Pixels of a region that jump.
+    """Pixels of a region with random telegraph noise.
 
     Attributes
     ----------
-    place, key : [n], of each: in the region, row-major, and of the full sensor.
-    amplitude_dn : [n], high level less low one. high_share : [n], part of the time at the high level.
-    change_hz : [n], 1/(mean time high) + 1/(mean time low).
-    frame_us : from one frame to the next.
+    place, key : [n], index of each pixel in the region, row-major, and on the full sensor.
+    amplitude_dn : [n], high level minus low level, DN.
+    high_share : [n], fraction of the time at the high level.
+    change_hz : [n], 1/(mean time high) + 1/(mean time low), Hz.
+    frame_us : time from one frame to the next, µs.
     """
 
     place: NDArray[np.intp]
@@ -48,14 +49,25 @@ class TelegraphPixels:
         return formulas.telegraph_variance(self.amplitude_dn, self.high_share)
 
     def values_dn(self, seed: int, frame: int) -> NDArray[np.float64]:
-        """[n], DN about the mean in a frame: a pure function of seed, device and frame."""
+        """Deviations from the mean in a frame, DN [n]: a pure function of seed, device and frame."""
         every = np.arange(self.place.size)
         signal = Telegraph(seed, Stream.TELEGRAPH, self.key, self.change_hz, self.high_share)
         high = signal.is_high(every, np.full(every.size, frame * self.frame_us))
         return np.where(high, *formulas.telegraph_levels(self.amplitude_dn, self.high_share)[::-1])
 
     def added_dn(self, seed: int, frame: int, pixels: int, index: UInt32) -> Float:
-        """The same at the pixels `index` of a region of so many, 0 where nothing jumps."""
+        """Deviations from the mean in a frame on the device; 0 at pixels without telegraph noise.
+
+        Parameters
+        ----------
+        seed, frame : seed of the noise and number of the frame.
+        pixels : number of pixels of the region.
+        index : pixels that are asked for.
+
+        Returns
+        -------
+        Float, DN, one value per entry of `index`.
+        """
         import drjit as dr
 
         types = jit()
@@ -66,7 +78,10 @@ class TelegraphPixels:
 
 
 def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> TelegraphPixels | None:
-    """Those of a device: measured where a calibration has them, else drawn from the device seed; None without any."""
+    """Pixels of a device with telegraph noise; None without any.
+
+    They are taken from a calibration where it has measured them, and drawn from the device seed otherwise.
+    """
     frame_us, measured = US_PER_S / spec.frame_rate_hz, telegraph_maps(layout)
     if measured is not None:
         amplitude, share, correlation = (values.ravel().astype(np.float64) for values in measured.values())

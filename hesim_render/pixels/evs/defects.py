@@ -1,8 +1,8 @@
-"""Event pixels that are stuck, hot or flickering: which ones, at what rates, and the events that they give.
+"""Event pixels that are stuck, hot or flickering: which pixels, their rates and their events.
 
-A stuck pixel gives no event. A hot one gives events of its own at a steady rate, whatever the light, beside those of
-its comparisons; their rates spread over decades, as noise rates of event pixels do [hu2021]. A flickering one
-does so only while a random telegraph signal is high (`hesim_render.pixels.poisson_points`).
+A stuck pixel gives no event. A hot pixel gives events of its own at a steady rate that does not depend on the light, in
+addition to those of its comparisons. The rates spread over decades, as noise rates of event pixels do [hu2021]. A
+flickering pixel does so only while a random telegraph signal is high (`hesim_render.pixels.poisson_points`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from hesim_render.specs.calibration_spec import Defect
 from hesim_render.specs.defects import EventDefectSpec
 from hesim_render.specs.sensor import EvsSpec
 
-#: Events of a defect per comparison at a fixed tick beyond which more change nothing: e⁻³⁰ is left.
+#: Events of a defect per comparison above which more change nothing: the chance of no event is e⁻³⁰.
 _MOST_PER_TICK = 30.0
-#: Events that are worked out at once, about.
+#: Number of events computed at once, approximately.
 _AHEAD = 20_000
 
 
@@ -34,11 +34,11 @@ class EventDefects:
 
     Attributes
     ----------
-    stuck : [k], places on the event grid, row-major.
-    place, key : [n], of hot and flickering pixels: on the event grid, and of the full sensor.
-    on_hz, off_hz : [n], rates of their own events while they fire.
-    firing_share : [n], part of the time in which they fire; 1 of hot ones.
-    change_hz : [n], 1/(mean time firing) + 1/(mean time quiet); 0 of hot ones.
+    stuck : [k], indices on the event grid, row-major.
+    place, key : [n], index of each hot or flickering pixel on the event grid and on the full sensor.
+    on_hz, off_hz : [n], rates of their own events while they fire, Hz.
+    firing_share : [n], fraction of the time in which they fire; 1 for hot pixels.
+    change_hz : [n], 1/(mean time firing) + 1/(mean time quiet), Hz; 0 for hot pixels.
     """
 
     stuck: NDArray[np.intp]
@@ -50,7 +50,7 @@ class EventDefects:
     change_hz: NDArray[np.float64]
 
     def without(self, term: str) -> EventDefects:
-        """Without the stuck (``stuck``), hot (``hot``) or flickering (``flickering``) ones."""
+        """The same defects without the stuck (``stuck``), hot (``hot``) or flickering (``flickering``) pixels."""
         if term == "stuck":
             return replace(self, stuck=self.stuck[:0])
         kept = self.change_hz > 0 if term == "hot" else self.change_hz == 0
@@ -62,7 +62,14 @@ class EventDefects:
 
 
 def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
-    """Those of a device: measured where a calibration has them, else drawn from the device seed."""
+    """Defects of a device: measured where a calibration has them, drawn from the device seed otherwise.
+
+    Parameters
+    ----------
+    spec : the ``evs`` section of the sensor file.
+    layout : region read out.
+    device_seed : which device of this kind.
+    """
     key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
     measured = event_defects(layout)
     if measured is not None:
@@ -122,11 +129,14 @@ def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32], spec: EvsSpec) 
 
 
 class DefectEvents:
-    """The events that hot and flickering pixels give of themselves: a pure function of seed, device and time.
+    """Events that hot and flickering pixels give by themselves: a pure function of seed, device and time.
 
     Parameters
     ----------
-    tick_s : where pixels are compared at fixed ticks, their period; rates beyond what a tick can tell are cut.
+    defects : pixels and rates.
+    seed : seed of the events.
+    tick_s : period of the comparisons where pixels are compared at fixed ticks, s. Rates that a tick cannot tell apart
+        are limited.
     """
 
     def __init__(self, defects: EventDefects, seed: int, tick_s: float | None = None) -> None:
@@ -138,7 +148,7 @@ class DefectEvents:
         self._firing = np.flatnonzero(total > 0)
         key = defects.key[self._firing]
         self._events = PoissonPoints(seed, Stream.HOT_EVENTS, key, total[self._firing])
-        # events are worked out for many steps at once
+        # events are computed for many steps at once
         ahead = max(_AHEAD, 4 * self._firing.size)
         self._ahead_us = ahead / max(float(total.sum()), 1e-300) * US_PER_S
         self._known_us = (0.0, 0.0)
@@ -154,7 +164,16 @@ class DefectEvents:
     def between(
         self, begin_us: float, end_us: float
     ) -> tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.int8]]:
-        """Times, places on the event grid and polarities of the events after `begin_us` up to `end_us`, by time."""
+        """Events after `begin_us` and up to `end_us`, in order of time.
+
+        Parameters
+        ----------
+        begin_us, end_us : bounds, µs.
+
+        Returns
+        -------
+        t_us, place, polarity : [event], times in µs, indices on the event grid, +1 or −1.
+        """
         if not (self._known_us[0] <= begin_us and end_us <= self._known_us[1]):
             self._known_us = begin_us, max(end_us, begin_us + self._ahead_us)
             self._known = self._events_of(*self._known_us)
@@ -177,7 +196,14 @@ class DefectEvents:
         return t_us[order], place[order], polarity[order]
 
     def at_tick(self, polarity: NDArray[np.int8], begin_us: float, end_us: float) -> NDArray[np.int8]:
-        """Polarity of each pixel at a comparison, 0 for none, with the events of defects where it has none itself."""
+        """Polarity of each pixel at a comparison, 0 for no event. Events of defects count where the comparison gave
+        none.
+
+        Parameters
+        ----------
+        polarity : [pixel], result of the comparisons: +1, −1 or 0.
+        begin_us, end_us : time of the previous and of this comparison, µs.
+        """
         _, place, own = self.between(begin_us, end_us)
         place, own = place[::-1], own[::-1]  # the earliest of a pixel is written last
         free = polarity[place] == 0
@@ -187,7 +213,7 @@ class DefectEvents:
         return polarity
 
     def alive(self, events: NDArray[np.void], cols: int) -> NDArray[np.void]:
-        """Events without those of stuck pixels, on a grid `cols` wide."""
+        """Events without those of stuck pixels, on a grid of `cols` columns."""
         if self._defects.stuck.size == 0 or events.size == 0:
             return events
         place = events["y"].astype(np.int64) * cols + events["x"]

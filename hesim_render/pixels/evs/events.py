@@ -1,4 +1,4 @@
-"""The form in which events are handed around: one structured array, in order of time."""
+"""The form of events: one structured array, in order of time."""
 
 from __future__ import annotations
 

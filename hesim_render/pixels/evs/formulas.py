@@ -8,7 +8,7 @@ With I the signal in DN of the signal reference, per event position::
     S  = ln x₁/x₀,  σ_n² = s₀²/x₀² + s₁²/x₁²,  ΔV = S + σ_n·z
     P₊ = Q((θ₊ − S)/σ_n),  P₋ = Q((θ₋ + S)/σ_n)
 
-θ are natural-log thresholds; each pixel's own is θ·(1 + m·z). In a static scene S = 0 and σ_n² = 2 s²/x², and the
+θ are natural-log thresholds; the threshold of a pixel is θ·(1 + m·z). In a static scene S = 0 and σ_n² = 2 s²/x². The
 mean of Q(u (r + m z)) over a normal z, u = θ/σ_n, is exactly Q(r u/√(1 + m² u²)).
 
 Arrays are NumPy's or Dr.Jit's (`hesim_render.core.namespace`), probabilities NumPy's alone; nothing here draws a
@@ -34,10 +34,10 @@ ShotLaw = Literal["linear", "sqrt"]
 
 @dataclass(frozen=True)
 class Coefficients:
-    """x and s² as functions of a signal: x = slope·I + base, s² = light·y² + cross·y + dark with y of `shot_root`.
+    """x and s² as functions of a signal: x = slope·I + base, s² = light·y² + cross·y + dark with y from `shot_root`.
 
-    Numbers, or arrays over positions, pixels or fits. The signal is in DN, or in electrons of the window where the
-    coefficients were made with `dn_per_signal`.
+    The coefficients are numbers, or arrays over positions, pixels or fits. The signal is in DN, or in electrons of the
+    window if the coefficients were made with `dn_per_signal`.
     """
 
     slope: Values
@@ -48,7 +48,15 @@ class Coefficients:
 
     @classmethod
     def of(cls, beta: tuple[Values, ...], dn_per_signal: Values, law: ShotLaw, xp: Namespace) -> Coefficients:
-        """From β1 … β5 and the DN of one unit of the signal."""
+        """Coefficients from β1 … β5.
+
+        Parameters
+        ----------
+        beta : β1 … β5.
+        dn_per_signal : DN per unit of the signal.
+        law : shot law.
+        xp : functions of the arrays' library.
+        """
         beta1, beta2, beta3, beta4, beta5 = beta
         linear = law == "linear"
         return cls(
@@ -60,12 +68,21 @@ class Coefficients:
         )
 
     def each(self, change: Callable[[Values], Values]) -> Coefficients:
-        """With `change` applied to each: entries taken, another type, or a copy on the device."""
+        """The same with `change` applied to each coefficient: to select entries, convert the type or copy to the
+        device.
+        """
         return Coefficients(*(change(values) for values in (self.slope, self.base, self.light, self.cross, self.dark)))
 
 
 def shot_root(signal: Values, law: ShotLaw, xp: Namespace) -> Values:
-    """y, with which the noise of the light grows: I ("linear" law) or √I ("sqrt" law)."""
+    """y, to which the noise of the light is proportional: I ("linear" law) or √I ("sqrt" law).
+
+    Parameters
+    ----------
+    signal : I, in the unit of the coefficients.
+    law : shot law.
+    xp : functions of the arrays' library.
+    """
     return signal if law == "linear" else xp.sqrt(signal)
 
 
@@ -75,19 +92,44 @@ def voltage(k: Coefficients, signal: Values) -> Values:
 
 
 def voltage_variance(k: Coefficients, root: Values, xp: Namespace) -> Values:
-    """s² at y = `root`, in the unit of β2²."""
-    # with full anticorrelation s² is a square that can be 0: rounding must not take it below
+    """Variance s² at y = `root`, in the square of the unit of β2."""
+    # with full anticorrelation s² is a square that can be 0: rounding must not make it negative
     return xp.maximum((k.light * root + k.cross) * root + k.dark, 0.0)
 
 
 def log_level(k: Coefficients, signal: Values, law: ShotLaw, xp: Namespace) -> tuple[Values, Values]:
-    """ln x, and its noise variance s²/x²."""
+    """ln x and its noise variance s²/x².
+
+    Parameters
+    ----------
+    k : coefficients.
+    signal : I, in the unit of the coefficients.
+    law : shot law.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    ln x, s²/x².
+    """
     x = voltage(k, signal)
     return xp.log(x), voltage_variance(k, shot_root(signal, law, xp), xp) / (x * x)
 
 
 def noise_equivalent(k: Coefficients, signal: Values, least_change: Values, law: ShotLaw, xp: Namespace) -> Values:
-    """The change of the signal that equals s, or `least_change` of ln x where that is more."""
+    """Change of the signal that equals s, or `least_change` of ln x if that is larger.
+
+    Parameters
+    ----------
+    k : coefficients.
+    signal : I, in the unit of the coefficients.
+    least_change : least change of ln x.
+    law : shot law.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    Change, in the unit of the signal.
+    """
     noise = xp.sqrt(voltage_variance(k, shot_root(signal, law, xp), xp))
     return xp.maximum(noise, least_change * voltage(k, signal)) / k.slope
 
@@ -95,17 +137,25 @@ def noise_equivalent(k: Coefficients, signal: Values, least_change: Values, law:
 def corner_hz(
     k: Coefficients, log: Values, reference_level: Values, least_hz: float, largest_hz: float, xp: Namespace
 ) -> Values:
-    """Corner of a photoreceptor that follows the light, at ln x: proportional to the signal, between two limits.
+    """Corner frequency of a photoreceptor that follows the light: proportional to the signal, between two limits.
 
     Parameters
     ----------
+    k : coefficients.
+    log : ln x.
     reference_level : β1 times the signal at which the corner is `largest_hz`.
+    least_hz, largest_hz : limits, Hz.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    Corner frequency, Hz.
     """
     return xp.clip(largest_hz * ((xp.exp(log) - k.base) / reference_level), least_hz, largest_hz)
 
 
 def exceedance(margin: ArrayLike, sigma: ArrayLike) -> NDArray[np.float64]:
-    """P(σ·z > margin) = Q(margin/σ) of a normal z; without noise 1 where the margin is negative, else 0."""
+    """P(σ·z > margin) = Q(margin/σ) for a normal z. Without noise it is 1 where the margin is negative, else 0."""
     margin, sigma = np.asarray(margin), np.asarray(sigma)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(sigma > 0, special.ndtr(-margin / sigma), np.where(margin < 0, 1.0, 0.0))
@@ -119,44 +169,77 @@ def event_probabilities(
     Parameters
     ----------
     theta_on, theta_off : thresholds, ln units, positive.
-    change : S = ln x₁/x₀. sigma : σ_n; thresholds that spread by m θ count as noise: √(σ_n² + m² θ²).
+    change : S = ln x₁/x₀.
+    sigma : σ_n. Thresholds with the relative spread m are included as noise: √(σ_n² + m² θ²).
+
+    Returns
+    -------
+    P₊, P₋.
     """
     return exceedance(np.asarray(theta_on) - change, sigma), exceedance(np.asarray(theta_off) + change, sigma)
 
 
 def static_threshold_over_noise(theta: Values, x: Values, variance: Values, xp: Namespace) -> Values:
-    """u = θ/σ_n of a static scene, θ·x/√(2 s²)."""
+    """u = θ/σ_n in a static scene, θ·x/√(2 s²).
+
+    Parameters
+    ----------
+    theta : θ, ln units.
+    x : voltage, in the unit of β2.
+    variance : s², in the square of that unit.
+    xp : functions of the arrays' library.
+    """
     return theta * x / xp.sqrt(2 * variance)
 
 
 def over_thresholds(u: Values, relative: Values, spread: Values, xp: Namespace) -> Values:
-    """v with Q(v) the mean of Q(u (r + m z)) over a normal z.
+    """v such that Q(v) is the mean of Q(u (r + m z)) over a normal z.
 
     Parameters
     ----------
-    relative : r, what is known of a threshold, relative to the mean of all.
-    spread : m, the relative standard deviation of what is not known.
+    u : mean threshold over noise, θ/σ_n.
+    relative : r, the known threshold relative to the mean of all pixels.
+    spread : m, the relative standard deviation of the unknown part.
+    xp : functions of the arrays' library.
     """
     return relative * u / xp.sqrt(1 + (spread * u) ** 2)
 
 
 def leak_probability(rate_hz: float, interval_s: float) -> float:
-    """Chance of a leak event, a Poisson process, in an interval: 1 − exp(−rate·Δt)."""
+    """Probability of a leak event in an interval, 1 − exp(−rate·Δt); leak events are a Poisson process.
+
+    Parameters
+    ----------
+    rate_hz : rate, Hz.
+    interval_s : Δt, s.
+    """
     return -math.expm1(-rate_hz * interval_s)
 
 
 def rate_hz(probability: ArrayLike, interval_s: float) -> NDArray[np.float64]:
-    """Rate of the Poisson process that gives an event in an interval with such a chance; `leak_probability` turned
-    round. A chance of 1 counts as one less 1e-9."""
+    """Rate of the Poisson process that gives an event in an interval with this probability; inverse of
+    `leak_probability`.
+
+    Parameters
+    ----------
+    probability : probability of an event; 1 is taken as 1 − 1e-9.
+    interval_s : Δt, s.
+
+    Returns
+    -------
+    Rate, Hz.
+    """
     return -np.log1p(-np.clip(probability, 0.0, 1.0 - 1e-9)) / interval_s
 
 
 def own_events(counted: ArrayLike, own_on: ArrayLike, own_off: ArrayLike, polarity: ArrayLike) -> NDArray[np.float64]:
-    """Chance of an event of a defect in a comparison, from all events: it shows where the comparison gave none.
+    """Probability of an event of a defect in a comparison, from all events. It shows only where the comparison gave
+    none.
 
     Parameters
     ----------
-    counted : events per comparison, of the polarity. own_on, own_off : those of a good pixel's comparisons.
+    counted : events per comparison of this polarity.
+    own_on, own_off : ON and OFF events per comparison of a good pixel.
     polarity : +1 or −1.
     """
     on, off = np.asarray(own_on), np.asarray(own_off)
@@ -165,29 +248,32 @@ def own_events(counted: ArrayLike, own_on: ArrayLike, own_off: ArrayLike, polari
 
 
 def firing_share(firing_s: Values, quiet_s: Values) -> Values:
-    """Part of the time in which a flickering pixel fires, from the mean times of both states."""
+    """Fraction of the time in which a flickering pixel fires, from the mean times in both states, s."""
     return firing_s / (firing_s + quiet_s)
 
 
 def change_rate_hz(firing_s: Values, quiet_s: Values) -> Values:
-    """Rate at which a flickering pixel forgets its state: its states correlate as exp(−rate·Δt)."""
+    """Rate in Hz at which a flickering pixel forgets its state: the correlation of its state is exp(−rate·Δt)."""
     return 1.0 / firing_s + 1.0 / quiet_s
 
 
 def flicker_moments(
     rate_per_trial: Values, share: Values, correlation: Values, trials: int
 ) -> tuple[Values, Values, Values]:
-    """Of the counts of a flickering pixel in stretches of `trials` comparisons, one after the other.
+    """Moments of the counts of a flickering pixel in successive stretches of `trials` comparisons.
 
     Parameters
     ----------
-    rate_per_trial : r, chance of an event while it fires. share : p, of the time. correlation : of its state from one
-        comparison to the next, c.
+    rate_per_trial : r, probability of an event in a comparison while the pixel fires.
+    share : p, fraction of the time in which it fires.
+    correlation : c, correlation of its state from one comparison to the next.
+    trials : n, comparisons of a stretch.
 
     Returns
     -------
-    mean, variance, covariance of neighbours : n r p; n r p (1 − r p) + r² p (1 − p) Σ_{i≠j} c^|i−j|; and
-        r² p (1 − p) Σ_i Σ_j c^(n + j − i) = r² p (1 − p) c ((1 − cⁿ)/(1 − c))².
+    mean : n r p.
+    variance : n r p (1 − r p) + r² p (1 − p) Σ_{i≠j} c^|i−j|.
+    covariance of neighbours : r² p (1 − p) Σ_i Σ_j c^(n + j − i) = r² p (1 − p) c ((1 − cⁿ)/(1 − c))².
     """
     n, c = trials, correlation
     power = c**n

@@ -2,7 +2,8 @@
 
 The formulas are in `hesim_render.pixels.evs.formulas`, the sampler is in `hesim_render.pixels.evs.stage`. With N the
 electrons of one window of t_evs that ends at the sample, the signal is I = K·(N/t_evs)·t_ref·r in DN of the signal
-reference, r its filter over the pixel's own. Each pixel's thresholds are drawn from the device seed, or measured.
+reference. r is the response of the reference's filter over that of the pixel's own filter. The thresholds of each
+pixel are drawn from the device seed, or measured.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ EVS_TERMS = (
 #: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
 LEAST_THRESHOLD_REL = 0.05
 
-#: Least noise that deviations of the clean signal are measured against, in thresholds.
+#: Least noise with which deviations of the clean signal are compared, in thresholds.
 LEAST_NOISE_THETA = 0.05
 
 
@@ -51,7 +52,7 @@ class EvsNoise(PlainState):
     ----------
     spec : the ``evs`` section of the sensor file.
     layout : region read out; thresholds and random numbers are keyed by the full sensor's pixels.
-    device_seed : which device of this kind: the threshold maps follow from it alone.
+    device_seed : which device of this kind. It alone determines the threshold maps.
     signal_scale : [event positions], response of the signal reference's filter over the position's own.
     off : terms that are switched off, see `without`.
     """
@@ -67,8 +68,8 @@ class EvsNoise(PlainState):
 
         ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread of thresholds,
         ``leak`` the leak events, ``bandwidth`` the photoreceptor's low-pass, ``refractory`` the dead time after
-        an event, ``readout_limit`` the loss of events in the read-out, ``crosstalk`` what these pixels get of their
-        neighbours' light, ``stuck``, ``hot`` and ``flickering`` the defects of pixels.
+        an event, ``readout_limit`` the loss of events in the read-out, ``crosstalk`` the light from neighbouring
+        pixels, ``stuck``, ``hot`` and ``flickering`` the defects of pixels.
 
         Raises
         ------
@@ -78,7 +79,7 @@ class EvsNoise(PlainState):
         return replace(self, off=switched_off(self.off, terms, EVS_TERMS))
 
     def clean(self) -> EvsNoise:
-        """Without any noise or limit: nominal thresholds compared with the noise-free change, every event read."""
+        """The same model without any noise or limit: thresholds are nominal, ln x has no noise, every event is read."""
         return self.without(*EVS_TERMS)
 
     @property
@@ -95,7 +96,7 @@ class EvsNoise(PlainState):
 
     @property
     def crosstalk(self) -> float:
-        """Part of the electrons that comes from the four neighbours, not from the pixel itself."""
+        """Fraction of the electrons that comes from the four neighbours and not from the pixel itself."""
         return 0.0 if "crosstalk" in self.off else self.layout.spec.geometry.crosstalk
 
     @property
@@ -113,7 +114,7 @@ class EvsNoise(PlainState):
 
     @property
     def readout_buffer_events(self) -> int:
-        """Events that can wait for the read-out: as in the file, or those it takes in a tick or in 1 ms."""
+        """Events that can wait for the read-out: from the file, else the number that it reads in a tick or in 1 ms."""
         spec = self.spec
         if spec.readout_buffer_events is not None or spec.readout_max_events_per_s is None:
             return spec.readout_buffer_events or 1
@@ -168,10 +169,10 @@ class EvsNoise(PlainState):
 
     @cached_property
     def on_device(self) -> EventPixels:
-        """The same on the device, for the stage that samples it."""
+        """Parameters of the event pixels on the device, for the event stage."""
         thresholds = self.threshold_on_map, self.threshold_off_map
         reference = None if self.photoreceptor is None else self.photoreceptor.signal_dn
-        # x above its baseline there: β1·signal_dn
+        # x above its baseline at the reference signal: β1·signal_dn
         level = None if reference is None else self.table.slope / self._dn_per_electron * reference
         return EventPixels(self.layout, self.table, self.spec.shot_law, thresholds, level)
 
@@ -189,8 +190,8 @@ class EvsNoise(PlainState):
     def noise_equivalent_e(self, electrons: NDArray, position: NDArray[np.integer]) -> NDArray:
         """The change of a window's electrons that equals one standard deviation of ln x, or θ/20 if that is more.
 
-        What a deviation of the clean signal is measured against. The floor keeps a sensor (nearly) without
-        noise from asking for the impossible: θ/20 moves no threshold crossing by more than a twentieth.
+        Deviations of the clean signal are compared with it. Without the floor, a sensor with (nearly) no
+        noise would need an impossible accuracy. θ/20 moves no threshold crossing by more than a twentieth.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What the event stage needs of each event pixel, on the device: thresholds, keys and coefficients."""
+"""Parameters of each event pixel on the device, for the event stage: thresholds, keys and coefficients."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class EventPixels:
     ----------
     layout : the region.
     table : coefficients of each event position [position], for electrons of a window.
-    law : of the shot noise.
+    law : law of the shot noise.
     thresholds : θ₊ and θ₋ in ln units, maps or numbers.
     reference_level : [position], β1 times the signal at which the photoreceptor's corner is largest; None where no
         corner follows the light.
 
     Attributes
     ----------
-    key : full-sensor index of each pixel, UInt32: what random numbers are keyed by.
+    key : full-sensor index of each pixel, UInt32; random numbers are keyed by it.
     thresholds : θ₊ and θ₋, Floats; arrays of one entry where all pixels have the same.
     """
 
@@ -66,7 +66,7 @@ class EventPixels:
 def _by_position(layout: Layout) -> Callable[[NDArray[np.float64]], Float]:
     """Function that spreads values [position] over the pixels.
 
-    It gives an opaque number where all positions agree; else a table looked up by each pixel's position.
+    The function gives an opaque number where all positions agree, and a look-up table by position otherwise.
     """
     import drjit as dr
 

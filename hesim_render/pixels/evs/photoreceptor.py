@@ -1,12 +1,12 @@
 """The photoreceptor's bandwidth: ln x through two equal poles, stepped exactly.
 
-With u = ln x of the light and a the rate of both poles, z' = a(u − z) and y' = a(z − y); y is what the
-comparator sees. For u on a straight line from u₀ to u₁ in a time h, with E = exp(−ah) and p = (1 − E)/(ah)::
+With u = ln x of the light and a the rate of both poles, z' = a(u − z) and y' = a(z − y); y is the input of the
+comparator. For u on a straight line from u₀ to u₁ in a time h, with E = exp(−ah) and p = (1 − E)/(ah)::
 
     z₁ = u₁ + E (z₀ − u₀) − p (u₁ − u₀)
     y₁ = u₁ + E (y₀ − u₀ + ah (z₀ − u₀)) − (2p − E)(u₁ − u₀)
 
-which is exact whatever h is. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A photoreceptor is a
+The step is exact for every h. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A photoreceptor is a
 second-order system whose corner rises with the photocurrent [graca2021] until its bias current limits it.
 """
 
@@ -19,10 +19,10 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.model import EvsNoise
 
-#: Nodes per period of the highest corner frequency: between them y is taken as a straight line.
+#: Nodes per period of the highest corner frequency. Between nodes, y is taken as a straight line.
 NODES_PER_CORNER_PERIOD = 32
 
-#: 1 − E is a difference of near equals below this a·h; a series of five terms is good to 2e-8 there.
+#: Below this a·h, 1 − E is a difference of nearly equal numbers. A series of five terms is accurate to 2e-8 there.
 _SERIES_BELOW = 0.1
 
 
@@ -32,11 +32,11 @@ def _rate(corner_hz: Float) -> Float:
 
 
 class Photoreceptor:
-    """State of each pixel's low-pass, and a time grid of its own.
+    """State of each pixel's low-pass, with its own time grid.
 
-    A corner that follows the light is held from one node of the grid to the next, at its value half-way as
-    a straight line through this node and the last foretells it; steps within that stretch add up exactly.
-    So nothing depends on how often the filter is asked.
+    A corner frequency that follows the light is constant from one node of the grid to the next. Its value is that
+    at the middle of the stretch, on the straight line through the previous node and this one. Steps within a stretch
+    add up exactly, so the result does not depend on how often the filter is asked.
 
     Parameters
     ----------
@@ -65,7 +65,13 @@ class Photoreceptor:
         return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding
 
     def start(self, log: Float, t_us: int) -> Float:
-        """Begin settled at the light of the first sample; returns y."""
+        """Begin in the settled state at the light of the first sample. Returns y.
+
+        Parameters
+        ----------
+        log : ln x of each pixel.
+        t_us : time of the sample, µs.
+        """
         self._t_us, self._node = float(t_us), self._node_at(t_us)
         self._input, self._state = log, (log, log)
         self._rate = self._node_rate = self._rate_at(log)
@@ -77,7 +83,7 @@ class Photoreceptor:
         return [node * self._period_us for node in range(self._node + 1, last + 1)]
 
     def to(self, log: Float, t_us: float) -> Float:
-        """y at `t_us`, ln x having gone on a straight line to `log`; no node lies in between."""
+        """y at `t_us`, µs, if ln x goes on a straight line to `log`. No node lies in between."""
         import drjit as dr
 
         types = jit()
@@ -111,7 +117,13 @@ class Photoreceptor:
         return self._state[1]
 
     def follow(self, log: Float, t_us: int) -> Float:
-        """y at the next sample, over all nodes in between; the first call begins settled."""
+        """y at the next sample, over all nodes in between. The first call begins in the settled state.
+
+        Parameters
+        ----------
+        log : ln x of each pixel at the sample.
+        t_us : time of the sample, µs.
+        """
         import drjit as dr
 
         if self._input is None:

@@ -1,7 +1,7 @@
 """Processes in time of asynchronous event pixels: band-limited noise and leak events.
 
-Both are functions of the seed, the pixel and the time the first sample was taken; nothing depends on
-how often they are asked.
+Both are functions of the seed, the pixel and the time of the first sample. They do not depend on how often they are
+asked.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ NODES_PER_CUTOFF_PERIOD = 16
 class BandNoise:
     """Unit noise of each pixel, band-limited at the cut-off: exact at nodes, linear in between.
 
-    White noise through two equal poles, −3 dB at the cut-off together. With a = 2π f_c/√(√2 − 1) its
-    correlation is (1 + a|τ|)·exp(−a|τ|), and its slope is finite, so that it crosses a level at a finite
-    rate [rice1945]: zero upwards a/2π times a second. Behind a single pole that rate has no limit, and
-    event rates would follow the spacing of the nodes.
+    It is white noise through two equal poles that are −3 dB at the cut-off together. With a = 2π f_c/√(√2 − 1) its
+    correlation is (1 + a|τ|)·exp(−a|τ|). Its slope is finite, so it crosses a level at a finite rate [rice1945]: it
+    crosses zero upwards a/2π times a second. Behind a single pole that rate would have no limit, and event rates would
+    depend on the spacing of the nodes.
 
-    The state (u, u'/a) steps from node to node with its exact transition matrix. Between nodes the
-    interpolated variance averages (2 + ρ)/3, ρ the correlation of neighbours; the amplitude makes up
-    for it.
+    The state (u, u'/a) steps from node to node with its exact transition matrix. Between nodes the interpolated
+    variance averages (2 + ρ)/3, with ρ the correlation of neighbouring nodes. The amplitude is scaled to compensate.
     """
 
     STATE = ("_node", "_value", "_state")
@@ -58,7 +57,7 @@ class BandNoise:
         return normal_pair(word[0], word[1])
 
     def _advance(self) -> None:
-        """The state one node further on."""
+        """Step the state by one node."""
         import drjit as dr
 
         self._value, speed = self._state
@@ -70,7 +69,7 @@ class BandNoise:
         dr.schedule(self._state)
 
     def start(self, t_us: int) -> Float:
-        """Begin in the stationary state; the noise at `t_us`."""
+        """Begin in the stationary state. Returns the noise at `t_us`, µs."""
         import drjit as dr
 
         self._node = math.floor(t_us / self._period_us)
@@ -97,7 +96,7 @@ class BandNoise:
 
 
 class LeakProcess:
-    """Leak events: each pixel waits exponentially distributed times."""
+    """Leak events. The waiting times of each pixel are exponentially distributed."""
 
     STATE = ("_due_us", "_count")
 
@@ -119,12 +118,14 @@ class LeakProcess:
         import drjit as dr
 
         self._count = dr.zeros(jit().UInt32, dr.width(self._key))
-        # opaque: a time written into the kernel would have it compiled again at every one
+        # opaque: a time written into the kernel would have the kernel compiled again for every time
         self._due_us = self._wait_us(self._key, self._count) + dr.opaque(jit().Float64, float(t_us))
         dr.eval(self._due_us)
 
     def until(self, t_us: float) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint32]]]:
-        """Times and pixels of the events up to `t_us`; each round has the next one of each pixel that is due."""
+        """Times (µs) and pixels of the events up to `t_us`, µs. Each round has the next event of each pixel that has
+        one.
+        """
         import drjit as dr
 
         types = jit()

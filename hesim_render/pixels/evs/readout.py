@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.units import US_PER_S
 
-#: Rows by which the scan's start moves on per microsecond, as a part of all rows: the golden section × 2³².
+#: Rows by which the start of the scan moves per microsecond, as a fraction of all rows: the golden section × 2³².
 _GOLDEN = 2654435769
 
 
@@ -21,16 +21,16 @@ def scan_start_row(t_us: NDArray[np.int64], rows: int) -> NDArray[np.int64]:
 class EventReadout:
     """Which events get through to the outside.
 
-    The bus takes one event at each tick k/rate of its clock from a buffer of `capacity` events; an event
-    that finds the buffer full is lost. Events queue by time; those of one microsecond by rows, from a row
+    The bus takes one event at each tick k/rate of its clock from a buffer of `capacity` events. An event
+    that finds the buffer full is lost. Events queue by time; events of one microsecond queue by rows, from a row
     that moves on with time (`scan_start_row`), so that no part of the sensor is favoured. An event keeps the
-    time at which its pixel fired, and a pixel whose event is lost does not know it.
+    time at which its pixel fired. The loss of an event does not change the state of its pixel.
 
     Parameters
     ----------
     rate_hz : events the bus takes per second.
     capacity : events the buffer holds.
-    rows : of the event grid.
+    rows : rows of the event grid.
 
     Attributes
     ----------
@@ -64,13 +64,13 @@ class EventReadout:
         return events[kept]
 
     def _admit(self, clock: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """For each event in its turn, at a time given in clock ticks: was there room?"""
+        """Whether the buffer has room for each event, in order; `clock` [event] is the time in clock ticks."""
         served = np.diff(clock, prepend=self._clock)
         added = np.cumsum(1 - served)
-        # the buffer's content just after each event, were there no limit: it runs empty, but never below
+        # content of the buffer just after each event if it had no limit; it is never negative
         after = added + np.maximum(self._waiting, np.maximum.accumulate(1 - added))
         if after.max() > self._capacity:
-            # each event adds 1 to what is left after serving, but the buffer stays within its capacity
+            # each event adds 1 to the content left after serving, and the buffer stays within its capacity
             add, low, high = _running(1 - served, np.ones_like(served), np.full_like(served, self._capacity))
             after = np.clip(self._waiting + add, low, high)
         before = np.maximum(np.concatenate([[self._waiting], after[:-1]]) - served, 0)
@@ -81,9 +81,17 @@ class EventReadout:
 def _running(
     add: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Each map w → clip(w + add, low, high) after all before it, as one such map; log₂ n passes.
+    """Each map w → clip(w + add, low, high) after all maps before it, as one such map; log₂ n passes.
 
-    Clips of sums are closed under composition, which makes the buffer a prefix scan [hillis1986].
+    Clips of sums are closed under composition, so the buffer is a prefix scan [hillis1986].
+
+    Parameters
+    ----------
+    add, low, high : [n], one map each.
+
+    Returns
+    -------
+    add, low, high : [n], the composed maps.
     """
     reach = 1
     while reach < add.size:

@@ -14,17 +14,17 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.pixels.arrays import take
 
-#: An event lies at least so long after the begin of its segment: rounding may have kept it from the one before.
+#: Least time of an event after the begin of its segment, µs: rounding may have moved it out of the previous segment.
 _SOON_US = 1e-3
 
 
 class Refractory:
-    """When each pixel will be ready again.
+    """Time at which each pixel will be ready again.
 
     Parameters
     ----------
-    period_us : dead time.
-    pixels : how many there are.
+    period_us : dead time, µs.
+    pixels : number of pixels.
     """
 
     STATE = ("_ready_us",)
@@ -48,9 +48,11 @@ class Refractory:
 
         Parameters
         ----------
-        reference : level each pixel compares with, Float.
+        reference : level with which each pixel compares, Float.
+        levels : levels at the begin and the end of the segment, one value per pixel.
         thresholds : θ₊, θ₋; numbers or one per pixel.
-        leak : times and pixels of the leak events in the segment.
+        begin_us, end_us : bounds of the segment, µs.
+        leak : times in µs and pixels of the leak events in the segment.
 
         Returns
         -------
@@ -97,7 +99,9 @@ class Refractory:
         end_us: float,
         leak: tuple[NDArray[np.float64], NDArray[np.uint32]],
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-        """Reference and readiness after the segment, and its events; each round has every pixel's next event."""
+        """Reference and end of the dead time after the segment, and its events. Each round has the next event of every
+        pixel.
+        """
         order = np.lexsort(leak)
         leak_us = np.append(leak[0][order], np.inf)
         turn, last = (np.searchsorted(leak[1][order], pixel, side=side) for side in ("left", "right"))

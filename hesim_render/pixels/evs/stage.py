@@ -1,7 +1,7 @@
-"""The event stage: one step per sample, each pixel's memory between them, events out.
+"""The event stage. It takes one sample per step, keeps the state of each pixel between samples and returns events.
 
-`EvsStage` is fed the noise-free electrons of each event pixel's window. In ``previous_sample`` mode the
-sensor's own tick decides when; in ``last_event`` mode the source may be sampled at any times.
+The input of `EvsStage` is the noise-free electrons of each event pixel's window. In ``previous_sample`` mode the
+sensor's own tick sets the sample times; in ``last_event`` mode the source may be sampled at any times.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ class EvsStage:
     Parameters
     ----------
     noise : the sensor's noise model (`Sensor.evs`, perhaps `without` some terms).
-    seed : the events are a pure function of it, the device seed, the sample times and the electrons.
+    seed : the events are a pure function of the seed, the device seed, the sample times and the electrons.
 
     Notes
     -----
-    ``previous_sample``: each sample is compared with the one before; at most one event per pixel and
+    ``previous_sample``: each sample is compared with the previous one; there is at most one event per pixel and
     tick, at the sample's time. With ``noise_mode: per_instant`` the noise n_t is drawn once per sample and
     differenced, so successive differences correlate by −½; with ``independent`` N(0, σ_n²) is drawn per
     difference. A leak event is an ON event that comes with probability 1 − exp(−rate·Δt), where the
     comparison itself gave none.
 
-    ``last_event``: the level of the last event is kept. ln x is linear in time between samples; a
+    ``last_event``: the level of the last event is the reference. ln x is linear in time between samples; a
     change of several thresholds gives several events, each at its own crossing, rounded up to whole µs. The
     noise is stationary and band-limited at the photoreceptor's cut-off (`BandNoise`), on time nodes of
     the sensor's own; its time-averaged variance is s²/x² at the current signal; `noise_mode` has no
     meaning. Leak events come as a Poisson process
-    and leave the reference alone. Nothing there depends on how often `step` is called.
+    and do not change the reference. The result does not depend on how often `step` is called.
 
-    Where the sensor has a photoreceptor, ln x (without its noise) first passes its low-pass, ln x being
+    Where the sensor has a photoreceptor, ln x (without its noise) first passes its low-pass, with ln x
     linear in time between samples in both modes. With a refractory period (``last_event``), see `Refractory`; with
     a read-out limit, see `EventReadout`.
     """
@@ -82,11 +82,11 @@ class EvsStage:
             self._readout = EventReadout(noise.readout_max_events_per_s, noise.readout_buffer_events, rows)
 
     def state(self) -> dict[str, Any]:
-        """What the pixels remember, plain values and NumPy arrays: a run goes on from there as if it never stopped."""
+        """State of the pixels, as plain values and NumPy arrays. A resumed run continues as if it had never stopped."""
         return saved(self)
 
     def resume(self, state: dict[str, Any]) -> None:
-        """Go on from a `state` of a stage of the same sensor, region, terms and seed."""
+        """Continue from a `state` of a stage with the same sensor, region, terms and seed."""
         restore(self, state)
 
     @property
@@ -106,11 +106,11 @@ class EvsStage:
         ----------
         electrons : Dr.Jit Float [event pixels], row-major on the event grid: noise-free electrons of the
             window of ``window_us`` that ends at `t_us`.
-        t_us : time of the sample, later than the one before.
+        t_us : time of the sample, µs, later than that of the previous sample.
 
         Returns
         -------
-        Events since the sample before, `EVENT_DTYPE`, sorted by time and then row-major. The first sample
+        Events since the previous sample, `EVENT_DTYPE`, sorted by time and then row-major. The first sample
         sets the reference and gives none.
 
         Raises
@@ -249,7 +249,7 @@ class _LastEvent:
         events = np.concatenate(parts) if parts else no_events()
         if self._defects:
             events = self._defects.alive(events, self._cols)
-        # stable: a pixel's own events stay in their order where they share a microsecond
+        # stable: the events of a pixel in one microsecond keep their order
         return events[np.lexsort((events["x"], events["y"], events["t_us"]))]
 
     def _nodes_us(self, t_us: int) -> list[float]:
@@ -258,7 +258,7 @@ class _LastEvent:
         return [*sorted(set().union(*grids)), float(t_us)]
 
     def _stamp(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Whole µs after the last sample: the end of the one an event falls in, so that steps do not overlap."""
+        """Whole µs after the last sample: the end of the microsecond of each event, so that steps do not overlap."""
         return np.maximum(np.ceil(t_us), self._t_us + 1)
 
     def _crossings(self, level: Float, begin_us: float, end_us: float) -> NDArray[np.void]:
@@ -288,7 +288,7 @@ class _LastEvent:
         number = np.arange(1, repeats.sum() + 1) - np.repeat(np.cumsum(repeats) - repeats, repeats)
         reference_0, level_0, level_1, theta_signed = (np.repeat(value, repeats) for value in values)
         travel = level_1 - level_0
-        # a crossing that rounding kept from the segment before is due at once
+        # a crossing that rounding moved out of the previous segment is due at once
         part = (reference_0 + number * theta_signed - level_0) / np.where(travel == 0, np.inf, travel)
         t_us = begin_us + np.clip(part, 0.0, 1.0) * (end_us - begin_us)
         return _events(self._stamp(t_us), np.repeat(found, repeats), np.sign(theta_signed), self._cols)
@@ -296,7 +296,15 @@ class _LastEvent:
     def _crossings_with_dead_time(
         self, refractory: Refractory, level: Float, begin_us: float, end_us: float
     ) -> NDArray[np.void]:
-        """The same where pixels rest after each event, a leak event too; both kinds come out together."""
+        """Events of one segment where pixels rest after each event, including leak events. Both kinds are returned
+        together.
+
+        Parameters
+        ----------
+        refractory : dead time of the pixels.
+        level : level at the end of the segment, one value per pixel.
+        begin_us, end_us : bounds of the segment, µs.
+        """
         due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
         if self._defects:  # of asynchronous sensors they are ON events, as those of leak
             due.append(self._defects.between(begin_us, end_us)[:2])
