@@ -129,7 +129,7 @@ def test_report_shows_curves_rates_and_maps(plain):
     page = (folder / "report.html").read_text()
     for text in ("S-curves, ON", "S-curves, OFF", "Events in steady light", "noise bandwidth", "mismatch of θ₊"):
         assert text in page
-    assert "{&#x27;" not in page and "nan" not in page
+    assert "{&#x27;" not in page and "nan" not in page and "mathdefault" not in page
     rows = maps["figure_s_curves"]
     assert set(rows[:, 0]) == {1.0, -1.0} and np.all(rows[:, 4] <= rows[:, 5])
     first = rows[rows[:, 3] == 0]

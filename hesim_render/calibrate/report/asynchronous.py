@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.calibrate.report.drawing import COLOURS, legend_below, panel, picture, points, svg
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, table
+from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, table, tick_text
 
 #: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
 _UPPER_OF_NONE = 3.0
@@ -64,6 +64,9 @@ def _noise_rate(maps: dict[str, NDArray]) -> str:
     # a logarithmic axis with the dark on it
     axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest)), linscale=0.5)
     axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(tick_text)
+        axis.set_minor_formatter("")
     for events, fit, colour, label in ((on, fit_on, COLOURS[1], "ON"), (off, fit_off, COLOURS[0], "OFF")):
         some = events > 0
         points(axes, signal[some], events[some] / seconds[some], colour, label)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.calibrate.report.drawing import COLOURS, legend_below, panel, picture, points, svg
-from hesim_render.calibrate.report.parts import findings, number, p_text, parameter_row, row_of, table
+from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, table, tick_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,15 +52,11 @@ def _rate_panel(title: str, signal: NDArray) -> tuple[Figure, Axes]:
     darkest_lit = float(signal[signal > 0].min(initial=np.inf))
     if float(signal.max()) > 100 * darkest_lit:
         axes.set_xscale("symlog", linthresh=10 ** np.floor(np.log10(darkest_lit)), linscale=0.5)
-        axes.xaxis.set_major_formatter(_number)
+        axes.xaxis.set_major_formatter(tick_text)
     axes.set_yscale("log", subs=range(2, 10))
-    axes.yaxis.set_major_formatter(_number)
+    axes.yaxis.set_major_formatter(tick_text)
     axes.yaxis.set_minor_formatter("")
     return figure, axes
-
-
-def _number(value: float, _: float) -> str:
-    return number(value).replace(".0e", "e")
 
 
 def _end_of_axis(axes: Axes, counted: float, fitted: float) -> None:

@@ -75,3 +75,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     header = "".join(f"<th>{escape(h)}</th>" for h in head)
     body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
     return f"<table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def tick_text(value: float, _: float) -> str:
+    """Text of a number on an axis: the formatter of logarithmic axes, whose own writes mathematics."""
+    return number(value).replace(".0e", "e")
