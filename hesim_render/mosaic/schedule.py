@@ -165,9 +165,3 @@ def blocks_of_run(
     instants = instants_us(cell, cell + CELL_US)
     beyond = int(instants[np.searchsorted(instants, end_us)])
     yield from instant_blocks(instants_us, window_us, first, beyond)
-
-
-def ticks_us(spec: EvsSpec, duration_us: int) -> NDArray[np.int64]:
-    """Times of the fixed comparisons: k·tick_us, k = 1, 2, …; each ends a window of window_us."""
-    assert spec.tick_us is not None
-    return np.arange(spec.tick_us, duration_us + 1, spec.tick_us, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Camera placement, and one ray per sample of each mosaic pixel.
+"""Camera placement.
 
 Camera space: x to the right of the image, y up, view direction −z, the origin at the centre of the
 entrance pupil. The optical axis meets the chip at the centre of the *full* sensor, or at the place that the lens in use
@@ -13,8 +13,6 @@ from math import atan2, degrees, radians, tan
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, Point2, Point3, Vector3
 from hesim_render.core.errors import SpecError
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sensor.lens import pixel_centres_mm
@@ -23,7 +21,6 @@ from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector
 
-_FWHM_PER_SIGMA = 2.3548200450309493  # 2 √(2 ln 2)
 #: From this camera's axes to Mitsuba's (x to the left, looking along +z), and back.
 MITSUBA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 
@@ -257,57 +254,3 @@ def _from_mitsuba(scene: SceneSpec, sensor: Sensor, camera: MitsubaCamera | None
     middle = (left + right) / 2, (top + bottom) / 2
     lens = replace(used.lens, axis_mm=(-middle[0] * image_mm, -middle[1] * image_mm))
     return _turned_to_region(View(matrix, replace(used, lens=lens), True, camera.near_m), middle)
-
-
-class RayFactory:
-    """Primary rays of mosaic pixels on the device: box aperture, Gaussian PSF, pinhole at the entrance pupil.
-
-    Rows and columns are those of the full sensor, so a crop's rays equal those of the full sensor to the bit.
-    """
-
-    def __init__(self, view: View) -> None:
-        import drjit as dr
-
-        types = jit()
-        geometry, lens = view.sensor.spec.geometry, view.sensor.lens
-        pitch_mm = geometry.pitch_um * 1e-3
-        # opaque, so that another lens or sensor needs no new kernel
-        self._middle = [
-            dr.opaque(types.Float, (count - 1) / 2 + axis / pitch_mm)
-            for count, axis in zip((geometry.cols, geometry.rows), lens.axis_mm, strict=True)
-        ]
-        #: Tangent of the chief ray's angle from one pixel to the next.
-        self._step = dr.opaque(types.Float, float(pitch_mm / lens.image_distance_mm))
-        psf_um = view.sensor.spec.lens.psf_fwhm_um
-        self.has_psf = psf_um > 0
-        self._sigma_px = dr.opaque(types.Float, float(psf_um / _FWHM_PER_SIGMA / geometry.pitch_um))
-        self._rotation = [[dr.opaque(types.Float, float(v)) for v in row] for row in view.camera_to_world[:3, :3]]
-        self._origin = [dr.opaque(types.Float, float(v)) for v in view.camera_to_world[:3, 3]]
-        self._near = dr.opaque(types.Float, view.near_m) if view.near_m > 0 else None
-
-    def rays(self, row: Float, col: Float, aperture: Point2, blur: Point2 | None) -> tuple[Point3, Vector3]:
-        """Origin and unit direction of one ray per lane in world space, with the camera at rest.
-
-        Parameters
-        ----------
-        row, col : Dr.Jit Float, position on the full sensor.
-        aperture : pair of Float in [0, 1), place inside the pixel.
-        blur : pair of Float in [0, 1) for the PSF, or None.
-        """
-        import drjit as dr
-
-        types = jit()
-        offset_x, offset_y = aperture[0] - 0.5, aperture[1] - 0.5
-        if blur is not None:  # Box-Muller
-            radius = self._sigma_px * dr.sqrt(-2 * dr.log(1 - blur[0]))
-            sine, cosine = dr.sincos(2 * dr.pi * blur[1])
-            offset_x, offset_y = offset_x + radius * cosine, offset_y + radius * sine
-        # half-integers relative to the centre of the chip are exact in float32
-        x = (col - self._middle[0] + offset_x) * self._step
-        y = (row - self._middle[1] + offset_y) * self._step
-        local = dr.normalize(types.Array3f(x, -y, -1.0))
-        direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
-        origin = types.Array3f(*self._origin)
-        if self._near is not None:  # the ray starts at that depth
-            origin = dr.fma(direction, self._near / -local.z, origin)
-        return origin, direction

@@ -13,8 +13,9 @@ from hesim_render.core.errors import RangeError
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.render.camera import RayFactory, place_camera
+from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.sampling.sampler import sampler_class
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
@@ -75,7 +76,7 @@ class Tracer:
         self.camera = next((trajectory for trajectory in tracks if trajectory.moves), None)
         mitsuba_scene = scene.spec.mitsuba
         self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
-        self._rays = RayFactory(self.view)
+        self.rays = RayFactory(self.view)
         self._sampler = sampler_class(mi.variant())()
         self._full_cols = dr.opaque(types.UInt32, self.sensor.spec.geometry.cols)
 
@@ -235,9 +236,9 @@ class PixelTracer(Tracer):
         sampler = self._sampler
         sampler.setup(self._key, index, half, sample, self.samples // 2)
         aperture, moment = sampler.next_3d()
-        blur = sampler.next_2d() if self._rays.has_psf else None
+        blur = sampler.next_2d() if self.rays.has_psf else None
         choice = sampler.next_1d()
-        origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
+        origin, direction = self.rays.rays(types.Float(row), types.Float(col), aperture, blur)
         if spread is not None:
             assert self.camera is not None
             pose = self.camera.pose_at(spread[0] + moment * spread[1])

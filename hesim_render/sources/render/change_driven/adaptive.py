@@ -36,6 +36,7 @@ class AdaptiveRenderer:
     ----------
     tracer, noise, quality, tuning : as given.
     gain : gain of stratified rays in this kind of scene.
+    zoom : finds pixels that small objects may cross.
     index : [row · cols + col], number of each mosaic pixel on the full sensor.
     counts : work done so far.
     """
@@ -46,7 +47,7 @@ class AdaptiveRenderer:
         self.counts = Counts()
         self._sensor = tracer.sensor
         self.index = self._sensor.layout.full_index.ravel()
-        self._zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning)
+        self.zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning)
         self._kept: dict[Role, Still] = {}
 
     def still(self, role: Role) -> Still:
@@ -85,7 +86,7 @@ class AdaptiveRenderer:
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
         width = self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
-        closer = self._zoom.sites(row, col, windows, numbers)
+        closer = self.zoom.sites(row, col, windows, numbers)
         found = take_pilot(self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer)
         self.counts.pilot_rays += self.tracer.rays_done - before
         return found
@@ -119,10 +120,11 @@ class AdaptiveRenderer:
         todo = what.rendered.copy()
         if first is not None:
             todo[0] = False
-        place = np.nonzero(todo)[1]
+        window, place = np.nonzero(todo)
         before = self.tracer.rays_done
+        aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         got = self.tracer.trace(
-            band.index[place], numbers[todo], windows, what.rays[todo], what.lit[todo], span_us=span_us
+            *(band.index[place], numbers[todo], windows, what.rays[todo], what.lit[todo]), span_us=span_us, aims=aims
         )
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,7 @@ from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import Blocks
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import traced_again
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
@@ -86,7 +88,7 @@ class ChangeDrivenFlux:
         self.view, self.sensor = self._tracer.view, self._tracer.sensor
         tracer = self._tracer
         self._renderer = AdaptiveRenderer(tracer, Noise(self.sensor, most_power), quality, tuning)
-        self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, tracer.least_distance_m)
+        self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self.is_static = not self._tracer.parts.groups and self._tracer.camera is None
         self._index = self._renderer.index
 
@@ -216,9 +218,12 @@ class ChangeDrivenFlux:
         if self._is_dark or pixel.size == 0:
             return np.zeros(pixel.size)
         renderer, index = self._renderer, self._index[pixel]
-        unit = renderer.noise.of("events" if events else "any", index)
+        role: Role = "events" if events else "any"
         wanted = quality if events else quality / renderer.tuning.frame_margin
-        return traced_again(self._tracer, index, begin_us, end_us, unit, wanted, renderer.gain, renderer.tuning)
+        return traced_again(
+            *(self._tracer, renderer.zoom, index, begin_us, end_us, partial(renderer.noise.of, role)),
+            *(wanted, renderer.gain, renderer.tuning),
+        )
 
     # ---- many windows -----------------------------------------------------------------------------
 

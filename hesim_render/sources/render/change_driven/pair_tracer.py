@@ -14,6 +14,7 @@ from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims, in_blocks
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
@@ -70,6 +71,7 @@ class PairTracer(Tracer):
         else:
             depth, roulette = (_told(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
+        self._aim = Aim(self.parts, self.rays)
         self._boxes = lru_cache(maxsize=8)(self._boxes_in)
         layout = self.sensor.layout
         tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
@@ -92,6 +94,7 @@ class PairTracer(Tracer):
         stream: Stream = Stream.RENDER,
         span_us: tuple[float, float] | None = None,
         repeat: int = 0,
+        aims: PairAims | None = None,
     ) -> PairFlux:
         """Flux of every listed pair.
 
@@ -105,6 +108,7 @@ class PairTracer(Tracer):
         stream : stream of random numbers.
         span_us : interval in which `PairFlux.met` tests for moving objects, µs; default: the windows themselves.
         repeat : number of the repetition; each has its own random numbers.
+        aims : small objects at which half of the rays are aimed, where a pair has any.
 
         Returns
         -------
@@ -114,18 +118,12 @@ class PairTracer(Tracer):
             np.empty(pixel.size, np.float32), np.empty(pixel.size, np.float32), np.empty(pixel.size, np.bool_)
         )
         packets = (samples // _PACKET).astype(np.int64)
-        ends = np.cumsum(packets)
         moments = self._moments(windows, span_us)
         key = self._key(stream, repeat)
-        first = 0
-        while first < pixel.size:
-            done = int(ends[first - 1]) if first else 0
-            last = int(np.searchsorted(ends, done + self._block_rays // _PACKET, side="right"))
-            part = slice(first, last)
+        for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims):
             lanes = [pixel[part], window[part].astype(np.uint32), lit[part].astype(np.uint32)]
-            self._trace_block(lanes, packets[part], moments, key, out, part)
-            self._report((int(ends[last - 1]) - done) * _PACKET)
-            first = last
+            self._trace_block(lanes, packets[part], moments, key, aimed, out, part)
+            self._report(int(packets[part].sum()) * _PACKET)
         # the lit estimate of a dark pixel may be negative; a flux is not
         below = np.minimum(out.mean, 0)
         scale = self._scale(pixel)
@@ -143,6 +141,7 @@ class PairTracer(Tracer):
         footprint_px: float,
         stream: Stream = Stream.RENDER_PILOT,
         span_us: tuple[float, float] | None = None,
+        aims: PairAims | None = None,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
 
@@ -153,6 +152,7 @@ class PairTracer(Tracer):
         pixel, window, windows, stream, span_us : see `trace`.
         samples : rays per pair, a power of two.
         footprint_px : width of the area in which the rays start, pixels.
+        aims : small objects at which half of the rays of each pair are aimed; each pair has one or more.
 
         Returns
         -------
@@ -168,40 +168,14 @@ class PairTracer(Tracer):
         room = max(1, self._block_rays // samples)
         for first in range(0, count, room):
             part = slice(first, min(count, first + room))
-            self._pilot_block(pixel[part], window[part].astype(np.uint32), moments, key, samples, footprint, out, part)
+            lanes = pixel[part], window[part].astype(np.uint32)
+            aimed = None if aims is None else aims.part(part)
+            self._pilot_block(lanes, moments, key, samples, footprint, aimed, out, part)
             self._report((part.stop - first) * samples)
         scale = self._scale(pixel)
         for values in (out.lit, out.hidden, out.unshadowed, out.lit_scatter, out.hidden_scatter):
             values *= scale
         return out
-
-    def least_distance_m(self, t_us: float, grid: tuple[int, int] = (24, 32)) -> float:
-        """Least depth of the resting surfaces in view, over an even grid of the picture, m.
-
-        Depth is measured along the camera's axis. It is infinite where nothing is seen.
-        """
-        import drjit as dr
-
-        mitsuba()
-        mi, types, geometry = self.built.mi, jit(), self.sensor.spec.geometry
-        left, right, top, bottom = self.view.followed_mm
-        x = left + (np.arange(grid[1]) + 0.5) / grid[1] * (right - left)
-        y = top + (np.arange(grid[0]) + 0.5) / grid[0] * (bottom - top)
-        pitch_mm = geometry.pitch_um * 1e-3
-        row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, grid[1])
-        col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, grid[0])
-        middle = types.Float(0.5), types.Float(0.5)
-        rows, cols = (types.Float(values.astype(np.float32)) for values in (row, col))
-        origin, direction = self._rays.rays(rows, cols, middle, None)
-        axis = -self.view.camera_to_world[:3, 2]
-        if self.camera is not None:
-            matrix = self.camera.matrix(t_us)
-            axis = matrix[:3, :3] @ axis
-            pose = self.camera.pose_at(types.Float(float(self.camera.local_us(t_us))))
-            origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
-        ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        far = self.parts.resting_distance(ray)
-        return float(dr.min(far * dr.dot(ray.d, mi.Vector3f(axis)))[0])
 
     def _key(self, stream: Stream, repeat: int = 0) -> UInt64:
         import drjit as dr
@@ -236,8 +210,9 @@ class PairTracer(Tracer):
         packets: NDArray[np.int64],
         moments: Moments,
         key: UInt64,
+        aims: PairAims | None,
         out: PairFlux,
-        part: slice,
+        part: slice | NDArray[np.int64],
     ) -> None:
         """Trace some pairs in packets of `_PACKET` rays."""
         import drjit as dr
@@ -255,8 +230,16 @@ class PairTracer(Tracer):
         per_half = spread_out(types.UInt32, half_rays, packet)
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
         pixel, window, lit = (spread_out(types.UInt32, values[pair], packet) for values in lanes)
-        self._sampler.setup(key, pixel, half, sample - half * per_half, per_half, MOST_SAMPLES // 2)
-        if_lit, if_hidden, _, met = self._rays_of(pixel, window, moments, types.Float(1.0))
+        within_half, aimed = sample - half * per_half, None
+        if aims is not None:
+            # rays of either kind have random numbers of their own, and are stratified among themselves
+            per_half //= 2
+            is_aimed = within_half >= per_half
+            aimed = LaneAims.of(aims, pair, packet, is_aimed)
+            within_half = dr.select(is_aimed, within_half - per_half, within_half)
+            half += dr.select(is_aimed, types.UInt32(2), 0)
+        self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2)
+        if_lit, if_hidden, _, met = self._rays_of(pixel, window, moments, types.Float(1.0), aimed)
         flux = dr.select(lit != 0, if_lit, if_hidden)
         met = _bits(types.UInt32, met, used * _PACKET)
         dr.eval(flux, met)
@@ -273,31 +256,42 @@ class PairTracer(Tracer):
 
     def _pilot_block(
         self,
-        pixels: NDArray[np.uint32],
-        window: NDArray[np.uint32],
+        lanes: tuple[NDArray[np.uint32], NDArray[np.uint32]],
         moments: Moments,
         key: UInt64,
         samples: int,
         footprint: Float,
+        aims: PairAims | None,
         out: PilotFlux,
         part: slice,
     ) -> None:
         import drjit as dr
 
         types = jit()
+        count = lanes[0].size * samples
         rays = dr.opaque(types.UInt32, samples)
-        ray_index = dr.arange(types.UInt32, pixels.size * samples)
+        ray_index = dr.arange(types.UInt32, count)
         lane = ray_index // rays
-        pixel, number = spread_out(types.UInt32, pixels, lane), spread_out(types.UInt32, window, lane)
-        self._sampler.setup(key, pixel, types.UInt32(0), ray_index - lane * rays, rays, MOST_SAMPLES // 2)
-        lit, hidden, unshadowed, met = self._rays_of(pixel, number, moments, footprint)
-        bits = _bits(types.UInt32, met, pixels.size * samples)
+        pixel, number = (spread_out(types.UInt32, values, lane) for values in lanes)
+        # rays that are aimed are a kind of their own: their mean differs from that of the others
+        kind, alike, half, aimed = lane, samples, types.UInt32(0), None
+        if aims is not None:
+            alike = samples // 2
+            kind = ray_index // dr.opaque(types.UInt32, alike)
+            half = 2 * (kind & 1)
+            aimed = LaneAims.of(aims, None, lane, half > 0)
+        per_kind = dr.opaque(types.UInt32, alike)
+        self._sampler.setup(key, pixel, half, ray_index - kind * per_kind, per_kind, MOST_SAMPLES // 2)
+        lit, hidden, unshadowed, met = self._rays_of(pixel, number, moments, footprint, aimed)
+        bits = _bits(types.UInt32, met, count)
         dr.eval(lit, hidden, unshadowed, bits)
         self._sampler.rest()
-        share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, samples / (samples - 1))
+        share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, alike / (alike - 1))
+        per_share = dr.opaque(types.Float, 1 / alike)
         for values, name in ((lit, "lit"), (hidden, "hidden")):
             mean = dr.block_sum(values, samples) * share
-            square = dr.square(values - dr.gather(types.Float, mean, lane))
+            own = dr.block_sum(values, alike) * per_share
+            square = dr.square(values - dr.gather(types.Float, own, kind))
             fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
             # these rays are a sample of the scatter in the scene
             scatter = dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
@@ -307,27 +301,36 @@ class PairTracer(Tracer):
         out.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, bits, samples))
 
     def _rays_of(
-        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float
+        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | None
     ) -> tuple[Float, Float, Float, Mask]:
-        """The integrator's `flux` of one ray per lane, with the scale of the optical axis."""
+        """The integrator's `flux` of one ray per lane, weighted, with the scale of the optical axis."""
         import drjit as dr
 
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(pixel)
         sampler = self._sampler
         aperture, moment = sampler.next_3d()
-        aperture = (aperture - 0.5) * footprint + 0.5
-        blur = sampler.next_2d() if self._rays.has_psf else None
-        origin, direction = self._rays.rays(types.Float(row), types.Float(col), aperture, blur)
+        widened = (aperture - 0.5) * footprint + 0.5
+        blur = sampler.next_2d() if self.rays.has_psf else None
+        centre = types.Float(col), types.Float(row)
+        (x, y), weight, slot = self.rays.offset(widened, blur), None, types.UInt32(0)
+        if aims is not None:
+            slot, moment = self._aim.choose(aims, moment)
         now = moments.at(window, moment)
-        if self.camera is not None:
-            pose = self.camera.pose_at(now.local_us(len(self.parts.groups)))
+        pose = None if self.camera is None else self.camera.pose_at(now.local_us(len(self.parts.groups)))
+        if aims is not None:
+            x, y, weight = self._aim.place(aims, slot, now, pose, centre, (x, y), aperture)
+        origin, direction = self.rays.towards(centre[1], centre[0], x, y)
+        if pose is not None:
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
         tile_row = row - row // self._tile_rows * self._tile_rows
         tile_col = col - col // self._tile_cols * self._tile_cols
         which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        return self._integrator.flux(sampler, primary, now, which)
+        lit, hidden, unshadowed, met = self._integrator.flux(sampler, primary, now, which)
+        if weight is None:
+            return lit, hidden, unshadowed, met
+        return lit * weight, hidden * weight, unshadowed * weight, met
 
 
 def _bits(kind: type[UInt32], condition: Mask, count: int) -> UInt32:

@@ -8,12 +8,13 @@ a change of the scene, not of the rays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
@@ -52,6 +53,7 @@ class Pilot:
     lit_scatter, hidden_scatter : scatter of single rays for each estimator, e⁻/s.
     unshadowed : flux if nothing hid any light, e⁻/s.
     closer : results of extra rays at some sites, one entry per window; empty where there were none.
+    aims : small objects at which rays are aimed; None if there are none.
     """
 
     lit: NDArray[np.float32]
@@ -60,6 +62,7 @@ class Pilot:
     hidden_scatter: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
     closer: list[Closer] = field(default_factory=list)
+    aims: Aims | None = None
 
     @property
     def windows(self) -> int:
@@ -116,8 +119,10 @@ def take_pilot(
         more = tracer.pilot(pixel, later.ravel(), windows, rays, width_px)
         for values, told in zip(_tables(pilot), _tables(more), strict=True):
             values[1:, moving] = told.reshape(later.shape)
-    pilot.closer.extend(_look_closer(tracer, sites, windows, numbers, pilot, width_px, closer))
-    return pilot, near
+    looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
+    aims = Aims.of([(window, *look.aims) for window, look in looks if look.aims is not None], sites.size)
+    found_closer = _look_closer(tracer, sites, windows, numbers, pilot, width_px, looks, aims)
+    return replace(pilot, closer=found_closer, aims=aims), near
 
 
 def _look_closer(
@@ -127,23 +132,33 @@ def _look_closer(
     numbers: NDArray[np.int64],
     pilot: Pilot,
     width_px: float,
-    closer: Sequence[Sequence[Look]],
+    looks: Sequence[tuple[int, Look]],
+    aims: Aims | None,
 ) -> list[Closer]:
-    """Trace extra pilot rays. Results for large objects replace those of the pilot; those for small objects are
-    returned.
+    """Trace extra pilot rays, listed with their windows. Results for large objects, and those of aimed rays, replace
+    those of the pilot; results for small objects are returned.
     """
-    looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
     nothing = Closer(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
-    parts = [[nothing] for _ in closer]
+    parts = [[nothing] for _ in range(numbers.shape[0])]
+    kinds = sorted({(look.is_small, look.aims is not None, look.rays) for _, look in looks})
     # large objects first: a pixel may show a small object as well, whose result must stay
-    for is_small, rays in sorted({(look.is_small, look.rays) for _, look in looks}):
-        alike = [(window, look.place) for window, look in looks if (look.is_small, look.rays) == (is_small, rays)]
+    for is_small, is_aimed, rays in kinds:
+        alike = [
+            (window, look.place)
+            for window, look in looks
+            if (look.is_small, look.aims is not None, look.rays) == (is_small, is_aimed, rays)
+        ]
         place = np.concatenate([places for _, places in alike])
         window = np.concatenate([np.full(places.size, window) for window, places in alike])
-        told = tracer.pilot(sites.index[place], numbers[window, place], windows, rays, width_px, Stream.RENDER_ZOOM)
-        if not is_small:
+        own_aims = aims.at(window, place) if is_aimed and aims is not None else None
+        width = 1.0 if is_aimed else width_px
+        told = tracer.pilot(
+            *(sites.index[place], numbers[window, place], windows, rays, width, Stream.RENDER_ZOOM), aims=own_aims
+        )
+        if is_aimed or not is_small:
             for values, found in zip(_tables(pilot), _tables(told), strict=True):
                 values[window, place] = found
+        if not is_small:
             continue
         for number in np.unique(window):
             own = window == number

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, allocate
@@ -60,12 +61,14 @@ class Plan:
     rays : number of rays of each rendered pair, a power of two.
     lit : True for the lit estimator, False for the hidden one, see `MattIntegrator`.
     error : expected standard error, e⁻/s.
+    aims : small objects at which rays are aimed, by window and site; None if there are none.
     """
 
     rendered: NDArray[np.bool_]
     rays: NDArray[np.int16]
     lit: NDArray[np.bool_]
     error: NDArray[np.float32]
+    aims: Aims | None = None
 
 
 def plan(
@@ -90,7 +93,11 @@ def plan(
     shape = count, sites.listed.size
     units = np.stack([unit(pilot.flux_of(window)) for window in range(count)])
     out = Plan(
-        np.ones(shape, np.bool_), np.zeros(shape, np.int16), np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
+        np.ones(shape, np.bool_),
+        np.zeros(shape, np.int16),
+        np.zeros(shape, np.bool_),
+        np.zeros(shape, np.float32),
+        pilot.aims,
     )
     if last > 1:
         flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units

@@ -9,7 +9,9 @@ the read-out region.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +37,14 @@ class Look:
     place : [k], places among the pixels that were asked about.
     rays : rays per pixel.
     is_small : True if a small object causes the look.
+    aims : numbers of the places at which rays are aimed, and of the moving groups at which they are, [m] each; None
+        where no rays are.
     """
 
     place: NDArray[np.int64]
     rays: int
     is_small: bool
+    aims: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
 
 
 @dataclass(frozen=True)
@@ -50,11 +55,15 @@ class Outline:
     ----------
     low, high : [2] each, least and largest column and row, pixels.
     sides : [k, 3], (a, b, c) with a·col + b·row + c ≤ 0 inside, (a, b) of length 1; empty if the box is the outline.
+    is_small : True if few rays could miss the object.
+    target : number of the moving group, if rays are aimed at it.
     """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     sides: NDArray[np.float64]
+    is_small: bool = True
+    target: int | None = None
 
     def inside(self, col: NDArray[np.float64], row: NDArray[np.float64], margin_px: float) -> NDArray[np.bool_]:
         """True for points inside the outline or at most `margin_px` pixels outside it."""
@@ -81,29 +90,35 @@ class Zoom:
     ) -> None:
         self._view, self._camera, self._groups = view, camera, groups
         self._is_matt, self._tuning = is_matt, tuning
+        # bands of rows ask for the same windows one after another, and so does the audit
+        self._outlines = lru_cache(maxsize=64)(self._outlines_in)
         geometry = view.sensor.spec.geometry
         left, right, top, bottom = (edge / (geometry.pitch_um * 1e-3) for edge in view.followed_mm)
         middle = np.array([geometry.cols / 2, geometry.rows / 2])
         self._low, self._high = np.array([left, top]) + middle, np.array([right, bottom]) + middle
+        # from the centre of a pixel to its corners, and the blur
+        psf_px = view.sensor.spec.lens.psf_fwhm_um / geometry.pitch_um
+        self._aim_margin_px = 0.5**0.5 + psf_px
 
-    def _outlines(self, begin_us: float, end_us: float) -> list[tuple[list[Outline], int, bool]]:
+    def _outlines_in(self, begin_us: float, end_us: float) -> list[tuple[list[Outline], int, bool]]:
         """Outlines in one window, the number of pilot rays of a pixel inside any of them, and whether they are
         small.
         """
         found: dict[bool, list[tuple[float, Outline]]] = {True: [], False: []}
         margin, tuning = self._tuning.zoom_margin_px, self._tuning
-        for group in self._groups:
-            extent, outline = self._outline(group, begin_us, end_us)
-            is_small = extent <= tuning.small_px
-            if outline is None or (self._is_matt and not is_small):
+        for number, group in enumerate(self._groups):
+            outline = self._outline(number, group, begin_us, end_us)
+            if outline is None or (self._is_matt and not outline.is_small):
                 continue
             size = np.maximum(np.minimum(outline.high, self._high) - np.maximum(outline.low, self._low), 0) + 2 * margin
-            found[is_small].append((float(np.prod(size)), outline))
+            found[outline.is_small].append((float(np.prod(size)), outline))
         looks = []
         for is_small, entries in found.items():
             entries.sort(key=lambda entry: entry[0])
-            room = (tuning.zoom_room if is_small else tuning.gloss_room) * float(np.prod(self._high - self._low))
-            areas = np.cumsum([area for area, _ in entries])
+            picture = float(np.prod(self._high - self._low))
+            room = (tuning.zoom_room if is_small else tuning.gloss_room) * picture
+            # outlines overlap where there are many
+            areas = np.minimum(np.cumsum([area for area, _ in entries]), picture)
             rays = tuning.zoom_rays
             while rays > 2 * tuning.pilot_rays and not (areas.size and areas[-1] * rays <= room):
                 rays //= 2
@@ -112,10 +127,8 @@ class Zoom:
                 looks.append(([outline for _, outline in entries[:some]], rays, is_small))
         return looks
 
-    def _outline(self, group: Group, begin_us: float, end_us: float) -> tuple[float, Outline | None]:
-        """Least extent of an object in the image at any instant, pixels, and the area that it sweeps; None outside
-        the view.
-        """
+    def _outline(self, number: int, group: Group, begin_us: float, end_us: float) -> Outline | None:
+        """The area that an object sweeps; None outside the view."""
         points, extents, wider = [], [], 0.0
         if self._camera is None:
             found = places(group.corners, group.trajectory, begin_us, end_us)
@@ -125,18 +138,20 @@ class Zoom:
             rest = np.broadcast_to(self._view.camera_to_world, (len(corners), 4, 4))
             seen, px_per_m = self._view.project_on_sensor(corners, rest)
             points.append(seen.reshape(-1, 2))
-            extents.append(np.ptp(seen, axis=1).min())
+            extents.append(np.ptp(seen, axis=1))
             wider = max(wider, margin * float(px_per_m.max()))
         every = np.concatenate(points)
         low, high = every.min(axis=0) - wider, every.max(axis=0) + wider
         if np.any(high < self._low) or np.any(low > self._high) or not np.all(np.isfinite(every)):
-            return 0.0, None
+            return None
         try:
             sides = ConvexHull(every).equations.copy()
             sides[:, 2] -= wider
         except QhullError:  # points on a line (an object seen edge-on): use their bounding box
             sides = np.empty((0, 3))
-        return float(min(extents)), Outline(low, high, sides)
+        extent = np.concatenate(extents)
+        is_small = bool(extent.min() <= self._tuning.small_px)
+        return Outline(low, high, sides, is_small, number if extent.max() <= self._tuning.aim_px else None)
 
     def sites(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, numbers: NDArray[np.int64]
@@ -167,21 +182,56 @@ class Zoom:
         step = np.maximum((end - begin) / _PARTS, 1.0)
         times = np.stack([np.floor(begin / step) * step, np.ceil(end / step) * step])
         looks, which = np.unique(times, axis=1, return_inverse=True)
-        found = []
+        found: list[Look] = []
         for look, (low, high) in enumerate(looks.T):
+            mine = np.flatnonzero(which.ravel() == look)
+            places = np.full(shape, -1)
+            places[row[mine] - top, col[mine] - left] = mine
             for outlines, rays, is_small in self._outlines(float(low), float(high)):
-                inside = self._image(outlines, top, left, shape)[row - top, col - left]
-                found.append(Look(np.flatnonzero(inside & (which.ravel() == look)), rays, is_small))
+                found.extend(self._looks(outlines, rays, is_small, places, top, left))
         return found
 
-    def _image(self, outlines: list[Outline], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """Pixels inside any outline, within a rectangle that begins at row `top` and column `left`."""
-        image, margin = np.zeros(shape, np.bool_), self._tuning.zoom_margin_px
+    def _looks(
+        self, outlines: list[Outline], rays: int, is_small: bool, places: NDArray[np.int64], top: int, left: int
+    ) -> Iterator[Look]:
+        """Looks at the pixels inside any outline.
+
+        Parameters
+        ----------
+        places : number of each pixel within a rectangle that begins at row `top` and column `left`; -1 for pixels that
+            were not asked about.
+        """
+        inside, aimed = np.zeros(places.shape, np.bool_), np.zeros(places.shape, np.bool_)
+        sites, targets = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for outline in outlines:
-            low = np.maximum(np.floor(outline.low - margin).astype(np.int64) - [left, top], 0)
-            high = np.minimum(np.ceil(outline.high + margin).astype(np.int64) - [left, top], shape[::-1])
-            if np.any(high <= low):
+            image, part = self._image(outline, top, left, places.shape, self._tuning.zoom_margin_px)
+            if outline.target is None:
+                inside[part] |= image
                 continue
-            x, y = np.arange(low[0], high[0])[None] + left + 0.5, np.arange(low[1], high[1])[:, None] + top + 0.5
-            image[low[1] : high[1], low[0] : high[0]] |= outline.inside(x, y, margin)
-        return image
+            aimed[part] |= image
+            image, part = self._image(outline, top, left, places.shape, self._aim_margin_px)
+            own = places[part][image]
+            sites.append(own[own >= 0])
+            targets.append(np.full(sites[-1].size, outline.target))
+        site, target = np.concatenate(sites), np.concatenate(targets)
+        has_target = np.zeros(int(places.max()) + 1, np.bool_)
+        has_target[site] = True
+        asked = places >= 0
+        for some, count in ((inside, rays), (aimed & ~inside, min(rays, self._tuning.aim_rays))):
+            place = places[some & asked]
+            at = has_target[place]
+            if not at.all():
+                yield Look(place[~at], count, is_small)
+            if at.any():
+                listed = np.isin(site, place[at])
+                yield Look(place[at], count, is_small, (site[listed], target[listed]))
+
+    def _image(
+        self, outline: Outline, top: int, left: int, shape: tuple[int, ...], margin_px: float
+    ) -> tuple[NDArray[np.bool_], tuple[slice, slice]]:
+        """Pixels inside an outline, in a part of a rectangle that begins at row `top` and column `left`."""
+        low = np.maximum(np.floor(outline.low - margin_px).astype(np.int64) - [left, top], 0)
+        high = np.minimum(np.ceil(outline.high + margin_px).astype(np.int64) - [left, top], shape[::-1])
+        high = np.maximum(low, high)
+        x, y = np.arange(low[0], high[0])[None] + left + 0.5, np.arange(low[1], high[1])[:, None] + top + 0.5
+        return outline.inside(x, y, margin_px), (slice(low[1], high[1]), slice(low[0], high[0]))

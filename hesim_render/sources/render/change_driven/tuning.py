@@ -43,6 +43,10 @@ class Tuning:
         get no extra rays.
     small_px : px, F. An object is small if its least extent in the image is at most this. Without (0): as without
         `zoom_rays`.
+    aim_px : px, C. Rays are aimed at an object whose largest extent in the image is at most this. Without (0): objects
+        that cover a thousandth of a pixel need more than `most_rays`.
+    aim_rays : rays, C. Pilot rays for a pixel at whose small objects rays are aimed. Without (as many as `zoom_rays`):
+        pilot passes of many small objects take longer than the picture.
     footprint_px : px, F. Width of the area in which pilot rays start. Without (1): edges are noticed only after
         they have entered the pixel.
     lone_footprint_px : px, F. The same where pixels lie apart. Without: as above, with no neighbour to notice them.
@@ -92,6 +96,8 @@ class Tuning:
     gloss_room: float = 16.0
     zoom_margin_px: float = 1.0
     small_px: float = 8.0
+    aim_px: float = 1.0
+    aim_rays: int = 32
     footprint_px: float = 1.25
     lone_footprint_px: float = 1.75
     tolerance: float = 3.0

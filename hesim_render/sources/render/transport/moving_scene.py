@@ -26,6 +26,7 @@ from hesim_render.core.device_types import (
     MitsubaModule,
     MitsubaObject,
     Ray,
+    UInt32,
     Vector3,
 )
 from hesim_render.core.errors import SpecError
@@ -245,6 +246,10 @@ class MovingScene:
             hit, _, near = self._fleet.nearest(ray, moment, dr.minimum(ray.maxt, nearest), active)
             nearest, met = dr.select(hit.is_valid(), hit.t, nearest), met | near
         return nearest, met
+
+    def pose(self, group: UInt32, moment: Moment) -> DevicePose:
+        """Pose of the group whose number each lane holds."""
+        return self._tracks.pose(group, moment.local_us(group))
 
     def resting_distance(self, ray: Ray) -> Float:
         """Distance to the nearest resting surface, m; infinite where there is none."""

@@ -1,0 +1,37 @@
+"""How near the resting surfaces in view are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hesim_render.core.backend import jit
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+
+
+def least_depth_m(tracer: PairTracer, t_us: float, grid: tuple[int, int] = (24, 32)) -> float:
+    """Least depth of the resting surfaces in view at a time, over an even grid of the picture, m.
+
+    Depth is measured along the camera's axis. It is infinite where nothing is seen.
+    """
+    import drjit as dr
+
+    mitsuba()  # the variant may have been changed by other code
+    mi, types, geometry, view = tracer.built.mi, jit(), tracer.sensor.spec.geometry, tracer.view
+    left, right, top, bottom = view.followed_mm
+    x = left + (np.arange(grid[1]) + 0.5) / grid[1] * (right - left)
+    y = top + (np.arange(grid[0]) + 0.5) / grid[0] * (bottom - top)
+    pitch_mm = geometry.pitch_um * 1e-3
+    row = np.repeat(y / pitch_mm + (geometry.rows - 1) / 2, grid[1])
+    col = np.tile(x / pitch_mm + (geometry.cols - 1) / 2, grid[0])
+    rows, cols = (types.Float(values.astype(np.float32)) for values in (row, col))
+    origin, direction = tracer.rays.towards(rows, cols, types.Float(0), types.Float(0))
+    axis = -view.camera_to_world[:3, 2]
+    if tracer.camera is not None:
+        matrix = tracer.camera.matrix(t_us)
+        axis = matrix[:3, :3] @ axis
+        pose = tracer.camera.pose_at(types.Float(float(tracer.camera.local_us(t_us))))
+        origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
+    ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
+    far = tracer.parts.resting_distance(ray)
+    return float(dr.min(far * dr.dot(ray.d, mi.Vector3f(axis)))[0])
