@@ -62,9 +62,12 @@ def test_the_numbers_of_a_long_run_come_from_a_part_of_it(pieces, rel):
 
 def test_fixed_ticks_are_sampled_like_instants():
     spec = hr.load_sensor("reference-mono").spec.evs
-    length_us = 4_000 * 1_000_000
+    begin_us, length_us = 1_000 * 1_000_000, 4_000 * 1_000_000
     stretch_us = 16 * spec.tick_us
-    sample = sample_of_blocks(lambda a, b: tick_blocks(spec, a, b), stretch_us, 0, length_us, seed=3)
+    sample = sample_of_blocks(lambda a, b: tick_blocks(spec, a, b), stretch_us, begin_us, begin_us + length_us, seed=3)
     assert len(sample.blocks) == 1024
+    part_us = length_us / 1024
+    assert begin_us <= sample.blocks[0].end_us[-1] < begin_us + part_us + stretch_us
+    assert begin_us + length_us - part_us < sample.blocks[-1].end_us[-1] <= begin_us + length_us
     assert sample.count == pytest.approx(length_us / stretch_us)
     assert sample.windows == pytest.approx(length_us / spec.tick_us)
