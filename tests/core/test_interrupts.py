@@ -89,7 +89,7 @@ main(["doctor"])
     child = _start(sys.executable, "-c", lost)
     assert child.stdout.readline() == "there\n"  # it went on
     began = time.monotonic()
-    out, err = child.communicate(timeout=60)
+    _, err = child.communicate(timeout=60)
     assert (child.returncode, err) == (INTERRUPTED, "hesim-render: interrupted\n")
     assert time.monotonic() - began < 2
 
