@@ -113,7 +113,15 @@ def test_python_gets_a_keyboard_interrupt_at_the_next_step():
     assert (status, out, err) == (0, "KeyboardInterrupt\n", "")
 
 
-def test_an_interrupt_waits_while_native_libraries_are_loaded():
+@pytest.fixture
+def python_handles_interrupts():
+    """Where a shell started the tests in its background, they ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_waits_while_native_libraries_are_loaded(python_handles_interrupts):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     loaded = False
     with pytest.raises(KeyboardInterrupt), interrupts_held():
