@@ -264,13 +264,9 @@ def test_flickering_pixels_are_told_from_hot_ones_and_so_are_their_times():
     assert np.all(classify(steady, steps, np.ones(2400, bool)).kind == Defect.HOT)
 
 
-def with_parts(folder, target, parts=8, trials=4, **arrays):
-    """The captures, as if 32 trials in the brightest light had been counted in parts."""
-    data = dict(np.load(folder / "evs_noise_rate.npz"))
-    silent = (data["n_calm"][-1] - data["n_on"][-1].sum(axis=0) - data["n_off"][-1].sum(axis=0)).astype(int)
-    disturbed = parts * trials - silent
-    each = np.stack([(disturbed + k) // parts for k in range(parts)])
-    given = {"bright_parts": each, "part_trials": np.array(trials), "part_us": np.array(trials * TRIAL_S * 1e6)}
+def with_parts(folder, target, parts, trials, **arrays):
+    """The captures, as if the trials in the brightest light had been counted in parts."""
+    given = reset_captures.parts_of(np.load(folder / "evs_noise_rate.npz"), parts, trials, TRIAL_S)
     return spoiled(folder, target, "evs_noise_rate", **given | arrays)
 
 

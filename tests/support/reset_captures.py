@@ -128,3 +128,11 @@ def write(folder, pixels, rng, shape=(32, 32), count=12, steps=8, change=None, n
             n_off=off_.reshape(*off_.shape[:2], *shape).astype(np.uint16),
         )
     return on, off
+
+
+def parts_of(data, parts, trials, trial_s):
+    """Arrays as if the trials in the last light had been ``parts`` times ``trials``, with events evenly over the parts."""
+    silent = data["n_calm"][-1].astype(int) - data["n_on"][-1].sum(axis=0) - data["n_off"][-1].sum(axis=0)
+    disturbed = parts * trials - silent
+    each = np.stack([(disturbed + k) // parts for k in range(parts)])
+    return {"bright_parts": each, "part_trials": np.array(trials), "part_us": np.array(trials * trial_s * 1e6)}
