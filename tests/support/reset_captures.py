@@ -131,8 +131,9 @@ def write(folder, pixels, rng, shape=(32, 32), count=12, steps=8, change=None, n
 
 
 def parts_of(data, parts, trials, trial_s):
-    """Arrays as if the trials in the last light had been ``parts`` times ``trials``, with events evenly over the parts."""
-    silent = data["n_calm"][-1].astype(int) - data["n_on"][-1].sum(axis=0) - data["n_off"][-1].sum(axis=0)
+    """Arrays as if there had been `parts` times `trials` trials in the last light, with events evenly over the parts."""
+    calm, on, off = (data[name][-1].astype(int) for name in ("n_calm", "n_on", "n_off"))
+    silent = calm - on.sum(axis=0) - off.sum(axis=0)
     disturbed = parts * trials - silent
     each = np.stack([(disturbed + k) // parts for k in range(parts)])
     return {"bright_parts": each, "part_trials": np.array(trials), "part_us": np.array(trials * trial_s * 1e6)}
