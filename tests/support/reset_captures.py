@@ -131,7 +131,7 @@ def write(folder, pixels, rng, shape=(32, 32), count=12, steps=8, change=None, n
 
 
 def parts_of(data, parts, trials, trial_s):
-    """Arrays as if there had been `parts` times `trials` trials in the last light, with events evenly over the parts."""
+    """Arrays as if the last light had had `parts` times `trials` trials, with events evenly over the parts."""
     calm, on, off = (data[name][-1].astype(int) for name in ("n_calm", "n_on", "n_off"))
     silent = calm - on.sum(axis=0) - off.sum(axis=0)
     disturbed = parts * trials - silent
