@@ -32,8 +32,10 @@ except PackageNotFoundError:  # run from a source tree that was never installed
 
 # Imported on first use: the command line must answer --help without loading a renderer.
 _HOMES = {
+    "ImuModel": "hesim_render.sources.render.truth.imu",
     "Recording": "hesim_render.recording.recording",
     "Scene": "hesim_render.sources.scene",
+    "SceneTruth": "hesim_render.sources.render.truth.scene_truth",
     "Sensor": "hesim_render.sensor.sensor",
     "load_scene": "hesim_render.sources.scene",
     "load_sensor": "hesim_render.sensor.sensor",
@@ -43,8 +45,10 @@ _HOMES = {
 }
 
 __all__ = [
+    "ImuModel",
     "Recording",
     "Scene",
+    "SceneTruth",
     "Sensor",
     "__version__",
     "load_scene",
@@ -60,6 +64,8 @@ if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
     from hesim_render.sensor.photocurrent import photocurrent
     from hesim_render.sensor.sensor import Sensor, load_sensor
+    from hesim_render.sources.render.truth.imu import ImuModel
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene, load_scene
 
 

@@ -108,6 +108,7 @@ class MovingScene:
     Parameters
     ----------
     built : from `build`; its moving shapes may be at any pose.
+    geometry_only : True if the scene is used to find surfaces, not to render them; no scene is then refused.
 
     Raises
     ------
@@ -116,15 +117,10 @@ class MovingScene:
         path tracer, or it hides lights.
     """
 
-    def __init__(self, built: BuiltScene) -> None:
+    def __init__(self, built: BuiltScene, geometry_only: bool = False) -> None:
         mi = built.mi
-        if built.exact_because is not None:
-            raise NeedsExactMode(built.exact_because)
-        if not path_traced(built):
-            name = built.integrator.class_name()
-            raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
-        if built.integrator.hide_emitters:
-            raise NeedsExactMode("the integrator hides lights that are seen directly")
+        if not geometry_only:
+            _require_paths(built)
         self.mi = mi
         moving = {
             shape: group
@@ -141,7 +137,7 @@ class MovingScene:
             if group is None:
                 resting[f"shape_{number}"] = shape
                 continue
-            if shape.is_emitter():
+            if shape.is_emitter() and not geometry_only:
                 raise NeedsExactMode(f"{group!r} moves and emits light")
             parts[group][f"shape_{number}"] = shape
         emitters = built.scene.emitters()
@@ -294,6 +290,17 @@ class MovingScene:
 
             state = dr.if_stmt(state, near, turn_to, lambda *state: state, label="moving group")
         return state, met
+
+
+def _require_paths(built: BuiltScene) -> None:
+    """Refuse scenes that paths between surfaces do not describe."""
+    if built.exact_because is not None:
+        raise NeedsExactMode(built.exact_because)
+    if not path_traced(built):
+        name = built.integrator.class_name()
+        raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
+    if built.integrator.hide_emitters:
+        raise NeedsExactMode("the integrator hides lights that are seen directly")
 
 
 def _at_rest(ray: Ray, pose: DevicePose) -> Ray:
