@@ -33,6 +33,6 @@ def _app(
 
 for _command in (
     doctor.doctor, doctor.list_, simulate.simulate, video.video, simulate.demo, calibrate.lab, calibrate.calibrate,
-    look.isp, look.view,
+    look.isp, look.view, look.export,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,15 @@ class FolderWriter:
 
     def set_events_dropped(self, count: int) -> None:
         self._dropped = int(count)
+
+    def write_in(self, name: str, write: Callable[[Path], object]) -> None:
+        """Have a function write one more file, whose path it gets."""
+        with output_errors(self._folder.target):
+            write(self._folder.path / name)
+
+    def copy_in(self, source: Path, name: str) -> None:
+        """Copy one more file."""
+        self.write_in(name, lambda path: shutil.copyfile(source, path))
 
     def finish(self) -> Path:
         """Write the manifest, call `DRAWERS`, and rename the folder to its final name, which is returned."""
