@@ -40,8 +40,11 @@ _HOMES = {
     "load_scene": "hesim_render.sources.scene",
     "load_sensor": "hesim_render.sensor.sensor",
     "photocurrent": "hesim_render.sensor.photocurrent",
+    "read_spectral_exr": "hesim_render.sources.render.cube",
+    "render_cube": "hesim_render.sources.render.cube",
     "simulate": "hesim_render.capture.simulate",
     "simulate_video": "hesim_render.capture.simulate_video",
+    "write_spectral_exr": "hesim_render.sources.render.cube",
 }
 
 __all__ = [
@@ -54,8 +57,11 @@ __all__ = [
     "load_scene",
     "load_sensor",
     "photocurrent",
+    "read_spectral_exr",
+    "render_cube",
     "simulate",
     "simulate_video",
+    "write_spectral_exr",
 ]
 
 if TYPE_CHECKING:
@@ -64,6 +70,7 @@ if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
     from hesim_render.sensor.photocurrent import photocurrent
     from hesim_render.sensor.sensor import Sensor, load_sensor
+    from hesim_render.sources.render.cube import read_spectral_exr, render_cube, write_spectral_exr
     from hesim_render.sources.render.truth.imu import ImuModel
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene, load_scene
