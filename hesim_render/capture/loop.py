@@ -20,6 +20,7 @@ from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import Block, Exposure, exposures, tick_blocks
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
+from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
@@ -99,10 +100,11 @@ class Capture:
         run in which it ends.
     pixels : state of the event pixels at the end of the previous run (its `pixel_state`). Both runs together
         then equal one run.
+    labels : label each event with its cause; not for a run that continues another.
 
     Attributes
     ----------
-    errors : error of the render, for frames and for events.
+    errors, labeller : error of the render, for frames and for events; labels of the events so far, or None.
     """
 
     def __init__(
@@ -115,6 +117,7 @@ class Capture:
         seed: int,
         begin_us: int = 0,
         pixels: dict[str, Any] | None = None,
+        labels: bool = False,
     ) -> None:
         self._sensor, self._aps, self._seed = sensor, aps, seed
         self._begin_us, self._duration_us = begin_us, duration_us
@@ -133,7 +136,8 @@ class Capture:
         self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
         if flux.is_static:
             self._frame_source, self._event_source = self._still_sources()
-        self._stage = EvsStage(evs, seed) if evs is not None else None
+        self.labeller = Labeller(evs, seed, begin_us, duration_us) if labels and evs is not None else None
+        self._stage = EvsStage(evs, seed, self.labeller) if evs is not None else None
         if self._stage is not None and pixels is not None:
             self._stage.resume(pixels)
         self._pixel_state: dict[str, Any] = {}
@@ -222,13 +226,7 @@ class Capture:
             piece = next(pieces, None)
 
     def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
-        """Run the capture, and write frames, events and the truth of the event pixels as they come.
-
-        Parameters
-        ----------
-        writer : takes frames and events.
-        progress : called with (done, total, what).
-        """
+        """Run the capture, and write frames, events and the truth of the event pixels as they come; see `run`."""
         for item in self.run(progress):
             if isinstance(item, np.ndarray):
                 writer.add_events(item)
@@ -238,6 +236,8 @@ class Capture:
             truth = self.event_flux
             writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
+        if self.labeller is not None:
+            writer.set_event_labels(self.labeller.finish())
 
     def _compare(self, sample: Sample, t_us: int) -> NDArray:
         """Events up to a sample."""

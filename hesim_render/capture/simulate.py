@@ -159,7 +159,7 @@ def simulate(
             if flux.is_static:
                 rendering[0].progress = _share_progress(expected.rays, told)
         noted = _noted(flux, plain, seed) if rendering else None
-        capture = plain if noted is None else Capture(noted, flux.sensor, *noise, duration_us, seed)
+        capture = Capture(noted or flux, flux.sensor, *noise, duration_us, seed, labels=EVENTS in kinds)
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
             overwrite=overwrite,

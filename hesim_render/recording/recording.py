@@ -32,8 +32,10 @@ from hesim_render.recording.dng import read_dng
 from hesim_render.recording.event_file import read_events
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
+from hesim_render.recording.label_file import LABEL_FILE, read_labels
 
 if TYPE_CHECKING:
+    from hesim_render.pixels.evs.labels import EventLabels
     from hesim_render.recording.truth_file import StoredTruth
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene
@@ -84,6 +86,7 @@ class Recording:
     events : structured array [event] of `EVENT_DTYPE`; None reads the events of `path` on first use.
     event_truth : noise-free flux of the event pixels; None reads the truth of `path` on first use.
     path : the folder, None for a recording in memory.
+    labels : what caused each event; None reads the labels of `path` on first use, where there are any.
     scene : the scene that was rendered, where it is known; None makes it from the manifest when `truth` asks for it.
 
     Examples
@@ -106,10 +109,11 @@ class Recording:
         events: NDArray | None = None,
         event_truth: EventTruth | None = None,
         path: Path | None = None,
+        labels: EventLabels | None = None,
         scene: Scene | None = None,
     ) -> None:
         self.frames, self.manifest, self.path, self._scene = frames, manifest, path, scene
-        self._events, self._event_truth = events, event_truth
+        self._events, self._event_truth, self._labels = events, event_truth, labels
 
     @property
     def events(self) -> NDArray:
@@ -152,6 +156,19 @@ class Recording:
             maps = _read_maps(inside(self.path, "truth/events.npz"), names, self.event_shape)
             self._event_truth = EventTruth(*maps)
         return self._event_truth
+
+    @property
+    def event_labels(self) -> EventLabels | None:
+        """What caused each event, lost events and the events without noise; None where the run was not asked for them.
+
+        Raises
+        ------
+        SpecError
+            If the file is damaged or does not fit the recording.
+        """
+        if self._labels is None and self.path is not None and (self.path / LABEL_FILE).is_file():
+            self._labels = read_labels(self.path, self.event_shape, self.manifest["counts"]["events"])
+        return self._labels
 
     @cached_property
     def truth(self) -> SceneTruth:
@@ -236,6 +253,8 @@ class Recording:
             if self.event_truth is not None:
                 writer.set_event_truth(self.event_truth)
             writer.set_events_dropped(self.manifest["counts"].get("events_dropped", 0))
+            if self.event_labels is not None:
+                writer.set_event_labels(self.event_labels)
             self._save_truth(writer)
             return writer.finish()
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import no_events
+from hesim_render.pixels.evs.labels import EventLabels
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
@@ -69,6 +70,7 @@ class RecordingWriter:
         self._frames: list[Frame] = []
         self._events: list[NDArray] = []
         self._truth: EventTruth | None = None
+        self._labels: EventLabels | None = None
         self._dropped = 0
 
     def add_frame(self, frame: Frame) -> None:
@@ -113,6 +115,18 @@ class RecordingWriter:
             self._folder.set_event_truth(truth)
         else:
             self._truth = truth
+
+    def set_event_labels(self, labels: EventLabels) -> None:
+        """Set what caused each event; all events have been added.
+
+        Parameters
+        ----------
+        labels : in the order of the events.
+        """
+        if self._folder is not None:
+            self._folder.set_event_labels(labels)
+        else:
+            self._labels = labels
 
     def set_events_dropped(self, count: int) -> None:
         """Set how many events were lost in the read-out. No other count includes them.
@@ -161,7 +175,9 @@ class RecordingWriter:
             "frames": len(self._frames), "events": events.size, "events_on": on, "events_off": events.size - on,
             "events_dropped": self._dropped,
         }  # fmt: skip
-        return Recording(self._frames, self._manifest, events=events, event_truth=self._truth, scene=scene)
+        return Recording(
+            self._frames, self._manifest, events=events, event_truth=self._truth, scene=scene, labels=self._labels
+        )
 
     def __enter__(self) -> RecordingWriter:
         return self

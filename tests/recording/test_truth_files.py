@@ -156,6 +156,38 @@ def test_a_damaged_file_is_one_error(recorded, tmp_path):
         _ = hr.Recording.load(copy.path).stored_truth
 
 
+# ---- labels of events ----------------------------------------------------------------------------------------------
+
+
+def test_labels_of_a_recording_are_kept_saved_and_checked(tmp_path):
+    run = {"duration_s": 0.03, "samples": 2, "seed": 3}
+    plain = simulate(moving_scene(), sensor(), **run)
+    kept = simulate(moving_scene(), sensor(), truth=["events"], **run)
+    stored = simulate(moving_scene(), sensor(), truth=["events"], out=tmp_path / "stored", **run)
+    clean = simulate(moving_scene(), sensor(), clean=True, **run)
+    again = hr.Recording.load(kept.save(tmp_path / "again"))
+    assert plain.event_labels is None and stored.stored_truth is None
+    for other in (kept, stored, again):
+        np.testing.assert_array_equal(other.events, plain.events)
+        labels = other.event_labels
+        np.testing.assert_array_equal(labels.label, kept.event_labels.label)
+        np.testing.assert_array_equal(labels.clean, clean.events)
+        np.testing.assert_array_equal(labels.lost, kept.event_labels.lost)
+        assert labels.counts()["signal"] > 20 and labels.label.size == plain.events.size
+    file = again.path / "truth" / "event_labels.h5"
+    with h5py.File(file, "r+") as opened:
+        values = opened["label"][:]
+        del opened["label"]
+        opened["label"] = values[:-1]
+    with pytest.raises(SpecError, match=rf"event_labels.h5: holds {values.size - 1} labels; the recording has"):
+        _ = hr.Recording.load(again.path).event_labels
+    with h5py.File(file, "r+") as opened:
+        del opened["label"]
+        opened["label"] = np.full(values.size, 9, np.uint8)
+    with pytest.raises(SpecError, match="label holds 9; expected 0 to 4"):
+        _ = hr.Recording.load(again.path).event_labels
+
+
 # ---- formats of others ---------------------------------------------------------------------------------------------
 
 
