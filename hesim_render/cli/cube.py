@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from hesim_render.cli.options import Overwrite, Region, SensorFile, cropped, names_of
 from hesim_render.cli.terminal import say, split_overrides
@@ -62,23 +61,23 @@ def cube(
     out.parent.mkdir(parents=True, exist_ok=True)
     hr.write_spectral_exr(out, radiance, found)
     mean = float(radiance.mean())
-    share = float(np.sqrt(np.mean(np.square(stderr, dtype=np.float64)))) / mean if mean > 0 else 0.0
+    share = math.sqrt(float((stderr.astype("f8") ** 2).mean())) / mean if mean > 0 else 0.0
     say(f"{found.size} bands of {radiance.shape[1]}x{radiance.shape[0]} px, mean {mean:.4g} W m^-2 sr^-1 nm^-1, "
         f"standard error of a pixel {100 * share:.2g} % of it (rms), in {out}")  # fmt: skip
 
 
-def parse_bands(text: str) -> NDArray[np.float64]:
+def parse_bands(text: str) -> list[float]:
     """Wavelengths of ``400:700:10`` or ``450,550,650``, nm."""
     expected = "FIRST:LAST:STEP or a list with commas, in nm, such as 400:700:10"
     if re.fullmatch(r"[0-9.:,eE+ -]+", text) is None:
         raise RangeError("--bands", text, expected)
     try:
         if ":" not in text:
-            return np.array([float(part) for part in text.split(",")])
+            return [float(part) for part in text.split(",")]
         first, last, step = (float(part) for part in text.split(":"))
     except ValueError:
         raise RangeError("--bands", text, expected) from None
     if not (step > 0 and last >= first and (last - first) / step < _MOST_BANDS):
         raise RangeError("--bands", text, f"{expected}, at most {_MOST_BANDS} bands")
-    count = int(np.floor((last - first) / step + 1e-9)) + 1
-    return np.array([first + step * number for number in range(count)])
+    count = math.floor((last - first) / step + 1e-9) + 1
+    return [first + step * number for number in range(count)]
