@@ -42,6 +42,7 @@ _HOMES = {
     "photocurrent": "hesim_render.sensor.photocurrent",
     "read_spectral_exr": "hesim_render.sources.render.cube",
     "render_cube": "hesim_render.sources.render.cube",
+    "rig_scenes": "hesim_render.sources.render.truth.rig",
     "simulate": "hesim_render.capture.simulate",
     "simulate_video": "hesim_render.capture.simulate_video",
     "write_spectral_exr": "hesim_render.sources.render.cube",
@@ -59,6 +60,7 @@ __all__ = [
     "photocurrent",
     "read_spectral_exr",
     "render_cube",
+    "rig_scenes",
     "simulate",
     "simulate_video",
     "write_spectral_exr",
@@ -72,6 +74,7 @@ if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor, load_sensor
     from hesim_render.sources.render.cube import read_spectral_exr, render_cube, write_spectral_exr
     from hesim_render.sources.render.truth.imu import ImuModel
+    from hesim_render.sources.render.truth.rig import rig_scenes
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene, load_scene
 

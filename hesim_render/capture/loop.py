@@ -226,7 +226,12 @@ class Capture:
             piece = next(pieces, None)
 
     def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
-        """Run the capture, and write frames, events and the truth of the event pixels as they come; see `run`."""
+        """Run the capture, and write frames, events and the truth of the event pixels as they come.
+
+        Parameters
+        ----------
+        writer, progress : takes frames and events; called with (done, total, what).
+        """
         for item in self.run(progress):
             if isinstance(item, np.ndarray):
                 writer.add_events(item)

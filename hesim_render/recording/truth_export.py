@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from hesim_render.recording.truth_file import POSE_STEP_US, images_at
 from hesim_render.recording.truth_kinds import IMAGES
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.poses import CameraModel
+from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 MARKER = "export.json"
@@ -205,8 +206,10 @@ def _tum(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | 
 # ---- Kalibr --------------------------------------------------------------------------------------------------------
 
 
-def _kalibr_camera(camera: CameraModel, topic: str, from_first: bool) -> dict[str, Any]:
-    k, same = camera.k, np.eye(4).tolist()
+def _kalibr_camera(
+    camera: CameraModel, topic: str, from_imu: NDArray[np.float64], from_previous: NDArray[np.float64] | None
+) -> dict[str, Any]:
+    k = camera.k
     entry = {
         "camera_model": "pinhole",
         "intrinsics": [k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
@@ -214,19 +217,40 @@ def _kalibr_camera(camera: CameraModel, topic: str, from_first: bool) -> dict[st
         "distortion_coeffs": [*camera.distortion, 0.0, 0.0, 0.0, 0.0][:4],
         "resolution": [camera.width, camera.height],
         "rostopic": topic,
-        "T_cam_imu": same,
+        "T_cam_imu": from_imu.tolist(),
         "timeshift_cam_imu": 0.0,
     }
-    return {**entry, "T_cn_cnm1": same, "cam_overlaps": [0]} if from_first else entry
+    return entry if from_previous is None else {**entry, "T_cn_cnm1": from_previous.tolist()}
+
+
+def write_kalibr_camchain(path: str | Path, truths: Sequence[SceneTruth], grids: Sequence[Grid]) -> Path:
+    """Write the cameras of a rig for Kalibr; the inertial unit is in the first one.
+
+    Parameters
+    ----------
+    path : YAML file to write.
+    truths : scene of each camera, as from `rig_scenes`.
+    grids : grid of each, ``mosaic`` or ``events``.
+
+    Returns
+    -------
+    The file.
+    """
+    target, poses = Path(path), [truth.camera_pose(0.0) for truth in truths]
+    chain = {}
+    for number, (truth, grid, pose) in enumerate(zip(truths, grids, poses, strict=True)):
+        before = None if number == 0 else np.linalg.inv(pose) @ poses[number - 1]
+        topic, from_imu = f"/cam{number}/image_raw", np.linalg.inv(pose) @ poses[0]
+        chain[f"cam{number}"] = _kalibr_camera(truth.camera(grid), topic, from_imu, before)
+    with output_errors(target):
+        _write_yaml(target, chain)
+    return target
 
 
 def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
-    grids = ["mosaic"] if truth.sensor.spec.aps is not None else []
+    grids: list[Grid] = ["mosaic"] if truth.sensor.spec.aps is not None else []
     grids += ["events"] if 0 not in truth.sensor.layout.evs_shape else []
-    chain = {
-        f"cam{number}": _kalibr_camera(truth.camera(grid), f"/cam{number}/image_raw", number > 0)  # type: ignore[arg-type]
-        for number, grid in enumerate(grids)
-    }
+    write_kalibr_camchain(folder / "camchain.yaml", [truth] * len(grids), grids)
     model = ImuModel()
     unit = {
         "rostopic": "/imu0",
@@ -236,7 +260,6 @@ def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int
         "gyroscope_noise_density": model.gyro_noise_density,
         "gyroscope_random_walk": model.gyro_random_walk,
     }
-    _write_yaml(folder / "camchain.yaml", chain)
     _write_yaml(folder / "imu.yaml", unit)
     return {"cameras": {f"cam{number}": grid for number, grid in enumerate(grids)}}
 
