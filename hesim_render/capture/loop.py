@@ -98,8 +98,7 @@ class Capture:
     seed : seed of all temporal noise.
     begin_us : begin of the run, µs. The times of frames and comparisons do not depend on it; a frame belongs to the
         run in which it ends.
-    pixels : state of the event pixels at the end of the previous run (its `pixel_state`). Both runs together
-        then equal one run.
+    pixels : state of the event pixels at the end of the previous run (`pixel_state`); together they equal one run.
     labels : label each event with its cause; not for a run that continues another.
 
     Attributes
@@ -238,8 +237,7 @@ class Capture:
             else:
                 writer.add_frame(item)
         if self._stage is not None:
-            truth = self.event_flux
-            writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
+            writer.set_event_truth(self.event_flux.mean_e_per_s(), self.event_flux.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
         if self.labeller is not None:
             writer.set_event_labels(self.labeller.finish())

@@ -7,7 +7,7 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 import hesim_render as hr
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
@@ -496,3 +496,60 @@ def test_imu_models_that_are_none_are_refused():
         ImuModel(rate_hz=0)
     with pytest.raises(RangeError, match="gyro_random_walk"):
         ImuModel(gyro_random_walk=-1)
+
+
+# ---- scenes of Mitsuba's ---------------------------------------------------------------------------------------------
+
+
+def test_what_lies_before_the_near_plane_is_neither_seen_nor_in_the_way():
+    inline = {
+        "type": "scene",
+        "integrator": {"type": "path"},
+        "sensor": {"type": "perspective", "fov": 20.0, "near_clip": 1.0,
+                   "to_world": [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 2], [0, 0, 0, 1]]},
+        "wall": {"type": "rectangle"},
+        "near": {"type": "rectangle", "to_world": [[0.05, 0, 0, 0], [0, 0.05, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]},
+        "far": {"type": "rectangle", "to_world": [[0.1, 0, 0, 0.2], [0, 0.1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]},
+        "light": {"type": "constant"},
+    }  # fmt: skip
+    truth = SceneTruth(rendering.make_scene(mitsuba={"inline": inline}), rendering.mono(32, 32))
+    depth, names = truth.depth(0), truth.names.objects
+    ids = truth.ids(0).object
+    assert names.index("near") not in ids and (ids == names.index("far")).any()
+    np.testing.assert_allclose(depth[ids == names.index("wall")], 2.0, rtol=1e-6)
+    np.testing.assert_allclose(depth[ids == names.index("far")], 1.5, rtol=1e-6)
+    flow = truth.flow(0, 1_000)
+    assert flow.visible.all() and np.abs(flow.flow_px).max() < 1e-4
+
+
+def test_instances_of_one_shape_are_objects_of_their_own():
+    ball = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.1}}
+    place = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]] for x in (-0.15, 0.15)]
+    shapes = {
+        "type": "scene", "integrator": {"type": "path"}, "group": ball, "light": {"type": "constant"},
+        **{f"copy-{k}": {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": place[k]}
+           for k in (0, 1)},
+    }  # fmt: skip
+    truth = SceneTruth(rendering.mitsuba_scene(shapes), rendering.mono(32, 32))
+    ids = truth.ids(0).object
+    left, right = (truth.names.objects.index(f"copy-{k}") for k in (0, 1))
+    assert set(np.unique(ids)) == {0, left, right}
+    assert np.nonzero(ids == left)[1].max() < 16 <= np.nonzero(ids == right)[1].min()
+    shapes["wall"] = {"type": "rectangle"}
+    track = {"object": "wall", "keyframes": [{"t_us": 0}, {"t_us": 1_000, "translation_m": [0.1, 0, 0]}]}
+    with pytest.raises(SpecError, match="moving objects in a scene with instances"):
+        SceneTruth(rendering.mitsuba_scene(shapes, [track]), rendering.mono(32, 32))
+
+
+def test_a_sensor_with_uneven_event_pixels_says_so():
+    """Eiger has four event pixels in a tile; the truth of each is that of its own place."""
+    sensor = hr.load_sensor("eiger").crop(32, 24)
+    truth = SceneTruth(scene(), sensor)
+    raster = truth.raster("events")
+    np.testing.assert_array_equal(
+        raster.row * 3264 + raster.col, sensor.layout.full_index.ravel()[sensor.layout.evs_pixel]
+    )
+    even = np.ptp(np.diff(raster.col[0])) == 0 and np.ptp(np.diff(raster.row[:, 0])) == 0
+    assert truth.camera("events").is_even == even
+    where = np.divmod(sensor.layout.evs_pixel, 32)
+    np.testing.assert_array_equal(truth.depth(3_000.0, "events"), truth.depth(3_000.0)[where])

@@ -112,6 +112,8 @@ class MovingScene:
 
     Raises
     ------
+    SpecError
+        If something moves in a scene with instances.
     NeedsExactMode
         If a moving shape emits light, a plugin of the scene asks for that mode, the scene's integrator is not Mitsuba's
         path tracer, or it hides lights.
@@ -145,7 +147,15 @@ class MovingScene:
         for number, emitter in enumerate(emitters):
             if emitter.get_shape() is None:
                 resting[f"emitter_{number}"] = emitter
-        self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
+        if any(shape.class_name() == "Instance" for shape in built.scene.shapes()):
+            # Mitsuba cannot put an instance into a second scene
+            if parts:
+                raise SpecError(
+                    "geometric truth is not known of moving objects in a scene with instances; give copies of the shape in their place"
+                )
+            self.static = built.scene
+        else:
+            self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
         lights = self.static.emitters()
         #: Lights that a ray can hit: the environment, and corners of boxes around all other lights [n, 2, 3], m.
         self.has_sky = any(light.is_environment() for light in lights)

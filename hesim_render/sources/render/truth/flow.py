@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.bands import in_bands
+from hesim_render.sources.render.tracer import BLOCK_RAYS
 from hesim_render.sources.render.truth.chief_rays import ChiefRays
 from hesim_render.sources.render.truth.poses import PoseTable, inverse
 from hesim_render.sources.render.truth.raster import Raster
-from hesim_render.sources.render.truth.surfaces import Surfaces
+from hesim_render.sources.render.truth.surfaces import BAND, Surfaces
 
 #: Largest error of the row at which the iteration ends, px, and most steps.
 _SETTLED_PX, _MOST_STEPS = 1e-5, 60
-#: Points that one thread works on at a time.
-_BAND = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +84,16 @@ def flow_between(rays: ChiefRays, raster: Raster, surfaces: Surfaces, to_us: NDA
         settled = np.isfinite(moved) & (after.is_global | ~(moved > _SETTLED_PX))
         facing[part] = settled & ((towards > 0) | ~np.isfinite(distance[part]))
 
-    in_bands(count, follow, _BAND)
+    in_bands(count, follow, BAND)
     start = np.stack([col, raster.row.ravel()], axis=-1)
     flow = ((place - start) / np.array(raster.step)).astype(np.float32)
     corner = place - np.array(raster.first)
     size = np.array([rays.sensor.cols, rays.sensor.rows])
     candidate = np.flatnonzero(facing & np.all((corner >= -0.5) & (corner <= size - 0.5), axis=1))
     visible = np.zeros(count, np.bool_)
-    visible[candidate] = _unhidden(rays, after, before, surfaces, group, col, row, candidate, corner, distance)
+    for first in range(0, candidate.size, BLOCK_RAYS):
+        which = candidate[first : first + BLOCK_RAYS]
+        visible[which] = _unhidden(rays, after, before, surfaces, group, col, row, which, corner, distance)
     return Flow(flow.reshape(*raster.shape, 2), visible.reshape(raster.shape))
 
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.bands import in_bands
 from hesim_render.sources.render.projection import Projection
+from hesim_render.sources.render.tracer import BLOCK_RAYS
 from hesim_render.sources.render.truth.chief_rays import ChiefRays, Hits, Placed
 from hesim_render.sources.render.truth.poses import PoseTable
 from hesim_render.sources.render.truth.raster import Raster
@@ -17,6 +19,9 @@ from hesim_render.sources.render.truth.raster import Raster
 MIXED_DEG, MIXED_DEPTH = 15.0, 0.01
 #: Distance of those rays from the centre, px: just inside, so that rounding takes none into the next pixel.
 _BORDER_PX = 0.5 - 1 / 64
+_AROUND = [(x, y) for x in (-_BORDER_PX, 0.0, _BORDER_PX) for y in (-_BORDER_PX, 0.0, _BORDER_PX) if x or y]
+#: Points that one thread works on at a time.
+BAND = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +68,17 @@ class Surfaces:
 
     def position(self, rays: ChiefRays, raster: Raster) -> NDArray[np.float32]:
         """World position of the surface, [row, col, 3], m; NaN where there is none."""
-        table = PoseTable(rays, self.times_us)
-        row = raster.row.ravel()
-        camera = table.camera[table.index(row - raster.first[1])]
-        found = self.points(raster.col.ravel(), row, self.distance_m.ravel(), camera)
-        found[found[:, 3] == 0] = np.nan
-        return found[:, :3].astype(np.float32).reshape(*raster.shape, 3)
+        table, row, col = PoseTable(rays, self.times_us), raster.row.ravel(), raster.col.ravel()
+        distance, found = self.distance_m.ravel(), np.empty((row.size, 3), np.float32)
+
+        def place(part: slice) -> None:
+            camera = table.camera[table.index(row[part] - raster.first[1])]
+            points = self.points(col[part], row[part], distance[part], camera)
+            points[points[:, 3] == 0] = np.nan
+            found[part] = points[:, :3]
+
+        in_bands(row.size, place, BAND)
+        return found.reshape(*raster.shape, 3)
 
 
 def _placed(raster: Raster, times_us: NDArray[np.float64]) -> Placed:
@@ -95,23 +105,21 @@ def mixed_pixels(rays: ChiefRays, raster: Raster, surfaces: Surfaces) -> NDArray
     Rays through the four corners and the middles of the four sides are compared with the chief ray. Things smaller than
     half a pixel may pass between them.
     """
-    placed = _placed(raster, surfaces.times_us)
+    placed, table = _placed(raster, surfaces.times_us), PoseTable(rays, surfaces.times_us)
     shape, normal = surfaces.shape.ravel(), surfaces.normal.reshape(-1, 3)
-    distance = surfaces.distance_m.ravel()
+    distance, row = surfaces.distance_m.ravel(), raster.row.ravel() - raster.first[1]
     mixed = np.zeros(shape.size, np.bool_)
-    centre = np.stack([placed.col, placed.row], axis=-1)
-    table = PoseTable(rays, surfaces.times_us)
-    rotation = table.camera[:, :3, :3]
-    index = table.index(raster.row.ravel() - raster.first[1])
-    # normals in camera space, so that both rays begin at the origin
-    own = np.einsum("nji,nj->ni", rotation[index] if len(rotation) > 1 else rotation[:1].repeat(len(index), 0), normal)
-    height = np.einsum("ni,ni->n", own, _unit(rays, centre)) * np.where(np.isinf(distance), 0, distance)
-    for dx in (-_BORDER_PX, 0.0, _BORDER_PX):
-        for dy in (-_BORDER_PX, 0.0, _BORDER_PX):
-            if dx == 0 and dy == 0:
-                continue
-            hits, beside = rays.trace(placed, (dx, dy)), centre + np.array([dx, dy])
-            mixed |= _differs(hits, shape, normal, height, own, _unit(rays, beside))
+    for first in range(0, shape.size, BLOCK_RAYS):
+        part = slice(first, first + BLOCK_RAYS)
+        here = Placed(placed.col[part], placed.row[part], placed.t_us[part])
+        centre = np.stack([here.col, here.row], axis=-1)
+        # normals in camera space, so that both rays begin at the origin
+        own = np.einsum("nji,nj->ni", table.camera[table.index(row[part]), :3, :3], normal[part])
+        far = np.where(np.isinf(distance[part]), 0, distance[part])
+        height = np.einsum("ni,ni->n", own, _unit(rays, centre)) * far
+        for offset in _AROUND:
+            beside = _unit(rays, centre + np.array(offset))
+            mixed[part] |= _differs(rays.trace(here, offset), shape[part], normal[part], height, own, beside)
     return mixed.reshape(raster.shape)
 
 
