@@ -151,7 +151,8 @@ class MovingScene:
             # Mitsuba cannot put an instance into a second scene
             if parts:
                 raise SpecError(
-                    "geometric truth is not known of moving objects in a scene with instances; give copies of the shape in their place"
+                    "geometric truth is not known of moving objects in a scene with instances; give copies of the "
+                    "shape in their place"
                 )
             self.static = built.scene
         else:
