@@ -553,3 +553,36 @@ def test_a_sensor_with_uneven_event_pixels_says_so():
     assert truth.camera("events").is_even == even
     where = np.divmod(sensor.layout.evs_pixel, 32)
     np.testing.assert_array_equal(truth.depth(3_000.0, "events"), truth.depth(3_000.0)[where])
+
+
+def test_a_card_close_to_the_wall_hides_what_it_covers():
+    """5 mm before a wall at 2 m, a quarter of a percent: at first beside the middle of the view, then over it."""
+    wall = {"name": "wall", "shape": "rectangle", "size_m": [9, 9, 0]}
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.2, 0.2, 0], "position_m": [0.3, 0, 0.005]}
+    track = [{"t_us": 0}, {"t_us": 10_000, "translation_m": [-0.3, 0, 0]}]
+    covering = rendering.make_scene(
+        objects=[wall, card], light=rendering.FURNACE, motion=[{"object": "card", "keyframes": track}],
+        camera={"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 8},
+    )  # fmt: skip
+    truth = SceneTruth(covering, rendering.mono(32, 32))
+    visible = truth.flow(0, 10_000).visible
+    first, second = truth.ids(0).object == 1, truth.ids(10_000).object == 2
+    assert first.all() and second.sum() > 300
+    np.testing.assert_array_equal(visible, ~second)
+
+
+def test_a_step_of_one_mesh_is_mixed_although_its_normals_agree(tmp_path):
+    """Two parallel squares in one mesh, 6 cm apart at 2 m: 3 % of the distance, over one column of pixels."""
+    corners = [(x, y, z) for z, low, high in ((0.0, -1, 0.003), (0.06, 0.003, 1)) for x in (low, high) for y in (-1, 1)]
+    text = "ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n"
+    text += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
+    text += "".join(f"{x} {y} {z}\n" for x, y, z in corners)
+    (tmp_path / "step.ply").write_text(text + "3 0 2 1\n3 2 3 1\n3 4 6 5\n3 6 7 5\n")
+    (tmp_path / "step.yaml").write_text(
+        "schema_version: 1\nname: step\ndescription: two squares\n"
+        "objects: [{name: step, shape: mesh, mesh: step.ply, size_m: [2, 2, 0.06]}]\n"
+        "light: {type: uniform, illuminance_lux: 100}\n"
+        "camera: {origin_m: [0, 0, 2], target_m: [0, 0, 0], horizontal_fov_deg: 8}\n"
+    )
+    mixed = SceneTruth(hr.load_scene(tmp_path / "step.yaml"), rendering.mono(32, 24)).mixed(0)
+    assert mixed.any(axis=1).all() and mixed.sum(axis=1).max() <= 2
