@@ -234,3 +234,23 @@ def test_pairs_against_a_pixel_by_pixel_version_in_any_portions():
             found |= set(zip(cause.tolist(), effect.tolist(), strict=True))
             assert lost.size == 0
         assert found == expected and len(found) > 200
+
+
+def steps(*given):
+    """(time, pixel, sign, number) each."""
+    return Steps(*np.array(given, np.int64).reshape(-1, 4).T)
+
+
+def test_pairs_of_pixels_with_a_dead_time():
+    """10 µs. Pixel 0: a cause soon after its event is its partner, the next one is lost. Pixel 1: the event has no
+    partner once the pixel is released. Pixel 2: a cause after the release is paired with the next event.
+    """
+    causes = steps((5, 0, 1, 10), (8, 0, 1, 11), (50, 1, 1, 12), (20, 2, -1, 13))
+    effects = steps((0, 0, 1, 0), (0, 1, 1, 1), (0, 2, -1, 2), (60, 1, 1, 3), (30, 2, -1, 4), (70, 0, 1, 5))
+    cause, effect, lost = Balance(3, 10.0).take(causes, effects)
+    assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (12, 3), (13, 4)}
+    assert lost.tolist() == [11]
+    # without a dead time the events wait for their partners
+    cause, effect, lost = Balance(3).take(causes, effects)
+    assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (11, 5), (12, 1), (13, 2)}
+    assert lost.size == 0
