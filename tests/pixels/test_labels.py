@@ -128,7 +128,7 @@ def test_with_a_dead_time_leak_and_hot_events_keep_their_origin():
     assert (found.label[of_hot] == Label.HOT).mean() > 0.9
 
 
-@pytest.mark.parametrize(("noise_dn", "spread"), [(5.0, 0.0), (2.0, 0.03)])
+@pytest.mark.parametrize(("noise_dn", "spread"), [pytest.param(5.0, 0.0, marks=pytest.mark.slow), (2.0, 0.03)])
 def test_asynchronous_signal_has_the_rate_of_the_run_without_noise(noise_dn, spread):
     """In the second half of the run: the first reference level has noise in it, which gives steps of its own at first.
 
