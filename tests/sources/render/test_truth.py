@@ -569,6 +569,10 @@ def test_a_card_close_to_the_wall_hides_what_it_covers():
     first, second = truth.ids(0).object == 1, truth.ids(10_000).object == 2
     assert first.all() and second.sum() > 300
     np.testing.assert_array_equal(visible, ~second)
+    rows = 2_000 + 250.0 * np.arange(32)  # a rolling shutter: the card is somewhere else for each row
+    covered = truth.ids(rows).object == 2
+    assert covered.sum() > 100 and np.ptp(covered.sum(axis=1)) > 3
+    np.testing.assert_array_equal(truth.flow(0, rows).visible, ~covered)
 
 
 def test_a_step_of_one_mesh_is_mixed_although_its_normals_agree(tmp_path):
