@@ -27,8 +27,9 @@ from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.light import LightSpec
 from hesim_render.specs.motion import TrackSpec
 from hesim_render.specs.problems import line_of
+from hesim_render.specs.reflectance import ReflectanceSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.target import ReflectanceSpec, TargetSpec
+from hesim_render.specs.target import TargetSpec
 from hesim_render.specs.waveform import WaveformSpec
 
 #: Path of a file that a scene names.
@@ -280,5 +281,6 @@ def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tu
             yield from _named_files(value, (*location, key))
     elif isinstance(node, str):
         key = location[-1] if location else None
-        if key in ("csv", "mesh", "filename") or location == ("mitsuba", "file") or node.endswith(".csv"):
+        files = ("mitsuba", "file"), ("target", "file"), ("target", "patches")
+        if key in ("csv", "mesh", "filename") or location in files or node.endswith(".csv"):
             yield location, node

@@ -24,11 +24,14 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     transform,
 )
 from hesim_render.sources.render.scene.paint import Paint
-from hesim_render.sources.render.scene.targets import build_target
+from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
-from hesim_render.spectral.spectrum import Spectrum, require_coverage
+from hesim_render.specs.target import lamps_of
+from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
+from hesim_render.targets.build import placed_pieces
+from hesim_render.targets.piece import Picture, Piece
 
 #: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")
@@ -159,19 +162,24 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     )
 
 
-def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
-    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, and the paint of the shapes."""
+def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint] | None]:
+    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, and the paint of the shapes (None if
+    a shape shines or has a picture).
+    """
+    all_matt = True
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
     if spec.target is not None:
         groups["target"] = []
-        for number, piece in enumerate(build_target(spec.target)):
+        for number, piece in enumerate(_target_pieces(spec)):
             name = f"target_{number}"
-            bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
-            content[name] = make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf)
+            content[name] = _piece(mi, name, piece)
             groups["target"].append(name)
-            paints.append(Paint(name, (piece.reflectance,)))
+            if isinstance(piece.reflectance, Picture) or piece.radiance is not None:
+                all_matt = False
+            else:
+                paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
         content[name] = _object(mi, item, name, spec.folder)
@@ -181,7 +189,27 @@ def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
-    return content, groups, paints
+    return content, groups, paints if all_matt else None
+
+
+def _target_pieces(spec: SceneSpec) -> list[Piece]:
+    assert spec.target is not None
+    try:
+        return placed_pieces(spec.target)
+    except SpecError as error:
+        if error.file is not None:
+            raise
+        raise SpecError(str(error), file=spec.file) from None
+
+
+def _piece(mi: MitsubaModule, name: str, piece: Piece) -> MitsubaObject:
+    """A part of the target."""
+    if isinstance(piece.reflectance, Picture):
+        bsdf = {"type": "diffuse", "reflectance": picture_texture(mi, piece.reflectance)}
+    else:
+        bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
+    emitter = None if piece.radiance is None else {"type": "area", "radiance": spectrum_dict(piece.radiance)}
+    return make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf, piece.uv, emitter)
 
 
 def _paint(item: ObjectSpec, name: str) -> Paint:
@@ -265,14 +293,21 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
 
     The RGB colours of a Mitsuba scene become spectra over the whole visible range, so there is nothing to check.
     """
-    if spec.mitsuba is not None or not any(light.is_lit for light in spec.lights):
+    lamp = lamps_of(spec.target)
+    if spec.mitsuba is not None or not (any(light.is_lit for light in spec.lights) or (lamp and lamp.is_lit)):
         return
     for number, light in enumerate(spec.lights):
         if light.is_lit:
             yield f"{lights.key_of(spec.lights, number)}.illuminant", light.illuminant.load()
     if spec.target is not None:
-        for piece in build_target(spec.target):
-            yield f"target ({piece.name})", piece.reflectance
+        if lamp is not None and lamp.is_lit:
+            yield "target.illuminant", lamp.illuminant.load()
+        for piece in _target_pieces(spec):
+            if not isinstance(piece.reflectance, Picture):
+                yield f"target ({piece.name})", piece.reflectance
+            elif piece.reflectance.wavelength_nm is not None:
+                ends = piece.reflectance.wavelength_nm[[0, -1]].tolist()
+                yield f"target ({piece.name})", constant(1.0, *ends)
     for item in spec.objects:
         for key, source in (("reflectance", item.reflectance), ("pattern", item.pattern)):
             if source is not None:
