@@ -192,11 +192,16 @@ def bent(piece: Piece, radius_m: float, step_m: float) -> Piece:
             part = _cut(_cut(triangle, k * step_m, 1.0), (k + 1) * step_m, -1.0)
             parts += [part[[0, j, j + 1]] for j in range(1, len(part) - 1)]
     flat = np.concatenate(parts)
-    angle = flat[:, 0] / radius_m
-    vertices = np.column_stack([radius_m * np.sin(angle), flat[:, 1], radius_m * (1 - np.cos(angle))])
+    vertices = on_cylinder(flat[:, :2], radius_m)
     faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
     own_uv = None if piece.uv is None else flat[:, 2:]
     return Piece(piece.name, piece.reflectance, vertices, faces, own_uv, piece.radiance)
+
+
+def on_cylinder(flat: NDArray[np.float64], radius_m: float) -> NDArray[np.float64]:
+    """Points [n, 2] of a flat target on a cylinder about an axis parallel to y, [n, 3], m; see `bent`."""
+    angle = flat[:, 0] / radius_m
+    return np.column_stack([radius_m * np.sin(angle), flat[:, 1], radius_m * (1 - np.cos(angle))])
 
 
 def _cut(polygon: NDArray[np.float64], x: float, sign: float) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.reflectance import PlacedTarget
 from hesim_render.specs.target import TargetSpec
 from hesim_render.targets.boards import charuco_board, disc_centres
+from hesim_render.targets.piece import on_cylinder
 
 
 def target_points(target: TargetSpec) -> NDArray[np.float64]:
@@ -75,3 +76,13 @@ def placement(target: PlacedTarget) -> NDArray[np.float64]:
         matrix[:3, :3] = rotation_about(target.rotation_axis, target.rotation_deg)
     matrix[:3, 3] = target.position_m
     return matrix
+
+
+def surface_points(target: TargetSpec, count: int) -> NDArray[np.float64]:
+    """A grid of points over a target, row by row from the top left, before its tilt and shift, [count², 3], m."""
+    x = np.linspace(-0.5, 0.5, count) * target.width_m
+    y = np.linspace(0.5, -0.5, count) * target.height_m
+    flat = np.column_stack([np.tile(x, count), np.repeat(y, count), np.zeros(count**2)])
+    if target.bend_radius_m is None:
+        return flat
+    return on_cylinder(flat[:, :2], target.bend_radius_m)
