@@ -8,8 +8,10 @@ from typing import Any, Literal
 
 from pydantic import (
     Field,
+    SerializerFunctionWrapHandler,
     ValidationInfo,
     field_validator,
+    model_serializer,
     model_validator,
 )
 
@@ -17,7 +19,8 @@ from hesim_render.specs.geometry import Size
 from hesim_render.specs.light import LampSpec
 from hesim_render.specs.reflectance import PlacedTarget, ReflectanceSpec, SizedTarget
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.spectral.spectrum import colorchecker
+from hesim_render.spectral.patches import read_patches
+from hesim_render.spectral.spectrum import Spectrum, colorchecker
 
 
 class FlatTarget(SizedTarget):
@@ -60,13 +63,13 @@ class FileTarget(SizedTarget):
 
     @model_validator(mode="after")
     def _is_there(self) -> FileTarget:
-        if not os.path.isfile(self.folder / self.named_file):
+        if self.named_file is not None and not os.path.isfile(self.folder / self.named_file):
             raise ValueError(f"no such file: {self.folder / self.named_file}")
         return self
 
     @property
-    def named_file(self) -> str:
-        """The file, relative to the scene file."""
+    def named_file(self) -> str | None:
+        """The file, relative to the scene file; None if there is none."""
         raise NotImplementedError
 
 
@@ -78,16 +81,45 @@ class PatchChartTarget(FileTarget):
     """
 
     type: Literal["patch-chart"]
-    patches: str = Field(description="CSV file, relative to this file")
+    patches: str | None = Field(None, description="CSV file, relative to this file")
+    spectra: dict[str, ReflectanceSpec] | None = Field(None, description="the patches themselves, in place of a file")
     rows: int = Field(ge=1, le=1000)
     cols: int = Field(ge=1, le=1000)
     patch_fill: float = Field(0.86, gt=0, le=1, description="patch width over patch pitch")
     surround: ReflectanceSpec = SpectrumSpec(flat=0.035)
 
+    @model_validator(mode="after")
+    def _one_source(self) -> PatchChartTarget:
+        if (self.patches is None) == (self.spectra is None):
+            raise ValueError("give patches or spectra, exactly one of them")
+        count = len(self.load())
+        if count != self.rows * self.cols:
+            raise ValueError(f"there are {count} patches; rows times cols is {self.rows * self.cols}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _self_contained(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A dump (and so a hash) holds the numbers of the file, not its name."""
+        data = handler(self)
+        if self.patches is not None:
+            found = self.load().items()
+            data["patches"] = None
+            data["spectra"] = {
+                name: {"wavelength_nm": s.wavelength_nm.tolist(), "value": s.values.tolist()} for name, s in found
+            }
+        return data
+
     @property
-    def named_file(self) -> str:
-        """The file of the patches, relative to the scene file."""
+    def named_file(self) -> str | None:
+        """The file of the patches, relative to the scene file; None if they stand in the scene file."""
         return self.patches
+
+    def load(self) -> dict[str, Spectrum]:
+        """Reflectances of the patches by name, in order."""
+        if self.spectra is not None:
+            return {name: source.load() for name, source in self.spectra.items()}
+        assert self.patches is not None
+        return read_patches(self.folder / self.patches)
 
 
 class StepWedgeTarget(SizedTarget):

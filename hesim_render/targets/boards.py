@@ -117,7 +117,8 @@ def aprilgrid(target: AprilGridTarget) -> list[Piece]:
         for col in range(target.cols):
             number = target.first_id + (target.rows - 1 - row) * target.cols + col
             drawn = aruco.generateImageMarker(dictionary, number, bits, borderBits=target.border_bits)
-            dark[row * per + 1 : (row + 1) * per, col * per + 1 : (col + 1) * per] = drawn < 128
+            # OpenCV's tags are upside down against those of AprilTag
+            dark[row * per + 1 : (row + 1) * per, col * per + 1 : (col + 1) * per] = drawn[::-1, ::-1] < 128
     return _board(target, dark, x, y)
 
 

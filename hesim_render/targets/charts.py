@@ -13,7 +13,6 @@ from hesim_render.specs.charts import (
 )
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.spectrum import Spectrum, constant
-from hesim_render.targets.patches import read_patches
 from hesim_render.targets.piece import (
     Picture,
     Piece,
@@ -33,16 +32,8 @@ def colorchecker(target: ColorCheckerTarget) -> list[Piece]:
 
 
 def patch_chart(target: PatchChartTarget) -> list[Piece]:
-    """Patches from a file on their surround.
-
-    Raises
-    ------
-    SpecError
-        If the file is not valid, or has another number of patches than places.
-    """
-    return _patches(
-        read_patches(target.folder / target.patches, target.rows * target.cols), target.rows, target.cols, target
-    )
+    """A user's patches on their surround."""
+    return _patches(target.load(), target.rows, target.cols, target)
 
 
 def _patches(

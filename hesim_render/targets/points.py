@@ -16,7 +16,7 @@ from hesim_render.specs.boards import (
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.reflectance import PlacedTarget
 from hesim_render.specs.target import TargetSpec
-from hesim_render.targets.boards import charuco_board, disc_centres
+from hesim_render.targets.boards import disc_centres
 from hesim_render.targets.piece import on_cylinder
 
 
@@ -52,9 +52,9 @@ def target_points(target: TargetSpec) -> NDArray[np.float64]:
         y = (0.5 - np.arange(1, target.rows) / target.rows) * target.height_m
         flat = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
     elif isinstance(target, CharucoTarget):
-        w, h = target.pattern_m
-        corners = np.asarray(charuco_board(target).getChessboardCorners(), dtype=np.float64)
-        flat = np.column_stack([corners[:, 0] - w / 2, h / 2 - corners[:, 1]])
+        across = (np.arange(1, target.cols) - target.cols / 2) * target.square_m
+        down = (target.rows / 2 - np.arange(1, target.rows)) * target.square_m
+        flat = np.column_stack([np.tile(across, len(down)), np.repeat(down, len(across))])
     elif isinstance(target, AprilGridTarget):
         w, h = target.pattern_m
         pitch, gap = (1 + target.spacing) * target.tag_m, target.spacing * target.tag_m

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from rendering import FURNACE, make_scene
 
+import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.cube import render_cube
-from hesim_render.targets.patches import read_patches
+from hesim_render.spectral.patches import read_patches
 
 SPECTRA = """\
 # measured on a Monday
@@ -41,7 +42,7 @@ def test_patches_in_cielab_have_their_colour_under_d50(tmp_path):
     weights = np.stack([np.interp(grid, table.wavelengths, c) for c in table.values.T])
     weights *= np.interp(grid, light.wavelengths, light.values)
     white = weights.sum(axis=1)
-    for name, spectrum in read_patches(tmp_path / "chart.csv", 4).items():
+    for name, spectrum in read_patches(tmp_path / "chart.csv").items():
         assert spectrum.values.min() >= 0 and spectrum.values.max() <= 1
         t = (weights @ spectrum.at(grid)) / white
         f = np.where(t > (6 / 29) ** 3, np.cbrt(t), t / (3 * (6 / 29) ** 2) + 4 / 29)
@@ -59,7 +60,6 @@ MISTAKES = {
     "twice": ("name,400,700\na,0.1,0.2\na,0.2,0.3\n", ":3: the name 'a' is there twice"),
     "unnamed": ("name,400,700\n,0.1,0.2\n", ":2: the name '' is empty"),
     "percent": ("name,400,700\na,10,20\n", ":2: a reflectance must lie in [0, 1]; this one runs from 10 to 20; divide"),
-    "count": ("name,400,700\na,0.1,0.2\n", "the file has 1 patches; rows times cols of the target is 2"),
     "lightness": ("name,L,a,b\na,120,0,0\n", ":2: L must lie in 0 to 100; it is 120"),
     "no surface": ("name,L,a,b\na,50,-120,100\n", ":2: no reflectance in [0, 1] has the colour"),
 }
@@ -70,6 +70,47 @@ def test_a_wrong_chart_is_one_line_with_file_and_line(mistake, tmp_path):
     text, told = MISTAKES[mistake]
     (tmp_path / "chart.csv").write_text(text)
     with pytest.raises(SpecError) as caught:
-        read_patches(tmp_path / "chart.csv", 2)
+        read_patches(tmp_path / "chart.csv")
     assert told in str(caught.value) and str(caught.value).startswith(str(tmp_path / "chart.csv"))
     assert len(str(caught.value).splitlines()) == 1
+
+
+SCENE = """\
+schema_version: 1
+name: chart
+description: a chart of two patches
+target: {type: patch-chart, %s}
+light: {type: uniform, illuminance_lux: 100}
+camera: {fit: target}
+"""
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        (
+            "patches: chart.csv, rows: 2, cols: 2",
+            "scene.yaml:4: target.patches: there are 2 patches; rows times cols is 4",
+        ),
+        ("rows: 1, cols: 2", "scene.yaml:4: target: give patches or spectra, exactly one of them"),
+        ("patches: none.csv, rows: 1, cols: 2", "no such file: "),
+        ("patches: ../chart.csv, rows: 1, cols: 2", "lies outside of the scene's folder"),
+    ],
+)
+def test_a_chart_that_does_not_fit_its_scene_is_refused(keys, told, tmp_path):
+    (tmp_path / "chart.csv").write_text("name,300,1100\na,0.1,0.2\nb,0.3,0.4\n")
+    (tmp_path / "scene.yaml").write_text(SCENE % keys)
+    with pytest.raises(SpecError) as caught:
+        hr.load_scene(tmp_path / "scene.yaml")
+    assert told in str(caught.value) and len(str(caught.value).splitlines()) == 1
+
+
+def test_a_dump_holds_the_numbers_and_is_the_same_target(tmp_path):
+    (tmp_path / "chart.csv").write_text("name,300,1100\na,0.1,0.2\nb,0.3,0.4\n")
+    (tmp_path / "scene.yaml").write_text(SCENE % "patches: chart.csv, rows: 1, cols: 2")
+    spec = hr.load_scene(tmp_path / "scene.yaml").spec
+    dumped = spec.model_dump(mode="json", exclude_none=True)
+    assert "csv" not in str(dumped)
+    again = type(spec).model_validate(dumped).target.load()
+    assert list(again) == ["a", "b"]
+    np.testing.assert_array_equal(again["b"].values, [0.3, 0.4])

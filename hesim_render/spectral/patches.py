@@ -16,7 +16,7 @@ from hesim_render.spectral.spectrum import Spectrum, colour_science
 _LAB = ("l", "a", "b")
 
 
-def read_patches(file: Path, count: int) -> dict[str, Spectrum]:
+def read_patches(file: Path) -> dict[str, Spectrum]:
     """Reflectances of the patches of a file, by name, in its order.
 
     The first line is a header: ``name`` and wavelengths in nm, or ``name, L, a, b``; lines that begin with ``#`` are
@@ -26,7 +26,6 @@ def read_patches(file: Path, count: int) -> dict[str, Spectrum]:
     Parameters
     ----------
     file : the CSV file.
-    count : wanted number of patches.
 
     Raises
     ------
@@ -69,8 +68,6 @@ def read_patches(file: Path, count: int) -> dict[str, Spectrum]:
                 line=number,
             )
         found[name] = Spectrum(wavelengths, values)
-    if len(found) != count:
-        raise SpecError(f"the file has {len(found)} patches; rows times cols of the target is {count}", file=file)
     return found
 
 
