@@ -34,8 +34,15 @@ def content_of(kind, folder):
     return "rotation_deg: 10"
 
 
-@pytest.mark.parametrize("sensor", ["eiger", "davis346"])
-@pytest.mark.parametrize("kind", KINDS)
+#: Each kind on one of two sensors in the fast tests, and on the other one in the slow ones.
+RUNS = [
+    pytest.param(kind, sensor, id=f"{kind}-{sensor}", marks=[pytest.mark.slow] if (number + other) % 2 else [])
+    for number, kind in enumerate(KINDS)
+    for other, sensor in enumerate(("eiger", "davis346"))
+]
+
+
+@pytest.mark.parametrize(("kind", "sensor"), RUNS)
 def test_it_renders(kind, sensor, tmp_path, capsys):
     assert len(KINDS) == 19
     (tmp_path / "scene.yaml").write_text(
