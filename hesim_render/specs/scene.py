@@ -274,6 +274,11 @@ def read_scene(
     return spec.model_copy(update={"folder": file.parent, "file": file, "allow_outside": allow_outside})
 
 
+def _is_track(location: tuple[Any, ...]) -> bool:
+    """True for the place of the name of a trajectory file."""
+    return len(location) == 3 and location[0] == "motion" and location[2] == "file"
+
+
 def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], str]]:
     """Every file that a scene file names, with its place in it."""
     if isinstance(node, Mapping | list):
@@ -282,5 +287,5 @@ def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tu
     elif isinstance(node, str):
         key = location[-1] if location else None
         files = ("mitsuba", "file"), ("target", "file"), ("target", "patches")
-        if key in ("csv", "mesh", "filename") or location in files or node.endswith(".csv"):
+        if key in ("csv", "mesh", "filename") or location in files or node.endswith(".csv") or _is_track(location):
             yield location, node
