@@ -24,8 +24,8 @@ def read_poses(file: Path, axes: str = "scene") -> list[dict[str, Any]]:
     """Keyframes of a trajectory file, as they may stand in a scene file.
 
     A CSV file has the header ``t_us,x_m,y_m,z_m,qx,qy,qz,qw``. Any other file is one of the TUM RGB-D benchmark: time
-    in seconds and the same seven numbers, separated by blanks. Lines that begin with ``#`` are comments. Times are rounded
-    to whole microseconds.
+    in seconds and the same seven numbers, separated by blanks. Lines that begin with ``#`` are comments. Times are
+    rounded to whole microseconds.
 
     Parameters
     ----------

@@ -50,12 +50,17 @@ class ObjectSpec(Strict):
     reflectance: ReflectanceSpec = SpectrumSpec(flat=0.5)
     pattern: ReflectanceSpec | None = Field(None, description="second reflectance: checks over the shape's own u, v")
     pattern_count: tuple[Count, Count] = (8, 8)
-    mesh: str | None = Field(None, description="OBJ or PLY file, relative to this file")
+    mesh: str | None = Field(None, description="OBJ, PLY, STL, GLB or glTF file, relative to this file")
+    materials: Literal["own", "file"] = Field(
+        "own", description="of a mesh: the reflectance above, or the materials of a GLB or glTF file"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> ObjectSpec:
         if (self.shape == "mesh") != (self.mesh is not None):
             raise ValueError("shape 'mesh' and the key 'mesh' go together")
+        if self.materials == "file" and not str(self.mesh).lower().endswith((".glb", ".gltf")):
+            raise ValueError("materials: only GLB and glTF files have materials that are read")
         if min(self.size_m) < 0 or (min(self.size_m) == 0 and self.shape not in ("rectangle", "mesh")):
             raise ValueError("size_m must be above 0")
         if self.shape == "sphere" and len(set(self.size_m)) != 1:

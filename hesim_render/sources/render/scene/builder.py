@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
+from hesim_render.sources.render.scene.mesh_file import mesh_shapes
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
 from hesim_render.sources.render.scene.mitsuba_scene import load_mitsuba, path_tracer
 from hesim_render.sources.render.scene.mitsuba_version import (
@@ -182,9 +182,15 @@ def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[
                 paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
-        content[name] = _object(mi, item, name, spec.folder)
-        groups[item.name] = [name]
-        paints.append(_paint(item, name))
+        placement, bsdf = _placement(item), _bsdf(mi, item)
+        if item.shape == "mesh":
+            parts = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, spec.allow_outside or spec.file is None)
+            all_matt &= item.materials == "own"
+        else:
+            parts = {name: _object(mi, item, name, placement, bsdf)}
+        content.update(parts)
+        groups[item.name] = list(parts)
+        paints += [_paint(item, part) for part in parts]
     try:
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
@@ -219,11 +225,16 @@ def _paint(item: ObjectSpec, name: str) -> Paint:
     return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
 
 
-def _object(mi: MitsubaModule, item: ObjectSpec, name: str, folder: Path) -> MitsubaObject:
+def _placement(item: ObjectSpec) -> NDArray[np.float64]:
+    """Pose [4, 4] of an object at rest."""
     placement = np.eye(4)
     placement[:3, :3] = rotation_about(item.rotation_axis, item.rotation_deg)
     placement[:3, 3] = item.position_m
-    half = np.array(item.size_m) / 2
+    return placement
+
+
+def _bsdf(mi: MitsubaModule, item: ObjectSpec) -> dict[str, Any]:
+    """The matt surface of an object."""
     texture = spectrum_dict(item.reflectance.load())
     if item.pattern is not None:
         scale = np.diag([item.pattern_count[0] / 2, item.pattern_count[1] / 2, 1.0, 1.0])
@@ -234,36 +245,19 @@ def _object(mi: MitsubaModule, item: ObjectSpec, name: str, folder: Path) -> Mit
             "to_uv": transform(mi, scale),
         }
     bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
-    if item.shape in _OPEN_SHAPES:
-        bsdf = {"type": "twosided", "material": bsdf}
+    return {"type": "twosided", "material": bsdf} if item.shape in _OPEN_SHAPES else bsdf
+
+
+def _object(
+    mi: MitsubaModule, item: ObjectSpec, name: str, placement: NDArray[np.float64], bsdf: dict[str, Any]
+) -> MitsubaObject:
+    half = np.array(item.size_m) / 2
     if item.shape == "sphere":
         to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))
         return {"type": "sphere", "to_world": to_world, "bsdf": bsdf}
-    if item.shape == "mesh":
-        return _mesh_file(mi, item, placement, bsdf, folder)
     corners, faces, uv = _box_mesh() if item.shape == "box" else _rectangle_mesh()
     vertices = (corners * half) @ placement[:3, :3].T + placement[:3, 3]
     return make_mesh(mi, name, vertices, faces, bsdf, uv)
-
-
-def _mesh_file(
-    mi: MitsubaModule, item: ObjectSpec, placement: NDArray[np.float64], bsdf: dict[str, Any], folder: Path
-) -> MitsubaObject:
-    """A mesh file, scaled to a bounding box of `size_m` and centred on the object's place."""
-    path = folder / str(item.mesh)
-    if not path.is_file():
-        raise SpecError(f"no such mesh file: {path}", key=f"objects.{item.name}.mesh")
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in ("obj", "ply"):
-        raise SpecError(f"a mesh must be an OBJ or PLY file, not {path.name}", key=f"objects.{item.name}.mesh")
-    with as_spec_error(path, f"objects.{item.name}.mesh"):
-        box = mi.load_dict({"type": kind, "filename": str(path)}).bbox()
-    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-    extent = high - low
-    factors = np.divide(item.size_m, extent, out=np.ones(3), where=extent > 0)
-    fit = np.diag([*factors, 1.0])
-    fit[:3, 3] = -factors * (low + high) / 2
-    return {"type": kind, "filename": str(path), "to_world": transform(mi, placement @ fit), "bsdf": bsdf}
 
 
 def _rectangle_mesh() -> tuple[NDArray, NDArray, NDArray]:
