@@ -51,7 +51,7 @@ def test_it_renders(kind, sensor, tmp_path, capsys):
         "light: {type: uniform, illuminance_lux: 500}\ncamera: {fit: target}\n"
     )
     with pytest.raises(SystemExit) as caught:
-        cli.main(["simulate", str(tmp_path / "scene.yaml"), "--sensor", sensor, "--roi", "32x24", "--quality", "2",
+        cli.main(["simulate", str(tmp_path / "scene.yaml"), "--sensor", sensor, "--roi", "32x24", "--samples", "2",
                   "--duration", "0.03", "--out", str(tmp_path / "out")])  # fmt: skip
     assert caught.value.code == 0, capsys.readouterr().err
     frames = hr.Recording.load(tmp_path / "out").frames
