@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.pixels.evs.labels import EventLabels
+from hesim_render.pixels.evs.events import EventLabels
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.colour_view import thumbnail
 from hesim_render.recording.dng import write_dng

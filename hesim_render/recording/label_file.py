@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, reading, require_memory
-from hesim_render.pixels.evs.events import EVENT_DTYPE
-from hesim_render.pixels.evs.labels import EventLabels, Label, Lost
+from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, Label, Lost
 from hesim_render.recording.event_file import EventFileWriter, read_events
 from hesim_render.recording.hdf5 import COMPRESSION, Disk, dataset_of
 

@@ -35,7 +35,7 @@ from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.label_file import LABEL_FILE, read_labels
 
 if TYPE_CHECKING:
-    from hesim_render.pixels.evs.labels import EventLabels
+    from hesim_render.pixels.evs.events import EventLabels
     from hesim_render.recording.truth_file import StoredTruth
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene

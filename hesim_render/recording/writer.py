@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.pixels.evs.events import no_events
-from hesim_render.pixels.evs.labels import EventLabels
+from hesim_render.pixels.evs.events import EventLabels, no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame

@@ -6,7 +6,8 @@ import pytest
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.balance import Balance, Steps
-from hesim_render.pixels.evs.labels import Label, Labeller, Lost
+from hesim_render.pixels.evs.events import Label, Lost
+from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.specs.sensor import read_sensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -23,3 +24,44 @@ class Origin(IntEnum):
 def no_events() -> NDArray:
     """An empty event array."""
     return np.empty(0, dtype=EVENT_DTYPE)
+
+
+class Label(IntEnum):
+    """Causes of events; the numbers are those of the file."""
+
+    SIGNAL = 0
+    MISMATCH = 1
+    LEAK = 2
+    HOT = 3
+    NOISE = 4
+
+
+class Lost(IntEnum):
+    """Where events were lost."""
+
+    READOUT = 0
+    REFRACTORY = 1
+
+
+@dataclass(frozen=True, eq=False)
+class EventLabels:
+    """Labels of all events of a run.
+
+    Parameters
+    ----------
+    label : uint8 [event], numbers of `Label`, in the order of the events.
+    lost : events (`EVENT_DTYPE`) that the read-out or the dead time has lost, in order of time.
+    lost_in : uint8 [lost], numbers of `Lost`.
+    clean : events of the noise-free pixels, `EVENT_DTYPE`, in order of time.
+    """
+
+    label: NDArray[np.uint8]
+    lost: NDArray[np.void]
+    lost_in: NDArray[np.uint8]
+    clean: NDArray[np.void]
+
+    def counts(self) -> dict[str, int]:
+        """Number of events of each cause, of lost ones, and of noise-free ones."""
+        found = {label.name.lower(): int(np.count_nonzero(self.label == label)) for label in Label}
+        lost = {f"lost_{place.name.lower()}": int(np.count_nonzero(self.lost_in == place)) for place in Lost}
+        return {**found, **lost, "noise_free": int(self.clean.size)}

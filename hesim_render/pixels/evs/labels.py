@@ -13,15 +13,12 @@ partner is `leak` or `hot` if that process gave it, else `noise`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device_types import Float
 from hesim_render.pixels.evs.balance import Balance, Steps
-from hesim_render.pixels.evs.events import Origin, no_events
+from hesim_render.pixels.evs.events import EventLabels, Label, Lost, Origin, no_events
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 
@@ -30,47 +27,6 @@ _NOISE = (
     *("shot", "dark_current", "leak", "refractory", "readout_limit"),
     *("stuck", "hot", "flickering"),
 )
-
-
-class Label(IntEnum):
-    """Causes of events; the numbers are those of the file."""
-
-    SIGNAL = 0
-    MISMATCH = 1
-    LEAK = 2
-    HOT = 3
-    NOISE = 4
-
-
-class Lost(IntEnum):
-    """Where events were lost."""
-
-    READOUT = 0
-    REFRACTORY = 1
-
-
-@dataclass(frozen=True, eq=False)
-class EventLabels:
-    """Labels of all events of a run.
-
-    Parameters
-    ----------
-    label : uint8 [event], numbers of `Label`, in the order of the events.
-    lost : events (`EVENT_DTYPE`) that the read-out or the dead time has lost, in order of time.
-    lost_in : uint8 [lost], numbers of `Lost`.
-    clean : events of the noise-free pixels, `EVENT_DTYPE`, in order of time.
-    """
-
-    label: NDArray[np.uint8]
-    lost: NDArray[np.void]
-    lost_in: NDArray[np.uint8]
-    clean: NDArray[np.void]
-
-    def counts(self) -> dict[str, int]:
-        """Number of events of each cause, of lost ones, and of noise-free ones."""
-        found = {label.name.lower(): int(np.count_nonzero(self.label == label)) for label in Label}
-        lost = {f"lost_{place.name.lower()}": int(np.count_nonzero(self.lost_in == place)) for place in Lost}
-        return {**found, **lost, "noise_free": int(self.clean.size)}
 
 
 class Labeller:

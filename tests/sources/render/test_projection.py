@@ -5,7 +5,8 @@ import rendering
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
-from hesim_render.sources.render.camera import RayFactory, place_camera
+from hesim_render.sources.render.camera import place_camera
+from hesim_render.sources.render.primary_rays import RayFactory
 
 SCENE = {
     "objects": [{"name": "wall", "shape": "rectangle", "size_m": [4, 4, 0]}],
