@@ -62,7 +62,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "tests/calibrate/test_calibration_closed_forms.py",
         "tests/calibrate/test_calibrate_evs.py",
     ),
-    "calibrate.evs.flicker": ("tests/pixels/test_pixel_defects.py",),
+    "calibrate.flicker": ("tests/pixels/test_pixel_defects.py",),
     "calibrate.aps.telegraph": ("tests/pixels/test_pixel_defects.py",),
     "pixels.poisson_points": ("tests/pixels/test_pixel_defects.py",),
     "sources.flicker": ("tests/sources/test_flicker.py",),

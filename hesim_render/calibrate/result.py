@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.guard import read_text
 from hesim_render.core.npz import NpzWriter
-from hesim_render.core.output import check_place, output_errors, replacing
+from hesim_render.core.output import alone_in, check_place, output_errors, replacing
 from hesim_render.specs.calibration import file_digest, read_calibration, read_maps
 from hesim_render.specs.calibration_spec import SCHEMA_VERSION
 
@@ -33,7 +33,8 @@ def write_section(
     """Add or replace a section of a calibration, with its maps in ``<name>_<section>_maps-<hash>.npz`` beside it.
 
     The name of a map file contains a hash of its content, and the calibration holds that hash. New maps replace old
-    ones in the same step in which the new calibration gets its name.
+    ones in the same step in which the new calibration gets its name. Runs that write different sections of one
+    calibration at the same time wait for each other here, and neither loses its section.
 
     Raises
     ------
@@ -43,8 +44,20 @@ def write_section(
         If it cannot be written.
     """
     path = Path(file)
-    data = check_calibration(path, capture)
     names = [name for name in maps if not name.startswith("figure_")]
+    with alone_in(path.absolute().parent):
+        _write_section(path, section, check_calibration(path, capture), content, maps, names)
+    return path
+
+
+def _write_section(
+    path: Path,
+    section: str,
+    data: dict[str, Any],
+    content: Mapping[str, Any],
+    maps: Mapping[str, NDArray],
+    names: list[str],
+) -> None:
     target = path.with_name(f"{path.stem}_{section}_maps-{_digest(maps)[:12]}.npz")
     try:
         with replacing(target) as temporary, NpzWriter(temporary) as archive:
@@ -57,7 +70,6 @@ def write_section(
     finally:
         with contextlib.suppress(OSError, SpecError):  # not what was asked for, and the next run does it
             _remove_unnamed(path, section)
-    return path
 
 
 def check_calibration(file: str | Path, capture: Mapping[str, Any]) -> dict[str, Any]:

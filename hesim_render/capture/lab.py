@@ -40,6 +40,7 @@ _CONTRASTS, _REACH = 21, 2.0
 _LEAST_TRIALS = 50
 _FEWEST_FRAMES = 8
 _FEWEST_TRIALS = 4
+_FEWEST_PARTS, _MOST_PARTS = 8, 8191
 _FRAME_WORK = 8  # a frame takes about as long as this many ticks
 _NODES_PER_CUTOFF_PERIOD = 16  # of the noise of asynchronous pixels, each of which costs about as much as a tick
 
@@ -76,7 +77,8 @@ def write_captures(
         repeats.
     without : noise terms to switch off, as in `simulate`.
     parts : number of equal parts of the dark ticks that are also counted separately (``dark_parts``). They distinguish
-        flickering event pixels from steady ones. A divisor of `ticks`, at least 8; or 0 for none.
+        flickering event pixels from steady ones. A divisor of `ticks`, at least 8; or 0 for none. For sensors with
+        reference ``last_event``: number of parts of 8 trials in the brightest steady light (``bright_parts``).
     dark_exposures_us, lit_exposures_us : exposures of the dark and of the lit frames, µs.
     illuminant : name of the light's spectrum.
     overwrite : replace an existing capture set.
@@ -104,8 +106,11 @@ def write_captures(
         raise RangeError("ticks", ticks, "1 to 2^31 - 1")
     if not _FEWEST_TRIALS <= trials < 2**16:
         raise RangeError("trials", trials, f"{_FEWEST_TRIALS} to 65535")
-    if parts and (parts < _FEWEST_FRAMES or ticks % parts):
-        raise RangeError("parts", parts, f"0, or a divisor of the {ticks} ticks from {_FEWEST_FRAMES} on")
+    has_ticks = sensor.spec.evs is None or sensor.spec.evs.reference == "previous_sample"
+    if parts and has_ticks and (parts < _FEWEST_PARTS or ticks % parts):
+        raise RangeError("parts", parts, f"0, or a divisor of the {ticks} ticks from {_FEWEST_PARTS} on")
+    if parts and not has_ticks and not _FEWEST_PARTS <= parts <= _MOST_PARTS:
+        raise RangeError("parts", parts, f"0, or {_FEWEST_PARTS} to {_MOST_PARTS}")
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
     bench = set_up(sensor, lit_exposures_us, illuminant, without)
@@ -115,7 +120,7 @@ def write_captures(
     step_trials = max(_LEAST_TRIALS, ticks // 100)
     plans: dict[str, TrialPlan] = {}
     if bench.evs is not None and bench.evs.spec.reference == "last_event":
-        plans = plan_trials(bench.evs, trials)
+        plans = plan_trials(bench.evs, trials, parts)
         session.total += sum(session.work_of(plan.duration_s) for plan in plans.values())
     elif bench.evs is not None:
         session.total += 2 * ticks + 2 * step_trials * _CONTRASTS

@@ -18,7 +18,16 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
-from hesim_render.mosaic.schedule import Block, Exposure, exposures, tick_blocks
+from hesim_render.mosaic.schedule import (
+    BLOCK_INTERVALS,
+    CELL_US,
+    Block,
+    BlockSample,
+    Exposure,
+    exposures,
+    sample_of_blocks,
+    tick_blocks,
+)
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
@@ -162,18 +171,29 @@ class Capture:
         """Blocks of windows for which the source is asked for the flux of event pixels."""
         if self._stage is None:
             return
-        spec = self._stage.noise.spec
-        if spec.reference == "previous_sample":
-            yield from tick_blocks(spec, self._begin_us, self._duration_us)
-            return
-        known_us = self._stage.t_us
-        if known_us is None:
-            yield from self._event_source.sample_blocks(spec.window_us, self._begin_us, self._duration_us)
+        spec, known_us = self._stage.noise.spec, self._stage.t_us
+        if spec.reference == "previous_sample" or known_us is None:
+            yield from self._blocks_between(self._begin_us, self._duration_us)
             return
         # the state of the previous run holds its last sample
-        blocks = self._event_source.sample_blocks(spec.window_us, known_us - spec.window_us, self._duration_us)
+        blocks = self._blocks_between(known_us - spec.window_us, self._duration_us)
         next(blocks)
         yield from blocks
+
+    def _blocks_between(self, begin_us: float, end_us: float) -> Iterator[Block]:
+        """Blocks of windows of a run between two times."""
+        assert self._stage is not None
+        spec = self._stage.noise.spec
+        if spec.reference == "previous_sample":
+            return tick_blocks(spec, begin_us, end_us)
+        return self._event_source.sample_blocks(spec.window_us, int(begin_us), int(end_us))
+
+    def sample_of_event_blocks(self) -> BlockSample:
+        """Some of `event_blocks`, which stand for all of them; a long run has millions."""
+        if self._stage is None:
+            return BlockSample([], 1.0)
+        stretch_us = BLOCK_INTERVALS * (self._stage.noise.spec.tick_us or CELL_US)
+        return sample_of_blocks(self._blocks_between, stretch_us, self._begin_us, self._duration_us, self._seed)
 
     @property
     def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:

@@ -13,7 +13,7 @@ from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
 from hesim_render.core.progress import Progress, ProgressReport, shown
 from hesim_render.core.units import US_PER_S
-from hesim_render.mosaic.schedule import require_countable
+from hesim_render.mosaic.schedule import BlockSample, require_countable
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
@@ -129,8 +129,9 @@ def simulate(
         rendering = _change_driven_parts(flux)
         wanted = rendering[0].quality if rendering else None
         plain = Capture(flux, flux.sensor, *noise, duration_us, seed)
+        sample = plain.sample_of_event_blocks() if rendering and not flux.is_static else BlockSample([], 1.0)
         if rendering:
-            expected = forecast(rendering, plain.event_pixels, plain.event_blocks, *plain.frame_exposures)
+            expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
             if on_estimate is not None:
                 on_estimate(expected)
             if max_minutes is not None and expected.seconds > 60 * max_minutes:
@@ -145,7 +146,7 @@ def simulate(
                 told.expect(expected.seconds)
             if flux.is_static:
                 rendering[0].progress = _share_progress(expected.rays, told)
-        noted = _noted(flux, plain, seed) if rendering else None
+        noted = _noted(flux, plain, round(sample.windows), seed) if rendering else None
         capture = plain if noted is None else Capture(noted, flux.sensor, *noise, duration_us, seed)
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
@@ -219,11 +220,10 @@ def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
     return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
 
 
-def _noted(flux: Any, capture: Capture, seed: int) -> NotedFlux:
+def _noted(flux: Any, capture: Capture, windows: int, seed: int) -> NotedFlux:
     """The source, wrapped so that units of the audit are noted during the run."""
     spec = flux.sensor.spec.evs
     stretch = STRETCHES[spec.reference] if spec is not None else (0, 1, 0)
-    windows = 0 if flux.is_static else sum(int(block.wanted.sum()) for block in capture.event_blocks())
     frames = 1 if flux.is_static else max(1, len(capture.frame_exposures[1]))
     return NotedFlux(flux, capture.event_pixels, windows, frames, *stretch, seed)
 

@@ -33,7 +33,7 @@ _PER_PIXEL_S, _PER_ITEM_S, _IN_ALL_S = np.array([8e-9, 17e-9, 60e-9]), np.array(
 
 @dataclass(frozen=True)
 class VideoEstimate:
-    """Estimated work of a run, right to about a factor of two. The time to decode slow codecs comes on top.
+    """Estimated work of a run, right to about a factor of two.
 
     Parameters
     ----------
@@ -54,7 +54,10 @@ class VideoEstimate:
 
 
 def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimate:
-    """Estimate from counts alone. Nothing is read, and memory does not depend on the length of the run."""
+    """Estimate from counts and from the measured time to read the first pictures.
+
+    Memory does not depend on the length of the run.
+    """
     aps, evs, shape = sensor.spec.aps, sensor.spec.evs, sensor.layout.shape
     pictures = min(flux.clock.count, int(np.searchsorted(flux.clock.middle_us, duration_us)) + 1)
     samples = 0
@@ -65,6 +68,7 @@ def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimat
     rows, cols = sensor.layout.evs_shape
     pixels = np.array([shape[0] * shape[1], rows * cols, shape[0] * shape[1]])
     seconds = (count * pixels * _PER_PIXEL_S).sum() / (os.cpu_count() or 1) + (count * _PER_ITEM_S).sum() + _IN_ALL_S
+    seconds += pictures * flux.seconds_per_picture(pictures)
     return VideoEstimate(float(seconds), pictures, int(samples), frames)
 
 

@@ -36,7 +36,7 @@ def lab(
     lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
     illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
     parts: Annotated[
-        int, typer.Option(help="parts of the dark ticks that are counted too: tells flickering pixels")
+        int, typer.Option(help="parts of the dark ticks (of bright trials) counted too: tells flickering pixels")
     ] = 0,
     seed: Annotated[int, typer.Option(help="of all temporal noise")] = 7,
     set_: SensorKeys = None,

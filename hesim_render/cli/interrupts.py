@@ -23,12 +23,20 @@ class Interrupts:
     Python runs its signal handlers between two of its own instructions, so a long call of native code would delay
     an interrupt. The C part of Python's handler, however, writes the signal's number into a pipe at once. A thread
     reads it there, waits `GRACE_S` for the main thread, then removes unfinished output and ends the process.
+
+    Where the handler runs inside of a finaliser or of a callback of a weak reference, Python cannot pass its exception
+    on: it would print a traceback and go on. Nothing is printed then, and the thread ends the process.
     """
 
     def __init__(self) -> None:
         self.happened = False
         self._before: dict[int, Any] = {}
         self._ended = threading.Event()
+        self._tell_unraisable = sys.unraisablehook
+
+    def _unraisable(self, about: Any) -> None:
+        if not (self.happened and issubclass(about.exc_type, KeyboardInterrupt)):
+            self._tell_unraisable(about)
 
     def _note(self, *_: Any) -> None:
         self.happened = True
@@ -42,6 +50,7 @@ class Interrupts:
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._note)
+        self._tell_unraisable, sys.unraisablehook = sys.unraisablehook, self._unraisable
         return self
 
     def _watch(self) -> None:
@@ -61,6 +70,7 @@ class Interrupts:
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
+        sys.unraisablehook = self._tell_unraisable
         for number, handler in self._before.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup_before)

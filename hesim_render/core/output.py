@@ -5,12 +5,14 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import fcntl
 import glob
 import hashlib
 import os
 import re
 import shutil
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +22,8 @@ from hesim_render.core.errors import HesimError, OutputError
 _unfinished: dict[Path, Path] = {}
 #: Longest part of a target's name in a temporary name, because file names have at most 255 bytes.
 _LONGEST_NAME = 100
+#: Time to wait for another run in the same folder, and between two looks at it, s.
+_PATIENCE_S, _PAUSE_S = 120.0, 0.05
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")
 _RENAME_EXCHANGE = 2  # of renameat2(2)
 
@@ -188,6 +192,41 @@ def replacing(target: Path) -> Iterator[Path]:
         except BaseException:
             _remove(path)
             raise
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other runs from changing files of a folder that belong together, while they are read, changed and written.
+
+    The folder itself is locked (flock), so nothing is left behind, and the lock ends with the process. A run that holds
+    it does so for seconds. Where a file system has no such locks, none is taken.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be made, or another run holds it for two minutes.
+    """
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        end = time.monotonic() + _PATIENCE_S
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > end:
+                    raise OutputError(
+                        f"{folder}: another run has been writing its results there for {_PATIENCE_S:g} s; run this "
+                        "again when it has ended"
+                    ) from None
+                time.sleep(_PAUSE_S)
+            except OSError:
+                break
+        yield
+    finally:
+        os.close(handle)
 
 
 class OutputFolder:

@@ -165,3 +165,60 @@ def blocks_of_run(
     instants = instants_us(cell, cell + CELL_US)
     beyond = int(instants[np.searchsorted(instants, end_us)])
     yield from instant_blocks(instants_us, window_us, first, beyond)
+
+
+#: Number of stretches of time, of one block of ticks or of cells each, that stand for a run of more of them.
+_STRETCHES = 1024
+
+
+@dataclass(frozen=True)
+class BlockSample:
+    """Blocks from random stretches of a run, or all blocks of a short run.
+
+    Parameters
+    ----------
+    blocks : in order of time.
+    share : fraction of the run's time that they cover; 1 for a short run.
+    """
+
+    blocks: list[Block]
+    share: float
+
+    @property
+    def count(self) -> float:
+        """Estimated number of blocks of the run."""
+        return len(self.blocks) / self.share
+
+    @property
+    def windows(self) -> float:
+        """Estimated number of wanted windows of the run."""
+        return sum(int(np.count_nonzero(block.wanted)) for block in self.blocks) / self.share
+
+
+def sample_of_blocks(
+    blocks: Callable[[float, float], Iterator[Block]], stretch_us: int, begin_us: int, end_us: int, seed: int
+) -> BlockSample:
+    """Sample the blocks of a run in a time that does not grow with its length.
+
+    A run of up to 1024 stretches is listed whole. Of a longer one, the stretches at one random time in each of 1024
+    equal parts are listed.
+
+    Parameters
+    ----------
+    blocks : yields the blocks between two times, µs.
+    stretch_us : length of a stretch, µs; blocks of the source begin and end at its multiples.
+    begin_us, end_us : begin and end of the run, µs.
+    seed : seed of the choice.
+
+    Returns
+    -------
+    The sample.
+    """
+    if end_us - begin_us <= _STRETCHES * stretch_us:
+        return BlockSample(list(blocks(begin_us, end_us)), 1.0)
+    part = np.arange(_STRETCHES) + np.random.default_rng(seed).random(_STRETCHES)
+    chosen = ((begin_us + part / _STRETCHES * (end_us - begin_us)) // stretch_us).astype(np.int64)
+    found = [block for k in chosen.tolist() for block in blocks(k * stretch_us, (k + 1) * stretch_us)]
+    # a source adds a single window where a run begins, and these stretches are not runs
+    found = [block for block in found if block.wanted.size > 1]
+    return BlockSample(found, _STRETCHES * stretch_us / (end_us - begin_us))

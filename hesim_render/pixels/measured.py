@@ -17,7 +17,7 @@ _EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu
 _EXPECTED |= {
     "defect": ("u", 255.0), "defect_on_per_trial": ("f", 1.0), "defect_off_per_trial": ("f", 1.0),
     "defect_firing_share": ("f", 1.0), "defect_correlation": ("f", 1.0),
-    "defect_on_hz": ("f", 1e9), "defect_off_hz": ("f", 1e9),
+    "defect_on_hz": ("f", 1e9), "defect_off_hz": ("f", 1e9), "defect_change_hz": ("f", 1e9),
     "telegraph_amplitude_dn": ("f", 65535.0), "telegraph_high_share": ("f", 1.0), "telegraph_correlation": ("f", 1.0),
 }  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
@@ -63,7 +63,7 @@ def event_defects(layout: Layout) -> dict[str, NDArray] | None:
     Rates are per comparison for sensors with fixed comparisons, in Hz for asynchronous ones.
     """
     evs = layout.spec.evs
-    names = ASYNCHRONOUS_DEFECT_MAPS if evs is not None and evs.tick_us is None else DEFECT_MAPS
+    names = ASYNCHRONOUS_DEFECT_MAPS if evs is not None and evs.reference == "last_event" else DEFECT_MAPS
     return _if_there(layout, "evs", names, _event_region)
 
 

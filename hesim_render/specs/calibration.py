@@ -60,7 +60,7 @@ DEFECT_MAPS = (
     *("defect", "defect_on_per_trial", "defect_off_per_trial"),
     *("defect_firing_share", "defect_correlation"),
 )
-ASYNCHRONOUS_DEFECT_MAPS = ("defect", "defect_on_hz", "defect_off_hz")
+ASYNCHRONOUS_DEFECT_MAPS = ("defect", "defect_on_hz", "defect_off_hz", "defect_firing_share", "defect_change_hz")
 #: Maps that a sensor takes from each section; thresholds are known only where contrast steps were captured.
 SENSOR_MAPS = {
     "aps": ("n_row", "n_blc", "n_dp", *TELEGRAPH_MAPS),
@@ -68,8 +68,7 @@ SENSOR_MAPS = {
         "bad_pixels",
         "threshold_on_relative",
         "threshold_off_relative",
-        *DEFECT_MAPS,
-        *ASYNCHRONOUS_DEFECT_MAPS[1:],
+        *dict.fromkeys((*DEFECT_MAPS, *ASYNCHRONOUS_DEFECT_MAPS)),
     ),
 }
 

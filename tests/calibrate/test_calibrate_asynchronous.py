@@ -1,5 +1,7 @@
 """Calibration of asynchronous event pixels, against trials written out in NumPy, closed forms and the event stage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import reset_captures
@@ -9,9 +11,12 @@ from scipy.stats import binom
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate.asynchronous.defects import classify, plainly_bad
 from hesim_render.calibrate.asynchronous.first_event import first_event
+from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
 from hesim_render.capture.lab import write_captures
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.recording.capture_set import read_captures
 from hesim_render.specs.calibration_spec import Defect
 
 TRUTH = Pixels()
@@ -179,6 +184,113 @@ def test_stuck_hot_and_odd_pixels_are_found_and_no_other(tmp_path):
     assert (kinds[5], kinds[77], kinds[300]) == (Defect.STUCK, Defect.HOT, Defect.OTHER)
     assert maps["defect_on_hz"].ravel()[77] == pytest.approx(np.log(2) / (20 / 300), rel=0.2)
     assert max(abs(z) for z in scores(section, TRUTH).values()) < 4
+
+
+# ---- flickering pixels: counts of successive parts in the brightest light ----------------------------
+
+SETTLE_S, WINDOW_S = 0.0025, 0.067
+TRIAL_S = SETTLE_S + WINDOW_S
+
+
+def own_trials(rate_hz, firing_s, quiet_s, parts, trials, rng):
+    """Trials of a pixel that fires at a rate in one state and not at all in the other; states last exponential times.
+
+    Returns the numbers of disturbed trials [part], of calm trials, and of calm trials with an event. The states and
+    the events are drawn one after the other in continuous time. A quiet time of 0 is a pixel that always fires.
+    """
+    end_s, t, events = parts * trials * TRIAL_S, 0.0, []
+    fires = rng.random() < firing_s / (firing_s + quiet_s)
+    while t < end_s:
+        lasts = rng.exponential(firing_s if fires else quiet_s) if quiet_s else end_s
+        if fires:
+            events.append(t + lasts * rng.random(rng.poisson(rate_hz * lasts)))
+        t, fires = t + lasts, not fires or not quiet_s
+    events = np.concatenate(events) if events else np.empty(0)
+    events = events[events < end_s]
+    trial, within = (events // TRIAL_S).astype(int), events % TRIAL_S
+    disturbed = np.bincount(trial, minlength=parts * trials) > 0
+    unsettled = np.bincount(trial[within < SETTLE_S], minlength=parts * trials) > 0
+    return disturbed.reshape(parts, trials).sum(axis=1), np.sum(~unsettled), np.sum(disturbed & ~unsettled)
+
+
+def bright_trials(kinds, parts, trials, rng):
+    """Steady trials in one light, and empty ones of steps, of pixels given by (rate, firing, quiet)."""
+    disturbed, calm, events = (
+        np.stack(values, axis=-1)
+        for values in zip(*(own_trials(*kind, parts, trials, rng) for kind in kinds), strict=True)
+    )
+    steady = Trials(
+        np.array([1000.0]), np.zeros(1), SETTLE_S, np.array([0.0, WINDOW_S]), calm[None], events[None, None],
+        0 * events[None, None], (1, len(kinds)), Parts(disturbed, trials, TRIAL_S),
+    )  # fmt: skip
+    seen = np.ones((2, 1, len(kinds)), int)
+    steps = Trials(
+        np.full(2, 100.0), np.array([0.3, -0.3]), SETTLE_S, np.array([0.0, 1e-3]), 9 * seen[:, 0], seen, seen,
+        (1, len(kinds)),
+    )  # fmt: skip
+    return steady, steps
+
+
+def test_flickering_pixels_are_told_from_hot_ones_and_so_are_their_times():
+    """60 pixels of each kind: 15 events/s for 1 s in 3 s on the average, 15/s and 60/s always, and good ones.
+
+    Medians over the flickering ones, each from 512 trials of 70 ms: over 12 other seeds they were 8 % too high (rate),
+    5 % too low (share) and 14 % too high (rate of change), with a scatter of 5, 6 and 7 %. The bounds are 4 of these
+    beyond. The bias comes from the state that is taken to last for a whole trial, a tenth of its correlation time.
+    """
+    each = [(15.0, 1.0, 2.0), (15.0, 1.0, 0.0), (60.0, 1.0, 0.0)]
+    few = [kind for kind in each for _ in range(3)] + [(0.02, 1.0, 0.0)] * 2000
+    assert np.array_equal(
+        np.flatnonzero(plainly_bad(*bright_trials(few, 64, 8, np.random.default_rng(7)))), np.arange(9)
+    )
+    kinds = [kind for kind in each for _ in range(60)] + [(0.02, 1.0, 0.0)] * 600
+    steady, steps = bright_trials(kinds, 64, 8, np.random.default_rng(5))
+    bad = np.arange(780) < 180
+    found = classify(steady, steps, bad)
+    assert np.all(found.kind[:60] == Defect.FLICKERING) and np.all(found.kind[60:180] == Defect.HOT)
+    assert not found.kind[180:].any()
+    flickering = slice(0, 60)
+    for name, true, rel in (("on_hz", 15.0, 0.28), ("firing_share", 1 / 3, 0.29), ("change_hz", 1.5, 0.42)):
+        assert np.median(getattr(found, name)[flickering]) == pytest.approx(true, rel=rel), name
+    assert np.median(found.on_hz[60:120]) == pytest.approx(15.0, rel=0.05)
+    assert np.all(found.firing_share[60:] == 1) and np.all(found.change_hz[60:] == 0)
+    assert not found.off_hz.any() and not found.on_hz[180:].any()
+    # without the parts nothing tells them
+    alone = classify(replace(steady, parts=None), steps, bad)
+    assert np.all(alone.kind[:180] == Defect.HOT) and np.all(alone.firing_share == 1)
+    # what all are steady at, no pixel is called flickering for: 2400 pixels at 1e-6
+    steady, steps = bright_trials([(rate, 1.0, 0.0) for rate in (3.0, 15.0, 40.0) for _ in range(800)], 64, 8,
+                                  np.random.default_rng(6))  # fmt: skip
+    assert np.all(classify(steady, steps, np.ones(2400, bool)).kind == Defect.HOT)
+
+
+def with_parts(folder, target, parts, trials, **arrays):
+    """The captures, as if the trials in the brightest light had been counted in parts."""
+    given = reset_captures.parts_of(np.load(folder / "evs_noise_rate.npz"), parts, trials, TRIAL_S)
+    return spoiled(folder, target, "evs_noise_rate", **given | arrays)
+
+
+def test_parts_are_read_and_checked(plain, tmp_path):
+    steady, _ = read_trials(read_captures(with_parts(plain[0], tmp_path / "good", 8, 2)))
+    assert steady.parts.trials == 2 and steady.parts.trial_s == pytest.approx(TRIAL_S)
+    assert steady.parts.disturbed.shape == (8, 1024)
+    few = {"bright_parts": np.zeros((4, 32, 32), int)}
+    for number, (arrays, text) in enumerate(
+        (
+            ({"part_us": None}, "no 'part_us'"),
+            ({"part_trials": np.array(1)}, "part_trials"),
+            ({"part_trials": np.array(3)}, "does not add up"),
+            (few, "holds 4 parts; expected 8"),
+            ({"bright_parts": np.zeros((8, 32, 31), int)}, r"of \(32, 32\) pixels"),
+            ({"bright_parts": np.zeros((8, 32, 32))}, "must be whole numbers"),
+            ({"bright_parts": np.full((8, 32, 32), -1)}, "outside 0 to part_trials"),
+            ({"part_us": np.array(-5.0)}, "part_us"),
+        )
+    ):
+        folder = with_parts(plain[0], tmp_path / str(number), 8, 2, **arrays)
+        with pytest.raises(SpecError, match=text) as error:
+            calibrate_evs(folder, tmp_path / "c.yaml")
+        assert str(error.value).startswith(str(folder / "evs_noise_rate.npz"))
 
 
 def ceiling(name, calm, on, off, rng=np.random.default_rng(8)):  # noqa: B008
@@ -375,22 +487,46 @@ def test_intervals_cover_the_truth(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_session_with_stuck_and_hot_pixels_gives_a_sensor_that_has_them(tmp_path):
-    """Hot pixels of 20 ON events/s (spread 0.1 decades): 12 trials of 67 ms in a light tell a rate to a third."""
+def test_a_session_with_defects_gives_a_sensor_that_has_them(tmp_path):
+    """Hot pixels of 20 ON events/s (spread 0.1 decades); flickering ones of 15/s for 1 s in 3 s on the average.
+
+    512 trials of 67 ms tell the rate of a hot pixel to 7 %; of flickering ones, medians are right to a third.
+    """
     changes = {
-        "evs.defects": {"stuck_share": 0.01, "hot_share": 0.02, "hot_rate_hz": 20, "hot_rate_spread_decades": 0.1}
-    }
+        "evs.defects": {
+            "stuck_share": 0.01, "hot_share": 0.02, "hot_rate_hz": 20, "hot_rate_spread_decades": 0.1,
+            "flickering_share": 0.03, "flickering_rate_hz": 15, "flickering_firing_s": 1, "flickering_quiet_s": 2,
+        }
+    }  # fmt: skip
     given = hr.load_sensor("davis346", changes).crop(32, 32)
     write_captures(
-        given, tmp_path / "c", frames=8, trials=12, dark_exposures_us=(1000, 5000), lit_exposures_us=(1000, 5000)
-    )
-    calibrate_evs(tmp_path / "c", tmp_path / "c.yaml")
+        given, tmp_path / "c", frames=8, trials=6, parts=64, dark_exposures_us=(1000, 5000),
+        lit_exposures_us=(1000, 5000),
+    )  # fmt: skip
+    calibrate_evs(tmp_path / "c", tmp_path / "c.yaml", tmp_path / "report.html")
+    section = read_calibration(tmp_path / "c.yaml")["evs"]
     again = hr.load_sensor("davis346", {"noise": str(tmp_path / "c.yaml")}).crop(32, 32)
     truth, found = given.evs.defects, again.evs.defects
-    assert truth.stuck.size > 3 and truth.place.size > 8
+    flickers = truth.change_hz > 0
+    counts = {"stuck": truth.stuck.size, "hot": int((~flickers).sum()), "flickering": int(flickers.sum()), "other": 0}
+    assert min(counts["stuck"], counts["hot"], counts["flickering"]) > 3 and section["defects"] == counts
+    assert f"flickering {counts['flickering']}" in (tmp_path / "report.html").read_text()
     assert np.array_equal(found.stuck, truth.stuck)
-    seen = np.isin(truth.place, found.place)
-    assert np.isin(found.place, truth.place).all() and seen.mean() > 0.8
-    rates = dict(zip(found.place, found.on_hz, strict=True))
-    ratio = np.array([rates[p] for p in truth.place[seen]]) / truth.on_hz[seen]
-    assert np.median(ratio) == pytest.approx(1, abs=0.25)
+    order, theirs = np.argsort(truth.place), np.argsort(found.place)
+    np.testing.assert_array_equal(found.place[theirs], truth.place[order])
+    flickers = flickers[order]
+    np.testing.assert_array_equal(found.change_hz[theirs] > 0, flickers)
+    ratio = found.on_hz[theirs] / truth.on_hz[order]
+    assert np.abs(ratio[~flickers] - 1).max() < 0.35 and np.median(ratio[~flickers]) == pytest.approx(1, abs=0.05)
+    for name, true in (("on_hz", 15.0), ("firing_share", 1 / 3), ("change_hz", 1.5)):
+        assert np.median(getattr(found, name)[theirs][flickers]) == pytest.approx(true, rel=0.33), name
+    assert max(abs(z) for z in scores(section, DAVIS).values()) < 4
+    # its own session has the same defects once more
+    write_captures(
+        again, tmp_path / "d", frames=8, trials=6, parts=64, seed=8, dark_exposures_us=(1000, 5000),
+        lit_exposures_us=(1000, 5000),
+    )  # fmt: skip
+    one, two = (np.load(tmp_path / name / "evs_noise_rate.npz")["bright_parts"].reshape(64, -1) for name in "cd")
+    place = truth.place[order][flickers]
+    assert two[:, place].mean() == pytest.approx(one[:, place].mean(), rel=0.25)
+    assert two[:, place].var(axis=0).mean() == pytest.approx(one[:, place].var(axis=0).mean(), rel=0.35)

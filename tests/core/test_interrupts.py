@@ -68,6 +68,43 @@ def test_native_code_that_never_returns_is_ended_and_cleaned_up_after(number, tm
     assert seconds < 2.0 and list(tmp_path.iterdir()) == []
 
 
+def test_an_interrupt_inside_of_a_finaliser_ends_the_run_without_a_traceback(tmp_path):
+    """Python cannot raise there: it would print the exception and go on."""
+    lost = """
+import os, signal, sys, time
+from hesim_render.recording import manifest
+from hesim_render.cli import main
+class Finalised:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(10):
+            pass
+def versions():
+    Finalised()
+    print("there", flush=True)
+    time.sleep(30)
+manifest.software_versions = versions
+main(["doctor"])
+"""
+    child = _start(sys.executable, "-c", lost)
+    assert child.stdout.readline() == "there\n"  # it went on
+    began = time.monotonic()
+    _, err = child.communicate(timeout=60)
+    assert (child.returncode, err) == (INTERRUPTED, "hesim-render: interrupted\n")
+    assert time.monotonic() - began < 2
+
+
+def test_other_errors_of_finalisers_are_still_told(capsys, monkeypatch):
+    class Broken:
+        def __del__(self):
+            raise ValueError("told")
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
+    with Interrupts():
+        Broken()
+    assert "ValueError: told" in capsys.readouterr().err and sys.unraisablehook is sys.__unraisablehook__
+
+
 def test_python_gets_a_keyboard_interrupt_at_the_next_step():
     child = _start(sys.executable, "-c", _IN_PYTHON)
     assert child.stdout.readline() == "there\n"
@@ -76,7 +113,15 @@ def test_python_gets_a_keyboard_interrupt_at_the_next_step():
     assert (status, out, err) == (0, "KeyboardInterrupt\n", "")
 
 
-def test_an_interrupt_waits_while_native_libraries_are_loaded():
+@pytest.fixture
+def python_handles_interrupts():
+    """Where a shell started the tests in its background, they ignore SIGINT."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_waits_while_native_libraries_are_loaded(python_handles_interrupts):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     loaded = False
     with pytest.raises(KeyboardInterrupt), interrupts_held():

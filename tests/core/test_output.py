@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import capture_sets
@@ -281,3 +282,76 @@ def test_events_ask_as_frames_do(tmp_path):
     with pytest.raises(OutputError, match="is no report"):
         calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "thesis.txt", overwrite=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "thesis.txt"]
+
+
+#: Runs a command line that stops for a while between reading the old calibration and replacing it.
+SLOW = """
+import sys, time
+from pathlib import Path
+from hesim_render.calibrate import result
+made = result._yaml
+def slowly():
+    Path("writing").touch()
+    time.sleep(float(sys.argv[1]))
+    return made()
+result._yaml = slowly
+from hesim_render.cli import main
+main(sys.argv[2:])
+"""
+
+
+def both_sets(folder):
+    capture_sets.write_frames(folder / "frames", size=16, frames=8)
+    capture_sets.write_events(folder / "events", size=16, trials=20000)
+
+
+def slow_run(folder, seconds, *arguments):
+    """A run in another process that is about to replace ``c.yaml``."""
+    child = subprocess.Popen(
+        [sys.executable, "-c", SLOW, str(seconds), *arguments], cwd=folder, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    end = time.monotonic() + 60
+    while not (folder / "writing").exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert child.poll() is None
+    return child
+
+
+def test_two_runs_into_one_calibration_lose_no_section(tmp_path):
+    """One process holds the old content for two seconds before it replaces it; the other one writes meanwhile."""
+    both_sets(tmp_path)
+    child = slow_run(tmp_path, 2.0, "calibrate", "evs", "events", "--out", "c.yaml")
+    calibrate_aps(tmp_path / "frames", tmp_path / "c.yaml", tmp_path / "aps.html")
+    _, err = child.communicate(timeout=60)
+    assert child.returncode == 0, err
+    data = read_calibration(tmp_path / "c.yaml")
+    assert {"aps", "evs"} <= set(data)
+    for section in ("aps", "evs"):
+        assert read_maps(tmp_path / "c.yaml", section, data)
+    found = [name for name in names(tmp_path) if name not in ("events", "frames", "writing")]
+    assert found == ["aps.html", "c.yaml", "c_aps_maps-HASH.npz", "c_evs_maps-HASH.npz"]
+
+
+def test_a_run_that_waits_too_long_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(output, "_PATIENCE_S", 0.3)
+    both_sets(tmp_path)
+    child = slow_run(tmp_path, 60.0, "calibrate", "evs", "events", "--out", "c.yaml")
+    try:
+        with pytest.raises(OutputError, match=r"another run has been writing its results there for 0\.3 s"):
+            calibrate_aps(tmp_path / "frames", tmp_path / "c.yaml")
+    finally:
+        child.kill()
+        child.communicate()
+    calibrate_aps(tmp_path / "frames", tmp_path / "c.yaml")  # the lock ended with its process
+    found = [name for name in names(tmp_path) if name not in ("events", "frames", "writing")]
+    assert "c.yaml" in found and not any("partial" in name for name in found)
+
+
+def test_file_systems_without_locks_are_written_to(tmp_path, monkeypatch):
+    def none(*_):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(output.fcntl, "flock", none)
+    with output.alone_in(tmp_path / "new"):
+        assert (tmp_path / "new").is_dir()

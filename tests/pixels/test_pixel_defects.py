@@ -8,7 +8,7 @@ import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.aps.telegraph import _suspects, fit_two_levels
 from hesim_render.calibrate.evs.counts import read_static
-from hesim_render.calibrate.evs.flicker import dynamics, unsteady
+from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture.lab import write_captures

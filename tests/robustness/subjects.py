@@ -57,6 +57,9 @@ def captures_evs(folder):
 
 def captures_trials(folder):
     reset_captures.write(folder / "set", reset_captures.Pixels(), np.random.default_rng(2), (16, 16), steps=5)
+    file = folder / "set" / "evs_noise_rate.npz"
+    data = dict(np.load(file))
+    np.savez(file, **data, **reset_captures.parts_of(data, 8, 2, 0.07))
 
 
 def calibrate_aps(folder):

@@ -128,3 +128,12 @@ def write(folder, pixels, rng, shape=(32, 32), count=12, steps=8, change=None, n
             n_off=off_.reshape(*off_.shape[:2], *shape).astype(np.uint16),
         )
     return on, off
+
+
+def parts_of(data, parts, trials, trial_s):
+    """Arrays as if the last light had had `parts` times `trials` trials, with events evenly over the parts."""
+    calm, on, off = (data[name][-1].astype(int) for name in ("n_calm", "n_on", "n_off"))
+    silent = calm - on.sum(axis=0) - off.sum(axis=0)
+    disturbed = parts * trials - silent
+    each = np.stack([(disturbed + k) // parts for k in range(parts)])
+    return {"bright_parts": each, "part_trials": np.array(trials), "part_us": np.array(trials * trial_s * 1e6)}

@@ -11,7 +11,9 @@ from scipy.stats import poisson
 
 from hesim_render.calibrate.asynchronous.fit import Fit
 from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
-from hesim_render.calibrate.asynchronous.trials import Trials
+from hesim_render.calibrate.asynchronous.trials import Parts, Trials
+from hesim_render.calibrate.flicker import dynamics, unsteady
+from hesim_render.pixels.evs.formulas import rate_hz
 from hesim_render.specs.calibration_spec import Defect
 
 #: Probability that a good pixel's counts are called bad.
@@ -28,14 +30,23 @@ _CHUNK = 8192
 
 @dataclass(frozen=True)
 class TrialDefects:
-    """Bad pixels, flat arrays: mask of all bad pixels, `Defect` of each, and events per second of hot pixels, 0
-    elsewhere.
+    """Bad pixels; flat arrays [pixel].
+
+    Attributes
+    ----------
+    bad : all bad pixels.
+    kind : `Defect`.
+    on_hz, off_hz : events per second of hot pixels, and of flickering pixels while they fire; 0 elsewhere.
+    firing_share, change_hz : fraction of the time in which a flickering pixel fires, and the rate at which it forgets
+        whether it does, Hz; 1 and 0 elsewhere.
     """
 
     bad: NDArray[np.bool_]
     kind: NDArray[np.uint8]
     on_hz: NDArray[np.float32]
     off_hz: NDArray[np.float32]
+    firing_share: NDArray[np.float32]
+    change_hz: NDArray[np.float32]
 
 
 def plainly_bad(steady: Trials, steps: Trials) -> NDArray[np.bool_]:
@@ -96,25 +107,64 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
 
 
 def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefects:
-    """Classify the bad pixels."""
-    kind = np.zeros(bad.size, np.uint8)
-    on_hz, off_hz = np.zeros((2, bad.size), np.float32)
+    """Classify the bad pixels: stuck, hot, flickering or other.
+
+    A flickering pixel is told from a hot one by the parts of the trials in the brightest light: their scatter has a
+    chance below 1e-6 at a constant rate.
+    """
+    nothing = np.zeros(bad.size, np.float32)
+    found = TrialDefects(
+        bad, np.zeros(bad.size, np.uint8), nothing, nothing.copy(), np.ones(bad.size, np.float32), nothing.copy()
+    )
     some = np.flatnonzero(bad)
     if some.size == 0:
-        return TrialDefects(bad, kind, on_hz, off_hz)
+        return found
     ours, light = steady.of(some), int(np.argmax(steady.signal_dn))
-    seconds = max(float(steady.calm[light].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
+    seconds = max(float(steady.calm[light, ~bad].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
     duration = np.maximum(ours.calm[light] * steady.edges_s[-1], 1e-12)
     never_calm = ours.calm[light] < _CALM * steady.calm[light].max()
     rates = [np.where(never_calm, 0, n[light].sum(axis=0, dtype=np.float64)) / duration for n in (ours.on, ours.off)]
-    usual = [float(n[light].sum(dtype=np.float64)) / seconds for n in (steady.on, steady.off)]
+    usual = [float(n[light][:, ~bad].sum(dtype=np.float64)) / seconds for n in (steady.on, steady.off)]
     excess = [poisson.sf(r * duration - 1, max(u, 1e-9) * duration) < 1e-3 for r, u in zip(rates, usual, strict=True)]
     hot = never_calm | excess[0] | excess[1]
     silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm
-    kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
-    on_hz[some], off_hz[some] = _own_rates(ours, light, never_calm, float(steady.calm[light].max()))
-    on_hz[kind != Defect.HOT] = off_hz[kind != Defect.HOT] = 0
-    return TrialDefects(bad, kind, on_hz, off_hz)
+    found.kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
+    own = _own_rates(ours, light, never_calm, float(steady.calm[light].max()))
+    if steady.parts is not None:
+        flickers = hot & ~silent & unsteady(steady.parts.disturbed[:, some], steady.parts.trials)
+        found.kind[some[flickers]] = Defect.FLICKERING
+        _flicker(found, some[flickers], steady.parts, own[:, flickers])
+    is_hot = found.kind[some] == Defect.HOT
+    found.on_hz[some[is_hot]], found.off_hz[some[is_hot]] = own[:, is_hot]
+    return found
+
+
+def _flicker(found: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: NDArray[np.float64]) -> None:
+    """Enter the times and rates of flickering pixels.
+
+    The state of a pixel is taken to be constant during a trial: the share of trials with an event while it fires is
+    1 − exp(−rate · trial).
+
+    Parameters
+    ----------
+    found : where they are entered.
+    pixels : the flickering pixels.
+    own : [polarity, flickering pixel], mean rates of ON and OFF events, Hz, for the share of ON events.
+    """
+    counts = parts.disturbed[:, pixels]
+    good = parts.disturbed[:, ~found.bad]
+    usual = float(good.mean(dtype=np.float64)) / parts.trials if good.size else 0.0
+    share, correlation = dynamics(counts, parts.trials, usual)
+    chance = np.maximum(counts.mean(axis=0, dtype=np.float64) / parts.trials - usual, 0.0) / share
+    # more cannot be told from the trials than that one is silent in all of those in which the pixel fires
+    most = 1 - 0.5 / np.maximum(counts.shape[0] * parts.trials * share, 1.0)
+    rate = rate_hz(np.minimum(chance, most), parts.trial_s)
+    on_share = own[0] / np.maximum(own.sum(axis=0), 1e-300)
+    found.on_hz[pixels], found.off_hz[pixels] = on_share * rate, (1 - on_share) * rate
+    switching = (correlation > 0) & (share < 1)
+    with np.errstate(divide="ignore"):
+        change = -np.log(np.where(switching, correlation, 1.0)) / parts.trial_s
+    found.firing_share[pixels], found.change_hz[pixels] = np.where(switching, share, 1.0), change
 
 
 def _own_rates(steady: Trials, light: int, never_calm: NDArray[np.bool_], most: float) -> NDArray[np.float64]:

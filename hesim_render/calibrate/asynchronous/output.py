@@ -120,7 +120,8 @@ def maps(result: AsynchronousCalibration) -> dict[str, NDArray]:
     shape, defects = result.steps.shape, result.defects
     arrays: dict[str, NDArray] = {
         "bad_pixels": defects.bad, "defect": defects.kind, "defect_on_hz": defects.on_hz,
-        "defect_off_hz": defects.off_hz,
+        "defect_off_hz": defects.off_hz, "defect_firing_share": defects.firing_share,
+        "defect_change_hz": defects.change_hz,
         "threshold_on_relative": result.relative[0], "threshold_off_relative": result.relative[1],
         "threshold_on_noise": result.noise[0], "threshold_off_noise": result.noise[1],
     }  # fmt: skip

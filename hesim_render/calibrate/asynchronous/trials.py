@@ -3,7 +3,8 @@
 ``evs_noise_rate.npz`` (steady light) and ``evs_s_curve.npz`` (steps of contrast) hold the same arrays, of uniform
 light. A trial begins with a reset of the pixels; ``settle_us`` later comes the step of light, and then the time bins
 bounded by ``edges_us``. A pixel without an event while settling was calm; its first event after that falls into one of
-the bins.
+the bins. ``evs_noise_rate.npz`` may also hold counts of successive parts of the trials in its brightest light, which
+tell flickering pixels from steady ones.
 """
 
 from __future__ import annotations
@@ -21,10 +22,29 @@ from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, Captu
 
 NOISE_RATE, S_CURVE = "evs_noise_rate", "evs_s_curve"
 _ARRAYS = ("signal_dn", "settle_us", "edges_us", "n_calm", "n_on", "n_off")
+_PART_ARRAYS = ("bright_parts", "part_trials", "part_us")
+#: Least number of parts.
+_FEWEST_PARTS = 8
 #: Largest |ln I₁/I₀| of a step.
 _LARGEST_CONTRAST = 20.0
 #: Least fraction of all trials that must be calm.
 _LEAST_CALM = 0.2
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Successive parts of the trials in the brightest steady light, one after another without a pause.
+
+    Attributes
+    ----------
+    disturbed : [part, pixel], number of trials with an event of this pixel at any time after the reset.
+    trials : number of trials of a part.
+    trial_s : time from one reset to the next, s.
+    """
+
+    disturbed: NDArray[np.integer]
+    trials: int
+    trial_s: float
 
 
 @dataclass(frozen=True)
@@ -39,6 +59,7 @@ class Trials:
     calm : [kind, pixel], number of trials without an event while settling.
     on, off : [kind, bin, pixel], number of calm trials whose first event has this polarity and falls in this bin.
     shape : (rows, cols) of the event grid.
+    parts : counts of successive parts, None where there are none.
     """
 
     signal_dn: NDArray[np.float64]
@@ -49,9 +70,10 @@ class Trials:
     on: NDArray[np.integer]
     off: NDArray[np.integer]
     shape: tuple[int, int]
+    parts: Parts | None = None
 
     def of(self, pixels: NDArray) -> Trials:
-        """Trials of some pixels, given by indices or a mask."""
+        """Trials of some pixels, given by indices or a mask, without their parts."""
         return Trials(
             self.signal_dn, self.contrast, self.settle_s, self.edges_s, self.calm[:, pixels], self.on[..., pixels],
             self.off[..., pixels], self.shape,
@@ -120,6 +142,7 @@ def read_trials(captures: CaptureSet) -> tuple[Trials, Trials]:
 
 def _read(file: Path, has_steps: bool) -> Trials:
     arrays = read_arrays(file, (*_ARRAYS, *(("contrast",) if has_steps else ())), kinds="uif")
+    has_parts = not has_steps and "bright_parts" in arrays
     signal = _list(arrays["signal_dn"], "signal_dn", file)
     if not np.all((signal >= 0) & (signal <= BRIGHTEST_DN)):
         raise SpecError(SIGNAL_RANGE, file=file)
@@ -170,7 +193,35 @@ def _read(file: Path, has_steps: bool) -> Trials:
     return Trials(
         signal, contrast, settle_s, edges * S_PER_US, calm.reshape(count, -1), on.reshape(*wanted[:2], -1),
         off.reshape(*wanted[:2], -1), (calm.shape[1], calm.shape[2]),
+        _parts(arrays, signal, calm, events, file) if has_parts else None,
     )  # fmt: skip
+
+
+def _parts(
+    arrays: dict[str, NDArray], signal: NDArray[np.float64], calm: NDArray, events: NDArray, file: Path
+) -> Parts:
+    """``bright_parts``, checked against the counts of the brightest light."""
+    for name in _PART_ARRAYS:
+        if name not in arrays:
+            raise SpecError(f"holds bright_parts and no {name!r}, which belongs to it", file=file)
+    disturbed = arrays["bright_parts"]
+    trials = int(number(arrays["part_trials"], "part_trials", file, whole=True, least=2))
+    part_s = number(arrays["part_us"], "part_us", file) * S_PER_US
+    if disturbed.ndim != 3 or disturbed.shape[1:] != calm.shape[1:] or disturbed.dtype.kind not in "ui":
+        raise SpecError(f"bright_parts must be whole numbers [part, row, col] of {calm.shape[1:]} pixels", file=file)
+    if len(disturbed) < _FEWEST_PARTS:
+        raise SpecError(f"bright_parts holds {len(disturbed)} parts; expected {_FEWEST_PARTS} or more", file=file)
+    bright = int(np.argmax(signal))
+    silent = calm[bright].astype(np.int64) - events[bright]
+    if disturbed.min() < 0 or disturbed.max() > trials:
+        raise SpecError(f"bright_parts holds numbers outside 0 to part_trials = {trials}", file=file)
+    if np.any(disturbed.sum(axis=0, dtype=np.int64) + silent != trials * len(disturbed)):
+        raise SpecError(
+            "bright_parts does not add up: the trials with an event, and those of the brightest signal_dn without one "
+            "(n_calm less n_on and n_off), must be part_trials times the number of parts",
+            file=file,
+        )
+    return Parts(disturbed.reshape(len(disturbed), -1), trials, part_s / trials)
 
 
 def _list(values: NDArray, name: str, file: Path) -> NDArray[np.float64]:

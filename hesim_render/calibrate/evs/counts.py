@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.result import read_calibration, read_maps
 from hesim_render.core.errors import SpecError
+from hesim_render.core.output import alone_in
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.capture_set import BRIGHTEST_DN, SIGNAL_RANGE, CaptureSet, number
 
@@ -146,7 +147,8 @@ def _composite_signal(captures: CaptureSet, calibration: str | Path | None, file
     """
     rate = None
     if calibration is not None and Path(calibration).exists() and "aps" in read_calibration(calibration):
-        maps = read_maps(calibration, "aps")
+        with alone_in(Path(calibration).absolute().parent):
+            maps = read_maps(calibration, "aps")
         if "evs_signal_uneven" in maps:
             rate = np.where(maps["evs_signal_uneven"], np.nan, maps["evs_signal_dn_per_s"])
     if rate is None:

@@ -10,7 +10,6 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import binom, poisson
 
 from hesim_render.calibrate.evs.counts import StaticCapture
-from hesim_render.calibrate.evs.flicker import dynamics, unsteady
 from hesim_render.calibrate.evs.medians import (
     LEAST_EVENTS,
     by_group,
@@ -21,6 +20,7 @@ from hesim_render.calibrate.evs.medians import (
 )
 from hesim_render.calibrate.evs.steps import Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, totals_of
+from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.pixels.evs.formulas import own_events
 from hesim_render.specs.calibration_spec import Defect
 

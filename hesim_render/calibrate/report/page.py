@@ -12,8 +12,9 @@ from hesim_render.calibrate.report.events import evs_section
 from hesim_render.calibrate.report.frames import aps_section
 from hesim_render.calibrate.report.parts import plain_text, table
 from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning
-from hesim_render.core.output import replacing
+from hesim_render.core.output import alone_in, replacing
 from hesim_render.specs.calibration import as_written
+from hesim_render.specs.calibration_spec import SECTIONS
 
 _STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;color:#1b1b1b;max-width:1320px;margin:2rem auto;padding:0 1rem}
@@ -42,14 +43,16 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
         If the report cannot be written, or something is there that must not be replaced.
     """
     path = check_report(calibration, report, overwrite)
-    data = read_calibration(calibration)
+    with as_written(calibration), alone_in(Path(calibration).absolute().parent):
+        data = read_calibration(calibration)
+        maps = {section: read_maps(calibration, section, data) for section in SECTIONS if section in data}
     with as_written(calibration), report_style():
         parts = [_introduction(data)]
         if "aps" in data:
-            parts.append(aps_section(data["aps"], read_maps(calibration, "aps", data)))
+            parts.append(aps_section(data["aps"], maps["aps"]))
         if "evs" in data:
             draw = asynchronous_section if data["evs"].get("reference") == "last_event" else evs_section
-            parts.append(draw(data["evs"], read_maps(calibration, "evs", data)))
+            parts.append(draw(data["evs"], maps["evs"]))
     body = "\n".join(parts)
     page = (
         f'{report_beginning(calibration)}"><title>Noise calibration</title>'

@@ -104,11 +104,12 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
 
 def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32], spec: EvsSpec) -> EventDefects:
     stuck = np.flatnonzero(maps["defect"].ravel() == Defect.STUCK)
-    if spec.tick_us is None:
-        on, off = (maps[f"defect_{name}_hz"].ravel().astype(np.float64) for name in ("on", "off"))
-        place = np.flatnonzero((on > 0) | (off > 0))
-        steady = np.ones(place.size), np.zeros(place.size)
-        return EventDefects(stuck, place, key[place], on[place], off[place], *steady)
+    if spec.reference == "last_event":
+        names = ("on_hz", "off_hz", "firing_share", "change_hz")
+        values = np.stack([maps[f"defect_{name}"].ravel() for name in names]).astype(np.float64)
+        place = np.flatnonzero((values[:2] > 0).any(axis=0))
+        return EventDefects(stuck, place, key[place], *values[:, place])
+    assert spec.tick_us is not None
     tick_s = spec.tick_us * S_PER_US
     on, off = (maps[f"defect_{name}_per_trial"].ravel().astype(np.float64) for name in ("on", "off"))
     share, correlation = (maps[f"defect_{name}"].ravel().astype(np.float64) for name in ("firing_share", "correlation"))

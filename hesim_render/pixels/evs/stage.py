@@ -48,6 +48,7 @@ class EvsStage:
     ----------
     noise : the sensor's noise model (`Sensor.evs`, perhaps `without` some terms).
     seed : the events are a pure function of the seed, the device seed, the sample times and the electrons.
+    defects : events of defective pixels, where several stages share them; default those of this `seed`.
 
     Notes
     -----
@@ -71,10 +72,13 @@ class EvsStage:
 
     STATE = ("_mode", "_t_us", "_readout")
 
-    def __init__(self, noise: EvsNoise, seed: int) -> None:
+    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None = None) -> None:
         self.noise = noise
-        mode = _PreviousSample if noise.spec.reference == "previous_sample" else _LastEvent
-        self._mode: _Mode = mode(noise, int(seed))
+        has_ticks = noise.spec.reference == "previous_sample"
+        if defects is None and noise.defects:
+            tick_s = noise.spec.tick_us * S_PER_US if has_ticks and noise.spec.tick_us else None
+            defects = DefectEvents(noise.defects, int(seed), tick_s)
+        self._mode: _Mode = (_PreviousSample if has_ticks else _LastEvent)(noise, int(seed), defects)
         self._t_us: int | None = None
         self._readout: EventReadout | None = None
         if noise.readout_max_events_per_s is not None:
@@ -135,13 +139,11 @@ class _PreviousSample:
 
     STATE = ("_t_us", "_level", "_variance", "_photoreceptor")
 
-    def __init__(self, noise: EvsNoise, seed: int) -> None:
-        self._noise, self._seed = noise, seed
+    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None) -> None:
+        self._noise, self._seed, self._defects = noise, seed, defects
         self._cols = noise.layout.evs_shape[1]
         self._independent = noise.spec.noise_mode == "independent"
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
-        assert noise.spec.tick_us is not None
-        self._defects = DefectEvents(noise.defects, seed, noise.spec.tick_us * S_PER_US) if noise.defects else None
         self._t_us = 0
         self._level: Float = None  # ln x, with the noise of its instant where that is shared
         self._variance: Float = None  # s²/x² of the last sample, where noise is independent
@@ -196,8 +198,8 @@ class _LastEvent:
         *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
     )
 
-    def __init__(self, noise: EvsNoise, seed: int) -> None:
-        self._noise = noise
+    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None) -> None:
+        self._noise, self._defects = noise, defects
         self._cols = noise.layout.evs_shape[1]
         self._t_us = 0
         self._log: Float = None  # ln x of the last sample
@@ -210,7 +212,6 @@ class _LastEvent:
         if noise.refractory_period_us is not None:
             self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
         self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
-        self._defects = DefectEvents(noise.defects, seed) if noise.defects else None
 
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr

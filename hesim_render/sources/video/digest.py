@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -51,13 +52,14 @@ class Digest:
         self._thread.join()
 
 
-class Hashed:
-    """An input whose data are hashed; `_pieces` yields them."""
+class Hashed(ABC):
+    """An input whose data are hashed."""
 
     _digest: Digest | None = None
 
+    @abstractmethod
     def _pieces(self) -> Iterable[Any]:
-        raise NotImplementedError
+        """All data of the input, in order: bytes, or arrays whose bytes are hashed."""
 
     def start_digest(self) -> None:
         """Start hashing in parallel to the run."""

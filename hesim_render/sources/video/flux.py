@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral import spectrum as spectra
 
 Source = str | Path | NDArray
+
+#: Number of pictures, and time, after which the measurement of their reading time ends.
+_TIMED_PICTURES, _TIMED_S = 33, 0.5
 
 
 def open_video(source: Source, options: VideoOptions) -> Reader:
@@ -54,8 +58,8 @@ class VideoFlux(WindowByWindow):
 
     M comes from `hesim_render.sources.video.inversion`; V is 1 unless `lens_shading` is set. Negative rates, of
     colours outside the sensor's gamut, count as 0. Each picture is converted to the rates of all mosaic pixels once,
-    when it is first needed. The maps of as many pictures are kept as an event window reaches back, so pictures are read
-    in order, each once.
+    when it is first needed. The maps of as many pictures are kept as an event window reaches back, so a run reads
+    pictures in order, each once.
 
     Parameters
     ----------
@@ -253,6 +257,24 @@ class VideoFlux(WindowByWindow):
         dr.eval(flux)
         self._maps[number] = flux
         return flux
+
+    def seconds_per_picture(self, count: int) -> float:
+        """Measured time to read and decode a picture, s; 0 where only one is needed, which has been read already.
+
+        Parameters
+        ----------
+        count : number of pictures of the run. No others are read, and reading ends after half a second or 32 pictures.
+
+        Raises
+        ------
+        SpecError
+            If one of the pictures is damaged.
+        """
+        begin, done = time.perf_counter(), 0
+        while done + 1 < min(count, _TIMED_PICTURES) and time.perf_counter() - begin < _TIMED_S:
+            done += 1
+            self._reader.read(done)
+        return (time.perf_counter() - begin) / done if done else 0.0
 
     def start_digest(self) -> None:
         """Start hashing the input in parallel to the run; `describe` waits for it."""

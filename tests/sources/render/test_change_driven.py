@@ -1,5 +1,7 @@
 """The default mode: a pure function of what it is asked for, and as right as it says."""
 
+import time
+
 import numpy as np
 import pytest
 import rendering
@@ -8,7 +10,7 @@ from test_renderer_pairs import DIFFUSE, LAMP, SKY, plane, sphere
 
 import hesim_render as hr
 from hesim_render.capture.loop import Capture, noise_models
-from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.errors import RangeError, SpecError, TooLongError
 from hesim_render.mosaic.schedule import instant_blocks, tick_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
@@ -282,6 +284,29 @@ def test_a_long_run_is_refused_unless_wanted():
         hr.simulate(scene, sensor, quality=-1.0)
     with pytest.raises(RangeError, match="exact mode"):
         hr.simulate(scene, sensor, quality=0.5, samples=16)
+
+
+def test_the_estimate_of_the_longest_run_comes_at_once():
+    """4000 s of an asynchronous sensor are millions of windows, and none of them is listed before the estimate.
+
+    The star turns evenly: a run of 4000 s has 2000 times the rays of one of 2 s, whose windows are all listed. The
+    pilot passes see other phases of the star, and an estimate is right to a factor of two.
+    """
+    scene, sensor = hr.load_scene("rotating-star"), hr.load_sensor("davis346").crop(32, 24)
+    told = []
+    for seconds in (2.0, 4000.0):
+        began = time.perf_counter()
+        with pytest.raises(TooLongError, match="has to be wanted"):
+            hr.simulate(scene, sensor, duration_s=seconds, max_minutes=1e-6, on_estimate=told.append)
+        assert time.perf_counter() - began < 10  # 1.3 s; it took 60 s while all windows were listed
+    assert 0.5 < told[1].rays / (2000 * told[0].rays) < 2
+
+
+def test_a_run_without_a_comparison_has_an_estimate():
+    told = []
+    sensor = hr.load_sensor("reference-mono").crop(8, 8)
+    run = hr.simulate(hr.load_scene("rotating-star"), sensor, duration_s=0.0005, on_estimate=told.append)
+    assert told[0].rays == 0 and len(run.events) == 0
 
 
 @pytest.mark.slow

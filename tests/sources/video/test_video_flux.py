@@ -1,6 +1,7 @@
 """The video as a source of flux: time, geometry, and what the capture loop makes of it."""
 
 import gc
+import time
 
 import numpy as np
 import pytest
@@ -442,6 +443,47 @@ def test_frames_and_events_together_read_each_picture_once_and_in_order(window_u
     monkeypatch.setattr(
         ArrayVideo, "read", lambda self, number, real=ArrayVideo.read: read.append(number) or real(self, number)
     )
+    # before the run, the estimate reads the first pictures
+    monkeypatch.setattr(VideoFlux, "seconds_per_picture", lambda *_: 0.0)
     sensor = mono(8, 8, evs__tick_us=2500, evs__window_us=window_us, aps__exposure_us=20_000, aps__frame_rate_hz=40)
     hr.simulate_video(pictures, sensor, fps=2000, transfer="srgb", interpolation=interpolation)
     assert read == sorted(set(read)) and len(read) > 60
+
+
+# -- estimate
+
+
+def estimate(pictures, **options):
+    told = []
+    hr.simulate_video(pictures, mono(), on_estimate=told.append, **{**UNIT, "fps": 1000, **options})
+    return told[0]
+
+
+def test_the_estimate_holds_the_time_to_decode(monkeypatch):
+    """Each of 20 pictures takes 50 ms to read: 1 s more than where reading takes no time."""
+    pictures = np.ascontiguousarray(grey(np.linspace(0.1, 0.9, 20)))
+    plain, read, given = estimate(pictures), ArrayVideo.read, []
+
+    def slowly(self, index):
+        given.append(index)
+        time.sleep(0.05)
+        return read(self, index)
+
+    monkeypatch.setattr(ArrayVideo, "read", slowly)
+    whole = estimate(pictures)
+    assert whole.seconds - plain.seconds == pytest.approx(1.0, rel=0.3, abs=0.1)
+    first = given.index(0)  # the run begins anew with the first picture
+    assert given[:first] == list(range(1, first + 1)) and 5 < first < 15
+    assert given[first:] == list(range(20))
+    assert (whole.pictures, whole.event_samples) == (plain.pictures, plain.event_samples)
+
+
+def test_only_pictures_of_the_run_are_read_for_the_estimate():
+    """The fourth picture is damaged: a run of three pictures goes through, a longer one is refused before its start."""
+    pictures = np.array(grey([0.1, 0.2, 0.3, 0.4]))
+    pictures[3, 0, 0] = np.nan
+    assert estimate(pictures, duration_s=0.0024).pictures == 3
+    with pytest.raises(SpecError, match="picture 3"):
+        estimate(pictures)
+    flux = source(pictures)
+    assert flux.seconds_per_picture(1) == 0  # the first one is read in any case

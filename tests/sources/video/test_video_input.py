@@ -16,7 +16,7 @@ import hesim_render as hr
 from hesim_render.core.errors import HesimError, RangeError, SpecError
 from hesim_render.sources.video import VideoFlux, VideoOptions, open_video
 from hesim_render.sources.video.colours import ColourTags
-from hesim_render.sources.video.digest import Digest
+from hesim_render.sources.video.digest import Digest, Hashed
 from hesim_render.sources.video.folder import FolderVideo
 from hesim_render.sources.video.linear import Lineariser
 from hesim_render.sources.video.picture import PictureFormat
@@ -602,3 +602,8 @@ def test_the_hash_is_made_beside_the_run_and_its_errors_are_told():
     count = len(seen)
     time.sleep(0.05)
     assert len(seen) == count
+
+
+def test_an_input_without_its_data_cannot_be_made():
+    with pytest.raises(TypeError, match="_pieces"):
+        Hashed()

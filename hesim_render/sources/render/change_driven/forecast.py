@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.mosaic.schedule import Block, Exposure
+from hesim_render.mosaic.schedule import BlockSample, Exposure
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 #: Number of patches, side of a patch, px, and number of blocks over the run, in which rays are counted.
@@ -46,7 +46,7 @@ class Estimate:
 def forecast(
     sources: Sequence[ChangeDrivenFlux],
     event_pixel: NDArray[np.uint32],
-    blocks: Callable[[], Iterator[Block]],
+    blocks: BlockSample,
     frame_pixel: NDArray[np.uint32],
     exposures: Sequence[Exposure],
 ) -> Estimate:
@@ -55,7 +55,7 @@ def forecast(
     Parameters
     ----------
     sources : renderers of one scene; the whole run is asked of each.
-    event_pixel, blocks : [n] mosaic indices of event pixels, and the blocks of windows of the run.
+    event_pixel, blocks : [n] mosaic indices of event pixels, and a sample of the run's blocks of windows.
     frame_pixel, exposures : [n] mosaic indices of frame pixels, and the exposures of the run.
 
     Returns
@@ -67,13 +67,13 @@ def forecast(
     rays = rate = 0.0
     windows = 0
     for source in sources:
-        if event_pixel.size and not is_static:
-            every = list(blocks())
+        if event_pixel.size and blocks.blocks:
+            every = blocks.blocks
             windows = max(block.wanted.size for block in every)
             chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, _BLOCKS).astype(int))]
             patch = _patches(event_pixel, source, rng)
             each = [source.foretell(patch, block.begin_us, block.end_us, "events") for block in chosen]
-            rays += float(np.mean(each)) * event_pixel.size * len(every)
+            rays += float(np.mean(each)) * event_pixel.size * blocks.count
         pixel = np.union1d(frame_pixel if exposures else frame_pixel[:0], event_pixel if is_static else event_pixel[:0])
         if pixel.size:
             patch = _patches(pixel, source, rng)

@@ -1,4 +1,7 @@
-"""Event pixels that fire intermittently: their mean times, from counts of successive parts of a capture."""
+"""Event pixels that fire intermittently: their mean times, from counts of successive parts of a capture.
+
+A trial is a comparison of a sensor with fixed ticks, or the time after a reset of an asynchronous sensor.
+"""
 
 from __future__ import annotations
 

@@ -1,0 +1,73 @@
+"""Samples of the blocks of long runs, against blocks that are all listed."""
+
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render.mosaic.schedule import blocks_of_run, sample_of_blocks, tick_blocks
+
+#: 16 cells of 1 ms.
+STRETCH_US = 16_000
+
+
+def of_cells(pieces):
+    """Blocks between two times where cell k of 1 ms has pieces(k) intervals; the calls are noted."""
+    calls = []
+
+    def instants(begin_us, end_us):
+        calls.append((begin_us, end_us))
+        cells = range(int(begin_us) // 1000, int(end_us) // 1000 + 1)
+        times = [np.rint(np.linspace(1000 * k, 1000 * (k + 1), pieces(k) + 1)) for k in cells]
+        found = np.unique(np.concatenate(times)).astype(np.int64)
+        return found[(found >= begin_us) & (found <= end_us)]
+
+    return calls, lambda begin_us, end_us: blocks_of_run(instants, 1, int(begin_us), int(end_us))
+
+
+def listed(blocks, end_us):
+    every = list(blocks(0, end_us))
+    return len(every), sum(int(block.wanted.sum()) for block in every)
+
+
+def test_a_short_run_is_listed_whole():
+    _, blocks = of_cells(lambda k: 1 + k % 7)
+    sample = sample_of_blocks(blocks, STRETCH_US, 0, 1_234_567, seed=1)
+    assert sample.share == 1 and (sample.count, sample.windows) == listed(blocks, 1_234_567)
+
+
+@pytest.mark.parametrize(
+    ("pieces", "rel"),
+    [
+        (lambda k: 3, 1e-3),
+        # in step with the 1024 parts: fixed places, or parts of whole stretches, would see some phases more often
+        (lambda k: 1 + 10 * ((k // 40) % 2), 0.03),
+        # a tenth of the run has nine tenths of the windows: of 1024 stretches 102 ± 0.5 fall into it
+        (lambda k: 90 if 4000 <= k < 8096 else 1, 0.03),
+    ],
+    ids=["even", "periodic", "burst"],
+)
+def test_the_numbers_of_a_long_run_come_from_a_part_of_it(pieces, rel):
+    """40.96 s are 2560 stretches. Bounds are 4 standard errors of 1024 stratified stretches, at most."""
+    calls, blocks = of_cells(pieces)
+    end_us = 40_960_000
+    sample = sample_of_blocks(blocks, STRETCH_US, 0, end_us, seed=2)
+    assert len(calls) <= 3 * 1024  # one for the windows of a stretch, two at its end
+    assert sample.share == pytest.approx(0.4)
+    count, windows = listed(blocks, end_us)
+    assert sample.count == pytest.approx(count, rel=rel)
+    assert sample.windows == pytest.approx(windows, rel=rel)
+    ends = [block.end_us[-1] for block in sample.blocks]
+    assert np.all(np.diff(ends) >= -STRETCH_US) and ends[0] < 0.01 * end_us and ends[-1] > 0.99 * end_us
+
+
+def test_fixed_ticks_are_sampled_like_instants():
+    spec = hr.load_sensor("reference-mono").spec.evs
+    begin_us, length_us = 1_000 * 1_000_000, 4_000 * 1_000_000
+    stretch_us = 16 * spec.tick_us
+    sample = sample_of_blocks(lambda a, b: tick_blocks(spec, a, b), stretch_us, begin_us, begin_us + length_us, seed=3)
+    assert len(sample.blocks) == 1024
+    part_us = length_us / 1024
+    assert begin_us <= sample.blocks[0].end_us[-1] < begin_us + part_us + stretch_us
+    assert begin_us + length_us - part_us < sample.blocks[-1].end_us[-1] <= begin_us + length_us
+    assert sample.count == pytest.approx(length_us / stretch_us)
+    assert sample.windows == pytest.approx(length_us / spec.tick_us)
