@@ -32,26 +32,38 @@ except PackageNotFoundError:  # run from a source tree that was never installed
 
 # Imported on first use: the command line must answer --help without loading a renderer.
 _HOMES = {
+    "ImuModel": "hesim_render.sources.render.truth.imu",
     "Recording": "hesim_render.recording.recording",
     "Scene": "hesim_render.sources.scene",
+    "SceneTruth": "hesim_render.sources.render.truth.scene_truth",
     "Sensor": "hesim_render.sensor.sensor",
     "load_scene": "hesim_render.sources.scene",
     "load_sensor": "hesim_render.sensor.sensor",
     "photocurrent": "hesim_render.sensor.photocurrent",
+    "read_spectral_exr": "hesim_render.sources.render.cube",
+    "render_cube": "hesim_render.sources.render.cube",
+    "rig_scenes": "hesim_render.sources.render.truth.rig",
     "simulate": "hesim_render.capture.simulate",
     "simulate_video": "hesim_render.capture.simulate_video",
+    "write_spectral_exr": "hesim_render.sources.render.cube",
 }
 
 __all__ = [
+    "ImuModel",
     "Recording",
     "Scene",
+    "SceneTruth",
     "Sensor",
     "__version__",
     "load_scene",
     "load_sensor",
     "photocurrent",
+    "read_spectral_exr",
+    "render_cube",
+    "rig_scenes",
     "simulate",
     "simulate_video",
+    "write_spectral_exr",
 ]
 
 if TYPE_CHECKING:
@@ -60,6 +72,10 @@ if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
     from hesim_render.sensor.photocurrent import photocurrent
     from hesim_render.sensor.sensor import Sensor, load_sensor
+    from hesim_render.sources.render.cube import read_spectral_exr, render_cube, write_spectral_exr
+    from hesim_render.sources.render.truth.imu import ImuModel
+    from hesim_render.sources.render.truth.rig import rig_scenes
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene, load_scene
 
 

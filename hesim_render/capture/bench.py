@@ -14,7 +14,7 @@ from math import pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.capture.loop import noise_models
+from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.errors import RangeError
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.pixels.aps.model import ApsNoise

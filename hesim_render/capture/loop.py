@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import pairwise, tee
@@ -15,7 +15,6 @@ from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.capture.event_flux import EventFlux
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
-from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import (
@@ -28,8 +27,9 @@ from hesim_render.mosaic.schedule import (
     sample_of_blocks,
     tick_blocks,
 )
-from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
-from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
+from hesim_render.pixels.aps.model import ApsNoise
+from hesim_render.pixels.evs.labels import Labeller
+from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
 from hesim_render.sensor.sensor import Sensor
@@ -39,41 +39,6 @@ from hesim_render.sources.still import StillFlux
 
 if TYPE_CHECKING:
     from hesim_render.recording.writer import RecordingWriter
-
-#: Names of all noise terms that can be switched off.
-NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))
-
-
-def noise_models(
-    sensor: Sensor, clean: bool = False, without: Sequence[str] = ()
-) -> tuple[ApsNoise | None, EvsNoise | None]:
-    """Both noise models of a sensor, with terms switched off.
-
-    Parameters
-    ----------
-    sensor : the sensor; the model of a pixel kind that it lacks is None.
-    clean : switch all terms off.
-    without : names of terms to switch off, such as ``aps.read`` or ``evs.leak``; see `NOISE_TERMS`.
-
-    Returns
-    -------
-    aps, evs : models of frame pixels and of event pixels.
-
-    Raises
-    ------
-    RangeError
-        For a name that is not a term.
-    """
-    for name in without:
-        if name not in NOISE_TERMS:
-            raise RangeError("noise term", name, f"one of {', '.join(NOISE_TERMS)}{did_you_mean(name, NOISE_TERMS)}")
-    aps = sensor.aps if sensor.spec.aps is not None else None
-    evs = sensor.evs if sensor.spec.evs is not None else None
-    if aps is not None:
-        aps = aps.clean() if clean else aps.without(*[n[4:] for n in without if n.startswith("aps.")])
-    if evs is not None:
-        evs = evs.clean() if clean else evs.without(*[n[4:] for n in without if n.startswith("evs.")])
-    return aps, evs
 
 
 @dataclass
@@ -106,12 +71,12 @@ class Capture:
     seed : seed of all temporal noise.
     begin_us : begin of the run, µs. The times of frames and comparisons do not depend on it; a frame belongs to the
         run in which it ends.
-    pixels : state of the event pixels at the end of the previous run (its `pixel_state`). Both runs together
-        then equal one run.
+    pixels : state of the event pixels at the end of the previous run (`pixel_state`); together they equal one run.
+    labels : label each event with its cause; not for a run that continues another.
 
     Attributes
     ----------
-    errors : error of the render, for frames and for events.
+    errors, labeller : error of the render, for frames and for events; labels of the events so far, or None.
     """
 
     def __init__(
@@ -124,6 +89,7 @@ class Capture:
         seed: int,
         begin_us: int = 0,
         pixels: dict[str, Any] | None = None,
+        labels: bool = False,
     ) -> None:
         self._sensor, self._aps, self._seed = sensor, aps, seed
         self._begin_us, self._duration_us = begin_us, duration_us
@@ -142,7 +108,8 @@ class Capture:
         self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
         if flux.is_static:
             self._frame_source, self._event_source = self._still_sources()
-        self._stage = EvsStage(evs, seed) if evs is not None else None
+        self.labeller = Labeller(evs, seed, begin_us, duration_us) if labels and evs is not None else None
+        self._stage = EvsStage(evs, seed, labels=self.labeller) if evs is not None else None
         if self._stage is not None and pixels is not None:
             self._stage.resume(pixels)
         self._pixel_state: dict[str, Any] = {}
@@ -246,8 +213,7 @@ class Capture:
 
         Parameters
         ----------
-        writer : takes frames and events.
-        progress : called with (done, total, what).
+        writer, progress : takes frames and events; called with (done, total, what).
         """
         for item in self.run(progress):
             if isinstance(item, np.ndarray):
@@ -255,9 +221,10 @@ class Capture:
             else:
                 writer.add_frame(item)
         if self._stage is not None:
-            truth = self.event_flux
-            writer.set_event_truth(truth.mean_e_per_s(), truth.stderr_e_per_s())
+            writer.set_event_truth(self.event_flux.mean_e_per_s(), self.event_flux.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
+        if self.labeller is not None:
+            writer.set_event_labels(self.labeller.finish())
 
     def _compare(self, sample: Sample, t_us: int) -> NDArray:
         """Events up to a sample."""

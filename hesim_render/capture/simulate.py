@@ -8,13 +8,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
 from hesim_render.core.progress import Progress, ProgressReport, shown
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.schedule import BlockSample, require_countable
 from hesim_render.recording.recording import Recording
+from hesim_render.recording.truth_kinds import EVENTS, truth_kinds
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.flicker import flickering
@@ -25,6 +27,7 @@ from hesim_render.sources.render.change_driven.forecast import Estimate, forecas
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
+from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.sources.scene import Scene
 
 #: Default rays per pixel in the exact mode. A static scene is rendered once for the whole run,
@@ -45,6 +48,8 @@ def simulate(
     samples: int | None = None,
     exact: bool = False,
     max_minutes: float | None = None,
+    truth: Sequence[str] = (),
+    truth_every_us: int | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
@@ -67,6 +72,10 @@ def simulate(
     exact : render every pixel of every slice with the same number of rays; default 64 for a static scene, 16
         for a moving one.
     max_minutes : refuse a run whose estimated time is longer, min; None sets no limit.
+    truth : kinds of geometric truth to write into the recording (`TRUTH_KINDS`, or ``all``): ``depth``, ``flow``, …
+        Without `out`, `Recording.truth` computes them when they are asked for.
+    truth_every_us : interval between the times at which event pixels are described, µs; default: the middle of each
+        frame, or every 10 ms where there are none.
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
@@ -94,7 +103,7 @@ def simulate(
     Raises
     ------
     RangeError
-        If duration, seed, quality, sample count or noise term is out of range.
+        If duration, seed, quality, sample count, noise term or kind of truth is out of range.
     ConflictError
         If `quality` comes with `exact` or `samples`.
     TooLongError
@@ -115,10 +124,15 @@ def simulate(
             f"give --quality or --{other} (quality, {other}), not both: --quality asks for an error and gives each "
             f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same number",
         )
+    kinds = truth_kinds(truth)
+    if truth_every_us is not None and not 1 <= truth_every_us <= duration_us:
+        raise RangeError("truth_every_us", truth_every_us, f"1 to {duration_us} µs, the length of the run")
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     backend.jit()
     noise = noise_models(sensor, clean, without)
     settings: dict[str, Any] = {"clean": clean, "without": list(without)}
+    if kinds:
+        settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
         seen, level = in_absolute_light(scene)
         flux, mode = _source(seen, sensor, seed, quality, samples, exact, told)
@@ -128,7 +142,7 @@ def simulate(
         settings |= {"backend": backend.select().describe(), "camera": _camera_used(flux)}
         rendering = _change_driven_parts(flux)
         wanted = rendering[0].quality if rendering else None
-        plain = Capture(flux, flux.sensor, *noise, duration_us, seed)
+        plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=EVENTS in kinds)
         sample = plain.sample_of_event_blocks() if rendering and not flux.is_static else BlockSample([], 1.0)
         if rendering:
             expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
@@ -147,7 +161,9 @@ def simulate(
             if flux.is_static:
                 rendering[0].progress = _share_progress(expected.rays, told)
         noted = _noted(flux, plain, round(sample.windows), seed) if rendering else None
-        capture = plain if noted is None else Capture(noted, flux.sensor, *noise, duration_us, seed)
+        capture = plain
+        if noted is not None:
+            capture = Capture(noted, flux.sensor, *noise, duration_us, seed, labels=EVENTS in kinds)
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
             overwrite=overwrite,
@@ -163,6 +179,9 @@ def simulate(
                 model = flux.sensor.evs if flux.sensor.spec.evs is not None else None
                 render["audit"] = Audit(noted, flux, rendering[0].quality, model, capture.event_pixels, seed).run()
             writer.add_settings({"render": render})
+            if set(kinds) - {EVENTS}:
+                step = None if told is None else lambda done, total: told(done, total, "truth")
+                writer.write_truth(SceneTruth(scene, sensor), step)
             return writer.finish()
 
 

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core import backend
 from hesim_render.core.errors import RangeError, SpecError, TooLongError
 from hesim_render.core.progress import Progress, ProgressReport, in_words, shown

@@ -17,6 +17,7 @@ class Kind(StrEnum):
     sensors = "sensors"
     illuminants = "illuminants"
     noise = "noise"
+    truth = "truth"
 
 
 def doctor() -> None:
@@ -39,7 +40,9 @@ def doctor() -> None:
 
 
 def list_(
-    kind: Annotated[Kind | None, typer.Argument(help="scenes, sensors, illuminants or noise; default all")] = None,
+    kind: Annotated[
+        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise or truth; default all")
+    ] = None,
 ) -> None:
     """List the names that can be used."""
     if kind is not None:
@@ -56,9 +59,13 @@ def _lines_of(kind: Kind) -> list[str]:
 
         return illuminant_names()
     if kind is Kind.noise:
-        from hesim_render.capture.loop import NOISE_TERMS
+        from hesim_render.capture.noise_terms import NOISE_TERMS
 
         return list(NOISE_TERMS)
+    if kind is Kind.truth:
+        from hesim_render.recording.truth_kinds import TRUTH_KINDS
+
+        return list(TRUTH_KINDS)
     from hesim_render.specs.files import data_folder, list_names, load_yaml
 
     names = list_names(kind.value)

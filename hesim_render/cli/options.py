@@ -29,7 +29,7 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
 
 
 def _noise_terms(incomplete: str) -> list[str]:
-    from hesim_render.capture.loop import NOISE_TERMS
+    from hesim_render.capture.noise_terms import NOISE_TERMS
 
     return [name for name in NOISE_TERMS if name.startswith(incomplete)]
 
@@ -52,6 +52,10 @@ Without = Annotated[
         autocompletion=_noise_terms,
     ),
 ]
+Truth = Annotated[
+    str | None,
+    typer.Option(metavar="KIND,KIND…", help="ground truth to write: depth, flow, poses, … or all (see 'list truth')"),
+]
 #: Runs with a longer estimate need a confirmation.
 LONG_MINUTES = 30
 Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")]
@@ -61,6 +65,11 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an existin
 def check_duration(duration_s: float) -> None:
     if not 0 < duration_s < float("inf"):
         raise RangeError("--duration", duration_s, "a time above 0, in seconds")
+
+
+def listed(names: str | None) -> list[str]:
+    """The names of a list with commas."""
+    return [name.strip() for name in (names or "").split(",") if name.strip()]
 
 
 def check_output(out: Path, overwrite: bool) -> None:

@@ -13,11 +13,13 @@ from hesim_render.cli.options import (
     Overwrite,
     Region,
     SensorFile,
+    Truth,
     Without,
     Yes,
     check_duration,
     check_output,
     cropped,
+    listed,
     names_of,
     told_beside,
 )
@@ -49,6 +51,11 @@ def simulate(
     exact: Annotated[bool, typer.Option("--exact", help="render every pixel of every slice, all alike")] = False,
     samples: Annotated[int | None, typer.Option(help="with --exact: rays per pixel and slice of time")] = None,
     yes: Yes = False,
+    truth: Truth = None,
+    truth_every_us: Annotated[
+        int | None,
+        typer.Option(help="with --truth: interval between descriptions of event pixels (default: one for each frame)"),
+    ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -73,6 +80,7 @@ def simulate(
         overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
         max_minutes=None if yes else LONG_MINUTES,
         clean=clean, without=without or (), allow_outside=allow_outside,
+        truth=listed(truth), truth_every_us=truth_every_us,
     )  # fmt: skip
     say(summary(recording))
     if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):

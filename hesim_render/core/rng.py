@@ -44,6 +44,7 @@ class Stream(IntEnum):
     TELEGRAPH = 50
     TELEGRAPH_SHARE = 51
     TELEGRAPH_AMPLITUDE = 52
+    IMU = 60
 
 
 def stream_key(seed: int, stream: Stream) -> int:

@@ -6,74 +6,23 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import h5py
-import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading, require_memory
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+from hesim_render.recording.hdf5 import COMPRESSION, LARGEST_CHUNK_BYTES, Disk, dataset_of
 
 _CHUNK = 1 << 16
 _COLUMNS = {"t": np.uint32, "x": np.uint16, "y": np.uint16, "p": np.uint8}
 _LONGEST_US = 2**32 - 1
 _LATEST_US = 2**53  # 285 years
-_LARGEST_CHUNK_BYTES = 1 << 26
 _BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event, and its columns while they are read
-#: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
-_FILTERS = {1, 2, 3, 32000, 32001}
-
-
-class _Disk:
-    """File object for HDF5 that never reports a write error, because HDF5 crashes if it cannot close its file.
-
-    `check` raises the first error. After an error, further data are dropped; the file is useless then and is removed.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w+b", buffering=0)
-        self._error: OSError | None = None
-        self.read, self.seek, self.tell, self.close = (
-            getattr(self._file, name) for name in ("read", "seek", "tell", "close")
-        )
-
-    def write(self, data: Any) -> int:
-        view = memoryview(data).cast("B")
-        place, done = self._file.tell(), 0
-        try:
-            while done < len(view):
-                done += self._file.write(view[done:])
-        except OSError as error:
-            self._error = self._error or error
-            self._file.seek(place + len(view))
-        return len(view)
-
-    def readinto(self, buffer: Any) -> int:
-        view = memoryview(buffer).cast("B")
-        found = self._file.readinto(view) or 0
-        view[found:] = bytes(len(view) - found)  # data that were dropped
-        return len(view)
-
-    def truncate(self, size: int) -> int:
-        try:
-            return self._file.truncate(size)
-        except OSError as error:
-            self._error = self._error or error
-            return size
-
-    def flush(self) -> None:
-        """Nothing is buffered."""
-
-    def check(self) -> None:
-        """Raise the error that was kept from HDF5."""
-        if self._error is not None:
-            raise self._error
 
 
 class EventFileWriter:
@@ -100,12 +49,11 @@ class EventFileWriter:
         self._written = 0
         self._last_us = begin_us
         self._first_of_ms = np.zeros(1, dtype=np.uint64)
-        self._disk = _Disk(path)
+        self._disk = Disk(path)
         self._file = h5py.File(self._disk, "w")
-        compression = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
         for name, kind in _COLUMNS.items():
             self._file.create_dataset(
-                f"events/{name}", shape=(0,), maxshape=(None,), chunks=(_CHUNK,), dtype=kind, compression=compression
+                f"events/{name}", shape=(0,), maxshape=(None,), chunks=(_CHUNK,), dtype=kind, compression=COMPRESSION
             )
         self._file["t_offset"] = np.int64(begin_us)
         self._file.attrs.update({"height": shape[0], "width": shape[1], "time_unit": "µs", "begin_us": begin_us})
@@ -122,7 +70,7 @@ class EventFileWriter:
         self._pending.append(events)
         self._pending_count += events.size
         if self._pending_count >= _CHUNK:
-            with self._told():
+            with self._disk.told():
                 self._flush()
 
     def _flush(self) -> None:
@@ -144,23 +92,13 @@ class EventFileWriter:
 
     def close(self) -> None:
         """Write the pending events and the millisecond index."""
-        with self._told():
+        with self._disk.told():
             self._flush()
             missing = self._duration_us // 1000 + 2 - self._first_of_ms.size
             rest = np.full(max(0, missing), self._written, dtype=np.uint64)
             self._file["ms_to_idx"] = np.concatenate([self._first_of_ms, rest])
             self._file.close()
             self._disk.close()
-
-    @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
-        """Raise an error of the disk in place of the error that HDF5 makes of it."""
-        try:
-            yield
-        except (OSError, RuntimeError):
-            self._disk.check()
-            raise
-        self._disk.check()
 
     def abandon(self) -> None:
         """Close the unfinished file before it is removed."""
@@ -228,28 +166,9 @@ def read_events(
     return events[low:high]
 
 
-def _dataset(file: Any, name: str, path: Path) -> Any:
-    """A data set that is stored in this file itself."""
-    parts = name.split("/")
-    for k in range(len(parts)):
-        part = "/".join(parts[: k + 1])
-        if not isinstance(file.get(part, getlink=True), h5py.HardLink):
-            raise SpecError(f"{part} is a link to elsewhere", file=path)
-    found = file[name]
-    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "ui":
-        raise SpecError(f"{name} is no data set of whole numbers", file=path)
-    layout = found.id.get_create_plist()
-    if found.is_virtual or layout.get_external_count():
-        raise SpecError(f"{name} has its values in another file", file=path)
-    for k in range(layout.get_nfilters()):
-        if (used := layout.get_filter(k)[0]) not in _FILTERS:
-            raise SpecError(f"{name} is packed by filter {used}; expected one of {sorted(_FILTERS)}", file=path)
-    return found
-
-
 def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
     """A one-dimensional data set whose values are all stored, without fill values."""
-    found = _dataset(file, name, path)
+    found = dataset_of(file, name, path)
     if found.dtype.kind != "u" or found.dtype.itemsize > np.dtype(kind).itemsize:
         raise SpecError(f"{name} holds {found.dtype.name}; expected {np.dtype(kind).name}", file=path)
     if found.ndim != 1:
@@ -258,7 +177,7 @@ def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
     if found.chunks is None:
         stored = found.id.get_storage_size() >= size * item
     else:
-        require_memory(found.chunks[0] * item, f"a chunk of {name}", path, _LARGEST_CHUNK_BYTES)
+        require_memory(found.chunks[0] * item, f"a chunk of {name}", path, LARGEST_CHUNK_BYTES)
         stored = found.id.get_num_chunks() >= -(-size // found.chunks[0])
     if not stored:
         raise SpecError(f"{name} holds fewer values than the {size} it says", file=path)
@@ -266,7 +185,7 @@ def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
 
 
 def _offset(file: Any, path: Path) -> int:
-    found = _dataset(file, "t_offset", path)
+    found = dataset_of(file, "t_offset", path)
     offset = int(found[()]) if found.shape == () else -1
     if not 0 <= offset <= _LATEST_US:
         raise SpecError(f"t_offset must be one whole number of µs from 0 to {_LATEST_US}", file=path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.mosaic.description import Mosaic
+from hesim_render.pixels.evs.labels import EventLabels
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.colour_view import thumbnail
 from hesim_render.recording.dng import write_dng
 from hesim_render.recording.event_file import EventFileWriter
 from hesim_render.recording.frame import EventTruth, Frame
+from hesim_render.recording.label_file import write_labels
 
 #: Functions called with each complete folder before it gets its name. A module that draws pictures of recordings
 #: appends its function here, so that the writer does not need to import it.
@@ -92,8 +95,23 @@ class FolderWriter:
                 flux_stderr_e_per_s=np.asarray(truth.flux_stderr_e_per_s, dtype=np.float32),
             )
 
+    def set_event_labels(self, labels: EventLabels) -> None:
+        time, grid = self.manifest["time"], self.manifest["event_grid"]
+        shape = grid["height"], grid["width"]
+        with output_errors(self._folder.target):
+            write_labels(self._folder.path, labels, shape, time["begin_us"], time["end_us"])
+
     def set_events_dropped(self, count: int) -> None:
         self._dropped = int(count)
+
+    def write_in(self, name: str, write: Callable[[Path], object]) -> None:
+        """Have a function write one more file, whose path it gets."""
+        with output_errors(self._folder.target):
+            write(self._folder.path / name)
+
+    def copy_in(self, source: Path, name: str) -> None:
+        """Copy one more file."""
+        self.write_in(name, lambda path: shutil.copyfile(source, path))
 
     def finish(self) -> Path:
         """Write the manifest, call `DRAWERS`, and rename the folder to its final name, which is returned."""

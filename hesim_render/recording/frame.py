@@ -41,6 +41,12 @@ class Frame:
         return f"<Frame {self.index}: {cols}x{rows} px, t_us={self.t_us}, exposure_us={self.exposure_us}>"
 
     @property
+    def row_times_us(self) -> NDArray[np.float64]:
+        """Middle of each row's exposure, [row], µs: the time at which geometric truth of a frame is given."""
+        rows = np.arange(self.raw.shape[0], dtype=np.float64)
+        return self.exposure_start_us + self.exposure_us / 2 + rows * self.line_time_us
+
+    @property
     def times(self) -> dict[str, Any]:
         """All fields except the images, as in the manifest."""
         return {

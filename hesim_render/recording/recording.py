@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,13 @@ from hesim_render.recording.dng import read_dng
 from hesim_render.recording.event_file import read_events
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
+from hesim_render.recording.label_file import LABEL_FILE, read_labels
+
+if TYPE_CHECKING:
+    from hesim_render.pixels.evs.labels import EventLabels
+    from hesim_render.recording.truth_file import StoredTruth
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
+    from hesim_render.sources.scene import Scene
 
 
 class StoredFrames(Sequence[Frame]):
@@ -79,6 +86,8 @@ class Recording:
     events : structured array [event] of `EVENT_DTYPE`; None reads the events of `path` on first use.
     event_truth : noise-free flux of the event pixels; None reads the truth of `path` on first use.
     path : the folder, None for a recording in memory.
+    labels : what caused each event; None reads the labels of `path` on first use, where there are any.
+    scene : the scene that was rendered, where it is known; None makes it from the manifest when `truth` asks for it.
 
     Examples
     --------
@@ -100,9 +109,11 @@ class Recording:
         events: NDArray | None = None,
         event_truth: EventTruth | None = None,
         path: Path | None = None,
+        labels: EventLabels | None = None,
+        scene: Scene | None = None,
     ) -> None:
-        self.frames, self.manifest, self.path = frames, manifest, path
-        self._events, self._event_truth = events, event_truth
+        self.frames, self.manifest, self.path, self._scene = frames, manifest, path, scene
+        self._events, self._event_truth, self._labels = events, event_truth, labels
 
     @property
     def events(self) -> NDArray:
@@ -146,6 +157,62 @@ class Recording:
             self._event_truth = EventTruth(*maps)
         return self._event_truth
 
+    @property
+    def event_labels(self) -> EventLabels | None:
+        """What caused each event, lost events and the events without noise; None where the run was not asked for them.
+
+        Raises
+        ------
+        SpecError
+            If the file is damaged or does not fit the recording.
+        """
+        if self._labels is None and self.path is not None and (self.path / LABEL_FILE).is_file():
+            self._labels = read_labels(self.path, self.event_shape, self.manifest["counts"]["events"])
+        return self._labels
+
+    @cached_property
+    def truth(self) -> SceneTruth:
+        """Geometric truth at any time: depth, flow, poses and more, computed from the scene when it is asked for.
+
+        Raises
+        ------
+        SpecError
+            If the recording is of a video, or its scene needs files that the recording does not hold (`truth_with`).
+        """
+        return self._geometry(self._scene)
+
+    def truth_with(self, scene: Scene) -> SceneTruth:
+        """Geometric truth at any time, for a scene that needs files besides its own.
+
+        Parameters
+        ----------
+        scene : the scene of this recording, from `load_scene`.
+
+        Returns
+        -------
+        As `truth`.
+
+        Raises
+        ------
+        SpecError
+            If it is another scene.
+        """
+        return self._geometry(scene)
+
+    def _geometry(self, scene: Scene | None) -> SceneTruth:
+        from hesim_render.recording.geometry import geometry_of
+
+        return geometry_of(self.manifest, self.path, scene)
+
+    @cached_property
+    def stored_truth(self) -> StoredTruth | None:
+        """Geometric truth that the run has written; None where it was not asked for, or the recording is in memory."""
+        from hesim_render.recording.truth_file import TRUTH_FILE, StoredTruth
+
+        if self.path is None or not (self.path / TRUTH_FILE).is_file():
+            return None
+        return StoredTruth(inside(self.path, TRUTH_FILE))
+
     @cached_property
     def mosaic(self) -> Mosaic:
         """Tile, filters, levels and colour profile of the sensor, from the manifest."""
@@ -186,7 +253,22 @@ class Recording:
             if self.event_truth is not None:
                 writer.set_event_truth(self.event_truth)
             writer.set_events_dropped(self.manifest["counts"].get("events_dropped", 0))
+            if self.event_labels is not None:
+                writer.set_event_labels(self.event_labels)
+            self._save_truth(writer)
             return writer.finish()
+
+    def _save_truth(self, writer: FolderWriter) -> None:
+        """Write the geometric truth that the run was asked for; a copy of a file, or computed again."""
+        from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
+
+        if self.path is not None:
+            if (self.path / TRUTH_FILE).is_file():
+                writer.copy_in(inside(self.path, TRUTH_FILE), TRUTH_FILE)
+            return
+        request = TruthRequest.of(self.manifest)
+        if request.geometry:
+            writer.write_in(TRUTH_FILE, lambda path: write_truth(path, self.truth, request))
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:

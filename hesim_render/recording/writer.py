@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import no_events
+from hesim_render.pixels.evs.labels import EventLabels
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.recording import Recording
+from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
+from hesim_render.sources.scene import Scene
+from hesim_render.specs.scene import SceneSpec
 
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
+    from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 
 class RecordingWriter:
@@ -61,9 +66,11 @@ class RecordingWriter:
         if mosaic is not None:
             self._manifest["mosaic"] = mosaic.model_dump(mode="json")
         self._folder = None if path is None else FolderWriter(path, self._manifest, overwrite)
+        self._scene = scene
         self._frames: list[Frame] = []
         self._events: list[NDArray] = []
         self._truth: EventTruth | None = None
+        self._labels: EventLabels | None = None
         self._dropped = 0
 
     def add_frame(self, frame: Frame) -> None:
@@ -109,6 +116,18 @@ class RecordingWriter:
         else:
             self._truth = truth
 
+    def set_event_labels(self, labels: EventLabels) -> None:
+        """Set what caused each event; all events have been added.
+
+        Parameters
+        ----------
+        labels : in the order of the events.
+        """
+        if self._folder is not None:
+            self._folder.set_event_labels(labels)
+        else:
+            self._labels = labels
+
     def set_events_dropped(self, count: int) -> None:
         """Set how many events were lost in the read-out. No other count includes them.
 
@@ -130,10 +149,25 @@ class RecordingWriter:
         for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
             manifest["settings"] = {**manifest["settings"], **settings}
 
+    def write_truth(self, truth: SceneTruth, told: Callable[[int, int], None] | None = None) -> None:
+        """Write the geometric truth that the settings ask for, after the last frame; nothing in memory, where
+        `Recording.truth` computes it.
+
+        Parameters
+        ----------
+        truth : the scene that was rendered, and its sensor.
+        told : called with numbers of images done and of all.
+        """
+        if self._folder is not None:
+            request = TruthRequest.of(self._folder.manifest)
+            self._folder.write_in(TRUTH_FILE, lambda path: write_truth(path, truth, request, told))
+
     def finish(self) -> Recording:
         """Finish and return the recording. A folder is now complete and has its final name."""
+        scene = Scene(self._scene) if isinstance(self._scene, SceneSpec) else None
         if self._folder is not None:
-            return Recording.load(self._folder.finish())
+            found = Recording.load(self._folder.finish())
+            return Recording(found.frames, found.manifest, path=found.path, scene=scene)
         events = np.concatenate(self._events) if self._events else no_events()
         on = int(np.count_nonzero(events["polarity"] > 0))
         self._manifest["frames"] = [frame.times for frame in self._frames]
@@ -141,7 +175,9 @@ class RecordingWriter:
             "frames": len(self._frames), "events": events.size, "events_on": on, "events_off": events.size - on,
             "events_dropped": self._dropped,
         }  # fmt: skip
-        return Recording(self._frames, self._manifest, events=events, event_truth=self._truth)
+        return Recording(
+            self._frames, self._manifest, events=events, event_truth=self._truth, scene=scene, labels=self._labels
+        )
 
     def __enter__(self) -> RecordingWriter:
         return self

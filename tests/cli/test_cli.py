@@ -14,7 +14,7 @@ import recordings
 
 import hesim_render as hr
 from hesim_render import cli
-from hesim_render.capture.loop import NOISE_TERMS
+from hesim_render.capture.noise_terms import NOISE_TERMS
 from hesim_render.cli.terminal import parse_roi
 from hesim_render.core import backend
 from hesim_render.core.backend import Candidate
@@ -41,7 +41,7 @@ def fails(capsys, *arguments):
 def test_help_lists_the_commands():
     done = subprocess.run([sys.executable, "-m", "hesim_render.cli", "--help"], capture_output=True, text=True)
     assert done.returncode == 0
-    for command in ("doctor", "list", "simulate", "video", "demo", "view", "lab", "calibrate", "isp"):
+    for command in ("doctor", "list", "simulate", "video", "demo", "view", "lab", "calibrate", "isp", "export", "cube"):
         assert command in done.stdout
 
 
@@ -84,7 +84,7 @@ def test_list_noise_names_every_term_and_the_docs_do_too(capsys):
 def test_list_alone_lists_everything(capsys):
     status, out, err = call(capsys, "list")
     assert status == 0 and err == ""
-    for kind in ("scenes", "sensors", "illuminants", "noise"):
+    for kind in ("scenes", "sensors", "illuminants", "noise", "truth"):
         below = out[out.index(f"{kind}:\n") :].splitlines()[1:]
         assert [line.strip() for line in below[:3]] == call(capsys, "list", kind)[1].splitlines()[:3]
 

@@ -6,7 +6,8 @@ import pytest
 from scipy import integrate, optimize, stats
 
 import hesim_render as hr
-from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout

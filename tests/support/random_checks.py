@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from random_scenes import DURATION_US, RandomScene
 
-from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.noise_terms import noise_models
 from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
 from hesim_render.sources.render.change_driven.error_target import Noise

@@ -16,6 +16,7 @@ from hesim_render.core.rng import Stream, device_normal, device_uniform
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
+from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.measured import event_defects
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
 from hesim_render.specs.calibration_spec import Defect
@@ -202,14 +203,14 @@ class DefectEvents:
 
         Parameters
         ----------
-        polarity : [pixel], result of the comparisons: +1, −1 or 0.
+        polarity : [pixel], result of the comparisons: +1, −1 or 0, times its `Origin`.
         begin_us, end_us : time of the previous and of this comparison, µs.
         """
         _, place, own = self.between(begin_us, end_us)
         place, own = place[::-1], own[::-1]  # the earliest of a pixel is written last
         free = polarity[place] == 0
         polarity = polarity.copy()
-        polarity[place[free]] = own[free]
+        polarity[place[free]] = own[free] * Origin.DEFECT
         polarity[self._defects.stuck] = 0
         return polarity
 

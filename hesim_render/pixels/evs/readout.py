@@ -46,14 +46,18 @@ class EventReadout:
         self.dropped = 0
 
     def take(self, events: NDArray[np.void]) -> NDArray[np.void]:
-        """The events that get through, in the order given (by time, then row-major).
+        """The events that get through, in the order given; see `admitted`."""
+        return events[self.admitted(events)]
+
+    def admitted(self, events: NDArray[np.void]) -> NDArray[np.bool_]:
+        """Whether each event gets through.
 
         Parameters
         ----------
-        events : `EVENT_DTYPE`, sorted, none before those of earlier calls.
+        events : `EVENT_DTYPE`, sorted by time and then row-major, none before those of earlier calls.
         """
         if events.size == 0:
-            return events
+            return np.zeros(0, np.bool_)
         t_us = events["t_us"].astype(np.int64)
         row = (events["y"] - scan_start_row(t_us, self._rows)) % self._rows
         order = np.lexsort((events["x"], row, t_us))
@@ -61,7 +65,7 @@ class EventReadout:
         kept = np.empty(events.size, dtype=bool)
         kept[order] = self._admit(clock[order])
         self.dropped += int(np.count_nonzero(~kept))
-        return events[kept]
+        return kept
 
     def _admit(self, clock: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the buffer has room for each event, in order; `clock` [event] is the time in clock ticks."""

@@ -42,7 +42,7 @@ class Refractory:
         thresholds: tuple[Float, Float],
         begin_us: float,
         end_us: float,
-        leak: tuple[NDArray[np.float64], NDArray[np.uint32]],
+        leak: tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]],
     ) -> tuple[Float, NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]]:
         """Events of one segment in which the level goes on a straight line from `levels[0]` to `levels[1]`.
 
@@ -52,12 +52,12 @@ class Refractory:
         levels : levels at the begin and the end of the segment, one value per pixel.
         thresholds : θ₊, θ₋; numbers or one per pixel.
         begin_us, end_us : bounds of the segment, µs.
-        leak : times in µs and pixels of the leak events in the segment.
+        leak : times in µs, pixels and origins of the leak events in the segment, and of those of defects.
 
         Returns
         -------
         reference : the new one.
-        t_us, pixel, polarity : the events, unsorted.
+        t_us, pixel, polarity : the events, unsorted; the polarity times their `Origin`.
         """
         import drjit as dr
 
@@ -97,13 +97,13 @@ class Refractory:
         thresholds: tuple[NDArray[np.float64], NDArray[np.float64]],
         begin_us: float,
         end_us: float,
-        leak: tuple[NDArray[np.float64], NDArray[np.uint32]],
+        leak: tuple[NDArray[np.float64], NDArray[np.uint32], NDArray[np.float64]],
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
         """Reference and end of the dead time after the segment, and its events. Each round has the next event of every
         pixel.
         """
-        order = np.lexsort(leak)
-        leak_us = np.append(leak[0][order], np.inf)
+        order = np.lexsort(leak[:2])
+        leak_us, leak_origin = np.append(leak[0][order], np.inf), np.append(leak[2][order], 0.0)
         turn, last = (np.searchsorted(leak[1][order], pixel, side=side) for side in ("left", "right"))
         travel, length = high - low, end_us - begin_us
         found: list[tuple[NDArray, NDArray, NDArray]] = []
@@ -115,13 +115,14 @@ class Refractory:
             part = (own[here] + sign * theta - low[here]) / np.where(travel[here] == 0, np.inf, travel[here])
             crossing_us = np.maximum(begin_us + np.maximum(np.clip(part, 0.0, 1.0) * length, _SOON_US), ready[here])
             crossing_us[(np.abs(distance) < theta) | (ready[here] > end_us)] = np.inf
-            due_us = leak_us[np.where(turn[here] < last[here], turn[here], -1)]
+            due = np.where(turn[here] < last[here], turn[here], -1)
+            due_us = leak_us[due]
             leaks = due_us < crossing_us
             t_us = np.where(leaks, due_us, crossing_us)
             fires = np.isfinite(t_us) & ~(leaks & (due_us < ready[here]))
             turn[here[leaks]] += 1
             firing = here[fires]
-            found.append((t_us[fires], pixel[firing], np.where(leaks, 1.0, sign)[fires]))
+            found.append((t_us[fires], pixel[firing], np.where(leaks, leak_origin[due], sign)[fires]))
             ready[firing] = t_us[fires] + self._period_us
             released = firing[ready[firing] <= end_us]
             own[released] = low[released] + (ready[released] - begin_us) / length * travel[released]

@@ -19,7 +19,7 @@ from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.arrays import restore, saved, take
 from hesim_render.pixels.evs.defects import DefectEvents
-from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin, no_events
 from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
@@ -30,7 +30,22 @@ from hesim_render.pixels.normal import normal_pair
 
 
 class _Mode(Protocol):
-    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]: ...
+    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
+        """Events; the size of their polarity is their `Origin`, its sign the polarity itself."""
+        ...
+
+
+class Labels(Protocol):
+    """Takes all that a step has, to tell later what caused each event; see `EventLabels`."""
+
+    def take(
+        self,
+        stage: EvsStage,
+        electrons: Float,
+        events: NDArray[np.void],
+        origin: NDArray[np.int8],
+        kept: NDArray[np.bool_] | None,
+    ) -> None: ...
 
 
 def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
@@ -49,6 +64,7 @@ class EvsStage:
     noise : the sensor's noise model (`Sensor.evs`, perhaps `without` some terms).
     seed : the events are a pure function of the seed, the device seed, the sample times and the electrons.
     defects : events of defective pixels, where several stages share them; default those of this `seed`.
+    labels : takes the events with their origins; it changes none of them.
 
     Notes
     -----
@@ -72,8 +88,10 @@ class EvsStage:
 
     STATE = ("_mode", "_t_us", "_readout")
 
-    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None = None) -> None:
-        self.noise = noise
+    def __init__(
+        self, noise: EvsNoise, seed: int, defects: DefectEvents | None = None, labels: Labels | None = None
+    ) -> None:
+        self.noise, self._labels = noise, labels
         has_ticks = noise.spec.reference == "previous_sample"
         if defects is None and noise.defects:
             tick_s = noise.spec.tick_us * S_PER_US if has_ticks and noise.spec.tick_us else None
@@ -131,7 +149,12 @@ class EvsStage:
             raise RangeError("t_us", t_us, f"a time after the last sample, {self._t_us}")
         self._t_us = int(t_us)
         events = self._mode.step(electrons, self._t_us)
-        return events if self._readout is None else self._readout.take(events)
+        origin = np.abs(events["polarity"])
+        events["polarity"] = np.sign(events["polarity"])
+        kept = None if self._readout is None else self._readout.admitted(events)
+        if self._labels is not None:
+            self._labels.take(self, electrons, events, origin, kept)
+        return events if kept is None else events[kept]
 
 
 class _PreviousSample:
@@ -167,11 +190,12 @@ class _PreviousSample:
             change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
         theta_on, theta_off = self._noise.on_device.thresholds
         on, off = change > theta_on, change < -theta_off
+        polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
         if self._noise.leak_rate_hz > 0:
             probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
-            on |= ~off & (word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1)))
+            leaks = word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1))
+            polarity = dr.select(~on & ~off & leaks, types.Int8(Origin.LEAK), polarity)
         begin_us = self._t_us
-        polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
         dr.schedule(polarity)
         self._keep(level, variance, t_us)
         found = polarity.numpy()
@@ -242,10 +266,10 @@ class _LastEvent:
                 begin_us = end_us
             if self._leak and not self._refractory:
                 for due_us, pixel in self._leak.until(t_us):
-                    parts.append(_events(self._stamp(due_us), pixel, 1, self._cols))
+                    parts.append(_events(self._stamp(due_us), pixel, Origin.LEAK, self._cols))
             if self._defects and not self._refractory:
                 own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
-                parts.append(_events(self._stamp(own_us), pixel, polarity, self._cols))
+                parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
         self._t_us, self._log, self._spread = t_us, log, spread
         events = np.concatenate(parts) if parts else no_events()
         if self._defects:
@@ -307,12 +331,14 @@ class _LastEvent:
         begin_us, end_us : bounds of the segment, µs.
         """
         due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
+        origins = [np.full(len(part[0]), Origin.LEAK, np.float64) for part in due]
         if self._defects:  # of asynchronous sensors they are ON events, as those of leak
             due.append(self._defects.between(begin_us, end_us)[:2])
+            origins.append(np.full(len(due[-1][0]), Origin.DEFECT, np.float64))
         due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
         levels, thresholds = (self._level, level), self._noise.on_device.thresholds
         self._reference, t_us, pixel, polarity = refractory.crossings(
-            self._reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel)
+            self._reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel, np.concatenate(origins))
         )
         self._level = level
         return _events(self._stamp(t_us), pixel, polarity, self._cols)

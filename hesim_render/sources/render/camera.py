@@ -8,6 +8,7 @@ states (`Lens.axis_mm`). Positions on the chip are measured from that centre.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import atan2, degrees, radians, tan
 
 import numpy as np
@@ -17,6 +18,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sensor.lens import pixel_centres_mm
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.projection import Projection
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector
@@ -58,50 +60,51 @@ class View:
         half = self.sensor.spec.geometry.pitch_um * 1e-3 / 2
         return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
+    @cached_property
+    def projection(self) -> Projection:
+        """Geometry of the lens: places on the full sensor and directions in camera space."""
+        return Projection.of(self.sensor)
+
     def project(self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64] | None = None) -> NDArray:
-        """Column and row (fractional pixels of this region) of world points [..., 3]; [..., 2].
+        """Column and row of world points [..., 3], in pixels of this region with (0, 0) at its left top corner;
+        [..., 2].
 
         Points beside or behind the pupil are treated as if at a small positive depth.
         """
         matrix = self.camera_to_world if camera_to_world is None else camera_to_world
-        local = (points - matrix[..., None, :3, 3]) @ matrix[..., :3, :3]
-        depth = np.maximum(-local[..., 2], 1e-3 + 0.02 * np.linalg.norm(local, axis=-1))
-        scale = self.sensor.lens.image_distance_mm / depth / (self.sensor.spec.geometry.pitch_um * 1e-3)
-        left, _, top, _ = self.region_mm
-        axis_x, axis_y = self.sensor.lens.axis_mm
-        pitch = self.sensor.spec.geometry.pitch_um * 1e-3
-        x, y = (axis_x - left) / pitch, (axis_y - top) / pitch
-        return np.stack([local[..., 0] * scale + x, -local[..., 1] * scale + y], axis=-1)
+        layout = self.sensor.layout
+        return self.projection.project(_in_front(points, matrix)) + 0.5 - np.array([layout.col0, layout.row0])
 
     def project_on_sensor(
         self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Column and row (fractional pixels of the full sensor) of world points [k, n, 3] for k poses of the camera.
+        """Column and row of world points [k, n, 3] for k poses of the camera, in pixels of the full sensor with (0, 0)
+        at its left top corner.
 
         Returns
         -------
         places : [k, n, 2]; points beside or behind the pupil are treated as if at a small positive depth.
         px_per_m : [k, n], pixels per metre across the axis at that depth.
         """
-        left, _, top, _ = self.region_mm
-        geometry = self.sensor.spec.geometry
-        pitch = geometry.pitch_um * 1e-3
-        own = self.project(points, camera_to_world)
-        local = (points - camera_to_world[..., None, :3, 3]) @ camera_to_world[..., :3, :3]
-        depth = np.maximum(-local[..., 2], 1e-3 + 0.02 * np.linalg.norm(local, axis=-1))
-        first = np.array([left / pitch + geometry.cols / 2, top / pitch + geometry.rows / 2])
-        return own + first, self.sensor.lens.image_distance_mm / depth / pitch
+        local = _in_front(points, camera_to_world)
+        return self.projection.project(local) + 0.5, self.projection.focal_px / -local[..., 2]
 
     def unproject(self, depth_m: NDArray[np.float64], camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """World points of a 5×5 grid over the picture, at each depth along the axis; [25 · depths, 3]."""
-        left, right, top, bottom = self.region_mm
-        x, y = np.meshgrid(np.linspace(left, right, 5), np.linspace(top, bottom, 5))
-        image_mm, (axis_x, axis_y) = self.sensor.lens.image_distance_mm, self.sensor.lens.axis_mm
-        tangent = np.stack(
-            [(x.ravel() - axis_x) / image_mm, -(y.ravel() - axis_y) / image_mm, -np.ones(x.size)], axis=-1
+        layout = self.sensor.layout
+        x, y = np.meshgrid(
+            layout.col0 - 0.5 + np.linspace(0, layout.cols, 5), layout.row0 - 0.5 + np.linspace(0, layout.rows, 5)
         )
-        local = (depth_m[:, None, None] * tangent).reshape(-1, 3)
+        rays = self.projection.unproject(np.stack([x.ravel(), y.ravel()], axis=-1))
+        local = (depth_m[:, None, None] * rays).reshape(-1, 3)
         return local @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+
+
+def _in_front(points: NDArray[np.float64], camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World points in camera space, [..., 3], at a small positive depth if they lie beside or behind the pupil."""
+    local = (points - camera_to_world[..., None, :3, 3]) @ camera_to_world[..., :3, :3]
+    local[..., 2] = -np.maximum(-local[..., 2], 1e-3 + 0.02 * np.linalg.norm(local, axis=-1))
+    return local
 
 
 def look_at(origin: Vector, target: Vector, up: Vector) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Spectral radiance cubes L(row, col, λ) of one instant, and spectral EXR files.
+"""Spectral radiance cubes L(row, col, λ) of an instant or a window of time, and spectral EXR files.
 
 The files follow the OpenEXR layout of Fichet, Pacanowski and Wilkie [fichet2021]: one channel per band named
 ``S0.550,000000nm`` (Stokes component 0, decimal comma), and the attributes ``spectralLayoutVersion`` and
@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +23,15 @@ from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.lens import Lens
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.light_parts import light_parts
+from hesim_render.sources.render.exact import timeline_of
+from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import named_spectra
 from hesim_render.sources.render.tracer import PixelTracer
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.sensor import read_sensor
 from hesim_render.spectral.spectrum import RENDERABLE_NM
+from hesim_render.spectral.waveform import Waveform
 
 EMISSIVE_UNITS = "W.m^-2.sr^-1.nm^-1"
 _CHANNEL = re.compile(r"S0\.(\d*,?\d*(?:[eE][+-]?\d+)?)nm")
@@ -64,21 +70,31 @@ def render_cube(
     samples: int = 64,
     t_us: float = 0.0,
     *,
+    end_us: float | None = None,
     seed: int = 0,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
-    """Spectral radiance of one instant on a pixel grid, at exact wavelengths.
+    """Spectral radiance on a pixel grid at exact wavelengths, at one instant or as the mean over a window of time.
 
     Each value is the radiance averaged over one pixel pitch (and the lens PSF). Filters and relative
     illumination are not applied.
 
     Parameters
     ----------
-    scene : the scene; objects and camera are frozen at `t_us`.
+    scene : the scene; lights with a waveform have their power of the instant, or their mean over the window.
     sensor : sensor whose pixel grid is used, or (rows, cols) of an ideal camera.
     bands_nm : [band], wavelengths in nm, increasing, 360 to 830.
-    samples : rays per pixel and group of four bands, even.
-    t_us : instant, µs.
+    samples : rays per pixel, group of four bands and slice of time in which objects stand still, even.
+    t_us : instant, or begin of the window, µs.
+    end_us : end of the window, µs; None for an instant, at which objects and camera stand still.
     seed : seed of the random numbers; all bands share them.
+
+    Examples
+    --------
+    >>> import hesim_render as hr
+    >>> sensor = hr.load_sensor("reference-mono").crop(16, 12)
+    >>> bands, radiance, stderr = hr.render_cube(hr.load_scene("flat-field"), sensor, [450, 550, 650], end_us=1000)
+    >>> radiance.shape, bool((radiance > 0).all())
+    ((12, 16, 3), True)
 
     Returns
     -------
@@ -90,19 +106,52 @@ def render_cube(
     SpecError
         If the scene cannot be loaded or a spectrum does not reach a band.
     RangeError
-        If `bands_nm` or `samples` is out of range.
+        If `bands_nm` or `samples` is out of range, or the window ends before it begins.
     """
-    import drjit as dr
-
     bands = np.atleast_1d(np.asarray(bands_nm, dtype=np.float64))
     _check_bands(scene, bands)
+    if end_us is not None and not end_us > t_us:
+        raise RangeError("end_us", end_us, f"a time after the begin of the window, {t_us:g} µs")
     chosen = sensor if isinstance(sensor, Sensor) else _camera_of_size(*sensor)
-    tracer = PixelTracer(scene, chosen, samples, seed, {})
-    shape = (*chosen.layout.shape, bands.size)
-    radiance, stderr = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    if tracer.built.is_dark:
-        return bands, radiance, stderr
-    tracer.pose(t_us)
+    lit, _ = in_absolute_light(scene)
+    halves = np.zeros((2, *chosen.layout.shape, bands.size), np.float32)
+    for waveform, part in light_parts(lit):
+        tracer = PixelTracer(part, chosen, samples, seed, {})
+        if not tracer.built.is_dark:
+            for begin, end, share in _slices(tracer, waveform, t_us, t_us if end_us is None else end_us):
+                _add_slice(tracer, bands, begin, end, share, halves)
+    return bands, (halves[0] + halves[1]) / 2, np.abs(halves[0] - halves[1]) / 2
+
+
+def _slices(
+    tracer: PixelTracer, waveform: Waveform | None, begin_us: float, end_us: float
+) -> Iterator[tuple[float, float, float]]:
+    """Begin, end and weight of parts of a window in which objects stand still; they are posed for each."""
+    if begin_us == end_us:
+        tracer.pose(begin_us)
+        yield begin_us, end_us, 1.0 if waveform is None else float(waveform.mean(begin_us, begin_us))
+        return
+    timeline = timeline_of(tracer)
+    edges = [begin_us, *timeline.edges_us(begin_us, end_us), end_us]
+    for low, high in pairwise(edges):
+        power = 1.0 if waveform is None else float(waveform.mean(low, high))
+        if power > 0:
+            tracer.pose(timeline.pose_time_us(low, high))
+            yield low, high, power * (high - low) / (end_us - begin_us)
+
+
+def _add_slice(
+    tracer: PixelTracer,
+    bands: NDArray[np.float64],
+    begin_us: float,
+    end_us: float,
+    share: float,
+    halves: NDArray[np.float32],
+) -> None:
+    """Add the radiance of one slice with a weight to `halves`, [half, row, col, band]."""
+    import drjit as dr
+
+    shape = tracer.view.sensor.layout.shape
     pixels = np.arange(tracer.pixel_count, dtype=np.uint32)
     for first in range(0, bands.size, _BANDS_PER_RAY):
         group = bands[first : first + _BANDS_PER_RAY]
@@ -115,12 +164,10 @@ def render_cube(
         def weigh(pixel: UInt32, spectrum: Bands) -> list[Float]:
             return [spectrum[k] * tracer.radiance_scale for k in range(_BANDS_PER_RAY)]
 
-        halves = tracer.trace(pixels, t_us, t_us, choose, weigh)
+        traced = tracer.trace(pixels, begin_us, end_us, choose, weigh)
         for k in range(group.size):
-            a, b = (np.array(half, dtype=np.float64).reshape(shape[:2]) for half in halves[k])
-            radiance[:, :, first + k] = (a + b) / 2
-            stderr[:, :, first + k] = np.abs(a - b) / 2
-    return bands, radiance, stderr
+            for half in (0, 1):
+                halves[half, :, :, first + k] += np.float32(share) * np.array(traced[k][half]).reshape(shape)
 
 
 def channel_name(wavelength_nm: float) -> str:
@@ -135,7 +182,23 @@ def write_spectral_exr(path: str | Path, radiance: NDArray[np.float32], waveleng
     Parameters
     ----------
     radiance : [row, col, band], W m⁻² sr⁻¹ nm⁻¹.
+    path : the file.
     wavelength_nm : [band].
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import hesim_render as hr
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = hr.write_spectral_exr(f"{folder}/cube.exr", np.ones((4, 6, 2), np.float32), [500, 600])
+    ...     bands, radiance = hr.read_spectral_exr(path)
+    >>> bands.tolist(), radiance.shape
+    ([500.0, 600.0], (4, 6, 2))
+
+    Returns
+    -------
+    The file.
 
     Raises
     ------
@@ -176,6 +239,20 @@ def write_spectral_exr(path: str | Path, radiance: NDArray[np.float32], waveleng
 
 def read_spectral_exr(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """A cube from a spectral EXR file in the layout of Fichet et al.
+
+    Parameters
+    ----------
+    path : the file.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import hesim_render as hr
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = hr.write_spectral_exr(f"{folder}/cube.exr", np.ones((4, 6, 1), np.float32), [550])
+    ...     hr.read_spectral_exr(f"{folder}/cube.exr")[0].tolist()
+    [550.0]
 
     Returns
     -------

@@ -59,6 +59,13 @@ def require_finite(half_a: Float, half_b: Float, scene: Scene, layout: Layout, p
         )
 
 
+def timeline_of(tracer: PixelTracer, max_motion_px: float = MAX_MOTION_PX) -> Timeline:
+    """Slices of the scene of a tracer, in each of which objects stand still."""
+    built = tracer.built
+    corners = {name: np.concatenate([s.corners for s in built.groups[name]]) for name in built.trajectories}
+    return Timeline(tracer.view, tracer.camera, built.trajectories, corners, built.corners, max_motion_px)
+
+
 class RenderedFlux(WindowByWindow):
     """Φ = V(x) · ∫ L(x, t, λ) R(λ) dλ in e⁻/s, by path tracing; implements `FluxSource`.
 
@@ -110,12 +117,8 @@ class RenderedFlux(WindowByWindow):
         self._tracer = PixelTracer(scene, sensor, samples, seed, used_responses(sensor), progress, block_rays)
         self.view = self._tracer.view
         self.sensor = self.view.sensor
-        built = self._tracer.built
-        corners = {name: np.concatenate([s.corners for s in built.groups[name]]) for name in built.trajectories}
-        self._timeline = Timeline(
-            self.view, self._tracer.camera, built.trajectories, corners, built.corners, max_motion_px
-        )
-        self.is_static = not built.trajectories and self._tracer.camera is None
+        self._timeline = timeline_of(self._tracer, max_motion_px)
+        self.is_static = not self._tracer.built.trajectories and self._tracer.camera is None
         types = jit()
         self._wavelengths = WavelengthSampler(self.sensor.responses)
         self._filter = types.UInt32(self.sensor.layout.filter_index.ravel().astype(np.uint32))

@@ -8,6 +8,7 @@ from __future__ import annotations
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Point2, Point3, Vector3
 from hesim_render.sources.render.camera import View
+from hesim_render.sources.render.projection import DeviceProjection
 
 _FWHM_PER_SIGMA = 2.3548200450309493  # 2 √(2 ln 2)
 #: Part of the PSF in which `RayFactory.density` is not zero, standard deviations: all but 2e-7 of the rays.
@@ -24,15 +25,8 @@ class RayFactory:
         import drjit as dr
 
         types = jit()
-        geometry, lens = view.sensor.spec.geometry, view.sensor.lens
-        pitch_mm = geometry.pitch_um * 1e-3
-        # opaque, so that another lens or sensor needs no new kernel
-        self._middle = [
-            dr.opaque(types.Float, (count - 1) / 2 + axis / pitch_mm)
-            for count, axis in zip((geometry.cols, geometry.rows), lens.axis_mm, strict=True)
-        ]
-        #: Tangent of the chief ray's angle from one pixel to the next.
-        self._step = dr.opaque(types.Float, float(pitch_mm / lens.image_distance_mm))
+        geometry = view.sensor.spec.geometry
+        self._projection = DeviceProjection(view.projection)
         psf_um = view.sensor.spec.lens.psf_fwhm_um
         self.has_psf = psf_um > 0
         self._sigma_px = dr.opaque(types.Float, float(psf_um / _FWHM_PER_SIGMA / geometry.pitch_um))
@@ -67,9 +61,7 @@ class RayFactory:
         import drjit as dr
 
         types = jit()
-        # half-integers relative to the centre of the chip are exact in float32
-        x = (col - self._middle[0] + offset_x) * self._step
-        y = (row - self._middle[1] + offset_y) * self._step
+        x, y = self._projection.tangents(row, col, offset_x, offset_y)
         local = dr.normalize(types.Array3f(x, -y, -1.0))
         direction = types.Array3f(*(r[0] * local.x + r[1] * local.y + r[2] * local.z for r in self._rotation))
         origin = types.Array3f(*self._origin)
@@ -114,11 +106,6 @@ class RayFactory:
         types = jit()
         away = types.Array3f(point) - types.Array3f(*self._origin)
         x, y, z = (sum(self._rotation[row][axis] * away[row] for row in range(3)) for axis in range(3))
-        ahead = z < 0
-        scale = dr.select(ahead, dr.rcp(-z * self._step), 0)
-        stretch = dr.norm(away) * dr.rcp(-z)
-        return (
-            x * scale + self._middle[0],
-            self._middle[1] - y * scale,
-            dr.select(ahead, stretch * scale, 0),
-        )
+        ahead, nearness = z < 0, dr.rcp(-z)
+        col, row, scale = self._projection.places(x * nearness, -y * nearness)
+        return col, row, dr.select(ahead, dr.norm(away) * dr.square(nearness) * scale, 0)

@@ -13,7 +13,8 @@ import pytest
 from rendering import pair_tracer
 
 import hesim_render as hr
-from hesim_render.capture.loop import Capture, noise_models
+from hesim_render.capture.loop import Capture
+from hesim_render.capture.noise_terms import noise_models
 from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.audit.compare import compare_ticks

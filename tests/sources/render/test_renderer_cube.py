@@ -47,6 +47,43 @@ def test_cube_follows_motion():
     np.testing.assert_array_equal(early, whole)
 
 
+def test_cube_of_a_window_is_the_mean_of_the_motion_in_it():
+    """A card that moves by 1.6 of the 25 mm pixels within the window, in front of nothing: its share of each pixel,
+    averaged over the window, times ρE/π.
+    """
+    card = {"name": "card", "shape": "rectangle", "size_m": [0.4, 2, 0], "reflectance": {"flat": 0.8}}
+    frames = [{"t_us": 0}, {"t_us": 10_000, "translation_m": [0.05, 0, 0]}]
+    scene = make_scene(
+        objects=[card], light={**D65_1000_LUX, "type": "directional", "direction": [0, 0, -1]},
+        motion=[{"object": "card", "keyframes": frames}],
+        camera={"origin_m": [0, 0, 2], "target_m": [0, 0, 0], "horizontal_fov_deg": 2 * np.degrees(np.arctan(0.2))},
+    )  # fmt: skip
+    _, window, stderr = render_cube(scene, (4, 32), [450, 650], 64, 1_000.0, end_us=9_000.0)
+    edges = -0.4 + 0.025 * np.arange(33)
+    shift = np.linspace(0.005, 0.045, 2001)[:, None]
+    covered = np.clip(np.minimum(edges[1:], 0.2 + shift) - np.maximum(edges[:-1], -0.2 + shift), 0, None) / 0.025
+    grid, irradiance = d65_irradiance(1000)
+    expected = covered.mean(axis=0)[:, None] * 0.8 * np.interp([450, 650], grid, irradiance) / np.pi
+    # objects stand still while they move by half a pixel, so a rim may be off by a sixteenth of its change
+    np.testing.assert_allclose(window.mean(axis=0), expected, atol=0.07 * expected.max())
+    np.testing.assert_allclose(window.mean(axis=0).sum(axis=0), expected.sum(axis=0), rtol=0.002)
+    assert stderr.max() < 0.1 * expected.max()
+    still, _ = render_cube(scene, (4, 32), [450, 650], 64, 1_000.0)[1:]
+    assert np.abs(still.mean(axis=0) - expected).max() > 0.3 * expected.max()
+    with pytest.raises(RangeError, match="a time after the begin of the window, 9000 µs"):
+        render_cube(scene, (4, 32), [450], 4, 9_000.0, end_us=1_000.0)
+
+
+def test_cube_has_the_power_of_a_flickering_light_at_its_instant_or_over_its_window():
+    wave = {"type": "mains", "frequency_hz": 50, "depth": 0.5, "phase_deg": 0}
+    scene = make_scene(**{**FLAT, "light": {**D65_1000_LUX, "waveform": wave}})
+    steady = render_cube(make_scene(**FLAT), (2, 2), [550], 2)[1]
+    for times, power in (((0.0, None), 1.5), ((5_000.0, None), 0.5), ((0.0, 10_000.0), 1.0),
+                         ((0.0, 5_000.0), 1.0), ((0.0, 2_500.0), 1 + 0.5 * 2 / np.pi)):  # fmt: skip
+        found = render_cube(scene, (2, 2), [550], 2, times[0], end_us=times[1])[1]
+        np.testing.assert_allclose(found / steady, power, rtol=1e-5)
+
+
 def test_exr_round_trip_and_the_openexr_library_itself(tmp_path):
     rng = np.random.default_rng(0)
     bands = np.array([400.0, 550.0, 550.25, 700.123456])

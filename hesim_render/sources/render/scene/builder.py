@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,8 @@ class BuiltScene:
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
+    object_of_shape : name of the object of each shape, by the shape's id; a shape of a Mitsuba scene is an object
+        of its own, under its id, and is not listed.
     """
 
     mi: MitsubaModule
@@ -64,6 +66,7 @@ class BuiltScene:
     exact_because: str | None = None
     camera: MitsubaCamera | None = None
     integrator_plugin: dict[str, Any] | None = None
+    object_of_shape: dict[str, str] = field(default_factory=dict)
 
     def pose(self, t_us: float) -> None:
         """Move every moving object to its pose at `t_us`."""
@@ -156,6 +159,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         exact_because=because,
         camera=camera,
         integrator_plugin=plugin,
+        object_of_shape={prefix: name for name, prefixes in groups.items() for prefix in prefixes},
     )
 
 

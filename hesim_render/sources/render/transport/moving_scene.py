@@ -109,23 +109,21 @@ class MovingScene:
     Parameters
     ----------
     built : from `build`; its moving shapes may be at any pose.
+    geometry_only : True if the scene is used to find surfaces, not to render them; no scene is then refused.
 
     Raises
     ------
+    SpecError
+        If something moves in a scene with instances.
     NeedsExactMode
         If a moving shape emits light, a plugin of the scene asks for that mode, the scene's integrator is not Mitsuba's
         path tracer, or it hides lights.
     """
 
-    def __init__(self, built: BuiltScene) -> None:
+    def __init__(self, built: BuiltScene, geometry_only: bool = False) -> None:
         mi = built.mi
-        if built.exact_because is not None:
-            raise NeedsExactMode(built.exact_because)
-        if not path_traced(built):
-            name = built.integrator.class_name()
-            raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
-        if built.integrator.hide_emitters:
-            raise NeedsExactMode("the integrator hides lights that are seen directly")
+        if not geometry_only:
+            _require_paths(built)
         self.mi = mi
         moving = {
             shape: group
@@ -142,7 +140,7 @@ class MovingScene:
             if group is None:
                 resting[f"shape_{number}"] = shape
                 continue
-            if shape.is_emitter():
+            if shape.is_emitter() and not geometry_only:
                 raise NeedsExactMode(f"{group!r} moves and emits light")
             parts[group][f"shape_{number}"] = shape
         emitters = built.scene.emitters()
@@ -150,7 +148,16 @@ class MovingScene:
         for number, emitter in enumerate(emitters):
             if emitter.get_shape() is None:
                 resting[f"emitter_{number}"] = emitter
-        self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
+        if any(shape.class_name() == "Instance" for shape in built.scene.shapes()):
+            # Mitsuba cannot put an instance into a second scene
+            if parts:
+                raise SpecError(
+                    "geometric truth is not known of moving objects in a scene with instances; give copies of the "
+                    "shape in their place"
+                )
+            self.static = built.scene
+        else:
+            self.static = mi.load_dict({"type": "scene", **resting}, optimize=False)
         lights = self.static.emitters()
         #: Lights that a ray can hit: the environment, and corners of boxes around all other lights [n, 2, 3], m.
         self.has_sky = any(light.is_environment() for light in lights)
@@ -299,6 +306,17 @@ class MovingScene:
 
             state = dr.if_stmt(state, near, turn_to, lambda *state: state, label="moving group")
         return state, met
+
+
+def _require_paths(built: BuiltScene) -> None:
+    """Refuse scenes that paths between surfaces do not describe."""
+    if built.exact_because is not None:
+        raise NeedsExactMode(built.exact_because)
+    if not path_traced(built):
+        name = built.integrator.class_name()
+        raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
+    if built.integrator.hide_emitters:
+        raise NeedsExactMode("the integrator hides lights that are seen directly")
 
 
 def _at_rest(ray: Ray, pose: DevicePose) -> Ray:

@@ -1,0 +1,134 @@
+"""Pairs of causes and effects of pixels that step up and down: which step of one follows from which of another.
+
+Two sequences of signed steps of the same pixel, such as the events with and without noise, follow the same signal. A
+step of the one is paired with a step of the other in the same direction, whichever comes first. A step and its opposite
+in the same sequence cancel if neither has a partner by then: the pixel went back. What is left has no partner.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Steps of a pixel that can wait for partners at first; the room doubles when it is needed.
+_ROOM = 2
+CAUSE, EFFECT = 0, 1
+
+
+class Steps(NamedTuple):
+    """Steps of pixels, [n] each, in order of time.
+
+    Parameters
+    ----------
+    t_us : times, µs.
+    pixel : numbers of the pixels.
+    sign : +1 or −1.
+    number : what names the step in the pairs.
+    """
+
+    t_us: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    sign: NDArray[np.int64]
+    number: NDArray[np.int64]
+
+
+class Balance:
+    """Steps of both sequences that wait for their partners.
+
+    Parameters
+    ----------
+    pixels : number of pixels.
+    dead_us : time after each effect in which the pixel has none, µs: causes within are lost, and waiting effects end;
+        None if there is no such time.
+    """
+
+    def __init__(self, pixels: int, dead_us: float | None = None) -> None:
+        self._dead_us = dead_us
+        #: Signed number of waiting steps, [sequence, pixel], and their numbers, [sequence, pixel, place].
+        self._count = np.zeros((2, pixels), np.int32)
+        self._waiting = np.zeros((2, pixels, _ROOM), np.int64)
+        self._ready_us = np.full(pixels, -np.inf)
+
+    def take(self, causes: Steps, effects: Steps) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Take the next steps of both sequences.
+
+        Parameters
+        ----------
+        causes, effects : none before those of earlier calls. At the same time, a cause comes first.
+
+        Returns
+        -------
+        cause, effect : [k], numbers of the steps of each new pair.
+        lost : numbers of causes within the dead time of a pixel.
+        """
+        both = [np.concatenate(values) for values in zip(causes, effects, strict=True)]
+        t_us, pixel, sign, number = both
+        side = np.repeat([CAUSE, EFFECT], [causes.pixel.size, effects.pixel.size])
+        pairs: list[tuple[NDArray, NDArray]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+        lost: list[NDArray[np.int64]] = [np.empty(0, np.int64)]
+        for here in _rounds(pixel, np.lexsort((side, t_us, pixel))):
+            for own in (CAUSE, EFFECT):
+                which = here[side[here] == own]
+                if which.size:
+                    self._step(own, t_us[which], pixel[which], sign[which], number[which], pairs, lost)
+        cause, effect = (np.concatenate(values) for values in zip(*pairs, strict=True))
+        return cause, effect, np.concatenate(lost)
+
+    def _step(
+        self,
+        own: int,
+        t_us: NDArray[np.int64],
+        pixel: NDArray[np.int64],
+        sign: NDArray[np.int64],
+        number: NDArray[np.int64],
+        pairs: list[tuple[NDArray, NDArray]],
+        lost: list[NDArray[np.int64]],
+    ) -> None:
+        """One step of each of different pixels in one sequence."""
+        other = 1 - own
+        if self._dead_us is not None:
+            # a pixel that was released compares with a new level: what waited has no partner any more
+            released = self._ready_us[pixel] < t_us
+            self._count[EFFECT, pixel[released & (self._count[EFFECT, pixel] != 0)]] = 0
+        match = self._count[other, pixel] * sign > 0
+        found = self._pop(other, pixel[match])
+        pairs.append((found, number[match]) if own == EFFECT else (number[match], found))
+        rest = ~match
+        if self._dead_us is not None and own == CAUSE:
+            asleep = rest & (t_us <= self._ready_us[pixel])
+            lost.append(number[asleep])
+            rest &= ~asleep
+        back = rest & (self._count[own, pixel] * sign < 0)
+        self._pop(own, pixel[back])
+        wait = rest & ~back
+        self._push(own, pixel[wait], sign[wait], number[wait])
+        if self._dead_us is not None and own == EFFECT:
+            self._ready_us[pixel] = t_us + self._dead_us
+
+    def _pop(self, side: int, pixel: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Numbers of the latest waiting steps, which wait no longer."""
+        count = self._count[side, pixel]
+        found = self._waiting[side, pixel, np.abs(count) - 1]
+        self._count[side, pixel] = count - np.sign(count)
+        return found
+
+    def _push(self, side: int, pixel: NDArray[np.int64], sign: NDArray[np.int64], number: NDArray[np.int64]) -> None:
+        place = np.abs(self._count[side, pixel])
+        room = self._waiting.shape[2]
+        if place.size and place.max() >= room:
+            self._waiting = np.concatenate([self._waiting, np.zeros_like(self._waiting)], axis=2)
+        self._waiting[side, pixel, place] = number
+        self._count[side, pixel] += sign.astype(np.int32)
+
+
+def _rounds(pixel: NDArray[np.int64], order: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """The steps in rounds, each with the next step of every pixel that has one; `order` is by pixel, then by time."""
+    if order.size == 0:
+        return []
+    sorted_pixel = pixel[order]
+    first = np.flatnonzero(np.diff(sorted_pixel, prepend=sorted_pixel[0] - 1))
+    rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))
+    by_rank = np.argsort(rank, kind="stable")
+    return np.split(order[by_rank], np.cumsum(np.bincount(rank))[:-1])

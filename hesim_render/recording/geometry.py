@@ -1,0 +1,64 @@
+"""The scene of a recording, made again from its manifest: geometric truth at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from hesim_render.core.errors import SpecError
+from hesim_render.mosaic.layout import Layout
+from hesim_render.recording import manifest as manifests
+from hesim_render.sensor.lens import Lens
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.truth.scene_truth import SceneTruth
+from hesim_render.sources.scene import Scene
+from hesim_render.specs.files import content_hash
+from hesim_render.specs.scene import SceneSpec
+
+
+def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene | None) -> SceneTruth:
+    """Geometry that the sensor of a recording sees.
+
+    Parameters
+    ----------
+    manifest : the manifest.
+    folder : folder of the recording, for errors; None for one in memory.
+    scene : the scene; None makes it from the manifest.
+
+    Raises
+    ------
+    SpecError
+        If there is no scene (a video), `scene` is another one, or it names files that a manifest does not hold.
+    """
+    file = None if folder is None else folder / manifests.MANIFEST_NAME
+    told = manifest["scene"]
+    if told is None:
+        raise SpecError("the recording was made from a video, which has no geometry", file=file)
+    if scene is None:
+        scene = _scene_of(told, file)
+    elif content_hash(scene.spec) != told["sha256"]:
+        raise SpecError(
+            f"scene {scene.name!r} is not the one of the recording, {told['name']!r}, or was changed since", file=file
+        )
+    spec, roi = manifests.sensor_spec(manifest, folder), manifest["roi"]
+    layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
+    return SceneTruth(scene, Sensor(layout, Lens.of(spec)))
+
+
+def _scene_of(told: Mapping[str, Any], file: Path | None) -> Scene:
+    if told.get("files_sha256"):
+        raise SpecError(
+            f"the scene needs files that are not in the recording ({', '.join(sorted(told['files_sha256']))}): give "
+            "the scene, recording.truth_with(load_scene(PATH))",
+            file=file,
+            key="scene.files_sha256",
+        )
+    try:
+        return Scene(SceneSpec.model_validate(told["spec"]))
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key = ".".join(["scene", "spec", *map(str, problem["loc"])])
+        raise SpecError(problem["msg"].removeprefix("Value error, "), file=file, key=key) from None

@@ -1,0 +1,97 @@
+"""HDF5 files of recordings: writing that survives a full disk, and data sets of untrusted files."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin
+
+from hesim_render.core.errors import SpecError
+
+#: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
+_FILTERS = {1, 2, 3, 32000, 32001}
+LARGEST_CHUNK_BYTES = 1 << 26
+#: How data sets are packed.
+COMPRESSION = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
+_KINDS = {"ui": "whole numbers"}
+
+
+class Disk:
+    """File object for HDF5 that never reports a write error, because HDF5 crashes if it cannot close its file.
+
+    `check` raises the first error. After an error, further data are dropped; the file is useless then and is removed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w+b", buffering=0)
+        self._error: OSError | None = None
+        self.read, self.seek, self.tell, self.close = (
+            getattr(self._file, name) for name in ("read", "seek", "tell", "close")
+        )
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        place, done = self._file.tell(), 0
+        try:
+            while done < len(view):
+                done += self._file.write(view[done:])
+        except OSError as error:
+            self._error = self._error or error
+            self._file.seek(place + len(view))
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        found = self._file.readinto(view) or 0
+        view[found:] = bytes(len(view) - found)  # data that were dropped
+        return len(view)
+
+    def truncate(self, size: int) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return size
+
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
+    @contextlib.contextmanager
+    def told(self) -> Iterator[None]:
+        """Raise an error of the disk in place of the error that HDF5 makes of it."""
+        try:
+            yield
+        except (OSError, RuntimeError):
+            self.check()
+            raise
+        self.check()
+
+    def check(self) -> None:
+        """Raise the error that was kept from HDF5."""
+        if self._error is not None:
+            raise self._error
+
+
+def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui") -> Any:
+    """A data set of numbers that is stored in this file itself; `kinds` are NumPy's letters of the kinds that it may
+    hold.
+    """
+    parts = name.split("/")
+    for k in range(len(parts)):
+        part = "/".join(parts[: k + 1])
+        if not isinstance(file.get(part, getlink=True), h5py.HardLink):
+            raise SpecError(f"{part} is a link to elsewhere", file=path)
+    found = file[name]
+    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in kinds:
+        raise SpecError(f"{name} is no data set of {_KINDS.get(kinds, 'numbers')}", file=path)
+    layout = found.id.get_create_plist()
+    if found.is_virtual or layout.get_external_count():
+        raise SpecError(f"{name} has its values in another file", file=path)
+    for k in range(layout.get_nfilters()):
+        if (used := layout.get_filter(k)[0]) not in _FILTERS:
+            raise SpecError(f"{name} is packed by filter {used}; expected one of {sorted(_FILTERS)}", file=path)
+    return found

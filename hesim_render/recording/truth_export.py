@@ -1,0 +1,314 @@
+"""Geometric truth in formats that others read: EXR, flow of DSEC, trajectories of TUM, calibration of Kalibr.
+
+Every format is a folder with ``export.json``, which states what was written. docs/ground-truth.md has the conventions.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from hesim_render.core.errors import RangeError, did_you_mean
+from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.core.units import S_PER_US
+from hesim_render.recording.recording import Recording
+from hesim_render.recording.truth_file import POSE_STEP_US, images_at
+from hesim_render.recording.truth_kinds import IMAGES
+from hesim_render.sources.render.truth.imu import ImuModel
+from hesim_render.sources.render.truth.poses import CameraModel
+from hesim_render.sources.render.truth.raster import Grid
+from hesim_render.sources.render.truth.scene_truth import SceneTruth
+
+MARKER = "export.json"
+#: DSEC's flow: 16 bit, 1/128 px, zero at 2¹⁵; interval of its flow, µs.
+_DSEC_ZERO, _DSEC_STEPS, DSEC_EVERY_US = 1 << 15, 128.0, 100_000
+
+
+def export_truth(
+    recording: Recording, format_: str, out: str | Path, *, every_us: int | None = None, overwrite: bool = False
+) -> Path:
+    """Write the geometric truth of a recording in a format that others read.
+
+    Parameters
+    ----------
+    recording : the recording.
+    format_ : ``exr``: images of every frame; ``dsec-flow``: forward flow of the event pixels; ``tum``: trajectories of
+        camera and objects; ``kalibr``: cameras and the inertial unit.
+    out : folder to write.
+    every_us : interval of flow (default 100 000) or of poses (default 1000), µs.
+    overwrite : replace an existing export.
+
+    Returns
+    -------
+    The folder.
+
+    Raises
+    ------
+    RangeError
+        If the format is unknown, or the interval does not fit it or the recording.
+    SpecError
+        If the scene of the recording is not known.
+    OutputError
+        If the folder exists or cannot be written.
+    """
+    write = FORMATS.get(format_)
+    if write is None:
+        raise RangeError("format", format_, f"one of {', '.join(FORMATS)}{did_you_mean(format_, FORMATS)}")
+    if every_us is not None and format_ not in ("dsec-flow", "tum"):
+        raise RangeError("every_us", every_us, f"no interval: {format_} has none")
+    if every_us is not None and not 1 <= every_us <= recording.duration_us:
+        raise RangeError("every_us", every_us, f"1 to {recording.duration_us} µs, the length of the recording")
+    truth = recording.truth
+    folder = OutputFolder(out, MARKER, overwrite)
+    try:
+        with output_errors(folder.target):
+            told = write(recording, truth, folder.path, every_us)
+            text = json.dumps({"format": format_, **told}, indent=2, ensure_ascii=False)
+            (folder.path / MARKER).write_text(text + "\n", encoding="utf-8")
+        return folder.commit()
+    except BaseException:
+        folder.discard()
+        raise
+
+
+# ---- EXR -----------------------------------------------------------------------------------------------------------
+
+#: Channels of each image, by the name of its data set.
+_XYZ, _UV = ("X", "Y", "Z"), ("u", "v")
+_CHANNELS = {
+    "depth_m": ("Z",),
+    "distance_m": ("distance",),
+    "normal": tuple(f"normal.{axis}" for axis in _XYZ),
+    "position_m": tuple(f"position.{axis}" for axis in _XYZ),
+    "object": ("object",),
+    "instance": ("instance",),
+    "material": ("material",),
+    "mixed": ("mixed",),
+    "flow_forward_px": tuple(f"forward.{axis}" for axis in _UV),
+    "flow_backward_px": tuple(f"backward.{axis}" for axis in _UV),
+    "visible_forward": ("forward.visible",),
+    "visible_backward": ("backward.visible",),
+}
+
+
+def _exr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+    import OpenEXR
+
+    frames = recording.manifest["frames"]
+    rows = np.array([_row_times_us(frame, truth.sensor.rows) for frame in frames])
+    for number in range(len(frames)):
+        channels = {}
+        for name, image in images_at(truth, "mosaic", IMAGES, rows, number):
+            kind = np.float32 if image.dtype.kind == "f" else np.uint32
+            layers = image[..., None] if image.ndim == 2 else image
+            for k, channel in enumerate(_CHANNELS[name]):
+                channels[channel] = np.ascontiguousarray(layers[..., k], dtype=kind)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels) as file:
+            file.write(str(folder / f"{number:06d}.exr"))
+    names = {kind: list(getattr(truth.names, kind)) for kind in ("objects", "instances", "materials")}
+    return {"frames": len(frames), "names": names, "camera": truth.camera().as_dict()}
+
+
+def _row_times_us(frame: dict[str, Any], rows: int) -> NDArray[np.float64]:
+    """As `Frame.row_times_us`, from the manifest."""
+    middle = float(frame["exposure_start_us"] + frame["exposure_us"] / 2)
+    return np.asarray(middle + np.arange(rows) * frame["line_time_us"], dtype=np.float64)
+
+
+# ---- flow of DSEC --------------------------------------------------------------------------------------------------
+
+
+def dsec_flow_image(flow_px: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Flow in the encoding of DSEC [gehrig2021]: red and green are 2¹⁵ + 128·flow, blue is 1 where the flow is valid.
+
+    Parameters
+    ----------
+    flow_px : [row, col, 2], px, to the right and downwards; NaN where there is none.
+
+    Returns
+    -------
+    uint16 [row, col, 3]; flow that is not finite or outside of ±256 px is not valid, and 0.
+    """
+    steps = np.rint(flow_px.astype(np.float64) * _DSEC_STEPS) + _DSEC_ZERO
+    valid = np.all(np.isfinite(steps) & (steps >= 0) & (steps < 1 << 16), axis=-1)
+    image = np.zeros((*valid.shape, 3), np.uint16)
+    image[valid, :2] = steps[valid]
+    image[valid, 2] = 1
+    return image
+
+
+def _png16(path: Path, image: NDArray[np.uint16]) -> None:
+    """Write [row, col, 3] as a PNG of 16 bits."""
+    import av
+
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb48le").reformat(format="rgb48be")
+    codec: Any = av.CodecContext.create("png", "w")
+    codec.width, codec.height, codec.pix_fmt, codec.time_base = frame.width, frame.height, "rgb48be", Fraction(1)
+    path.write_bytes(b"".join(bytes(packet) for packet in [*codec.encode(frame), *codec.encode(None)]))
+
+
+def _dsec_flow(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+    step = every_us or min(DSEC_EVERY_US, recording.duration_us)
+    times = np.arange(0, recording.duration_us + 1, step)
+    (folder / "forward").mkdir()
+    with (folder / "forward_timestamps.txt").open("w", encoding="utf-8", newline="") as stream:
+        table = csv.writer(stream, lineterminator="\n")
+        table.writerow(["# from_timestamp_us", " to_timestamp_us"])
+        for number, (begin, end) in enumerate(zip(times[:-1], times[1:], strict=True)):
+            flow = truth.flow(float(begin), float(end), "events")
+            _png16(folder / "forward" / f"{number:06d}.png", dsec_flow_image(flow.flow_px))
+            table.writerow([int(begin), f" {int(end)}"])
+    return {"every_us": int(step), "camera": truth.camera("events").as_dict()}
+
+
+# ---- trajectories --------------------------------------------------------------------------------------------------
+
+
+def tum_lines(t_us: NDArray[np.float64], poses: NDArray[np.float64]) -> list[str]:
+    """Lines of TUM's format: time in s, position in m, unit quaternion with the real part last.
+
+    Parameters
+    ----------
+    t_us : [n], µs.
+    poses : [n, 4, 4], to world.
+
+    Returns
+    -------
+    One line for each pose, without line ends.
+    """
+    quaternion = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    rows = np.concatenate([poses[:, :3, 3], quaternion], axis=1)
+    return [
+        f"{t * S_PER_US:.6f} " + " ".join(f"{value:.9g}" for value in row) for t, row in zip(t_us, rows, strict=True)
+    ]
+
+
+def _tum(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+    times = np.arange(0, recording.duration_us + 1, every_us or POSE_STEP_US, dtype=np.float64)
+    files = {"camera.txt": ("camera in world", truth.camera_pose(times))}
+    for number, (name, poses) in enumerate(truth.object_poses(times).items(), start=1):
+        files[f"object_{number:03d}.txt"] = (f"{name}: from its place in the scene file to its place in world", poses)
+    for name, (what, poses) in files.items():
+        head = ["# " + " ".join(what.split()), "# timestamp tx ty tz qx qy qz qw"]
+        (folder / name).write_text("\n".join([*head, *tum_lines(times, poses), ""]), encoding="utf-8")
+    return {"files": {name: what for name, (what, _) in files.items()}}
+
+
+# ---- Kalibr --------------------------------------------------------------------------------------------------------
+
+
+def _kalibr_camera(
+    camera: CameraModel, topic: str, from_imu: NDArray[np.float64], from_previous: NDArray[np.float64] | None
+) -> dict[str, Any]:
+    k = camera.k
+    entry = {
+        "camera_model": "pinhole",
+        "intrinsics": [k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
+        "distortion_model": "radtan",
+        "distortion_coeffs": [*camera.distortion, 0.0, 0.0, 0.0, 0.0][:4],
+        "resolution": [camera.width, camera.height],
+        "rostopic": topic,
+        "T_cam_imu": from_imu.tolist(),
+        "timeshift_cam_imu": 0.0,
+    }
+    return entry if from_previous is None else {**entry, "T_cn_cnm1": from_previous.tolist()}
+
+
+def write_kalibr_camchain(path: str | Path, truths: Sequence[SceneTruth], grids: Sequence[Grid]) -> Path:
+    """Write the cameras of a rig for Kalibr; the inertial unit is in the first one.
+
+    Parameters
+    ----------
+    path : YAML file to write.
+    truths : scene of each camera, as from `rig_scenes`.
+    grids : grid of each, ``mosaic`` or ``events``.
+
+    Returns
+    -------
+    The file.
+    """
+    target, poses = Path(path), [truth.camera_pose(0.0) for truth in truths]
+    chain = {}
+    for number, (truth, grid, pose) in enumerate(zip(truths, grids, poses, strict=True)):
+        before = None if number == 0 else np.linalg.inv(pose) @ poses[number - 1]
+        topic, from_imu = f"/cam{number}/image_raw", np.linalg.inv(pose) @ poses[0]
+        chain[f"cam{number}"] = _kalibr_camera(truth.camera(grid), topic, from_imu, before)
+    with output_errors(target):
+        _write_yaml(target, chain)
+    return target
+
+
+def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+    grids: list[Grid] = ["mosaic"] if truth.sensor.spec.aps is not None else []
+    grids += ["events"] if 0 not in truth.sensor.layout.evs_shape else []
+    write_kalibr_camchain(folder / "camchain.yaml", [truth] * len(grids), grids)
+    model = ImuModel()
+    unit = {
+        "rostopic": "/imu0",
+        "update_rate": model.rate_hz,
+        "accelerometer_noise_density": model.accelerometer_noise_density,
+        "accelerometer_random_walk": model.accelerometer_random_walk,
+        "gyroscope_noise_density": model.gyro_noise_density,
+        "gyroscope_random_walk": model.gyro_random_walk,
+    }
+    _write_yaml(folder / "imu.yaml", unit)
+    return {"cameras": {f"cam{number}": grid for number, grid in enumerate(grids)}}
+
+
+def write_kalibr_aprilgrid(
+    path: str | Path, tag_cols: int, tag_rows: int, tag_size_m: float, tag_spacing: float
+) -> Path:
+    """Write the description of an AprilGrid for Kalibr.
+
+    Parameters
+    ----------
+    path : YAML file to write.
+    tag_cols, tag_rows : number of tags.
+    tag_size_m : edge of a tag, m.
+    tag_spacing : gap between tags over their edge.
+
+    Returns
+    -------
+    The file.
+
+    Raises
+    ------
+    RangeError
+        If a number is not above 0.
+    """
+    values = {"tagCols": tag_cols, "tagRows": tag_rows, "tagSize": tag_size_m, "tagSpacing": tag_spacing}
+    for name, value in values.items():
+        if not 0 < value < float("inf"):
+            raise RangeError(name, value, "a number above 0")
+    target = Path(path)
+    with output_errors(target):
+        _write_yaml(target, {"target_type": "aprilgrid", **values})
+    return target
+
+
+def _write_yaml(path: Path, content: dict[str, Any]) -> None:
+    from ruamel.yaml import YAML
+
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 200
+    with path.open("w", encoding="utf-8") as stream:
+        yaml.dump(json.loads(json.dumps(content)), stream)
+
+
+#: Writers by the name of their format.
+FORMATS: dict[str, Callable[[Recording, SceneTruth, Path, int | None], dict[str, Any]]] = {
+    "exr": _exr,
+    "dsec-flow": _dsec_flow,
+    "tum": _tum,
+    "kalibr": _kalibr,
+}

@@ -1,0 +1,1 @@
+"""Geometric truth of a scene as a sensor sees it: surfaces, flow, poses, boxes, inertial measurements."""

@@ -1,0 +1,256 @@
+"""Labels of events against runs without noise, and against sequences worked out by hand."""
+
+import numpy as np
+import pytest
+
+from hesim_render.core.backend import jit
+from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs.balance import Balance, Steps
+from hesim_render.pixels.evs.labels import Label, Labeller, Lost
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.specs.sensor import read_sensor
+
+SIDE, THETA = 48, 0.2
+#: x = I + 1 with I = 2 DN per electron of a window; s² = β4², so that the noise of ln x at x = 101 is β4/101.
+NOISY = {"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 5.0, "beta5": 0.0}
+#: Terms that make noise; bandwidth stays.
+NOISES = ("shot", "dark_current", "leak", "stuck", "hot", "flickering")
+ASYNCHRONOUS = {"evs.reference": "last_event", "evs.tick_us": None, "evs.photoreceptor_cutoff_hz": 300.0,
+                "evs.noise_mode": None}  # fmt: skip
+
+
+def model(asynchronous=False, coefficients=NOISY, **overrides):
+    changes = {key.replace("__", "."): value for key, value in overrides.items()}
+    if asynchronous:
+        changes = {**{k: v for k, v in ASYNCHRONOUS.items() if v is not None or k == "evs.tick_us"}, **changes}
+    spec = read_sensor(
+        "reference-mono",
+        {"geometry.rows": SIDE, "geometry.cols": SIDE, "evs.coefficients": [coefficients],
+         "evs.contrast_threshold_on": THETA, "evs.contrast_threshold_off": THETA, **changes},
+    )  # fmt: skip
+    layout = Layout.full(spec)
+    return EvsNoise(spec.evs, layout, spec.device_seed, np.ones(1))
+
+
+def light(t_us, swing=0.6, hz=20.0):
+    """ln x of every pixel: a sinusoid with a phase of its own."""
+    phase = np.random.default_rng(5).uniform(0, 2 * np.pi, SIDE * SIDE)
+    return np.log(101.0) + swing * np.sin(2 * np.pi * hz * t_us * 1e-6 + phase)
+
+
+def run(noise, times_us, level=light, labels=True, seed=9):
+    """All events, and the labeller."""
+    labeller = Labeller(noise, seed, 0, int(times_us[-1])) if labels else None
+    stage = EvsStage(noise, seed, labels=labeller)
+    parts = [
+        stage.step(jit().Float(((np.exp(level(t)) - 1) / 2).astype(np.float32)), int(t)) for t in times_us
+    ]  # fmt: skip
+    return np.concatenate(parts), labeller.finish() if labels else None
+
+
+def keys(events):
+    return {tuple(event) for event in events.tolist()}
+
+
+TICKS = 1_000 * np.arange(1, 101)
+
+
+def test_labels_change_no_event_and_count_every_one():
+    for asynchronous in (False, True):
+        noise = model(asynchronous, evs__threshold_mismatch_std=0.05, evs__leak_rate_hz=1.0)
+        events, found = run(noise, TICKS)
+        without, _ = run(noise, TICKS, labels=False)
+        np.testing.assert_array_equal(events, without)
+        assert found.label.size == events.size > 5_000
+        assert sum(found.counts()[label.name.lower()] for label in Label) == events.size
+
+
+def test_with_fixed_ticks_signal_and_mismatch_are_the_events_of_runs_without_noise():
+    noise = model(evs__threshold_mismatch_std=0.1, evs__leak_rate_hz=5.0)
+    events, found = run(noise, TICKS, lambda t: light(t, hz=60.0))
+    clean, _ = run(noise.clean(), TICKS, lambda t: light(t, hz=60.0), labels=False)
+    own, _ = run(noise.without(*NOISES), TICKS, lambda t: light(t, hz=60.0), labels=False)
+    signal, mismatch = (events[found.label == label] for label in (Label.SIGNAL, Label.MISMATCH))
+    assert keys(signal) == keys(events) & keys(clean)
+    assert keys(signal) | keys(mismatch) == keys(events) & (keys(clean) | keys(own))
+    np.testing.assert_array_equal(found.clean, clean)
+    assert min(signal.size, mismatch.size) > 100
+    # without a spread of thresholds there is one run without noise, and no mismatch
+    alike = noise.without("mismatch")
+    events, found = run(alike, TICKS, lambda t: light(t, hz=60.0))
+    assert not np.any(found.label == Label.MISMATCH)
+    assert keys(events[found.label == Label.SIGNAL]) == keys(events) & keys(clean)
+
+
+def test_with_fixed_ticks_the_change_of_the_light_itself_decides():
+    """From the levels that are put in: p·Δ ln x > θ, of the nominal threshold and of the pixel's own."""
+    noise = model(evs__threshold_mismatch_std=0.1, evs__contrast_threshold_off=0.25)
+    events, found = run(noise, TICKS, lambda t: light(t, hz=60.0))
+    place = events["y"].astype(int) * SIDE + events["x"]
+    levels = np.array([light(t, hz=60.0) for t in [0, *TICKS]])
+    tick = events["t_us"] // 1000
+    change = levels[tick, place] - levels[tick - 1, place]
+    toward = events["polarity"] * change
+    nominal = np.where(events["polarity"] > 0, 0.2, 0.25)
+    own = np.where(
+        events["polarity"] > 0, noise.threshold_on_map.ravel()[place], noise.threshold_off_map.ravel()[place]
+    )
+    expected = np.where(toward > nominal, Label.SIGNAL, np.where(toward > own, Label.MISMATCH, Label.NOISE))
+    sure = (np.abs(toward - nominal) > 1e-5) & (np.abs(toward - own) > 1e-5)  # float32 levels
+    np.testing.assert_array_equal(found.label[sure], expected[sure])
+    assert sure.mean() > 0.99 and all(np.any(expected == label) for label in (0, 1, 4))
+
+
+def test_leak_and_hot_pixels_are_told_apart_from_noise():
+    still = np.full(SIDE * SIDE, np.log(101.0))
+    quiet = {**NOISY, "beta4": 0.0}
+    hot = {"evs.defects": {"hot_share": 0.02, "hot_rate_hz": 200.0}}
+    for asynchronous in (False, True):
+        noise = model(asynchronous, quiet, evs__leak_rate_hz=3.0)
+        events, found = run(noise, TICKS, lambda t: still)
+        assert events.size > 300 and (found.label == Label.LEAK).all() and found.clean.size == 0
+        noise = model(asynchronous, quiet, **hot)
+        events, found = run(noise, TICKS, lambda t: still)
+        assert events.size > 300 and (found.label == Label.HOT).all()
+        noise = model(asynchronous, **hot)
+        events, found = run(noise, TICKS, lambda t: still)
+        of_hot = np.isin(events["y"].astype(int) * SIDE + events["x"], noise.defects.place)
+        assert (found.label[~of_hot] == Label.NOISE).all() and (found.label[of_hot] == Label.HOT).mean() > 0.5
+
+
+def test_with_a_dead_time_leak_and_hot_events_keep_their_origin():
+    noise = model(True, {**NOISY, "beta4": 0.0}, evs__leak_rate_hz=3.0, evs__refractory_period_us=500,
+                  **{"evs.defects": {"hot_share": 0.02, "hot_rate_hz": 200.0}})  # fmt: skip
+    events, found = run(noise, TICKS, lambda t: np.full(SIDE * SIDE, np.log(101.0)))
+    of_hot = np.isin(events["y"].astype(int) * SIDE + events["x"], noise.defects.place)
+    assert (found.label[~of_hot] == Label.LEAK).all() and (~of_hot).sum() > 300
+    assert (found.label[of_hot] == Label.HOT).mean() > 0.9
+
+
+@pytest.mark.parametrize(("noise_dn", "spread"), [pytest.param(5.0, 0.0, marks=pytest.mark.slow), (2.0, 0.03)])
+def test_asynchronous_signal_has_the_rate_of_the_run_without_noise(noise_dn, spread):
+    """In the second half of the run: the first reference level has noise in it, which gives steps of its own at first.
+
+    Both are counts of steps over the same swings of 2304 pixels, from reference levels that differ; the bound is the
+    counting error of one of them. Noise of a quarter of the threshold, and of a tenth with a spread of thresholds.
+    """
+    coefficients = {**NOISY, "beta4": noise_dn}
+    noise = model(True, coefficients, evs__threshold_mismatch_std=spread, evs__leak_rate_hz=1.0)
+    times = 500 * np.arange(1, 401)
+    events, found = run(noise, times)
+    own, _ = run(noise.without(*NOISES), times, labels=False)
+    counts = found.counts()
+    for polarity in (1, -1):
+        labelled = (found.label <= Label.MISMATCH) & (events["polarity"] == polarity) & (events["t_us"] > 100_000)
+        expected = np.count_nonzero((own["polarity"] == polarity) & (own["t_us"] > 100_000))
+        assert expected > 10_000
+        assert abs(np.count_nonzero(labelled) - expected) < np.sqrt(expected)
+    assert (counts["mismatch"] > 0) == (spread > 0)
+    assert counts["noise"] > 100
+    np.testing.assert_array_equal(found.clean, run(noise.clean(), times, labels=False)[0])
+
+
+def test_noise_of_still_light_is_not_signal():
+    """But where the noise of the very first level exceeds the threshold, 4 σ here: 6e-5 of the pixels."""
+    noise = model(True, evs__threshold_mismatch_std=0.05)
+    events, found = run(noise, TICKS, lambda t: np.full(SIDE * SIDE, np.log(101.0)))
+    assert events.size > 1_000 and (found.label == Label.NOISE).mean() > 0.998
+    assert found.clean.size == 0
+
+
+def test_events_lost_in_the_read_out_are_those_that_a_faster_one_gives():
+    slow = model(evs__readout_max_events_per_s=20_000.0, evs__readout_buffer_events=10)
+    events, found = run(slow, TICKS)
+    every, labels = run(slow.without("readout_limit"), TICKS)
+    assert found.lost.size > 1_000 and (found.lost_in == Lost.READOUT).all()
+    assert keys(found.lost) == keys(every) - keys(events) and found.lost.size + events.size == every.size
+    expected = dict(zip(map(tuple, every.tolist()), labels.label, strict=True))
+    assert [expected[tuple(event)] for event in events.tolist()] == found.label.tolist()
+
+
+def test_events_lost_in_the_dead_time_are_noise_free_crossings_within_it():
+    noise = model(True, {**NOISY, "beta4": 0.0}, evs__refractory_period_us=3_000)
+    times = 500 * np.arange(1, 201)
+    events, found = run(noise, times)
+    crossings, _ = run(noise.without("refractory"), times, labels=False)
+    assert (found.label == Label.SIGNAL).mean() > 0.5
+    expected = []
+    place = events["y"].astype(int) * SIDE + events["x"]
+    for event in crossings.tolist():
+        fired = events["t_us"][place == event[2] * SIDE + event[1]]
+        if np.any((fired < event[0]) & (event[0] <= fired + 3_000)):
+            expected.append(event)
+        if len(expected) == 300:
+            break
+    assert len(expected) == 300 and (found.lost_in == Lost.REFRACTORY).all()
+    lost = keys(found.lost)
+    # a crossing within a dead time may be the partner of an event that came a little before it
+    assert np.mean([event in lost for event in expected]) > 0.9
+
+
+# ---- pairs ---------------------------------------------------------------------------------------------------------
+
+
+def paired(causes, effects):
+    """The pairs of one pixel, step by step; (time, sign) each."""
+    waiting = {0: [], 1: []}
+    pairs = []
+    both = sorted(
+        [(t, 0, s, n) for n, (t, s) in enumerate(causes)] + [(t, 1, s, n) for n, (t, s) in enumerate(effects)]
+    )
+    for _, side, sign, number in both:
+        other = waiting[1 - side]
+        if other and other[-1][0] == sign:
+            partner = other.pop()[1]
+            pairs.append((partner, number) if side else (number, partner))
+        elif waiting[side] and waiting[side][-1][0] != sign:
+            waiting[side].pop()
+        else:
+            waiting[side].append((sign, number))
+    return pairs
+
+
+def test_pairs_against_a_pixel_by_pixel_version_in_any_portions():
+    rng = np.random.default_rng(8)
+    pixels, length = 40, 60
+    steps = [
+        (np.sort(rng.integers(0, 1000, (pixels, length))), rng.choice([-1, 1], (pixels, length))) for _ in range(2)
+    ]
+    expected = set()
+    for pixel in range(pixels):
+        sequences = [list(zip(t[pixel].tolist(), s[pixel].tolist(), strict=True)) for t, s in steps]
+        expected |= {(pixel * length + a, pixel * length + b) for a, b in paired(*sequences)}
+    for cuts in ([0, 1001], [0, 100, 101, 480, 1001]):
+        balance, found = Balance(pixels), set()
+        for low, high in zip(cuts[:-1], cuts[1:], strict=True):
+            parts = []
+            for t, s in steps:
+                pixel, k = np.nonzero((t >= low) & (t < high))
+                order = np.argsort(t[pixel, k], kind="stable")
+                pixel, k = pixel[order], k[order]
+                parts.append(Steps(t[pixel, k], pixel, s[pixel, k], pixel * length + k))
+            cause, effect, lost = balance.take(*parts)
+            found |= set(zip(cause.tolist(), effect.tolist(), strict=True))
+            assert lost.size == 0
+        assert found == expected and len(found) > 200
+
+
+def steps(*given):
+    """(time, pixel, sign, number) each."""
+    return Steps(*np.array(given, np.int64).reshape(-1, 4).T)
+
+
+def test_pairs_of_pixels_with_a_dead_time():
+    """10 µs. Pixel 0: a cause soon after its event is its partner, the next one is lost. Pixel 1: the event has no
+    partner once the pixel is released. Pixel 2: a cause after the release is paired with the next event.
+    """
+    causes = steps((5, 0, 1, 10), (8, 0, 1, 11), (50, 1, 1, 12), (20, 2, -1, 13))
+    effects = steps((0, 0, 1, 0), (0, 1, 1, 1), (0, 2, -1, 2), (60, 1, 1, 3), (30, 2, -1, 4), (70, 0, 1, 5))
+    cause, effect, lost = Balance(3, 10.0).take(causes, effects)
+    assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (12, 3), (13, 4)}
+    assert lost.tolist() == [11]
+    # without a dead time the events wait for their partners
+    cause, effect, lost = Balance(3).take(causes, effects)
+    assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (11, 5), (12, 1), (13, 2)}
+    assert lost.size == 0
