@@ -90,7 +90,7 @@ MOVED = {
     "renderer.sites": "sources.render.change_driven.neighbours",
     "renderer.specfilm": "sources.render.specfilm",
     "renderer.tables": "core.tables",
-    "renderer.targets": "sources.render.scene.targets",
+    "renderer.targets": "targets.build",
     "renderer.timeline": "sources.render.timeline",
     "renderer.tracer": "sources.render.tracer",
     "renderer.tracks": "sources.render.scene.tracks",

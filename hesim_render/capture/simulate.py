@@ -25,6 +25,7 @@ from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.flux import QUALITY, ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.forecast import Estimate, forecast
 from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.framing import warn_if_unseen
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
@@ -136,6 +137,7 @@ def simulate(
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
         seen, level = in_absolute_light(scene)
         flux, mode = _source(seen, sensor, seed, quality, samples, exact, told)
+        warn_if_unseen(scene.spec, flux.view, duration_us)
         settings |= mode
         if level is not None:
             settings["light_level"] = level.as_dict()

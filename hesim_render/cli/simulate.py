@@ -24,6 +24,8 @@ from hesim_render.cli.options import (
     told_beside,
 )
 from hesim_render.cli.terminal import is_short_of_wish, say, split_overrides, summary
+from hesim_render.core.errors import OutputError
+from hesim_render.core.output import check_place, replacing
 from hesim_render.core.progress import progress_report
 
 if TYPE_CHECKING:
@@ -67,6 +69,9 @@ def simulate(
     allow_outside: Annotated[
         bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
     ] = False,
+    look: Annotated[
+        bool, typer.Option("--look", help="only show the framing: a quick picture without light, OUT.png")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a scene and record it: RAW frames, events and their ground truth.
@@ -75,6 +80,9 @@ def simulate(
     """
     check_duration(duration)
     scene_changes, sensor_changes = split_overrides(set_ or [])
+    if look:
+        _look(scene, sensor, out, scene_changes, sensor_changes, roi, allow_outside, overwrite)
+        return
     recording = _simulate(
         scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
         overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
@@ -85,6 +93,33 @@ def simulate(
     say(summary(recording))
     if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
         raise typer.Exit(_NOT_MET)
+
+
+def _look(
+    scene: str,
+    sensor: str,
+    out: Path,
+    scene_changes: dict[str, Any],
+    sensor_changes: dict[str, Any],
+    roi: str | None,
+    allow_outside: bool,
+    overwrite: bool,
+) -> None:
+    """Write the picture of ``--look``."""
+    target = out if out.suffix == ".png" else out.with_name(f"{out.name}.png")
+    check_place(target)
+    if target.exists() and not overwrite:
+        raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite)")
+    from PIL import Image
+
+    import hesim_render as hr
+    from hesim_render.sources.render.look import look
+
+    loaded = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
+    found = look(loaded, cropped(hr.load_sensor(sensor, sensor_changes), roi))
+    with replacing(target) as unfinished:
+        Image.fromarray(found.picture).save(unfinished, format="PNG")
+    say(f"{found.target or 'the scene has no target'}\nframing in {target}")
 
 
 def demo(

@@ -19,6 +19,7 @@ from hesim_render.recording.manifest_spec import RecordingSpec
 from hesim_render.specs.files import content_hash, validate
 from hesim_render.specs.light import mixed_light
 from hesim_render.specs.sensor import SensorSpec
+from hesim_render.specs.target import lamps_of
 
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
@@ -58,6 +59,9 @@ def build(
     """The manifest of a new recording; frames and counts are added as it grows."""
     layout, spec = sensor.layout, sensor.spec
     light = mixed_light(getattr(scene, "lights", ()))
+    lamp = lamps_of(getattr(scene, "target", None))
+    if light is None and lamp is not None:
+        light = lamp.illuminant.load()
     return {
         "schema_version": SCHEMA_VERSION,
         "software": software_versions(),
@@ -94,10 +98,13 @@ def _dump(spec: BaseModel) -> dict[str, Any]:
 
 
 def _file_hashes(scene: BaseModel) -> dict[str, str]:
-    """SHA-256 of each geometry file a scene names (a Mitsuba XML file's own includes are not followed)."""
+    """SHA-256 of each file of geometry, pictures and patches that a scene names (a Mitsuba XML file's own includes are
+    not followed).
+    """
     folder = getattr(scene, "folder", Path())
     mitsuba = getattr(scene, "mitsuba", None)
     names = [mitsuba.file if mitsuba is not None else None, *(item.mesh for item in getattr(scene, "objects", []))]
+    names.append(getattr(getattr(scene, "target", None), "named_file", None))
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if name is not None}
 
 

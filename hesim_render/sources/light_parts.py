@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from hesim_render.sources.scene import Scene
-from hesim_render.specs.light import LightSpec
+from hesim_render.specs.target import lamps_of
 from hesim_render.specs.waveform import WaveformSpec
 from hesim_render.spectral.waveform import Waveform
 
@@ -20,18 +21,19 @@ def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
     if own is not None:
         assert not own.has_level
         return _mitsuba_parts(scene)
-    lights = scene.spec.lights
-    flickering = [_flicker(light.waveform) for light in lights]
+    lamp = lamps_of(scene.spec.target)
+    shining: list[Any] = [*scene.spec.lights, *([lamp] if lamp is not None else [])]
+    flickering = [_flicker(light.waveform) for light in shining]
     if not any(flickering):
         return [(None, scene)]
     parts: list[tuple[Waveform | None, Scene]] = []
     for kind in _different(flickering):
         lit = [
             light.model_copy(update={"waveform": None}) if has == kind else light.unlit()
-            for light, has in zip(lights, flickering, strict=True)
+            for light, has in zip(shining, flickering, strict=True)
         ]
         if any(light.is_lit for light in lit):
-            parts.append((kind.load() if kind else None, _with_lights(scene, lit)))
+            parts.append((kind.load() if kind else None, _with_lights(scene, lit, lamp is not None)))
     return parts or [(None, scene)]
 
 
@@ -49,8 +51,10 @@ def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None
     return found
 
 
-def _with_lights(scene: Scene, lights: list[LightSpec]) -> Scene:
-    return Scene(scene.spec.model_copy(update={"light": tuple(lights)}))
+def _with_lights(scene: Scene, lit: Sequence[Any], target_last: bool) -> Scene:
+    """The scene with other lights, of which the last may be the target itself."""
+    update = {"light": tuple(lit[:-1]), "target": lit[-1]} if target_last else {"light": tuple(lit)}
+    return Scene(scene.spec.model_copy(update=update))
 
 
 def _mitsuba_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:

@@ -68,6 +68,27 @@ class LightSpec(Strict):
         return self if self.type == "none" else self.model_copy(update=off)
 
 
+class LampSpec(Strict):
+    """Light that a target emits itself: a spectrum, a luminance and a waveform."""
+
+    illuminant: Annotated[SpectrumSpec, AfterValidator(_not_negative)] = SpectrumSpec(illuminant="D65")
+    luminance_cd_m2: float = Field(ge=0, le=1e9, description="time mean")
+    waveform: WaveformSpec | None = Field(None, description="flicker; default steady")
+
+    @property
+    def is_lit(self) -> bool:
+        """False where the luminance is zero."""
+        return self.luminance_cd_m2 > 0
+
+    def unlit(self) -> LampSpec:
+        """The same target switched off; its geometry stays."""
+        return self.model_copy(update={"waveform": None, "luminance_cd_m2": 0.0})
+
+    def radiance(self) -> Spectrum:
+        """L(λ) in W m⁻² sr⁻¹ nm⁻¹, time mean: 683.002 lm/W · ∫ L V dλ is the luminance."""
+        return scale_to_lux(self.illuminant.load(), self.luminance_cd_m2)
+
+
 def irradiance(light: LightSpec) -> Spectrum | None:
     """E(λ) on the light's plane, W m⁻² nm⁻¹, time mean; None in darkness."""
     if not light.is_lit:

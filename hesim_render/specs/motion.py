@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vector
+from hesim_render.specs.poses import read_poses
 
 
 class KeyframeSpec(Strict):
@@ -74,6 +80,26 @@ class TrackSpec(Strict):
     pivot_m: Vector = (0.0, 0.0, 0.0)
     repeat: bool = False
     keyframes: list[KeyframeSpec] = Field(min_length=2)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_file(cls, data: Any, info: ValidationInfo) -> Any:
+        """Read the keyframes of ``file``; a dump then holds the numbers."""
+        if not isinstance(data, dict) or not ({"file", "axes"} & set(data)):
+            return data
+        name, axes = data.get("file"), data.get("axes", "scene")
+        if "keyframes" in data or not isinstance(name, str):
+            raise ValueError("give keyframes or file, exactly one of them; axes goes with file")
+        if axes not in ("scene", "opencv"):
+            raise ValueError("axes: expected scene or opencv")
+        file = (info.context or {}).get("folder", Path()) / name
+        if not os.path.isfile(file):
+            raise ValueError(f"file: no such file: {file}")
+        try:
+            frames = read_poses(file, axes)
+        except SpecError as error:
+            raise ValueError(str(error)) from None
+        return {key: value for key, value in data.items() if key not in ("file", "axes")} | {"keyframes": frames}
 
     @field_validator("keyframes")
     @classmethod

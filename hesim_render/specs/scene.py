@@ -27,8 +27,9 @@ from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.light import LightSpec
 from hesim_render.specs.motion import TrackSpec
 from hesim_render.specs.problems import line_of
+from hesim_render.specs.reflectance import ReflectanceSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.target import ReflectanceSpec, TargetSpec
+from hesim_render.specs.target import TargetSpec
 from hesim_render.specs.waveform import WaveformSpec
 
 #: Path of a file that a scene names.
@@ -49,12 +50,17 @@ class ObjectSpec(Strict):
     reflectance: ReflectanceSpec = SpectrumSpec(flat=0.5)
     pattern: ReflectanceSpec | None = Field(None, description="second reflectance: checks over the shape's own u, v")
     pattern_count: tuple[Count, Count] = (8, 8)
-    mesh: str | None = Field(None, description="OBJ or PLY file, relative to this file")
+    mesh: str | None = Field(None, description="OBJ, PLY, STL, GLB or glTF file, relative to this file")
+    materials: Literal["own", "file"] = Field(
+        "own", description="of a mesh: the reflectance above, or the materials of a GLB or glTF file"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> ObjectSpec:
         if (self.shape == "mesh") != (self.mesh is not None):
             raise ValueError("shape 'mesh' and the key 'mesh' go together")
+        if self.materials == "file" and not str(self.mesh).lower().endswith((".glb", ".gltf")):
+            raise ValueError("materials: only GLB and glTF files have materials that are read")
         if min(self.size_m) < 0 or (min(self.size_m) == 0 and self.shape not in ("rectangle", "mesh")):
             raise ValueError("size_m must be above 0")
         if self.shape == "sphere" and len(set(self.size_m)) != 1:
@@ -273,6 +279,11 @@ def read_scene(
     return spec.model_copy(update={"folder": file.parent, "file": file, "allow_outside": allow_outside})
 
 
+def _is_track(location: tuple[Any, ...]) -> bool:
+    """True for the place of the name of a trajectory file."""
+    return len(location) == 3 and location[0] == "motion" and location[2] == "file"
+
+
 def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], str]]:
     """Every file that a scene file names, with its place in it."""
     if isinstance(node, Mapping | list):
@@ -280,5 +291,6 @@ def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tu
             yield from _named_files(value, (*location, key))
     elif isinstance(node, str):
         key = location[-1] if location else None
-        if key in ("csv", "mesh", "filename") or location == ("mitsuba", "file") or node.endswith(".csv"):
+        files = ("mitsuba", "file"), ("target", "file"), ("target", "patches")
+        if key in ("csv", "mesh", "filename") or location in files or node.endswith(".csv") or _is_track(location):
             yield location, node

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
+from hesim_render.sources.render.scene.mesh_file import mesh_shapes
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
 from hesim_render.sources.render.scene.mitsuba_scene import load_mitsuba, path_tracer
 from hesim_render.sources.render.scene.mitsuba_version import (
@@ -24,11 +24,14 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     transform,
 )
 from hesim_render.sources.render.scene.paint import Paint
-from hesim_render.sources.render.scene.targets import build_target
+from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
-from hesim_render.spectral.spectrum import Spectrum, require_coverage
+from hesim_render.specs.target import lamps_of
+from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
+from hesim_render.targets.build import placed_pieces
+from hesim_render.targets.piece import Picture, Piece
 
 #: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")
@@ -163,29 +166,60 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     )
 
 
-def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint]]:
-    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, and the paint of the shapes."""
+def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint] | None]:
+    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, and the paint of the shapes (None if
+    a shape shines or has a picture).
+    """
+    all_matt = True
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
     if spec.target is not None:
         groups["target"] = []
-        for number, piece in enumerate(build_target(spec.target)):
+        for number, piece in enumerate(_target_pieces(spec)):
             name = f"target_{number}"
-            bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
-            content[name] = make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf)
+            content[name] = _piece(mi, name, piece)
             groups["target"].append(name)
-            paints.append(Paint(name, (piece.reflectance,)))
+            if isinstance(piece.reflectance, Picture) or piece.radiance is not None:
+                all_matt = False
+            else:
+                paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
-        content[name] = _object(mi, item, name, spec.folder)
-        groups[item.name] = [name]
-        paints.append(_paint(item, name))
+        placement, bsdf = _placement(item), _bsdf(mi, item)
+        if item.shape == "mesh":
+            parts = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, spec.allow_outside or spec.file is None)
+            all_matt &= item.materials == "own"
+        else:
+            parts = {name: _object(mi, item, name, placement, bsdf)}
+        content.update(parts)
+        groups[item.name] = list(parts)
+        paints += [_paint(item, part) for part in parts]
     try:
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
-    return content, groups, paints
+    return content, groups, paints if all_matt else None
+
+
+def _target_pieces(spec: SceneSpec) -> list[Piece]:
+    assert spec.target is not None
+    try:
+        return placed_pieces(spec.target)
+    except SpecError as error:
+        if error.file is not None:
+            raise
+        raise SpecError(str(error), file=spec.file) from None
+
+
+def _piece(mi: MitsubaModule, name: str, piece: Piece) -> MitsubaObject:
+    """A part of the target."""
+    if isinstance(piece.reflectance, Picture):
+        bsdf = {"type": "diffuse", "reflectance": picture_texture(mi, piece.reflectance)}
+    else:
+        bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
+    emitter = None if piece.radiance is None else {"type": "area", "radiance": spectrum_dict(piece.radiance)}
+    return make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf, piece.uv, emitter)
 
 
 def _paint(item: ObjectSpec, name: str) -> Paint:
@@ -195,11 +229,16 @@ def _paint(item: ObjectSpec, name: str) -> Paint:
     return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
 
 
-def _object(mi: MitsubaModule, item: ObjectSpec, name: str, folder: Path) -> MitsubaObject:
+def _placement(item: ObjectSpec) -> NDArray[np.float64]:
+    """Pose [4, 4] of an object at rest."""
     placement = np.eye(4)
     placement[:3, :3] = rotation_about(item.rotation_axis, item.rotation_deg)
     placement[:3, 3] = item.position_m
-    half = np.array(item.size_m) / 2
+    return placement
+
+
+def _bsdf(mi: MitsubaModule, item: ObjectSpec) -> dict[str, Any]:
+    """The matt surface of an object."""
     texture = spectrum_dict(item.reflectance.load())
     if item.pattern is not None:
         scale = np.diag([item.pattern_count[0] / 2, item.pattern_count[1] / 2, 1.0, 1.0])
@@ -210,36 +249,19 @@ def _object(mi: MitsubaModule, item: ObjectSpec, name: str, folder: Path) -> Mit
             "to_uv": transform(mi, scale),
         }
     bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
-    if item.shape in _OPEN_SHAPES:
-        bsdf = {"type": "twosided", "material": bsdf}
+    return {"type": "twosided", "material": bsdf} if item.shape in _OPEN_SHAPES else bsdf
+
+
+def _object(
+    mi: MitsubaModule, item: ObjectSpec, name: str, placement: NDArray[np.float64], bsdf: dict[str, Any]
+) -> MitsubaObject:
+    half = np.array(item.size_m) / 2
     if item.shape == "sphere":
         to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))
         return {"type": "sphere", "to_world": to_world, "bsdf": bsdf}
-    if item.shape == "mesh":
-        return _mesh_file(mi, item, placement, bsdf, folder)
     corners, faces, uv = _box_mesh() if item.shape == "box" else _rectangle_mesh()
     vertices = (corners * half) @ placement[:3, :3].T + placement[:3, 3]
     return make_mesh(mi, name, vertices, faces, bsdf, uv)
-
-
-def _mesh_file(
-    mi: MitsubaModule, item: ObjectSpec, placement: NDArray[np.float64], bsdf: dict[str, Any], folder: Path
-) -> MitsubaObject:
-    """A mesh file, scaled to a bounding box of `size_m` and centred on the object's place."""
-    path = folder / str(item.mesh)
-    if not path.is_file():
-        raise SpecError(f"no such mesh file: {path}", key=f"objects.{item.name}.mesh")
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in ("obj", "ply"):
-        raise SpecError(f"a mesh must be an OBJ or PLY file, not {path.name}", key=f"objects.{item.name}.mesh")
-    with as_spec_error(path, f"objects.{item.name}.mesh"):
-        box = mi.load_dict({"type": kind, "filename": str(path)}).bbox()
-    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-    extent = high - low
-    factors = np.divide(item.size_m, extent, out=np.ones(3), where=extent > 0)
-    fit = np.diag([*factors, 1.0])
-    fit[:3, 3] = -factors * (low + high) / 2
-    return {"type": kind, "filename": str(path), "to_world": transform(mi, placement @ fit), "bsdf": bsdf}
 
 
 def _rectangle_mesh() -> tuple[NDArray, NDArray, NDArray]:
@@ -269,14 +291,21 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
 
     The RGB colours of a Mitsuba scene become spectra over the whole visible range, so there is nothing to check.
     """
-    if spec.mitsuba is not None or not any(light.is_lit for light in spec.lights):
+    lamp = lamps_of(spec.target)
+    if spec.mitsuba is not None or not (any(light.is_lit for light in spec.lights) or (lamp and lamp.is_lit)):
         return
     for number, light in enumerate(spec.lights):
         if light.is_lit:
             yield f"{lights.key_of(spec.lights, number)}.illuminant", light.illuminant.load()
     if spec.target is not None:
-        for piece in build_target(spec.target):
-            yield f"target ({piece.name})", piece.reflectance
+        if lamp is not None and lamp.is_lit:
+            yield "target.illuminant", lamp.illuminant.load()
+        for piece in _target_pieces(spec):
+            if not isinstance(piece.reflectance, Picture):
+                yield f"target ({piece.name})", piece.reflectance
+            elif piece.reflectance.wavelength_nm is not None:
+                ends = piece.reflectance.wavelength_nm[[0, -1]].tolist()
+                yield f"target ({piece.name})", constant(1.0, *ends)
     for item in spec.objects:
         for key, source in (("reflectance", item.reflectance), ("pattern", item.pattern)):
             if source is not None:

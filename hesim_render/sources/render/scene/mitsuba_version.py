@@ -218,10 +218,13 @@ def make_mesh(
     faces: NDArray[np.uint32],
     bsdf: dict[str, Any],
     texcoords: NDArray[np.float64] | None = None,
+    emitter: dict[str, Any] | None = None,
 ) -> MitsubaObject:
     """A flat-shaded mesh from arrays: vertices [n, 3] in metres, faces [m, 3], texture coordinates [n, 2]."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
+    if emitter is not None:
+        properties["emitter"] = mi.load_dict(emitter)
     mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_texcoords=texcoords is not None, props=properties)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()

@@ -1,0 +1,71 @@
+"""Measuring on recordings: ``measure``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hesim_render.cli.terminal import parse_roi, say
+from hesim_render.core.errors import OutputError, RangeError
+
+
+class Quantity(StrEnum):
+    """What can be measured."""
+
+    mtf = "mtf"
+
+
+class SignalKind(StrEnum):
+    """Values to measure on."""
+
+    raw = "raw"
+    electrons = "electrons"
+
+
+def measure(
+    quantity: Annotated[Quantity, typer.Argument(help="mtf (spatial frequency response on a slanted edge)")],
+    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
+    roi: Annotated[
+        str | None, typer.Option(help="part of the frame with one edge: WIDTHxHEIGHT+X+Y, px; default all")
+    ] = None,
+    frame: Annotated[int, typer.Option(help="number of the frame")] = 0,
+    signal: Annotated[
+        SignalKind, typer.Option(help="RAW values, or the noise-free electrons of the truth")
+    ] = SignalKind.raw,
+    filter_: Annotated[
+        str | None, typer.Option("--filter", help="of a mosaic: measure on pixels of this filter")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="CSV file of frequency and response")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing file")] = False,
+) -> None:
+    """Measure the spatial frequency response (MTF) of a recording on a slanted edge."""
+    from hesim_render.core.output import check_place, replacing
+    from hesim_render.measure import measure_mtf
+    from hesim_render.recording.recording import Recording
+
+    region = None if roi is None else _region(roi)
+    if out is not None:
+        check_place(out)
+        if out.exists() and not overwrite:
+            raise OutputError(f"{out} exists; use --overwrite to replace it")
+    found = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
+    for frequency in (0.125, 0.25, 0.5):
+        value = found.mtf[abs(found.frequency_cy_per_px - frequency).argmin()]
+        say(f"MTF at {frequency:g} cycles per pixel: {value:.3f}")
+    say(f"MTF50: {found.frequency_at(0.5):.3f} cycles per pixel; edge {found.angle_deg:.2f}° from the vertical")
+    if out is not None:
+        rows = zip(found.frequency_cy_per_px, found.mtf, strict=True)
+        table = "".join(f"{frequency:.6g},{value:.6g}\n" for frequency, value in rows)
+        with replacing(out) as unfinished:
+            unfinished.write_text(f"frequency_cy_per_px,mtf\n{table}", encoding="utf-8")
+        say(f"in {out}")
+
+
+def _region(roi: str) -> tuple[int, int, int, int]:
+    width, height, x, y = parse_roi(roi)
+    if x is None or y is None:
+        raise RangeError("--roi", roi, "WIDTHxHEIGHT+X+Y, with the first column and row of the part")
+    return x, y, width, height

@@ -1,0 +1,81 @@
+"""Spatial frequency response of a recording."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from hesim_render.core.errors import RangeError
+from hesim_render.measure.slanted_edge import FREQUENCIES, OVERSAMPLING, EdgeResponse, edge_response
+from hesim_render.recording.recording import Recording
+
+#: What is measured: RAW values, or the noise-free electrons of the truth.
+Signal = Literal["raw", "electrons"]
+
+
+def measure_mtf(
+    recording: Recording,
+    frame: int = 0,
+    region: tuple[int, int, int, int] | None = None,
+    *,
+    signal: Signal = "raw",
+    filter_name: str | None = None,
+    oversampling: int = OVERSAMPLING,
+) -> EdgeResponse:
+    """Spatial frequency response on a slanted edge of a recorded frame; see `edge_response`.
+
+    Values are linear and undeveloped: RAW values, or the mean electrons of the truth. Of a mosaic only the pixels of
+    one filter are used, at their true places; frequencies are still in cycles per pixel of the mosaic.
+
+    Parameters
+    ----------
+    recording : the recording.
+    frame : number of the frame.
+    region : first column, first row, width and height of the part with the edge, px of the frame; default all.
+    signal : ``raw`` or ``electrons``.
+    filter_name : the filter; may be left out if all frame pixels have the same one.
+    oversampling : knots of the edge-spread function per pixel.
+
+    Examples
+    --------
+    >>> import hesim_render as hr
+    >>> from hesim_render.measure import measure_mtf
+    >>> sensor = hr.load_sensor("reference-mono").crop(64, 48)
+    >>> rec = hr.simulate(hr.load_scene("slanted-edge"), sensor, duration_s=0.03, seed=1)
+    >>> response = measure_mtf(rec, signal="electrons")
+    >>> bool(abs(response.angle_deg - 5) < 0.1), bool(abs(response.mtf[50] - 0.635) < 0.02)
+    (True, True)
+
+    Returns
+    -------
+    The response.
+
+    Raises
+    ------
+    RangeError
+        If the frame, the region or the filter does not exist, a RAW value is saturated, or the region has no edge that
+        can be measured.
+    """
+    if not 0 <= frame < len(recording.frames):
+        raise RangeError("frame", frame, f"0 to {len(recording.frames) - 1}")
+    mosaic, chosen = recording.mosaic, recording.frames[frame]
+    rows, cols = chosen.raw.shape
+    x, y, width, height = (0, 0, cols, rows) if region is None else region
+    if not (x >= 0 and y >= 0 and 0 < width <= cols - x and 0 < height <= rows - y):
+        raise RangeError("region", (x, y, width, height), f"a part of the frame of {cols}x{rows} px")
+    filters = np.array(mosaic.tile_filter)
+    aps = np.array(mosaic.tile_aps)
+    known = sorted(set(filters[aps].tolist()))
+    if filter_name is None and len(known) == 1:
+        filter_name = known[0]
+    if filter_name not in known:
+        raise RangeError("filter_name", filter_name, f"one of {', '.join(known)}")
+    tiles = -(-rows // filters.shape[0]), -(-cols // filters.shape[1])
+    own = np.tile((filters == filter_name) & aps, tiles)[:rows, :cols] & chosen.valid
+    part = np.s_[y : y + height, x : x + width]
+    values = np.asarray(chosen.raw if signal == "raw" else chosen.electrons_mean, dtype=np.float64)[part]
+    used = own[part]
+    if signal == "raw" and used.any() and values[used].max() >= mosaic.white_level_dn:
+        raise RangeError("raw", float(values[used].max()), "values below saturation; use less light or exposure")
+    return edge_response(values, used, frequency_cy_per_px=FREQUENCIES, oversampling=oversampling)

@@ -1,0 +1,138 @@
+"""What the camera of a scene has in its picture, before anything is rendered."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import HesimWarning
+from hesim_render.core.units import MM_PER_M
+from hesim_render.sources.render.camera import View
+from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.specs.scene import SceneSpec
+from hesim_render.targets.points import placement, surface_points
+
+#: Points across and along the target that are looked for in the picture, and times at which they are.
+_POINTS, _TIMES = 33, 33
+
+
+@dataclass(frozen=True)
+class Framing:
+    """The target in the picture at one time.
+
+    Parameters
+    ----------
+    inside : share of the target's surface that is in the picture, 0 to 1; other objects do not count.
+    fills : width and height of the target's image over those of the picture.
+    from_behind : True if the camera looks at the back of the target, which is black.
+    mm_per_px : size of a pixel on the target's centre, across the line of sight, mm.
+    distance_m : from the entrance pupil to the target's centre.
+    """
+
+    inside: float
+    fills: tuple[float, float]
+    from_behind: bool
+    mm_per_px: float
+    distance_m: float
+
+    def __str__(self) -> str:
+        width, height = self.fills
+        back = ", seen from behind" if self.from_behind else ""
+        return (
+            f"the target's image is {width:.0%} of the picture's width and {height:.0%} of its height; "
+            f"{self.inside:.0%} of the target is in the picture{back}; "
+            f"a pixel is {self.mm_per_px:.3g} mm on it, {self.distance_m:.4g} m away"
+        )
+
+
+def posed_view(spec: SceneSpec, view: View, t_us: float) -> View:
+    """The view at a time, with the motion of the camera."""
+    tracks = [track for track in spec.motion if track.object == "camera"]
+    if not tracks:
+        return view
+    return replace(view, camera_to_world=Trajectory(tracks[0]).matrix(t_us) @ view.camera_to_world)
+
+
+def _target_pose(spec: SceneSpec, t_us: float) -> NDArray[np.float64]:
+    """Pose [4, 4] of the target at a time."""
+    assert spec.target is not None
+    tracks = [track for track in spec.motion if track.object == "target"]
+    return Trajectory(tracks[0]).matrix(t_us) @ placement(spec.target) if tracks else placement(spec.target)
+
+
+def framing(spec: SceneSpec, view: View, t_us: float = 0.0) -> Framing | None:
+    """How the target lies in the picture at a time; None if the scene has no target.
+
+    Parameters
+    ----------
+    spec : content of the scene file.
+    view : the placed camera at rest.
+    t_us : time, µs.
+    """
+    if spec.target is None:
+        return None
+    pose = _target_pose(spec, t_us)
+    points = surface_points(spec.target, _POINTS) @ pose[:3, :3].T + pose[:3, 3]
+    at = posed_view(spec, view, t_us)
+    camera = at.camera_to_world
+    depth = -((points - camera[:3, 3]) @ camera[:3, :3])[:, 2]
+    place = at.project(points, camera)
+    cols, rows = view.sensor.cols, view.sensor.rows
+    ahead = depth > max(view.near_m, 0.0)
+    inside = ahead & np.all((place >= 0) & (place <= [cols, rows]), axis=1)
+    size = np.ptp(place[ahead], axis=0) / [cols, rows] if ahead.any() else np.zeros(2)
+    middle = pose[:3, 3]
+    towards = camera[:3, 3] - middle
+    pitch_mm = view.sensor.spec.geometry.pitch_um * 1e-3
+    middle_depth = float(-((middle - camera[:3, 3]) @ camera[:3, :3])[2])
+    return Framing(
+        float(inside.mean()),
+        (float(size[0]), float(size[1])),
+        bool(towards @ pose[:3, 2] <= 0),
+        pitch_mm * MM_PER_M * abs(middle_depth) / view.sensor.lens.image_distance_mm,
+        float(np.linalg.norm(towards)),
+    )
+
+
+def warn_if_unseen(spec: SceneSpec, view: View, duration_us: float) -> None:
+    """Warn if the target is never in the picture, or only from behind.
+
+    Parameters
+    ----------
+    spec : content of the scene file.
+    view : the placed camera at rest.
+    duration_us : length of the run; the target is looked for at some times of it, µs.
+    """
+    moves = any(track.object in ("target", "camera") for track in spec.motion)
+    times = np.linspace(0, duration_us, _TIMES) if moves else np.zeros(1)
+    found = [seen for seen in (framing(spec, view, float(t)) for t in times) if seen is not None]
+    if not found:
+        return
+    file = f"{spec.file}: " if spec.file is not None else ""
+    if all(seen.inside == 0 for seen in found):
+        told = "no part of the target is in the picture at any time of the run (see --look)"
+    elif all(seen.from_behind for seen in found if seen.inside > 0):
+        told = "the camera sees the target from behind, where it is black (see --look)"
+    else:
+        return
+    warnings.warn(f"{file}{told}", HesimWarning, stacklevel=3)
+
+
+def outline(spec: SceneSpec, view: View) -> NDArray[np.float64] | None:
+    """Column and row of points around the target at t = 0, [n, 2], px of the region; None if it has no target or is
+    partly behind the camera.
+    """
+    if spec.target is None:
+        return None
+    pose = _target_pose(spec, 0.0)
+    grid = surface_points(spec.target, _POINTS).reshape(_POINTS, _POINTS, 3)
+    rim = np.concatenate([grid[0], grid[1:, -1], grid[-1, -2::-1], grid[-2::-1, 0]])
+    points = rim @ pose[:3, :3].T + pose[:3, 3]
+    at = posed_view(spec, view, 0.0)
+    camera = at.camera_to_world
+    if np.any(-((points - camera[:3, 3]) @ camera[:3, :3])[:, 2] <= 0):
+        return None
+    return at.project(points, camera)

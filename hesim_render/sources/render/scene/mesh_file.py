@@ -1,0 +1,144 @@
+"""Objects from mesh files: OBJ and PLY by Mitsuba, STL, GLB and glTF by trimesh."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.device_types import MitsubaModule
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import leads_out, reading
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
+from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.specs.scene import OUTSIDE, ObjectSpec
+from hesim_render.spectral.transfer import decode
+from hesim_render.targets.piece import Picture
+
+_OF_MITSUBA, _OF_TRIMESH = ("obj", "ply"), ("stl", "glb", "gltf")
+
+
+def mesh_shapes(
+    mi: MitsubaModule,
+    item: ObjectSpec,
+    name: str,
+    placement: NDArray[np.float64],
+    bsdf: dict[str, Any],
+    folder: Path,
+    allow_outside: bool,
+) -> dict[str, Any]:
+    """Shapes of a mesh file, scaled to a bounding box of `size_m` and centred on the object's place.
+
+    Faces of GLB, glTF and STL files are flat. A material of a GLB or glTF file becomes Mitsuba's ``principled``: base
+    colour (factor times texture) by its sRGB, metallic and roughness by their factors; its other keys (normal maps,
+    emission, transparency, textures of roughness) are not used.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    item : the object.
+    name : beginning of the names of the shapes.
+    placement : [4, 4], pose of the object at rest.
+    bsdf : surface of the object where `materials` is ``own``.
+    folder : folder of the scene file.
+    allow_outside : let a glTF file name files outside of this folder.
+
+    Raises
+    ------
+    SpecError
+        If the file is missing, cannot be read, or has no surface.
+    """
+    path, key = folder / str(item.mesh), f"objects.{item.name}.mesh"
+    if not path.is_file():
+        raise SpecError(f"no such mesh file: {path}", key=key)
+    kind = path.suffix.lower().lstrip(".")
+    if kind in _OF_MITSUBA:
+        with as_spec_error(path, key):
+            shape = mi.load_dict({"type": kind, "filename": str(path)})
+        box = shape.bbox()
+        low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+        fit = placement @ _fit(item, low, high, int(shape.face_count()), path, key)
+        return {name: {"type": kind, "filename": str(path), "to_world": transform(mi, fit), "bsdf": bsdf}}
+    if kind not in _OF_TRIMESH:
+        known = ", ".join(end.upper() for end in (*_OF_MITSUBA, *_OF_TRIMESH))
+        raise SpecError(f"a mesh must be one of {known}, not {path.name}", key=key)
+    parts = _load(path, kind, None if allow_outside else folder, key)
+    corners = np.concatenate([part.vertices for part in parts] or [np.empty((0, 3))]).astype(np.float64)
+    low, high = (corners.min(axis=0), corners.max(axis=0)) if len(corners) else (np.zeros(3), np.zeros(3))
+    fit = placement @ _fit(item, low, high, sum(len(part.faces) for part in parts), path, key)
+    found = {}
+    for number, part in enumerate(parts):
+        own = f"{name}_{number}"
+        vertices = np.asarray(part.vertices, dtype=np.float64) @ fit[:3, :3].T + fit[:3, 3]
+        uv = getattr(part.visual, "uv", None)
+        surface = bsdf if item.materials == "own" else _principled(mi, part.visual, uv is not None)
+        found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv)
+    return found
+
+
+def _fit(
+    item: ObjectSpec, low: NDArray[np.float64], high: NDArray[np.float64], faces: int, path: Path, key: str
+) -> NDArray[np.float64]:
+    """The map from a file's own coordinates to a box of `size_m` about the origin."""
+    extent = high - low
+    if faces == 0 or not np.isfinite(extent).all() or np.count_nonzero(extent > 0) < 2:
+        what = "no faces" if faces == 0 else "no extent" if np.isfinite(extent).all() else "corners that are not finite"
+        raise SpecError(f"the mesh has {what}, so there is nothing to see", file=path, key=key)
+    factors = np.divide(item.size_m, extent, out=np.ones(3), where=extent > 0)
+    fit = np.diag([*factors, 1.0])
+    fit[:3, 3] = -factors * (low + high) / 2
+    return fit
+
+
+def _load(path: Path, kind: str, root: Path | None, key: str) -> list[Any]:
+    """All meshes of a file at their places in it.
+
+    Parameters
+    ----------
+    root : folder that must contain the files which a glTF file names; None allows all.
+    """
+    try:
+        import trimesh
+        from trimesh.resolvers import FilePathResolver
+    except ImportError:
+        told = f"{kind.upper()} files are read by trimesh, which is not installed: pip install 'hesim_render[meshes]'"
+        raise SpecError(told, file=path, key=key) from None
+
+    class Beside(FilePathResolver):
+        """Files in the folder of the scene alone."""
+
+        def get(self, name: str) -> bytes:
+            if root is not None and leads_out(root, path.parent / name):
+                raise SpecError(f"{name!r} {OUTSIDE}", file=path, key=key)
+            return super().get(name)
+
+    with reading(path, "as a mesh"):
+        loaded = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=kind, resolver=Beside(str(path)))
+        return [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh)]
+
+
+def _principled(mi: MitsubaModule, visual: Any, has_uv: bool) -> dict[str, Any]:
+    """The material of a part as Mitsuba's."""
+    material = visual.material.to_pbr() if hasattr(visual, "material") and hasattr(visual.material, "to_pbr") else None
+    material = getattr(visual, "material", None) if material is None else material
+    factor = getattr(material, "baseColorFactor", None)
+    # trimesh has the linear factors of the file in steps of 1/255
+    colour = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3]
+    if factor is not None and np.asarray(factor).dtype.kind in "ui":
+        colour = colour / 255
+    texture = getattr(material, "baseColorTexture", None)
+    base: Any = {"type": "rgb", "value": colour.tolist()}
+    if texture is not None and has_uv:
+        codes = np.asarray(texture.convert("RGB"), dtype=np.float64) / 255
+        base = picture_texture(mi, Picture((decode(codes, "srgb") * colour).astype(np.float32), "srgb"))
+    metallic, rough = getattr(material, "metallicFactor", None), getattr(material, "roughnessFactor", None)
+    surface = {
+        "type": "principled",
+        "base_color": base,
+        "metallic": 0.0 if metallic is None else float(metallic),
+        "roughness": 0.5 if rough is None else max(float(rough), 0.02),
+    }
+    return {"type": "twosided", "material": surface}

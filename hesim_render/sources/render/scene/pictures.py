@@ -1,0 +1,101 @@
+"""Pictures of a target as textures of Mitsuba."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.device_types import Float, Interaction, Mask, MitsubaModule
+from hesim_render.core.errors import SpecError
+from hesim_render.targets.piece import Picture
+
+
+def picture_texture(mi: MitsubaModule, picture: Picture) -> Any:
+    """A texture with the reflectances of a picture.
+
+    Grey pictures are the same at all wavelengths. Mitsuba turns sRGB colours into smooth spectra [jakob2019]. Spectral
+    pictures are linear between their wavelengths and zero beyond them.
+
+    Raises
+    ------
+    SpecError
+        If a spectral picture is to be rendered in a scalar variant.
+    """
+    if picture.kind == "spectral":
+        if mi.variant().startswith("scalar"):
+            raise SpecError("a hyperspectral picture is rendered in vectorised variants of Mitsuba only")
+        return _spectral_texture(mi.variant())(picture)
+    values = np.ascontiguousarray(picture.values[::-1], dtype=np.float32)  # Mitsuba's first row has v = 0
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(values[..., 0] if picture.kind == "grey" else values),
+        "raw": picture.kind == "grey",
+        "filter_type": picture.interpolation,
+        "wrap_mode": "clamp",
+    }
+
+
+@functools.cache
+def _spectral_texture(variant: str) -> type:
+    """The class of textures with one plane per wavelength; its base class depends on the variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class SpectralPicture(mi.Texture):  # type: ignore[misc, name-defined]
+        """A table of reflectances [row, col, wavelength] with linear interpolation between wavelengths."""
+
+        def __init__(self, picture: Picture) -> None:
+            mi.Texture.__init__(self, mi.Properties())
+            assert picture.wavelength_nm is not None
+            rows, cols, planes = picture.values.shape
+            self._size, self._planes = (mi.UInt32(rows), mi.UInt32(cols)), planes
+            self._values = mi.Float(np.ascontiguousarray(picture.values, dtype=np.float32).ravel())
+            self._knots = mi.Float(picture.wavelength_nm.astype(np.float32))
+            self._ends = mi.Float(float(picture.wavelength_nm[0])), mi.Float(float(picture.wavelength_nm[-1]))
+            self._bilinear = picture.interpolation == "bilinear"
+            self._mean = float(picture.values.mean())
+            dr.make_opaque(self._size, self._values, self._knots, self._ends)
+
+        def eval(self, si: Interaction, active: Mask = True) -> Any:
+            rows, cols = self._size
+            x, y = si.uv.x * mi.Float(cols), (1 - si.uv.y) * mi.Float(rows)
+            if not self._bilinear:
+                return self._at(si, dr.floor(y), dr.floor(x), active)
+            x, y = x - 0.5, y - 0.5
+            col, row = dr.floor(x), dr.floor(y)
+            right, low = x - col, y - row
+            upper = dr.lerp(self._at(si, row, col, active), self._at(si, row, col + 1, active), right)
+            lower = dr.lerp(self._at(si, row + 1, col, active), self._at(si, row + 1, col + 1, active), right)
+            return dr.lerp(upper, lower, low)
+
+        def _at(self, si: Interaction, row: Float, col: Float, active: Mask) -> Any:
+            """Reflectance of a texel at the wavelengths of each lane."""
+            (rows, cols), planes = self._size, self._planes
+            inside_row = mi.UInt32(dr.clip(row, 0, mi.Float(rows) - 1))
+            inside_col = mi.UInt32(dr.clip(col, 0, mi.Float(cols) - 1))
+            first = (inside_row * cols + inside_col) * planes
+            found = []
+            for wavelength in si.wavelengths:
+                above = dr.binary_search(0, planes, lambda k, w=wavelength: dr.gather(mi.Float, self._knots, k) < w)
+                above = dr.clip(above, 1, planes - 1)
+                start, end = (dr.gather(mi.Float, self._knots, k) for k in (above - 1, above))
+                a, b = (dr.gather(mi.Float, self._values, first + k, active) for k in (above - 1, above))
+                covered = (wavelength >= self._ends[0]) & (wavelength <= self._ends[1])
+                found.append(dr.select(covered, dr.lerp(a, b, (wavelength - start) / (end - start)), 0.0))
+            return mi.UnpolarizedSpectrum(found)
+
+        def mean(self) -> Float:
+            return mi.Float(self._mean)
+
+        def max(self) -> float:
+            return 1.0
+
+        def is_spatially_varying(self) -> bool:
+            return True
+
+        def to_string(self) -> str:
+            return "SpectralPicture[]"
+
+    return SpectralPicture

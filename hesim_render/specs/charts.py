@@ -1,0 +1,227 @@
+"""Targets of a scene file for tone, colour and uniformity."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+
+from hesim_render.specs.geometry import Size
+from hesim_render.specs.light import LampSpec
+from hesim_render.specs.reflectance import PlacedTarget, ReflectanceSpec, SizedTarget
+from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.spectral.patches import read_patches
+from hesim_render.spectral.spectrum import Spectrum, colorchecker
+
+
+class FlatTarget(SizedTarget):
+    """A uniform diffuse field."""
+
+    type: Literal["flat"]
+    reflectance: ReflectanceSpec = SpectrumSpec(flat=0.18)
+
+
+class ColorCheckerTarget(SizedTarget):
+    """24 measured patches, 4 rows of 6, on a dark surround."""
+
+    type: Literal["colorchecker"]
+    width_m: Size = 0.279
+    height_m: Size = 0.186
+    dataset: str = Field("ISO 17321-1", description="measured reflectances of colour-science")
+    patch_fill: float = Field(0.86, gt=0, le=1, description="patch width over patch pitch")
+    surround: ReflectanceSpec = SpectrumSpec(flat=0.035)
+
+    @field_validator("dataset")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        colorchecker(value)
+        return value
+
+
+class FileTarget(SizedTarget):
+    """A target whose content is in a file."""
+
+    folder: Path = Field(Path(), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
+        if isinstance(data, dict) and info.context:
+            if "folder" in data:
+                raise ValueError("unknown key 'folder'")
+            data = {**data, "folder": info.context["folder"]}
+        return data
+
+    @model_validator(mode="after")
+    def _is_there(self) -> FileTarget:
+        if self.named_file is not None and not os.path.isfile(self.folder / self.named_file):
+            raise ValueError(f"no such file: {self.folder / self.named_file}")
+        return self
+
+    @property
+    def named_file(self) -> str | None:
+        """The file, relative to the scene file; None if there is none."""
+        raise NotImplementedError
+
+
+class PatchChartTarget(FileTarget):
+    """Patches from a CSV file, row by row from the top left, on a surround.
+
+    The file has one line per patch. Its header is ``name`` and wavelengths in nm (reflectances, 0 to 1), or ``name, L,
+    a, b`` (CIELAB under D50, 2° observer).
+    """
+
+    type: Literal["patch-chart"]
+    patches: str | None = Field(None, description="CSV file, relative to this file")
+    spectra: dict[str, ReflectanceSpec] | None = Field(None, description="the patches themselves, in place of a file")
+    rows: int = Field(ge=1, le=1000)
+    cols: int = Field(ge=1, le=1000)
+    patch_fill: float = Field(0.86, gt=0, le=1, description="patch width over patch pitch")
+    surround: ReflectanceSpec = SpectrumSpec(flat=0.035)
+
+    @model_validator(mode="after")
+    def _one_source(self) -> PatchChartTarget:
+        if (self.patches is None) == (self.spectra is None):
+            raise ValueError("give patches or spectra, exactly one of them")
+        count = len(self.load())
+        if count != self.rows * self.cols:
+            raise ValueError(f"there are {count} patches; rows times cols is {self.rows * self.cols}")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _self_contained(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A dump (and so a hash) holds the numbers of the file, not its name."""
+        data = handler(self)
+        if self.patches is not None:
+            found = self.load().items()
+            data["patches"] = None
+            data["spectra"] = {
+                name: {"wavelength_nm": s.wavelength_nm.tolist(), "value": s.values.tolist()} for name, s in found
+            }
+        return data
+
+    @property
+    def named_file(self) -> str | None:
+        """The file of the patches, relative to the scene file; None if they stand in the scene file."""
+        return self.patches
+
+    def load(self) -> dict[str, Spectrum]:
+        """Reflectances of the patches by name, in order."""
+        if self.spectra is not None:
+            return {name: source.load() for name, source in self.spectra.items()}
+        assert self.patches is not None
+        return read_patches(self.folder / self.patches)
+
+
+class StepWedgeTarget(SizedTarget):
+    """Grey steps from dark to light, equally spaced in density."""
+
+    type: Literal["step-wedge"]
+    steps: int = Field(20, ge=2, le=256)
+    reflectance_min: float = Field(0.01, gt=0, le=1)
+    reflectance_max: float = Field(0.9, gt=0, le=1)
+
+    @model_validator(mode="after")
+    def _order(self) -> StepWedgeTarget:
+        if self.reflectance_min >= self.reflectance_max:
+            raise ValueError("reflectance_min must be below reflectance_max")
+        return self
+
+
+class GreyRampTarget(SizedTarget):
+    """Reflectance that rises linearly from the left side to the right one."""
+
+    type: Literal["grey-ramp"]
+    reflectance_min: float = Field(0.0, ge=0, le=1)
+    reflectance_max: float = Field(0.9, gt=0, le=1)
+
+    @model_validator(mode="after")
+    def _order(self) -> GreyRampTarget:
+        if self.reflectance_min >= self.reflectance_max:
+            raise ValueError("reflectance_min must be below reflectance_max")
+        return self
+
+
+class DeadLeavesTarget(SizedTarget):
+    """Discs of random place, radius and grey that hide each other, a scale-invariant texture [cao2010].
+
+    Radii have a density proportional to r⁻³ between the two limits, greys are uniform between the two reflectances.
+    The texture is drawn with `texels_across` texels, so that an edge is off by up to half a texel.
+    """
+
+    type: Literal["dead-leaves"]
+    width_m: Size = 0.2
+    radius_min_m: Size = 5e-4
+    radius_max_m: Size = 0.02
+    reflectance_min: float = Field(0.05, ge=0, le=1)
+    reflectance_max: float = Field(0.8, ge=0, le=1)
+    texels_across: int = Field(2048, ge=16, le=16384)
+    seed: int = Field(1, ge=0, lt=2**63)
+
+    @model_validator(mode="after")
+    def _order(self) -> DeadLeavesTarget:
+        if self.radius_min_m >= self.radius_max_m:
+            raise ValueError("radius_min_m must be below radius_max_m")
+        if self.reflectance_min >= self.reflectance_max:
+            raise ValueError("reflectance_min must be below reflectance_max")
+        if self.radius_min_m < self.width_m / self.texels_across:
+            raise ValueError("texels_across: the smallest leaves must have a radius of a texel or more")
+        return self
+
+
+class ImageTarget(FileTarget):
+    """A picture: sRGB colours (PNG, JPEG, TIFF), linear sRGB (EXR), or a reflectance at each wavelength.
+
+    Colours of an sRGB picture become the smooth reflectances of Mitsuba's own model [jakob2019]. A cube is an NPY file
+    [row, col, wavelength] with `wavelength_nm`, or a spectral EXR file [fichet2021].
+    """
+
+    type: Literal["image"]
+    file: str = Field(description="picture or cube, relative to this file")
+    wavelength_nm: list[float] | None = Field(None, min_length=2, description="of the planes of an NPY cube")
+    beyond: Literal["refuse", "hold"] = Field(
+        "refuse", description="outside the wavelengths of a cube: an error, or its first and last plane"
+    )
+    scale: float = Field(1.0, gt=0, le=1e9, description="multiplies the values of a cube or an EXR picture")
+    interpolation: Literal["bilinear", "nearest"] = "bilinear"
+
+    @property
+    def named_file(self) -> str:
+        """The file of the picture, relative to the scene file."""
+        return self.file
+
+
+class IntegratingSphereTarget(PlacedTarget, LampSpec):
+    """The round port of an integrating sphere, of the same radiance everywhere and in all directions, in a black
+    plate.
+    """
+
+    type: Literal["integrating-sphere"]
+    port_diameter_m: Size = 0.1
+    plate_m: Size = Field(0.15, description="side of the square plate around the port")
+    luminance_cd_m2: float = Field(1000.0, ge=0, le=1e9, description="of the port, time mean")
+
+    @model_validator(mode="after")
+    def _inside(self) -> IntegratingSphereTarget:
+        if self.port_diameter_m >= self.plate_m:
+            raise ValueError("port_diameter_m must be below plate_m")
+        return self
+
+    @property
+    def width_m(self) -> float:
+        """Width of the plate, m."""
+        return self.plate_m
+
+    @property
+    def height_m(self) -> float:
+        """Height of the plate, m."""
+        return self.plate_m

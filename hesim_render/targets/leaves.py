@@ -1,0 +1,99 @@
+"""The dead-leaves texture, and its autocovariance in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hesim_render.specs.charts import DeadLeavesTarget
+from hesim_render.targets.piece import Picture, Piece, picture_piece
+
+#: Leaves drawn at a time.
+_BATCH = 4096
+
+
+def dead_leaves(target: DeadLeavesTarget) -> list[Piece]:
+    """Discs that hide each other, from the front to the back, until nothing is left uncovered.
+
+    A texel has the grey of the front-most disc over its centre [cao2010]. Discs fall evenly on the target widened by
+    the largest radius, so that the texture is the same everywhere.
+    """
+    texel = target.width_m / target.texels_across
+    rows = int(np.ceil(target.height_m / texel))
+    values = leaves_picture(
+        rows,
+        target.texels_across,
+        target.radius_min_m / texel,
+        target.radius_max_m / texel,
+        (target.reflectance_min, target.reflectance_max),
+        target.seed,
+    )
+    height_part = target.height_m / (rows * texel)  # the lowest row of texels may stand over
+    picture = Picture(values[..., None], "grey", interpolation="nearest")
+    return [picture_piece("leaves", picture, target.width_m, target.height_m, (0.0, 1.0, 1.0 - height_part, 1.0))]
+
+
+def leaves_picture(
+    rows: int, cols: int, radius_min: float, radius_max: float, greys: tuple[float, float], seed: int
+) -> NDArray[np.float32]:
+    """A dead-leaves texture, float32 [rows, cols].
+
+    Parameters
+    ----------
+    rows, cols : size, texels.
+    radius_min, radius_max : limits of the radii, texels; their density is proportional to r⁻³.
+    greys : limits of the uniform law of the greys.
+    seed : seed of the texture.
+    """
+    generator = np.random.default_rng(seed)
+    picture = np.zeros((rows, cols), dtype=np.float32)
+    free = np.ones((rows, cols), dtype=bool)
+    left = rows * cols
+    while left:
+        u = generator.random(_BATCH)
+        # the distribution function of r⁻³ is linear in r⁻²
+        radius = (radius_min**-2 - u * (radius_min**-2 - radius_max**-2)) ** -0.5
+        x = generator.uniform(-radius_max, cols + radius_max, _BATCH)
+        y = generator.uniform(-radius_max, rows + radius_max, _BATCH)
+        grey = generator.uniform(*greys, _BATCH).astype(np.float32)
+        for k in range(_BATCH):
+            first_col, last_col = max(0, int(x[k] - radius[k])), min(cols, int(x[k] + radius[k]) + 2)
+            first_row, last_row = max(0, int(y[k] - radius[k])), min(rows, int(y[k] + radius[k]) + 2)
+            if first_col >= last_col or first_row >= last_row:
+                continue
+            part = free[first_row:last_row, first_col:last_col]
+            if not part.any():
+                continue
+            row, col = np.ogrid[first_row:last_row, first_col:last_col]
+            new = part & ((col + 0.5 - x[k]) ** 2 + (row + 0.5 - y[k]) ** 2 < radius[k] ** 2)
+            picture[first_row:last_row, first_col:last_col][new] = grey[k]
+            part[new] = False
+            left -= int(np.count_nonzero(new))
+    return picture
+
+
+def leaves_autocovariance(
+    distance: ArrayLike, radius_min: float, radius_max: float, greys: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Autocovariance of the dead-leaves texture, σ² γ(h)/(2 γ(0) − γ(h)) [cao2010].
+
+    γ(h) is the mean covariogram of a leaf: the area that a disc shares with itself moved by h, averaged over radii.
+    Two points have the same grey if the front-most leaf over either of them covers both.
+
+    Parameters
+    ----------
+    distance : h, in the unit of the radii.
+    radius_min, radius_max : limits of the radii, whose density is proportional to r⁻³.
+    greys : limits of the uniform law of the greys.
+    """
+    h = np.asarray(distance, dtype=np.float64)
+    # a Gauss rule in ln r, where the density is proportional to r⁻²
+    place, weight = np.polynomial.legendre.leggauss(200)
+    low, high = np.log(radius_min), np.log(radius_max)
+    radius = np.exp((low + high) / 2 + (high - low) / 2 * place)
+    share = weight * radius**-2.0
+    half = np.clip(h[..., None] / (2 * radius), 0.0, 1.0)
+    shared = 2 * radius**2 * (np.arccos(half) - half * np.sqrt(1 - half**2))
+    gamma = np.sum(share * shared, axis=-1) / share.sum()
+    whole = np.sum(share * np.pi * radius**2) / share.sum()
+    return (greys[1] - greys[0]) ** 2 / 12 * gamma / (2 * whole - gamma)

@@ -1,0 +1,132 @@
+"""e-SFR of rendered edges against the product of closed forms, and the command that measures it."""
+
+import numpy as np
+import pytest
+from rendering import flux_image, make_scene, mono
+
+import hesim_render as hr
+from hesim_render import cli
+from hesim_render.core.errors import RangeError
+from hesim_render.measure import edge_response, measure_mtf
+
+FREQUENCY = np.linspace(0, 0.5, 51)
+LIGHT = {"type": "uniform", "illuminance_lux": 1000}
+
+
+def closed_form(frequency, angle_deg, psf_fwhm_px):
+    """Square pixel of full fill seen along the normal of the edge, times the Gaussian of the lens."""
+    a, sigma = np.radians(angle_deg), psf_fwhm_px / np.sqrt(8 * np.log(2))
+    return (
+        np.abs(np.sinc(frequency * np.cos(a)) * np.sinc(frequency * np.sin(a)))
+        * np.exp(-2 * (np.pi * sigma * frequency) ** 2)
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("angle_deg", "psf_fwhm_um"), [(5.0, 0.0), (-8.0, 6.0), (12.0, 12.0)])
+def test_rendered_edges_have_the_product_of_pixel_and_lens(angle_deg, psf_fwhm_um):
+    target = {"type": "slanted-edge", "angle_deg": angle_deg}
+    scene = make_scene(target=target, light=LIGHT, camera={"origin_m": [0, 0, 1]})
+    a, b, _ = flux_image(scene, mono(64, 80, lens__psf_fwhm_um=psf_fwhm_um), 512)
+    found = edge_response((a + b) / 2, frequency_cy_per_px=FREQUENCY)
+    np.testing.assert_allclose(found.mtf, closed_form(FREQUENCY, angle_deg, psf_fwhm_um / 5), atol=0.01)
+    assert abs(found.angle_deg - angle_deg) < 0.05
+
+
+def test_edges_over_the_field_have_the_same_response_in_both_directions():
+    """Four edges of a square off the axis; the turned square has two nearly upright and two nearly level sides."""
+    field = {"type": "edge-field", "rows": 1, "cols": 2, "width_m": 0.4, "height_m": 0.2, "fill": 0.6}
+    scene = make_scene(target=field, light=LIGHT, camera={"fit": "target"})
+    a, b, _ = flux_image(scene, mono(240, 120, lens__psf_fwhm_um=4.0), 128)
+    image = (a + b) / 2
+    for part, angle in ((np.s_[34:86, 80:112], 5.0), (np.s_[8:40, 154:206], -85.0)):  # right side, then upper side
+        found = edge_response(image[part], frequency_cy_per_px=FREQUENCY)
+        assert abs(found.angle_deg - angle) < 0.1
+        np.testing.assert_allclose(found.mtf, closed_form(FREQUENCY, 5.0, 0.8), atol=0.015)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("psf_fwhm_um", [0.0, 3.0, 6.0, 10.0])
+@pytest.mark.parametrize("angle_deg", [3.0, 5.0, -7.0, 10.0])
+def test_more_rendered_edges_have_the_product_of_pixel_and_lens(angle_deg, psf_fwhm_um):
+    target = {"type": "slanted-edge", "angle_deg": angle_deg}
+    scene = make_scene(target=target, light=LIGHT, camera={"origin_m": [0, 0, 1]})
+    a, b, _ = flux_image(scene, mono(100, 200, lens__psf_fwhm_um=psf_fwhm_um), 512)
+    found = edge_response((a + b) / 2, frequency_cy_per_px=FREQUENCY)
+    np.testing.assert_allclose(found.mtf, closed_form(FREQUENCY, angle_deg, psf_fwhm_um / 5), atol=0.01)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("edge") / "recording"
+    sensor = hr.load_sensor("reference-bayer", {"lens.psf_fwhm_um": 4.0}).crop(120, 96)
+    changes = {"target.dark": 0.05, "light.illuminance_lux": 400}
+    hr.simulate(hr.load_scene("slanted-edge", changes), sensor, duration_s=0.03, seed=2, out=folder)
+    return folder
+
+
+def test_one_filter_of_a_mosaic_is_measured_in_a_part_of_a_frame(recording):
+    loaded = hr.Recording.load(recording)
+    pitch_um = loaded.manifest["sensor"]["spec"]["geometry"]["pitch_um"]
+    expected = closed_form(FREQUENCY, 5.0, 4.0 / pitch_um)
+    known = sorted({name for row in loaded.mosaic.tile_filter for name in row})
+    for name in known:
+        found = measure_mtf(loaded, region=(10, 0, 100, 96), signal="electrons", filter_name=name)
+        # a quarter of the pixels, rendered to half of the sensor's noise
+        np.testing.assert_allclose(found.mtf[:51], expected, atol=0.05)
+        assert abs(found.angle_deg - 5) < 0.2
+    raw = measure_mtf(loaded, region=(10, 0, 100, 96), filter_name=known[1])
+    assert abs(raw.mtf[10] - expected[10]) < 0.05
+    with pytest.raises(RangeError, match="filter_name is None; expected one of"):
+        measure_mtf(loaded)
+    with pytest.raises(RangeError, match=r"region is \(100, 0, 30, 30\)"):
+        measure_mtf(loaded, region=(100, 0, 30, 30), filter_name=known[0])
+    with pytest.raises(RangeError, match="frame is 7; expected 0 to 0"):
+        measure_mtf(loaded, 7, filter_name=known[0])
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as caught:
+        cli.main([str(argument) for argument in arguments])
+    return caught.value.code
+
+
+def test_the_command_prints_and_writes_the_response(recording, tmp_path, capsys):
+    name = hr.Recording.load(recording).mosaic.tile_filter[0][0]
+    out = tmp_path / "mtf.csv"
+    given = [
+        "measure",
+        "mtf",
+        recording,
+        "--roi",
+        "100x96+10+0",
+        "--filter",
+        name,
+        "--signal",
+        "electrons",
+        "--out",
+        out,
+    ]
+    assert run(*given) == 0
+    printed = capsys.readouterr().out
+    assert "MTF at 0.25 cycles per pixel: 0." in printed and "edge 5.0" in printed and f"in {out}" in printed
+    table = np.loadtxt(out, delimiter=",", skiprows=1)
+    loaded = hr.Recording.load(recording)
+    expected = measure_mtf(loaded, region=(10, 0, 100, 96), signal="electrons", filter_name=name)
+    np.testing.assert_allclose(table, np.column_stack([expected.frequency_cy_per_px, expected.mtf]), rtol=1e-5)
+    assert out.read_text().splitlines()[0] == "frequency_cy_per_px,mtf"
+    before = out.read_bytes()
+    assert run(*given) == 2 and out.read_bytes() == before and "--overwrite" in capsys.readouterr().err
+    assert run(*given, "--overwrite") == 0
+    capsys.readouterr()
+    assert run("measure", "mtf", recording, "--roi", "100x96") == 2
+    assert "first column and row" in capsys.readouterr().err
+    assert run("measure", "mtf", tmp_path / "none") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_saturated_pixels_are_refused(tmp_path):
+    bright = hr.load_scene("slanted-edge", {"light.illuminance_lux": 1e6})
+    recording = hr.simulate(bright, mono(64, 48), duration_s=0.02, clean=True)
+    with pytest.raises(RangeError, match="values below saturation"):
+        measure_mtf(recording)
+    assert measure_mtf(recording, signal="electrons").mtf[25] > 0.8  # the truth is not clipped

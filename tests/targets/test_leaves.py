@@ -1,0 +1,78 @@
+"""Dead leaves: the texture that is drawn has the autocovariance of the model."""
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+from scipy import integrate
+
+from hesim_render.specs.target import TargetSpec
+from hesim_render.targets.build import build_target
+from hesim_render.targets.leaves import leaves_autocovariance, leaves_picture
+
+GREYS = (0.1, 0.7)
+
+
+def closed_form(h, low, high):
+    """σ² γ(h)/(2 γ(0) − γ(h)), with γ the covariogram of a disc averaged over a density 2 r⁻³/(low⁻² − high⁻²)."""
+
+    def lens(r):
+        return 2 * r * r * np.arccos(h / (2 * r)) - h / 2 * np.sqrt(4 * r * r - h * h) if h < 2 * r else 0.0
+
+    def mean(value):
+        found, _ = integrate.quad(lambda r: value(r) * 2 * r**-3 / (low**-2 - high**-2), max(low, h / 2), high)
+        return found
+
+    def gamma(distance):
+        return mean(lens) if distance else 2 * np.pi * np.log(high / low) / (low**-2 - high**-2)
+
+    return (GREYS[1] - GREYS[0]) ** 2 / 12 * gamma(h) / (2 * gamma(0) - gamma(h))
+
+
+def test_the_closed_form_is_that_of_a_plain_quadrature():
+    distance = np.array([0.001, 1.0, 4.0, 9.0, 30.0, 79.0, 81.0])
+    expected = [closed_form(h, 2.0, 40.0) if h < 80 else 0.0 for h in distance]
+    np.testing.assert_allclose(leaves_autocovariance(distance, 2.0, 40.0, GREYS), expected, rtol=2e-3, atol=1e-7)
+    np.testing.assert_allclose(leaves_autocovariance(0.0, 2.0, 40.0, GREYS), 0.6**2 / 12, rtol=1e-9)
+
+
+def drawn(count, seed, size=160, low=3.0, high=40.0):
+    """Autocovariance of each of many independent textures along x and y, about the known mean; [texture, lag]."""
+    lags = np.array([0, 2, 5, 10, 20, 40, 70])
+    found = []
+    for k in range(count):
+        field = leaves_picture(size, size, low, high, GREYS, seed + k).astype(float) - 0.4
+        across = [np.mean(field[:, : size - lag] * field[:, lag:]) for lag in lags]
+        down = [np.mean(field[: size - lag] * field[lag:]) for lag in lags]
+        found.append((np.array(across) + down) / 2)
+    return lags, np.array(found)
+
+
+def agrees(lags, found, low=3.0, high=40.0):
+    # texels take the leaf over their centre, so there is no blur: points of the picture are points of the model
+    expected = np.array([closed_form(h, low, high) for h in lags])
+    error = found.std(axis=0, ddof=1) / np.sqrt(len(found))
+    assert np.all(error < 0.06 * expected[0])
+    assert np.all(np.abs(found.mean(axis=0) - expected) < 3 * error), (found.mean(axis=0) - expected) / error
+
+
+def test_the_autocovariance_of_drawn_leaves_is_that_of_the_model():
+    agrees(*drawn(30, 100))  # 7 lags within 3 standard errors: false alarm 3 %, with this fixed seed none
+
+
+@pytest.mark.slow
+def test_the_autocovariance_of_many_drawn_leaves_is_that_of_the_model():
+    lags, found = drawn(400, 1000)
+    agrees(lags, found)
+    assert np.all(found.std(axis=0, ddof=1) / 20 < 0.016 * 0.03)
+
+
+def test_a_target_of_dead_leaves_is_drawn_to_its_size_and_seed():
+    content = {"type": "dead-leaves", "width_m": 0.2, "height_m": 0.111, "texels_across": 100, "radius_min_m": 0.004,
+               "radius_max_m": 0.02, "seed": 5}  # fmt: skip
+    (piece,) = build_target(TypeAdapter(TargetSpec).validate_python(content))
+    values = piece.reflectance.values
+    assert values.shape == (56, 100, 1)  # rows of 2 mm: the last one stands over by half
+    np.testing.assert_allclose(piece.uv[:, 1].min(), 1 - 55.5 / 56, rtol=1e-9)
+    assert values.min() >= 0.05 and values.max() <= 0.8 and values.min() < 0.1 and values.max() > 0.75
+    np.testing.assert_array_equal(values[..., 0], leaves_picture(56, 100, 2, 10, (0.05, 0.8), 5))
+    assert np.any(values[..., 0] != leaves_picture(56, 100, 2, 10, (0.05, 0.8), 6))
