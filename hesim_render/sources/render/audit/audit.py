@@ -34,8 +34,6 @@ _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
 _STILL_PART = 0.25
 #: Quality of the reference, as a part of the quality of the run.
 _REFERENCE = 0.5
-#: Weight of the run in the mean of run and reference with the least error, if their errors are as wanted.
-_OF_RUN = _REFERENCE**2 / (1 + _REFERENCE**2)
 #: Sizes of the first and of the largest batch; after each batch the audit checks whether it has enough units.
 _LEAST_BATCH, _MOST_BATCH = 256, 16384
 #: Upper limit for the rays of an audit: a part of the run's own rays, or a fixed number if that is more.
@@ -212,10 +210,8 @@ class Audit:
             found = self._compare(part, part.flux, other)
             for total, values in zip(vars(tally.events).values(), vars(found).values(), strict=True):
                 total[place[moving]] = values
-            # Counts that errors as large as those of the run and of the reference cause on their own. They are added to
-            # the best estimate of the truth, because further noise on a noisy signal makes more events than it has.
-            best = other + _OF_RUN * (part.flux - other)
-            by_error = self._compare(part, best + part.difference, best + difference[:, moving])
+            # counts that errors as large as those of the run and of the reference cause on their own
+            by_error = self._compare(part, other + part.difference, other + difference[:, moving])
             tally.by_error[place[moving]] = by_error.missed + by_error.extra + by_error.flips
 
     def _reference(
