@@ -273,7 +273,7 @@ class FlickerFlux:
             asked, place = np.unique(pixel, return_inverse=True)
             zero = np.zeros(asked.size)
             parts = [
-                source.reference_flux(asked, zero, zero + 1.0, quality, events)[place] for source in self._auditable
+                source.reference_flux(asked, zero, zero + 1.0, quality, events)[:, place] for source in self._auditable
             ]
             return np.sum([w * part for w, part in zip(self._weights(begin_us, end_us), parts, strict=True)], axis=0)
         spans, number = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
@@ -283,9 +283,11 @@ class FlickerFlux:
         low, high = (np.concatenate([bounds[k][part] for k in number.ravel()]) for part in (slice(-1), slice(1, None)))
         length = (end_us - begin_us)[pair]
         share = np.divide(high - low, length, out=np.ones_like(length), where=length > 0)
-        total = np.zeros(pixel.size)
+        total = np.zeros((2, pixel.size))
         for source, weight in zip(self._auditable, self._weights(low, high), strict=True):
-            np.add.at(total, pair, share * weight * source.reference_flux(pixel[pair], low, high, quality, events))
+            found = share * weight * source.reference_flux(pixel[pair], low, high, quality, events)
+            for values, parts in zip(total, found, strict=True):
+                np.add.at(values, pair, parts)
         return total
 
 

@@ -128,7 +128,7 @@ class AuditableFlux(FluxSource, Protocol):
         quality: float,
         events: bool,
     ) -> NDArray[np.float64]:
-        """Mean Φ of each listed pixel in its own window, e⁻/s, with random numbers that the run does not use.
+        """Mean Φ of each listed pixel in its own window, and its error, with random numbers that the run does not use.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class AuditableFlux(FluxSource, Protocol):
 
         Returns
         -------
-        [n], e⁻/s.
+        [2, n], e⁻/s: the flux, and half the difference of its two halves.
         """
         ...
 

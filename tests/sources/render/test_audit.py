@@ -47,7 +47,8 @@ class Given:
 
     def reference_flux(self, pixel, begin_us, end_us, quality, events):
         self.rays_traced += self.rays_each * pixel.size
-        return self.truth[np.rint(end_us / TICK_US).astype(int) - 1, pixel]
+        found = self.truth[np.rint(end_us / TICK_US).astype(int) - 1, pixel]
+        return np.stack([found, np.zeros(found.size)])
 
 
 def audited(run, truth, seed, rays_each=1):
@@ -254,3 +255,41 @@ def test_crossings_start_anew_at_each_event_of_the_reference():
     assert crossings(late, rising)["missed"] == 0
     assert crossings([0] * 7, rising)["missed"] == 2
     assert crossings([0, 0.3, 0, 0, 0, 0, 0], [0] * 7)["extra"] == 1
+
+
+class Noisy(Given):
+    """A run and a reference that differ from the truth by normal errors, both with two halves."""
+
+    def __init__(self, truth, rng, error):
+        super().__init__(truth, truth)
+        self.halves, self.others = (
+            truth * (1 + part * error * 2**0.5 * rng.normal(size=(2, *truth.shape))) for part in (1.0, 0.5)
+        )
+        self.error = error
+
+    def flux_of_blocks(self, pixel, blocks):
+        types = jit()
+        for block in blocks:
+            for end in block.end_us[block.wanted]:
+                tick = round(end / TICK_US) - 1
+                a, b = (types.Float(half[tick][pixel].astype(np.float32)) for half in self.halves)
+                yield Sample(a, b, (self.error * self.truth[tick]).astype(np.float32))
+
+    def reference_flux(self, pixel, begin_us, end_us, quality, events):
+        a, b = self.others[:, np.rint(end_us / TICK_US).astype(int) - 1, pixel]
+        return np.stack([0.5 * (a + b), 0.5 * (a - b)])
+
+
+def test_flips_are_those_that_both_errors_cause(monkeypatch):
+    """Steps of all sizes about the threshold; so many flips that their ratio has an error of 2 %."""
+    monkeypatch.setattr(audit_module, "_RAYS", 10**9)
+    rng = np.random.default_rng(5)
+    steps = rng.choice([-1, 1], (TICKS, 1)) * rng.uniform(0.1, 0.3, (TICKS, ROWS * COLS))
+    source, sensor = Noisy(1e5 * np.exp(np.cumsum(steps, axis=0)), rng, 0.01), sensor_of()
+    pixels = sensor.layout.evs_pixel.ravel()
+    noted = NotedFlux(source, pixels, TICKS, 1, *STRETCHES["previous_sample"], 3)
+    for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+        pass
+    found = Audit(noted, source, QUALITY, sensor.evs, pixels, 3).run()["events"]
+    assert found["flips"] * found["true_events"] > 5000
+    assert found["flips_by_stated_error"] == pytest.approx(found["flips"], rel=0.06)

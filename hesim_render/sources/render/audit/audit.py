@@ -198,7 +198,7 @@ class Audit:
         self, units: Units, place: NDArray[np.int64], still: NDArray[np.bool_], which: str, tally: _Tally
     ) -> None:
         events, core, tolerance = which != "frames", units.core, TOLERANCE * self._quality
-        reference = self._reference(units, still, which)
+        reference, difference = self._reference(units, still, which)
         unit = self._source.noise_unit(units.pixel, reference, events)[core]
         deviation, weight = np.abs(units.flux - reference)[core] / unit, np.where(still, 1 / _STILL_PART, 1.0)
         tally.off[place] = weight * np.mean(deviation > tolerance, axis=0)
@@ -210,13 +210,15 @@ class Audit:
             found = self._compare(part, part.flux, other)
             for total, values in zip(vars(tally.events).values(), vars(found).values(), strict=True):
                 total[place[moving]] = values
-            # counts that an error as large as the stated one causes on its own
-            by_error = self._compare(part, other + part.difference, other)
+            # counts that errors as large as those of the run and of the reference cause on their own
+            by_error = self._compare(part, other + part.difference, other + difference[:, moving])
             tally.by_error[place[moving]] = by_error.missed + by_error.extra + by_error.flips
 
-    def _reference(self, units: Units, still: NDArray[np.bool_], which: str) -> NDArray[np.float64]:
-        """Flux by other random numbers, [window, unit], e⁻/s. Windows that are not needed keep the values of the
-        run.
+    def _reference(
+        self, units: Units, still: NDArray[np.bool_], which: str
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Flux by other random numbers, and half the difference of its halves, [window, unit], e⁻/s. Windows that are
+        not needed keep the values of the run.
         """
         needed = np.zeros(units.flux.shape, np.bool_)
         core = np.flatnonzero(units.core)
@@ -226,15 +228,15 @@ class Audit:
             needed[core[0] - 1] |= ~still
         elif which == "eventful":
             needed[:] |= ~still
-        reference = units.flux.copy()
+        reference, difference = units.flux.copy(), np.zeros(units.flux.shape)
         place = np.nonzero(needed)[1]
-        reference[needed] = self._source.reference_flux(
+        reference[needed], difference[needed] = self._source.reference_flux(
             units.pixel[place],
             *(units.begin_us[needed], units.end_us[needed]),
             _REFERENCE * self._quality,
             events=which != "frames",
         )
-        return reference
+        return reference, difference
 
     def _has_event(self, units: Units) -> NDArray[np.bool_]:
         """Units in which the run may have an event, [unit]."""

@@ -202,7 +202,7 @@ class ChangeDrivenFlux:
         quality: float,
         events: bool,
     ) -> NDArray[np.float64]:
-        """Mean Φ of each listed pixel in its own window, e⁻/s, with a stream of random numbers of its own.
+        """Mean Φ of each listed pixel in its own window, and its error, with a stream of random numbers of its own.
 
         Parameters
         ----------
@@ -213,10 +213,10 @@ class ChangeDrivenFlux:
 
         Returns
         -------
-        [n], e⁻/s.
+        [2, n], e⁻/s: the flux, and half the difference of its halves.
         """
         if self._is_dark or pixel.size == 0:
-            return np.zeros(pixel.size)
+            return np.zeros((2, pixel.size))
         renderer, index = self._renderer, self._index[pixel]
         role: Role = "events" if events else "any"
         wanted = quality if events else quality / renderer.tuning.frame_margin

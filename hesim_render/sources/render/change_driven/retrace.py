@@ -29,7 +29,7 @@ def traced_again(
     gain: Gain,
     tuning: Tuning,
 ) -> NDArray[np.float64]:
-    """Mean Φ of each listed pixel in its own window, with random numbers that only the audit uses.
+    """Mean Φ of each listed pixel in its own window, with random numbers that only the audit uses; and its error.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def traced_again(
 
     Returns
     -------
-    [n], e⁻/s.
+    [2, n], e⁻/s: the flux, and half the difference of its halves.
     """
     pairs, place = np.unique(np.stack([index.astype(np.float64), begin_us, end_us]), axis=1, return_inverse=True)
     pixel = pairs[0].astype(np.uint32)
@@ -62,13 +62,13 @@ def traced_again(
     )
     rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
     times = np.clip(np.ceil((gain.error(scatter, rays) / wanted_error) ** 2), 1, tuning.most_audit_times)
-    total = np.zeros(pixel.size)
+    total = np.zeros((2, pixel.size))
     for repeat in range(int(times.max())):
         more = np.flatnonzero(times > repeat)
         of = pixel[more], window[more], windows, rays[more], lit[more], Stream.AUDIT
         got = tracer.trace(*of, repeat=repeat, aims=None if aims is None else aims.part(more))
-        total[more] += got.mean
-    return (total / times)[place.ravel()]
+        total[:, more] += 0.5 * np.stack([got.half_a + got.half_b, got.half_a - got.half_b])
+    return (total / times)[:, place.ravel()]
 
 
 def _aims(
