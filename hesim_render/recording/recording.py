@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
 from hesim_render.core.npz import read_array, read_arrays
+from hesim_render.exchange.dsec import read_events
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.dng import read_dng
-from hesim_render.recording.event_file import read_events
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
 
@@ -187,6 +187,33 @@ class Recording:
                 writer.set_event_truth(self.event_truth)
             writer.set_events_dropped(self.manifest["counts"].get("events_dropped", 0))
             return writer.finish()
+
+    def export(self, format: str, path: str | Path, overwrite: bool = False) -> Path:
+        """Write the events, or the RAW frames, in the format of another program (docs/formats.md).
+
+        Parameters
+        ----------
+        format : of events ``evt2``, ``evt3``, ``aedat4``, ``dsec``, ``npz``, ``txt`` or ``nmnist``; of frames ``tiff``,
+            ``png``, ``npy`` or ``mipi``.
+        path : file of the events, or folder of the frames.
+        overwrite : replace an existing file, or an existing folder of exported frames.
+
+        Returns
+        -------
+        The file or folder, absolute.
+
+        Raises
+        ------
+        OutputError
+            If it exists (and `overwrite` is not set) or cannot be written; nothing is left then.
+        RangeError
+            If the format is unknown, or the recording has no such data.
+        SpecError
+            If the events do not fit into the format, or the recording is damaged.
+        """
+        from hesim_render.recording.exports import export
+
+        return export(self, format, path, overwrite)
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:
