@@ -2,8 +2,8 @@
 
 ``#!AER-DAT4.0``, a header (compression, place of the table of packets, XML that describes the streams), packets
 (stream, size, content), and the table of packets, whose places are those behind the packets' own headers. All parts
-are FlatBuffers (flatbuffers.dev) with the size in front. A packet of events is one vector of 16-byte structures, so NumPy
-writes and reads it without a library for FlatBuffers.
+are FlatBuffers (flatbuffers.dev) with the size in front. A packet of events is one vector of 16-byte structures, so
+NumPy writes and reads it without a library for FlatBuffers.
 """
 
 from __future__ import annotations
@@ -213,9 +213,9 @@ def _unpacked(content: bytes, compression: int, path: Path) -> bytes:
     elif compression in _ZSTD:
         import zstandard
 
-        unpack = zstandard.ZstdDecompressor().decompressobj()
-        found = unpack.decompress(content)
-        whole = unpack.eof
+        # a frame that ends early gives too few bytes, which the reader of the packet finds
+        found = zstandard.ZstdDecompressor().stream_reader(content).read(_LARGEST_PACKET + 1)
+        whole = len(found) <= _LARGEST_PACKET
     else:
         raise SpecError(f"has the compression {compression}; expected 0 to 4", file=path)
     if not whole:

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import recordings
-from test_round_trips import DATA, SHAPE, columns, made, many, raw, written
+from event_files import DATA, SHAPE, columns, made, many, raw, written
 
 import hesim_render as hr
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError

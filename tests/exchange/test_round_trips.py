@@ -1,33 +1,32 @@
 """Event files, read back by us and by libraries of others, to the exact event."""
 
+import os
 import re
-from pathlib import Path
+import struct
+import subprocess
+import sys
 
 import aedat
 import evt3
 import faery
 import h5py
+import hdf5plugin
 import lz4.frame
 import numpy as np
 import pytest
+import zstandard
+from event_files import DATA, SHAPE, columns, joined, made, many, raw, written
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from hesim_render.core.errors import SpecError
-from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events, stream
+from hesim_render.exchange import aedat4, open_events, stream
 from hesim_render.exchange.flatbuffer import Table
-from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
 
-DATA = Path(__file__).parents[1] / "data"
-SHAPE = (720, 1280)
 READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 #: Times at which the counters of EVT3 (2^12, 2^24) and EVT2 (2^6, 2^34) start again, and one of days.
 TURNS = [0, 1 << 6, 1 << 12, 1 << 24, 1 << 25, 1 << 32, 1 << 34, 1 << 40]
-
-
-def made(*items):
-    return np.array(list(items), dtype=EVENT_DTYPE)
 
 
 def times(latest_us):
@@ -44,31 +43,12 @@ def lists_of_events(latest_us, shape=SHAPE):
     return st.lists(event, max_size=40).map(lambda items: made(*sorted(items, key=lambda item: item[0])))
 
 
-def many(count, latest_us, shape=SHAPE, seed=3):
-    rng = np.random.default_rng(seed)
-    events = np.empty(count, dtype=EVENT_DTYPE)
-    events["t_us"] = np.sort(rng.integers(0, latest_us // 5, count) * 5)  # many equal times
-    events["y"], events["x"] = rng.integers(0, shape[0], count), rng.integers(0, shape[1], count)
-    events["polarity"] = rng.choice([-1, 1], count)
-    return events
-
-
-def written(events, name, folder, shape=SHAPE):
-    path = folder / f"events{EVENT_FORMATS[name].suffix}"
-    with path.open("wb") as file:
-        EVENT_FORMATS[name].write(EventStream.of(events, shape), file, path)
-    return path
-
-
-def joined(found):
-    return np.concatenate([no_events(), *found])
-
-
-def columns(t, x, y, on):
-    events = np.empty(len(t), dtype=EVENT_DTYPE)
-    events["t_us"], events["x"], events["y"] = t, x, y
-    events["polarity"] = np.where(np.asarray(on) > 0, 1, -1)
-    return events
+def aedat4_by_others(path):
+    decoder = aedat.Decoder(str(path))
+    assert decoder.id_to_stream() == {0: {"type": "events", "width": SHAPE[1], "height": SHAPE[0]}}
+    for packet in decoder:
+        if packet["stream_id"] == 0:
+            yield columns(*(packet["events"][key] for key in ("t", "x", "y", "on")))
 
 
 def read_by_others(path, name):
@@ -81,9 +61,7 @@ def read_by_others(path, name):
         assert (found.sensor_height, found.sensor_width) == SHAPE
         return columns(found.timestamp.astype(np.int64), found.x, found.y, found.polarity)
     if name == "aedat4":
-        decoder = aedat.Decoder(str(path))
-        assert decoder.id_to_stream() == {0: {"type": "events", "width": SHAPE[1], "height": SHAPE[0]}}
-        return joined(columns(*(packet["events"][key] for key in ("t", "x", "y", "on"))) for packet in decoder)
+        return joined(aedat4_by_others(path))
     if name == "dsec":
         with h5py.File(path) as file:
             t = file["events/t"][:].astype(np.int64) + file["t_offset"][()]
@@ -141,12 +119,6 @@ def test_many_events_in_several_blocks_come_back_exactly(name, tmp_path, monkeyp
     np.testing.assert_array_equal(read_by_others(path, name), events)
     if name in READABLE:
         np.testing.assert_array_equal(joined(open_events(path)), events)
-
-
-def raw(tmp_path, words, dtype="<u2", header="% evt 3.0\n% geometry 1280x720\n% end\n"):
-    path = tmp_path / "hand.raw"
-    path.write_bytes(header.encode() + np.array(words, dtype=dtype).tobytes())
-    return path
 
 
 def test_vectors_of_evt3_are_read(tmp_path, monkeypatch):
@@ -225,3 +197,84 @@ def test_the_table_of_packets_says_where_they_are(whose, tmp_path, monkeypatch):
         assert (t.size, t[0], t[-1]) == (count, entry.number(3, "<q", -1), entry.number(4, "<q", -1))
         done += t.size
     assert done == (1000 if whose == "ours" else 5)
+
+
+@pytest.mark.parametrize("kind", ["zstd", "none"])
+def test_other_packings_of_aedat4_are_read(kind, tmp_path):
+    events = many(1000, 1 << 20)
+    data = written(events, "aedat4", tmp_path).read_bytes()
+    _, _, _, begin, end = aedat4.read_header(tmp_path / "events.aedat4")
+    (size,) = struct.unpack("<i", data[begin + 4 : begin + 8])
+    content = lz4.frame.decompress(data[begin + 8 : begin + 8 + size])
+    packed = {"zstd": zstandard.compress(content), "none": content}[kind]
+    # compression is the number after the distance to the description of the fields, in the table at byte 24
+    place = len("#!AER-DAT4.0\r\n") + 4 + 24 + 4
+    assert begin + 8 + size == end and data[place : place + 4] == b"\x01\0\0\0"
+    header = data[:place] + struct.pack("<i", {"zstd": 3, "none": 0}[kind]) + data[place + 4 : begin]
+    path = tmp_path / "other.aedat4"
+    for other in (b"", struct.pack("<ii", 5, 3) + b"abc"):  # a stream of something else, which is passed over
+        body = other + struct.pack("<ii", 0, len(packed)) + packed
+        table = (begin + len(body)).to_bytes(8, "little")
+        path.write_bytes(header.replace(end.to_bytes(8, "little"), table) + body)
+        np.testing.assert_array_equal(joined(open_events(path)), events)
+        if not other:  # aedat refuses a stream that the header does not have
+            np.testing.assert_array_equal(joined([*aedat4_by_others(path)]), events)
+
+
+def test_files_of_dsec_are_read(tmp_path):
+    """Their layout, written by h5py alone: Blosc with Zstandard, no attributes, an offset."""
+    events = many(5000, 1 << 20, (480, 640))
+    path = tmp_path / "events.h5"
+    with h5py.File(path, "w") as file:
+        packing = hdf5plugin.Blosc(cname="zstd", clevel=5)
+        on = events["polarity"] > 0
+        columns_of = {"t": events["t_us"], "x": events["x"], "y": events["y"], "p": on}
+        for (name, values), kind in zip(columns_of.items(), ("u4", "u2", "u2", "u1"), strict=True):
+            file.create_dataset(f"events/{name}", data=values.astype(kind), compression=packing)
+        file["ms_to_idx"] = np.searchsorted(events["t_us"], np.arange(0, 1050) * 1000).astype(np.uint64)
+        file["t_offset"] = np.int64(49_599_300_523)
+    with pytest.raises(SpecError, match="does not state the size"):
+        open_events(path)
+    events["t_us"] += 49_599_300_523
+    np.testing.assert_array_equal(joined(open_events(path, shape=(480, 640))), events)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["evt2", "evt3", "aedat4", "dsec"])
+def test_a_hundred_million_events_take_bounded_memory(name, tmp_path):
+    """Peak memory of a process that writes and reads them; as one array they would take 1.3 GB. It was 250 MB."""
+    code = (
+        "import resource, sys; import numpy as np\n"
+        "from pathlib import Path\n"
+        "from hesim_render.exchange import EVENT_FORMATS, EventStream, open_events\n"
+        "from event_files import many\n"
+        "block = many(1 << 20, 1 << 20)\n"
+        "def blocks():\n"
+        "    for k in range(96):\n"
+        "        part = block.copy(); part['t_us'] += k << 20; yield part\n"
+        "path = Path(sys.argv[1]); stream = EventStream(blocks, (720, 1280))\n"
+        "with path.open('wb') as file: EVENT_FORMATS[sys.argv[2]].write(stream, file, path)\n"
+        "read = open_events(path); same = all((a == b).all() for a, b in zip(aligned(read), blocks()))\n"
+        "print(same, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)\n"
+    )
+    aligned = (
+        "def aligned(stream):\n"
+        "    parts, size = [], 0\n"
+        "    for part in stream:\n"
+        "        while part.size:\n"
+        "            taken = part[: (1 << 20) - size]; part = part[taken.size :]\n"
+        "            parts.append(taken); size += taken.size\n"
+        "            if size == 1 << 20: yield np.concatenate(parts); parts, size = [], 0\n"
+        "    assert not parts\n"
+    )
+    place = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, [*sys.path]))}
+    program = aligned + code
+    done = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "events", name],
+        env=place,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    same, peak_mb = done.stdout.split()
+    assert same == "True" and int(peak_mb) < 500
