@@ -7,10 +7,12 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.options import Overwrite
-from hesim_render.cli.terminal import parse_size, say
+from hesim_render.cli.options import SENSOR_HELP, Overwrite, Region, check_output, cropped, names_of
+from hesim_render.cli.terminal import parse_size, say, summary
+from hesim_render.core.errors import ConflictError
 
 _EXPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "txt", "nmnist", "tiff", "png", "npy", "mipi")
+_FRAMES = (".dng", ".tif", ".tiff", ".png", ".npy")
 _IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz")
 
 
@@ -43,17 +45,45 @@ def export(
 
 
 def import_(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="EVT2 or EVT3 RAW, AEDAT4, DSEC HDF5, or .npz file")],
-    out: Annotated[Path, typer.Option(help="HDF5 file to write")],
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="an event file (EVT2, EVT3 RAW, AEDAT4, DSEC HDF5, .npz); with --sensor also frames",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
     format: Annotated[
         str | None,
         typer.Option(help=f"{', '.join(_IMPORTS)}; default: what the file says", autocompletion=_complete_import),
     ] = None,
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, where the file does not say it")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help=f"make a recording of this sensor: {SENSOR_HELP}", autocompletion=names_of("sensors")),
+    ] = None,
+    roi: Region = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write the events of another program's file in the layout of a recording's events.h5."""
-    from hesim_render.recording.exports import import_events
+    """Write the events of another program in the layout of events.h5, or a capture of a real sensor as a recording."""
+    if sensor is None:
+        from hesim_render.recording.exports import import_events
 
-    shape = None if size is None else parse_size(size)
-    say(f"events in {import_events(source, out, format=format, shape=shape, overwrite=overwrite)}")
+        if len(sources) > 1 or roi is not None:
+            raise ConflictError("FILE", len(sources), "more than one file, or --roi, needs --sensor")
+        shape = None if size is None else parse_size(size)
+        say(f"events in {import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)}")
+        return
+    if size is not None or format is not None:
+        raise ConflictError("--sensor", sensor, "give --sensor or --size and --format, not both")
+    frames = [file for file in sources if file.suffix.lower() in _FRAMES]
+    events = [file for file in sources if file not in frames]
+    if len(events) > 1:
+        raise ConflictError("FILE", str(events[1]), f"{events[1]} is a second event file; one is taken")
+    check_output(out, overwrite)
+    import hesim_render as hr
+    from hesim_render.recording.imports import import_recording
+
+    loaded = cropped(hr.load_sensor(sensor), roi)
+    made = import_recording(out, loaded, events=events[0] if events else None, frames=frames, overwrite=overwrite)
+    say(summary(made))

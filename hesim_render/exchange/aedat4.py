@@ -193,8 +193,7 @@ def read(path: Path, number: int, compression: int, begin: int, end: int) -> Ite
                 raise SpecError("a packet of events is empty", file=path)
             made = Table.root(content[4:], b"EVTS").structures(0, _EVENT)
             events = np.empty(made.size, dtype=EVENT_DTYPE)
-            if made.size and min(made["x"].min(), made["y"].min()) < 0:
-                raise SpecError("an event has a negative coordinate", file=path)
+            # a negative coordinate becomes one above 32767, which no grid has
             events["t_us"], events["x"], events["y"] = made["t_us"], made["x"], made["y"]
             events["polarity"] = np.where(made["on"] > 0, 1, -1)
             yield events

@@ -51,7 +51,9 @@ _BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b
 READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
 
 
-def open_events(path: str | Path, format: str | None = None, shape: tuple[int, int] | None = None) -> EventStream:
+def open_events(
+    path: str | Path, format: str | None = None, shape: tuple[int, int] | None = None, *, keep_stated: bool = False
+) -> EventStream:
     """Open an event file of any known format; the events are read when the stream is used.
 
     Parameters
@@ -59,6 +61,7 @@ def open_events(path: str | Path, format: str | None = None, shape: tuple[int, i
     path : the file: EVT2 or EVT3 RAW, AEDAT4, HDF5 in the layout of DSEC, or ``.npz`` with t, x, y and p.
     format : ``evt2``, ``evt3``, ``aedat4``, ``dsec`` or ``npz``; default: what the begin of the file says.
     shape : rows and columns of the event grid, px; needed if the file does not state them.
+    keep_stated : let the shape that the file states, if it does, come before `shape`.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def open_events(path: str | Path, format: str | None = None, shape: tuple[int, i
     if found is None:
         raise SpecError(f"is of no known event format; expected one of {', '.join(READABLE)}", file=file)
     stream = _OPENERS[found](file)
-    if shape is not None:
+    if shape is not None and not (keep_stated and stream.shape != (0, 0)):
         return replace(stream, shape=shape)
     if stream.shape == (0, 0):
         raise SpecError("does not state the size of the sensor; give it (--size WIDTHxHEIGHT, shape)", file=file)

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import lz4.frame
 import numpy as np
 import pytest
 import recordings
@@ -71,6 +72,16 @@ def test_an_evt2_file_called_evt3_is_told(tmp_path):
         read_all(lying)
 
 
+@pytest.mark.parametrize(("header", "dtype", "words"), [
+    ("% evt 3.0\n% geometry 9x9\n% end\n", "<u2", [0x8FF0, 0x6001, 0x0003, 0x2005, 0x8010, 0x2005]),
+    ("% evt 2.0\n% geometry 9x9\n% end\n", "<u4", [0x8FFFFFF0, 0x00000801, 0x80000010, 0x00000801]),
+])  # fmt: skip
+def test_time_that_goes_back_is_no_new_start(header, dtype, words, tmp_path):
+    """A counter that ends starts again near 0; from elsewhere, time goes back."""
+    with pytest.raises(SpecError, match=r"goes back in time \(TIME_HIGH from \d+ to 16\)"):
+        read_all(raw(tmp_path, words, dtype, header))
+
+
 @pytest.mark.parametrize(("content", "told"), [
     (b"", "of no known event format"),
     (b"II*\0 a TIFF file", "of no known event format"),
@@ -87,6 +98,20 @@ def test_foreign_files_are_told(content, told, tmp_path):
     path.write_bytes(content)
     with pytest.raises(SpecError, match=told):
         open_events(path)
+
+
+def test_aedat4_with_entities_or_impossible_coordinates(tmp_path, monkeypatch):
+    from hesim_render.exchange import aedat4
+
+    path = written(made((1, 3, 4, 1)), "aedat4", tmp_path)
+    packet = lz4.frame.decompress(path.read_bytes()[aedat4.read_header(path)[3] + 8 :])
+    assert packet[-6:-4] == b"\4\0"  # y, before the polarity and its padding
+    monkeypatch.setattr(aedat4, "_packet", lambda events: packet[:-6] + b"\xff\xff" + packet[-4:])
+    with pytest.raises(SpecError, match=r"event 0 \(x 3, y 65535\) is outside of 1280x720 px"):
+        read_all(written(made((1, 3, 4, 1)), "aedat4", tmp_path))
+    monkeypatch.setattr(aedat4, "_INFO", '<!DOCTYPE dv [<!ENTITY a "aaaa">]>' + aedat4._INFO)
+    with pytest.raises(SpecError, match="declares a document type or entities"):
+        open_events(written(made((1, 3, 4, 1)), "aedat4", tmp_path))
 
 
 def test_no_file_and_no_such_format(tmp_path):
