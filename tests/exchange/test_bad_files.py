@@ -114,6 +114,18 @@ def test_aedat4_with_entities_or_impossible_coordinates(tmp_path, monkeypatch):
         open_events(written(made((1, 3, 4, 1)), "aedat4", tmp_path))
 
 
+@pytest.mark.parametrize(("name", "missing", "told"), [
+    ("evt2", 2, "ends within a word of 32 bits; the file is cut short"),
+    ("evt3", 1, "ends within a word of 16 bits; the file is cut short"),
+    ("aedat4", 1000, "ends before its table of packets; the file is cut short"),
+])  # fmt: skip
+def test_files_cut_short_are_told(name, missing, told, tmp_path):
+    path = written(many(3000, 1 << 20), name, tmp_path)
+    path.write_bytes(path.read_bytes()[:-missing])
+    with pytest.raises(SpecError, match=told):
+        read_all(path)
+
+
 def test_no_file_and_no_such_format(tmp_path):
     with pytest.raises(SpecError, match=r"missing.*No such file"):
         open_events(tmp_path / "missing.raw")
