@@ -1,4 +1,4 @@
-"""Looking at recordings: ``isp``, ``view`` and ``export``."""
+"""Looking at recordings: ``isp`` and ``view``."""
 
 from __future__ import annotations
 
@@ -37,31 +37,6 @@ def isp(
     noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
     if noise is not None and noise["maps"] == "unknown":
         say("the maps of the sensor's calibration are not in a recording: --calibration FILE takes them out")
-
-
-def export(
-    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
-    format_: Annotated[str, typer.Option("--format", help="exr, dsec-flow, tum or kalibr")],
-    out: Annotated[Path, typer.Option(help="folder to write")],
-    every_us: Annotated[
-        int | None, typer.Option(help="interval of flow (default 100000) or of poses (default 1000), µs")
-    ] = None,
-    scene: Annotated[
-        str | None, typer.Option(help="the scene file, if it needs files that the recording does not hold")
-    ] = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Write the geometric truth of a recording in a format that others read."""
-    from hesim_render.recording.recording import Recording
-    from hesim_render.recording.truth_export import export_truth
-
-    loaded = Recording.load(recording)
-    if scene is not None:
-        from hesim_render.sources.scene import load_scene
-
-        loaded.truth = loaded.truth_with(load_scene(scene))
-    folder = export_truth(loaded, format_, out, every_us=every_us, overwrite=overwrite)
-    say(f"{format_} in {folder}")
 
 
 def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:

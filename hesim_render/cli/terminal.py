@@ -41,6 +41,14 @@ def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
     return width, height, x, y
 
 
+def parse_size(text: str) -> tuple[int, int]:
+    """Rows and columns of ``1280x720``, which has the width first."""
+    match = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text)
+    if match is None:
+        raise RangeError("--size", text, "WIDTHxHEIGHT, such as 1280x720")
+    return int(match[2]), int(match[1])
+
+
 def parse_exposures(text: str) -> list[int]:
     """Exposures in µs of ``1,5,20``, in ms."""
     try:

@@ -33,10 +33,10 @@ class NpzWriter:
 
     Parameters
     ----------
-    path : file to write, replaced if it exists.
+    path : file to write, replaced if it exists; or an open file.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | IO[bytes]) -> None:
         self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True)
 
     def add(self, name: str, array: NDArray) -> None:
@@ -158,6 +158,22 @@ def stream_member(file: Path, member: str, count: int, shape: tuple[int, ...]) -
         for _ in range(count):
             _fill(stream, memoryview(buffer))
             yield np.frombuffer(buffer, dtype=dtype).reshape(shape)
+
+
+def stream_list(file: Path, member: str, size: int) -> Iterator[NDArray]:
+    """Pieces of at most `size` values of a one-dimensional member.
+
+    Raises
+    ------
+    SpecError
+        If the member cannot be read.
+    """
+    with reading(file, _WHAT), zipfile.ZipFile(file) as archive, archive.open(f"{member}.npy") as stream:
+        (total,), dtype = _in_c_order(stream, member, file)
+        for first in range(0, total, size):
+            buffer = bytearray(min(size, total - first) * dtype.itemsize)
+            _fill(stream, memoryview(buffer))
+            yield np.frombuffer(buffer, dtype=dtype)
 
 
 def read_header(stream: IO[bytes], name: str, file: Path) -> tuple[tuple[int, ...], bool, np.dtype]:

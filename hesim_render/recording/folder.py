@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.exchange.dsec import EventFileWriter
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import EventLabels
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.colour_view import thumbnail
 from hesim_render.recording.dng import write_dng
-from hesim_render.recording.event_file import EventFileWriter
 from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.label_file import write_labels
 

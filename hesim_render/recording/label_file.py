@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, reading, require_memory
+from hesim_render.core.hdf5 import COMPRESSION, Disk, dataset_of
+from hesim_render.exchange.dsec import EventFileWriter, read_events
 from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, Label, Lost
-from hesim_render.recording.event_file import EventFileWriter, read_events
-from hesim_render.recording.hdf5 import COMPRESSION, Disk, dataset_of
 
 LABEL_FILE, CLEAN_FILE = "truth/event_labels.h5", "truth/clean_events.h5"
 _COLUMNS = {"t_us": "i8", "x": "u2", "y": "u2", "polarity": "i1"}

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
 from hesim_render.core.npz import read_array, read_arrays
+from hesim_render.exchange.dsec import read_events
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.dng import read_dng
-from hesim_render.recording.event_file import read_events
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.label_file import LABEL_FILE, read_labels
@@ -269,6 +269,33 @@ class Recording:
         request = TruthRequest.of(self.manifest)
         if request.geometry:
             writer.write_in(TRUTH_FILE, lambda path: write_truth(path, self.truth, request))
+
+    def export(self, format: str, path: str | Path, overwrite: bool = False) -> Path:
+        """Write the events, the RAW frames or the geometric truth in the format of another program (docs/formats.md).
+
+        Parameters
+        ----------
+        format : of events ``evt2``, ``evt3``, ``aedat4``, ``dsec``, ``npz``, ``txt`` or ``nmnist``; of frames ``tiff``,
+            ``png``, ``npy`` or ``mipi``; of the truth ``exr``, ``dsec-flow``, ``tum`` or ``kalibr``.
+        path : file of the events, or folder of the frames or of the truth.
+        overwrite : replace an existing file, or an existing folder of exported frames.
+
+        Returns
+        -------
+        The file or folder, absolute.
+
+        Raises
+        ------
+        OutputError
+            If it exists (and `overwrite` is not set) or cannot be written; nothing is left then.
+        RangeError
+            If the format is unknown, or the recording has no such data.
+        SpecError
+            If the events do not fit into the format, or the recording is damaged.
+        """
+        from hesim_render.recording.exports import export
+
+        return export(self, format, path, overwrite)
 
     @classmethod
     def load(cls, path: str | Path) -> Recording:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.guard import MOST_BYTES, reading, require_memory
-from hesim_render.recording.hdf5 import COMPRESSION, Disk, dataset_of
+from hesim_render.core.hdf5 import COMPRESSION, Disk, dataset_of
 from hesim_render.recording.truth_kinds import EVENTS, truth_kinds
 
 if TYPE_CHECKING:

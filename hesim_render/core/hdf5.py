@@ -1,4 +1,4 @@
-"""HDF5 files of recordings: writing that survives a full disk, and data sets of untrusted files."""
+"""HDF5 files: writing that survives a full disk, and data sets of untrusted files."""
 
 from __future__ import annotations
 

@@ -1,0 +1,108 @@
+"""Files of other programs: ``export`` and ``import``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hesim_render.cli.options import SENSOR_HELP, Overwrite, Region, check_output, cropped, names_of
+from hesim_render.cli.terminal import parse_size, say, summary
+from hesim_render.core.errors import ConflictError
+
+_EXPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "txt", "nmnist", "tiff", "png", "npy", "mipi")
+_GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr")
+_FRAMES = (".dng", ".tif", ".tiff", ".png", ".npy")
+_IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz")
+
+
+def _complete_export(incomplete: str) -> list[str]:
+    return [name for name in (*_EXPORTS, *_GEOMETRY) if name.startswith(incomplete)]
+
+
+def _complete_import(incomplete: str) -> list[str]:
+    return [name for name in _IMPORTS if name.startswith(incomplete)]
+
+
+def export(
+    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
+    format: Annotated[
+        str,
+        typer.Option(help=f"events: {', '.join(_EXPORTS[:7])}; frames: {', '.join(_EXPORTS[7:])}; "
+                     f"geometric truth: {', '.join(_GEOMETRY)}", autocompletion=_complete_export),
+    ],
+    out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],
+    every_us: Annotated[
+        int | None, typer.Option(help="interval of flow (default 100000) or of poses (default 1000), µs")
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="for truth, the scene file, if it needs files that the recording does not hold")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:  # fmt: skip
+    """Write the events, the RAW frames or the geometric truth of a recording in the format of another program."""
+    from hesim_render.recording.recording import Recording
+
+    loaded = Recording.load(recording)
+    if format in _GEOMETRY:
+        from hesim_render.recording.truth_export import export_truth
+
+        if scene is not None:
+            from hesim_render.sources.scene import load_scene
+
+            loaded.truth = loaded.truth_with(load_scene(scene))
+        say(f"{format} in {export_truth(loaded, format, out, every_us=every_us, overwrite=overwrite)}")
+        return
+    for name, value in (("--every-us", every_us), ("--scene", scene)):
+        if value is not None:
+            raise ConflictError(name, value, f"only formats of geometric truth take it: {', '.join(_GEOMETRY)}")
+    written = loaded.export(format, out, overwrite)
+    counts = loaded.manifest["counts"]
+    what = f"{counts['frames']} frames" if written.is_dir() else f"{counts['events']} events"
+    say(f"{what} in {written}")
+
+
+def import_(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="an event file (EVT2, EVT3 RAW, AEDAT4, DSEC HDF5, .npz); with --sensor also frames",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
+    format: Annotated[
+        str | None,
+        typer.Option(help=f"{', '.join(_IMPORTS)}; default: what the file says", autocompletion=_complete_import),
+    ] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, where the file does not say it")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(help=f"make a recording of this sensor: {SENSOR_HELP}", autocompletion=names_of("sensors")),
+    ] = None,
+    roi: Region = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the events of another program in the layout of events.h5, or a capture of a real sensor as a recording."""
+    if sensor is None:
+        from hesim_render.recording.exports import import_events
+
+        if len(sources) > 1 or roi is not None:
+            raise ConflictError("FILE", len(sources), "more than one file, or --roi, needs --sensor")
+        shape = None if size is None else parse_size(size)
+        say(f"events in {import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)}")
+        return
+    if size is not None or format is not None:
+        raise ConflictError("--sensor", sensor, "give --sensor or --size and --format, not both")
+    frames = [file for file in sources if file.suffix.lower() in _FRAMES]
+    events = [file for file in sources if file not in frames]
+    if len(events) > 1:
+        raise ConflictError("FILE", str(events[1]), f"{events[1]} is a second event file; one is taken")
+    check_output(out, overwrite)
+    import hesim_render as hr
+    from hesim_render.recording.imports import import_recording
+
+    loaded = cropped(hr.load_sensor(sensor), roi)
+    made = import_recording(out, loaded, events=events[0] if events else None, frames=frames, overwrite=overwrite)
+    say(summary(made))

@@ -1,0 +1,193 @@
+"""Events in HDF5, in the layout of the DSEC data set [gehrig2021], Blosc LZ4.
+
+``events/t`` uint32 µs after ``t_offset``, ``events/x``, ``events/y`` uint16, ``events/p`` uint8 (1 ON,
+0 OFF); ``ms_to_idx[k]`` is the index of the first event at or after k ms, ``t_offset`` int64 µs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import reading, require_memory
+from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of
+from hesim_render.exchange.dsec_writer import COLUMNS, LONGEST_US, EventFileWriter, write
+from hesim_render.exchange.stream import BLOCK
+from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
+
+__all__ = ["EventFileWriter", "read_events", "read_shape", "stream_events", "write"]
+
+_LATEST_US = 2**53  # 285 years
+_BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event, and its columns while they are read
+
+
+def read_events(
+    path: Path,
+    begin_us: int | None = None,
+    end_us: int | None = None,
+    *,
+    shape: tuple[int, int] | None = None,
+    count: int | None = None,
+) -> NDArray:
+    """Events with begin_us <= t_us < end_us (default: all); only that part of the file is read.
+
+    Parameters
+    ----------
+    path : the file.
+    begin_us, end_us : the interval, µs.
+    shape : rows and columns of the event grid, which must contain all coordinates.
+    count : number of events that the file must hold.
+
+    Returns
+    -------
+    Structured array [event] of `EVENT_DTYPE`, in order of time.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, links to other files, or its parts do not fit each other.
+    """
+    with reading(path, "as events"), h5py.File(path, "r") as file:
+        columns, total = _columns(file, path, count)
+        offset = _offset(file, path)
+        first, last = _range(_index(file, total, path), offset, total, begin_us, end_us)
+        require_memory((last - first) * _BYTES_IN_ALL, f"{last - first} events", path)
+        if last <= first:
+            return no_events()
+        _check_index(columns["t"], first, last, offset, begin_us, end_us, path)
+        events = _block(columns, first, last, shape, path)
+    if np.any(events["t_us"][1:] < events["t_us"][:-1]):
+        raise SpecError("events/t goes back in time", file=path)
+    events["t_us"] += offset
+    low = 0 if begin_us is None else int(np.searchsorted(events["t_us"], begin_us, side="left"))
+    high = events.size if end_us is None else int(np.searchsorted(events["t_us"], end_us, side="left"))
+    return events[low:high]
+
+
+def stream_events(path: Path, count: int | None = None) -> Iterator[NDArray]:
+    """All events in blocks, whose order and coordinates are not checked; `count` as for `read_events`.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, links to other files, or its parts do not fit each other.
+    """
+    with reading(path, "as events"), h5py.File(path, "r") as file:
+        columns, total = _columns(file, path, count)
+        offset = _offset(file, path)
+        for first in range(0, total, BLOCK):
+            events = _block(columns, first, min(first + BLOCK, total), None, path)
+            events["t_us"] += offset
+            yield events
+
+
+def read_shape(path: Path) -> tuple[int, int] | None:
+    """Rows and columns of the event grid, px; None if the file does not state them, as those of DSEC.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, or states an impossible size.
+    """
+    with reading(path, "as events"), h5py.File(path, "r") as file:
+        if not {"height", "width"} <= set(file.attrs):
+            return None
+        rows, cols = (int(file.attrs[name]) for name in ("height", "width"))
+    if not (0 <= rows <= 1 << 16 and 0 <= cols <= 1 << 16):
+        raise SpecError(f"has the size {cols}x{rows}; expected at most 65536x65536 px", file=path)
+    return rows, cols
+
+
+def _columns(file: Any, path: Path, count: int | None) -> tuple[dict[str, Any], int]:
+    """The data sets of the events, and the number of events."""
+    columns = {name: _column(file, f"events/{name}", path, kind) for name, kind in COLUMNS.items()}
+    sizes = {name: column.shape[0] for name, column in columns.items()}
+    if len(set(sizes.values())) > 1:
+        told = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise SpecError(f"the columns of events are of different lengths ({told})", file=path)
+    total = sizes["t"]
+    if count is not None and count != total:
+        raise SpecError(f"holds {total} events; the recording has {count}", file=path)
+    return columns, total
+
+
+def _block(columns: Any, first: int, last: int, shape: tuple[int, int] | None, path: Path) -> NDArray:
+    """Events first to last (not included), with times relative to ``t_offset``."""
+    events = np.empty(last - first, dtype=EVENT_DTYPE)
+    events["t_us"] = columns["t"][first:last]
+    for name in ("x", "y"):
+        values = columns[name][first:last]
+        if shape is not None and values.max() >= shape[name == "x"]:
+            raise SpecError(f"events/{name} holds {values.max()}, outside the event grid", file=path)
+        events[name] = values
+    polarity = columns["p"][first:last]
+    if polarity.max() > 1:
+        raise SpecError(f"events/p holds {polarity.max()}; expected 0 and 1", file=path)
+    events["polarity"] = polarity.astype(np.int8) * 2 - 1
+    return events
+
+
+def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
+    """A one-dimensional data set whose values are all stored, without fill values."""
+    found = dataset_of(file, name, path)
+    if found.dtype.kind != "u" or found.dtype.itemsize > np.dtype(kind).itemsize:
+        raise SpecError(f"{name} holds {found.dtype.name}; expected {np.dtype(kind).name}", file=path)
+    if found.ndim != 1:
+        raise SpecError(f"{name} has shape {found.shape}; expected one dimension", file=path)
+    size, item = found.shape[0], found.dtype.itemsize
+    if found.chunks is None:
+        stored = found.id.get_storage_size() >= size * item
+    else:
+        require_memory(found.chunks[0] * item, f"a chunk of {name}", path, LARGEST_CHUNK_BYTES)
+        stored = found.id.get_num_chunks() >= -(-size // found.chunks[0])
+    if not stored:
+        raise SpecError(f"{name} holds fewer values than the {size} it says", file=path)
+    return found
+
+
+def _offset(file: Any, path: Path) -> int:
+    found = dataset_of(file, "t_offset", path)
+    offset = int(found[()]) if found.shape == () else -1
+    if not 0 <= offset <= _LATEST_US:
+        raise SpecError(f"t_offset must be one whole number of µs from 0 to {_LATEST_US}", file=path)
+    return offset
+
+
+def _index(file: Any, total: int, path: Path) -> NDArray[np.int64]:
+    """``ms_to_idx``: starts at 0, ends at the number of events, and never decreases."""
+    found = _column(file, "ms_to_idx", path)
+    if not 0 < found.shape[0] <= LONGEST_US // 1000 + 3:
+        raise SpecError(f"ms_to_idx holds {found.shape[0]} values; expected one for each ms", file=path)
+    index = found[:]
+    if np.any(index[1:] < index[:-1]) or index[-1] > total:
+        raise SpecError(f"ms_to_idx must run from 0 to the number of events, {total}, without going back", file=path)
+    return index.astype(np.int64)
+
+
+def _range(
+    index: NDArray[np.int64], offset: int, count: int, begin_us: int | None, end_us: int | None
+) -> tuple[int, int]:
+    """Indices of the events in the wanted whole milliseconds."""
+    last_ms = index.size - 1
+    first, last = 0, count
+    if begin_us is not None:
+        first = int(index[min(max(0, (begin_us - offset) // 1000), last_ms)])
+    if end_us is not None and (end_us - offset) // 1000 + 1 <= last_ms:
+        last = int(index[max(0, (end_us - offset) // 1000 + 1)])
+    return first, last
+
+
+def _check_index(
+    times: Any, first: int, last: int, offset: int, begin_us: int | None, end_us: int | None, path: Path
+) -> None:
+    """Check that the events just outside the indexed range lie outside the wanted time."""
+    early = begin_us is not None and first > 0 and int(times[first - 1]) + offset >= begin_us
+    late = end_us is not None and last < times.shape[0] and int(times[last]) + offset < end_us
+    if early or late:
+        raise SpecError("ms_to_idx does not fit the times of the events", file=path)

@@ -1,0 +1,138 @@
+"""Prophesee EVT2: words of 32 bits, little endian.
+
+An event: type 0 (OFF) or 1 (ON) in bits 31 to 28, time 27 to 22, x 21 to 11, y 10 to 0. TIME_HIGH (type 8) has the time
+above its lowest 6 bits in 28 bits, which start again after 2³⁴ µs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.exchange import raw_file
+from hesim_render.exchange.stream import EventStream
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+
+_LOW_BITS = 6
+_HIGH_BITS = 28
+_LAST_HIGH = (1 << _HIGH_BITS) - 1
+_OFF, _ON, _TIME_HIGH = 0x0, 0x1, 0x8
+#: With TIME_HIGH of 10 steps before its end and after its begin: so far a decrease is a new start.
+_NEAR_THE_END = 10
+_KNOWN = np.isin(np.arange(16), (_OFF, _ON, _TIME_HIGH, 0xA, 0xE, 0xF))  # trigger, other, continued
+
+
+def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
+    """Write events as an EVT2 RAW file.
+
+    Parameters
+    ----------
+    stream : the events.
+    file : where to write.
+    target : name of the file, for errors.
+
+    Raises
+    ------
+    SpecError
+        If the sensor has more than 2048 rows or columns.
+    """
+    raw_file.write_header(file, "EVT2", stream.shape, target)
+    high = np.int64(-1)
+    for events in stream:
+        file.write(_encoded(events, int(high)).data)
+        high = events["t_us"][-1] >> _LOW_BITS
+
+
+def _encoded(events: NDArray, high_before: int) -> NDArray[np.uint32]:
+    """Words of events; `high_before` is the TIME_HIGH (without its end at 28 bits) already written, -1 for none."""
+    high = events["t_us"] >> _LOW_BITS
+    step = np.diff(high, prepend=high_before)
+    added = (step > 0).astype(np.int64)
+    # all ones and then 0 tell a reader that TIME_HIGH starts again
+    starts = np.diff(high >> _HIGH_BITS, prepend=max(high_before, 0) >> _HIGH_BITS)
+    added += 2 * starts
+    place = np.arange(high.size) + np.cumsum(added)
+    words = np.empty(high.size + int(added.sum()), dtype="<u4")
+    for k in np.flatnonzero(starts):
+        words[place[k] - added[k] : place[k]] = np.resize(
+            np.array([_LAST_HIGH, 0], dtype=np.uint32) | np.uint32(_TIME_HIGH << _HIGH_BITS), added[k]
+        )
+    new = added > 0
+    words[place[new] - 1] = (high[new] & _LAST_HIGH) | (_TIME_HIGH << _HIGH_BITS)
+    word = (events["t_us"] & ((1 << _LOW_BITS) - 1)).astype(np.uint32) << np.uint32(22)
+    word |= (events["polarity"] > 0).astype(np.uint32) << np.uint32(28)
+    word |= events["x"].astype(np.uint32) << np.uint32(11)
+    word |= events["y"]
+    words[place] = word
+    return words
+
+
+def read(path: Path, begin: int) -> Iterator[NDArray]:
+    """Blocks of events of a RAW file, from byte `begin`, without those before the first TIME_HIGH (no time).
+
+    Raises
+    ------
+    SpecError
+        If the file ends within a word, or holds words that EVT2 does not have.
+    """
+    high, loops = -1, 0
+    for piece in raw_file.words(path, begin, "<u4"):
+        kind = (piece >> np.uint32(28)).astype(np.uint8)
+        raw_file.require_types(kind, _KNOWN, "EVT2", path)
+        if high < 0:
+            first = np.flatnonzero(kind == _TIME_HIGH)
+            if first.size == 0:
+                continue
+            piece, kind = piece[first[0] :], kind[first[0] :]
+            high = int(piece[0]) & _LAST_HIGH
+        piece = np.concatenate([np.array([high | _TIME_HIGH << _HIGH_BITS], dtype=np.uint32), piece])
+        kind = np.concatenate([np.array([_TIME_HIGH], dtype=np.uint8), kind])
+        is_high = kind == _TIME_HIGH
+        highs = (piece[is_high] & np.uint32(_LAST_HIGH)).astype(np.int64)
+        times, loops = unwrapped(highs, loops, _LAST_HIGH + 1, _NEAR_THE_END, path)
+        high = int(highs[-1])
+        is_event = kind <= _ON
+        word = piece[is_event]
+        events = np.empty(word.size, dtype=EVENT_DTYPE)
+        number = np.cumsum(is_high)[is_event] - 1
+        events["t_us"] = (times[number] << _LOW_BITS) | (word >> np.uint32(22) & np.uint32(63))
+        events["x"] = word >> np.uint32(11) & np.uint32(0x7FF)
+        events["y"] = word & np.uint32(0x7FF)
+        events["polarity"] = np.where(kind[is_event] == _ON, 1, -1)
+        yield events
+
+
+def unwrapped(
+    values: NDArray[np.int64], loops: int, period: int, near: int, path: Path
+) -> tuple[NDArray[np.int64], int]:
+    """Values of a counter that starts again at `period`, continued; and how often it has started again by the end.
+
+    Parameters
+    ----------
+    values : [word], the counter.
+    loops : how often it had started again before.
+    period : number of values of the counter.
+    near : a decrease from within `near` of its end to within `near` of 0 is a new start; another one is an error.
+    path : file, for the error.
+
+    Raises
+    ------
+    SpecError
+        If the counter goes back without a new start.
+    """
+    back = values[1:] < values[:-1]
+    wrong = back & (values[:-1] - values[1:] < period - 2 * near)
+    if wrong.any():
+        k = int(wrong.argmax())
+        raise SpecError(
+            f"goes back in time (TIME_HIGH from {values[k]} to {values[k + 1]}); the file is damaged, of another "
+            "format, or its events are out of order",
+            file=path,
+        )
+    starts = loops + np.concatenate([[0], np.cumsum(back)])
+    return values + starts * period, int(starts[-1])

@@ -1,0 +1,127 @@
+"""The formats by name, and the opening of event files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
+
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.guard import reading
+from hesim_render.exchange import aedat4, dsec, e2vid, evt2, evt3, frame_files, nmnist, raw_file
+from hesim_render.exchange.stream import EventStream
+
+
+@dataclass(frozen=True)
+class EventFormat:
+    """Suffix of a format's files; the function that writes one, of a stream, an open file, and its name for errors."""
+
+    suffix: str
+    write: Callable[[EventStream, IO[bytes], str | Path], None]
+
+
+@dataclass(frozen=True)
+class FrameFormat:
+    """Suffix of a format's files, and the function that writes one: of its path and a frame [row, col], DN."""
+
+    suffix: str
+    write: Callable[[Path, NDArray[Any]], None]
+
+
+EVENT_FORMATS = {
+    "evt2": EventFormat(".raw", evt2.write),
+    "evt3": EventFormat(".raw", evt3.write),
+    "aedat4": EventFormat(".aedat4", aedat4.write),
+    "dsec": EventFormat(".h5", dsec.write),
+    "npz": EventFormat(".npz", e2vid.write_arrays),
+    "txt": EventFormat(".txt", e2vid.write_text),
+    "nmnist": EventFormat(".bin", nmnist.write),
+}
+FRAME_FORMATS = {
+    "tiff": FrameFormat(".tiff", frame_files.write_tiff),
+    "png": FrameFormat(".png", frame_files.write_png),
+    "npy": FrameFormat(".npy", frame_files.write_npy),
+    "mipi": FrameFormat(".bin", frame_files.write_mipi),
+}
+#: Formats that can be read, by the first bytes of their files.
+_BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz"}
+READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
+
+
+def open_events(
+    path: str | Path, format: str | None = None, shape: tuple[int, int] | None = None, *, keep_stated: bool = False
+) -> EventStream:
+    """Open an event file of any known format; the events are read when the stream is used.
+
+    Parameters
+    ----------
+    path : the file: EVT2 or EVT3 RAW, AEDAT4, HDF5 in the layout of DSEC, or ``.npz`` with t, x, y and p.
+    format : ``evt2``, ``evt3``, ``aedat4``, ``dsec`` or ``npz``; default: what the begin of the file says.
+    shape : rows and columns of the event grid, px; needed if the file does not state them.
+    keep_stated : let the shape that the file states, if it does, come before `shape`.
+
+    Returns
+    -------
+    The stream.
+
+    Raises
+    ------
+    RangeError
+        If `format` cannot be read.
+    SpecError
+        If the file is not of the format, is damaged, or has no size and `shape` is not given.
+    """
+    file = Path(path).expanduser()
+    if format is not None and format not in READABLE:
+        raise RangeError("format", format, f"one of {', '.join(READABLE)}")
+    found = _detect(file)
+    if format is not None and found != format:
+        told = f"which is {found}" if found else "which has another begin"
+        raise SpecError(f"was to be read as {format}, {told}", file=file)
+    if found is None:
+        raise SpecError(f"is of no known event format; expected one of {', '.join(READABLE)}", file=file)
+    stream = _OPENERS[found](file)
+    if shape is not None and not (keep_stated and stream.shape != (0, 0)):
+        return replace(stream, shape=shape)
+    if stream.shape == (0, 0):
+        raise SpecError("does not state the size of the sensor; give it (--size WIDTHxHEIGHT, shape)", file=file)
+    return stream
+
+
+def _detect(file: Path) -> str | None:
+    with reading(file), file.open("rb") as opened:
+        begin = opened.read(16)
+    found = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
+    return raw_file.read_header(file)[0].lower() if found == "raw" else found
+
+
+def _open_raw(file: Path) -> EventStream:
+    name, shape, begin = raw_file.read_header(file)
+    read = {"EVT2": evt2.read, "EVT3": evt3.read}[name]
+    return EventStream(lambda: read(file, begin), shape or (0, 0), file)
+
+
+def _open_aedat4(file: Path) -> EventStream:
+    shape, *where = aedat4.read_header(file)
+    return EventStream(lambda: aedat4.read(file, *where), shape, file)
+
+
+def _open_dsec(file: Path) -> EventStream:
+    return EventStream(lambda: dsec.stream_events(file), dsec.read_shape(file) or (0, 0), file)
+
+
+def _open_npz(file: Path) -> EventStream:
+    shape, names = e2vid.read_arrays_header(file)
+    return EventStream(lambda: e2vid.read_arrays(file, names), shape or (0, 0), file)
+
+
+_OPENERS: dict[str, Callable[[Path], EventStream]] = {
+    "evt2": _open_raw,
+    "evt3": _open_raw,
+    "aedat4": _open_aedat4,
+    "dsec": _open_dsec,
+    "npz": _open_npz,
+}

@@ -1,0 +1,46 @@
+"""N-MNIST ``.bin``: five bytes for an event.
+
+x; y; polarity in bit 7 and the upper 7 bits of the time; the middle and the lower 8 bits of the time, in µs.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from hesim_render.core.errors import SpecError
+from hesim_render.exchange.stream import EventStream
+
+_LARGEST_SIDE = 1 << 8
+_TIME_BITS = 23
+
+
+def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
+    """Write events as an N-MNIST file.
+
+    Parameters
+    ----------
+    stream : the events.
+    file : where to write.
+    target : name of the file, for errors.
+
+    Raises
+    ------
+    SpecError
+        If the sensor has more than 256 rows or columns, or an event lies at 2²³ µs (8.4 s) or later.
+    """
+    rows, cols = stream.shape
+    if max(rows, cols) > _LARGEST_SIDE:
+        raise SpecError(f"N-MNIST addresses at most 256 rows and columns, not {cols}x{rows} px", file=target)
+    for events in stream:
+        last_us = int(events["t_us"][-1])
+        if last_us >> _TIME_BITS:
+            raise SpecError(f"N-MNIST ends at {1 << _TIME_BITS} µs; an event is at {last_us} µs", file=stream.source)
+        made = np.empty((events.size, 5), dtype=np.uint8)
+        made[:, 0], made[:, 1] = events["x"], events["y"]
+        made[:, 2] = (events["polarity"] > 0).astype(np.uint8) << np.uint8(7) | (events["t_us"] >> 16).astype(np.uint8)
+        made[:, 3] = events["t_us"] >> 8 & 0xFF
+        made[:, 4] = events["t_us"] & 0xFF
+        file.write(made.data)

@@ -1,0 +1,140 @@
+"""Header and words of Prophesee RAW files (EVT2, EVT3).
+
+Lines ``% key value`` state format and size of the sensor; ``% end`` closes them. Some programs leave ``% end`` out, so
+the header also ends before the first line that does not begin with ``% ``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import printable, reading
+
+#: Coordinates have 11 bits in EVT2 and EVT3.
+LARGEST_SIDE = 1 << 11
+_LONGEST_LINE = 1000
+_MOST_LINES = 1000
+#: Formats by the version number of the header.
+_VERSIONS = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
+#: Words of one piece.
+_PIECE = 1 << 18
+
+
+def write_header(file: IO[bytes], name: str, shape: tuple[int, int], target: str | Path) -> None:
+    """Write the header of a format, ``EVT2`` or ``EVT3``.
+
+    Parameters
+    ----------
+    file : the file.
+    name : the format.
+    shape : rows and columns of the sensor, px.
+    target : name of the file, for the error.
+
+    Raises
+    ------
+    SpecError
+        If the sensor has more rows or columns than the format can address.
+    """
+    rows, cols = shape
+    if max(shape) > LARGEST_SIDE:
+        raise SpecError(f"{name} addresses at most {LARGEST_SIDE} rows and columns, not {cols}x{rows} px", file=target)
+    version = next(number for number, known in _VERSIONS.items() if known == name)
+    lines = [
+        "camera_integrator_name hesim_render",
+        f"evt {version}",
+        f"format {name};height={rows};width={cols}",
+        f"geometry {cols}x{rows}",
+        "integrator_name hesim_render",
+        "plugin_name hal_plugin_prophesee",
+        "end",
+    ]
+    file.write("".join(f"% {line}\n" for line in lines).encode("ascii"))
+
+
+def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
+    """Format (``EVT2``, ``EVT3``), shape (rows, columns; None if the header has none), and first byte of the words.
+
+    Raises
+    ------
+    SpecError
+        If the file has no such header, or states a format that cannot be read.
+    """
+    keys: dict[str, str] = {}
+    with reading(path, "as a Prophesee RAW file"), path.open("rb") as file:
+        begin = 0
+        for _ in range(_MOST_LINES):
+            line = file.readline(_LONGEST_LINE)
+            if not line.startswith(b"% ") or not line.endswith(b"\n") or not line.isascii():
+                break
+            begin = file.tell()
+            key, _, value = line[2:].decode("ascii").strip().partition(" ")
+            if key == "end":
+                break
+            keys[key] = value
+    if not keys:
+        raise SpecError("is not a Prophesee RAW file (no header of lines with %)", file=path)
+    stated, *details = keys.get("format", "").split(";")
+    name = stated or _VERSIONS.get(keys.get("evt", ""), keys.get("evt", ""))
+    if name not in ("EVT2", "EVT3"):
+        raise SpecError(f"has the format {printable(name)!r}; expected EVT2 or EVT3", file=path)
+    return name, _shape(keys, details, path), begin
+
+
+def _shape(keys: dict[str, str], details: list[str], path: Path) -> tuple[int, int] | None:
+    found = dict(detail.partition("=")[::2] for detail in details)
+    size = re.fullmatch(r"(\d{1,5})x(\d{1,5})", keys.get("geometry", ""))
+    width, height = size.groups() if size else (found.get("width", ""), found.get("height", ""))
+    if not (width or height):
+        return None
+    if not (width.isdecimal() and height.isdecimal() and 0 < int(width) <= LARGEST_SIDE >= int(height) > 0):
+        told = printable(f"{width}x{height}")
+        raise SpecError(f"has the size {told}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
+    return int(height), int(width)
+
+
+def words(path: Path, begin: int, dtype: DTypeLike) -> Iterator[NDArray]:
+    """Words of a file from byte `begin`, in pieces.
+
+    Raises
+    ------
+    SpecError
+        If the file ends within a word.
+    """
+    size = np.dtype(dtype).itemsize
+    with reading(path), path.open("rb") as file:
+        file.seek(begin)
+        while data := file.read(_PIECE * size):
+            if len(data) % size:
+                raise SpecError(f"ends within a word of {8 * size} bits; the file is cut short", file=path)
+            yield np.frombuffer(data, dtype=dtype)
+
+
+def require_types(types: NDArray[np.uint8], known: NDArray[np.bool_], name: str, path: Path) -> None:
+    """Raise an error for word types that a format does not have.
+
+    Parameters
+    ----------
+    types : [word], type of each word, 0 to 15.
+    known : [16], which types the format has.
+    name, path : format and file, for the error.
+    """
+    unknown = ~known[types]
+    if unknown.any():
+        found = int(types[unknown.argmax()])
+        raise SpecError(
+            f"holds a word of type {found:#x}, which {name} does not have; the file is damaged or of another format",
+            file=path,
+        )
+
+
+def latest(positions_of: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Index of the latest True at or before each element; the first element must be True."""
+    index = np.where(positions_of, np.arange(positions_of.size), 0)
+    return np.maximum.accumulate(index)

@@ -1,0 +1,126 @@
+"""Captures of real sensors as recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.guard import reading, require_memory
+from hesim_render.core.npz import read_array
+from hesim_render.exchange import EventStream, open_events
+from hesim_render.recording.dng import read_dng
+from hesim_render.recording.frame import Frame
+from hesim_render.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from hesim_render.recording.recording import Recording
+    from hesim_render.sensor.sensor import Sensor
+
+
+def import_recording(
+    path: str | Path,
+    sensor: Sensor,
+    *,
+    events: str | Path | None = None,
+    frames: Sequence[str | Path] = (),
+    overwrite: bool = False,
+) -> Recording:
+    """Write a capture as a recording, for the ISP and the viewers. Its truth is unknown: the maps of frames are NaN.
+
+    Parameters
+    ----------
+    path : folder to write.
+    sensor : the sensor file that describes the camera, cropped to the region that was read out.
+    events : event file of a format that `open_events` reads, with the event grid of the sensor.
+    frames : RAW frames in order of time, uint16 [row, col], DN: DNG and TIFF files (not compressed, the mosaic as first
+        image), PNG or NPY. Frame k begins at k / frame rate of the sensor file, and has the exposure of that file.
+    overwrite : replace an existing recording.
+
+    Returns
+    -------
+    The recording.
+
+    Raises
+    ------
+    OutputError
+        If `path` exists (and `overwrite` is not set) or cannot be written.
+    RangeError
+        If neither events nor frames are given, or frames of a sensor that has none.
+    SpecError
+        If a file is damaged, or does not fit the sensor.
+    """
+    aps, layout = sensor.spec.aps, sensor.layout
+    if events is None and not frames:
+        raise RangeError("frames", list(frames), "events, frames or both")
+    if frames and aps is None:
+        raise RangeError("frames", len(frames), f"none, because {sensor.spec.name} has no frame pixels")
+    stream = None if events is None else _events(events, sensor)
+    end_us = 0 if stream is None else stream.span_us()[1]
+    starts: list[int] = []
+    if aps is not None and frames:
+        starts = [round(k * 1e6 / aps.frame_rate_hz) for k in range(len(frames))]
+        end_us = max(end_us, starts[-1] + aps.exposure_us + round((layout.rows - 1) * aps.line_time_us))
+    settings = {"imported": {"events": _name(events), "frames": [_name(file) for file in frames]}}
+    with RecordingWriter(path, sensor, seed=0, duration_us=end_us, settings=settings, overwrite=overwrite) as writer:
+        valid = layout.aps_mask
+        unknown = np.full(layout.shape, np.nan, dtype=np.float32)
+        for index, (file, start_us) in enumerate(zip(frames, starts, strict=True)):
+            assert aps is not None
+            raw = _frame(Path(file).expanduser(), layout.shape, aps.bit_depth)
+            writer.add_frame(
+                Frame(
+                    raw=np.where(valid, raw, 0).astype(np.uint16), valid=valid, electrons_mean=unknown,
+                    electrons_stderr=unknown, t_us=start_us + aps.exposure_us, exposure_start_us=start_us,
+                    exposure_us=aps.exposure_us, line_time_us=aps.line_time_us, index=index,
+                )
+            )  # fmt: skip
+        for block in stream or ():
+            writer.add_events(block)
+        return writer.finish()
+
+
+def _name(file: str | Path | None) -> str | None:
+    return None if file is None else Path(file).name
+
+
+def _events(file: str | Path, sensor: Sensor) -> EventStream:
+    """The events of a file, whose grid, where it states one, must be that of the sensor."""
+    grid = sensor.layout.evs_shape
+    stream = open_events(file, shape=grid, keep_stated=True)
+    if stream.shape != grid:
+        (rows, cols), (wanted_rows, wanted_cols) = stream.shape, grid
+        told = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"
+        raise SpecError(told, file=file)
+    return stream
+
+
+def _frame(file: Path, shape: tuple[int, int], bit_depth: int) -> NDArray[np.uint16]:
+    """The DN of a frame, [row, col]."""
+    suffix = file.suffix.lower()
+    if suffix in (".dng", ".tif", ".tiff"):
+        raw = read_dng(file, shape)
+    elif suffix == ".png":
+        raw = _png(file, shape)
+    elif suffix == ".npy":
+        raw = read_array(file, shape, "u")
+    else:
+        raise SpecError("is no frame; expected .dng, .tif, .tiff, .png or .npy", file=file)
+    if raw.max() >= 1 << bit_depth:
+        raise SpecError(f"holds {raw.max()} DN; the sensor has {bit_depth} bit", file=file)
+    return raw
+
+
+def _png(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
+    from PIL import Image
+
+    with reading(file, "as a PNG file"), Image.open(file, formats=["PNG"]) as image:
+        if image.size != shape[::-1] or image.mode not in ("L", "I;16"):
+            told = f"is a {image.mode} picture of {image.size[0]}x{image.size[1]} px"
+            raise SpecError(f"{told}; expected a grey one of {shape[1]}x{shape[0]} px", file=file)
+        require_memory(2 * shape[0] * shape[1], "the picture", file)
+        return np.asarray(image).astype(np.uint16)

@@ -1,0 +1,254 @@
+"""Damaged and foreign event files, and outputs that exist: one clear line, and nothing is changed."""
+
+import os
+import subprocess
+import sys
+
+import lz4.frame
+import numpy as np
+import pytest
+import recordings
+from event_files import DATA, SHAPE, columns, made, many, raw, written
+
+import hesim_render as hr
+from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
+from hesim_render.exchange import EVENT_FORMATS, EventStream, open_events
+from hesim_render.recording.exports import import_events
+
+READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
+
+
+def read_all(path, *options):
+    return sum(block.size for block in open_events(path, *options))
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_a_file_cut_anywhere_is_one_error_or_fewer_events(name, tmp_path):
+    """RAW files have no end mark: cut between two words, one is a shorter file."""
+    path = written(many(3000, 1 << 20), name, tmp_path)
+    whole, cut = path.read_bytes(), tmp_path / "cut"
+    for size in np.random.default_rng(1).integers(0, len(whole), 25):
+        cut.write_bytes(whole[:size])
+        try:
+            found = read_all(cut)
+        except HesimError as error:
+            assert str(error).startswith(str(cut)) and "\n" not in str(error)
+        else:
+            assert name in ("evt2", "evt3") and found < 3000
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_damaged_bytes_never_raise_another_error(name, tmp_path):
+    path = written(many(500, 1 << 20), name, tmp_path)
+    whole, bad = np.frombuffer(path.read_bytes(), dtype=np.uint8), tmp_path / "bad"
+    rng = np.random.default_rng(2)
+    for _ in range(60):
+        changed = whole.copy()
+        # half of the changes in the first bytes, where the headers are
+        places = rng.integers(0, changed.size if rng.random() < 0.5 else min(1000, changed.size), rng.integers(1, 6))
+        changed[places] = rng.integers(0, 256, places.size)
+        bad.write_bytes(changed.tobytes())
+        try:
+            read_all(bad)
+        except HesimError as error:
+            assert "\n" not in str(error)
+
+
+def swapped(path, old, new):
+    path.write_bytes(path.read_bytes().replace(old, new))
+    return path
+
+
+def test_an_evt2_file_called_evt3_is_told(tmp_path):
+    path = written(many(3000, 1 << 20), "evt2", tmp_path)
+    with pytest.raises(SpecError, match="was to be read as evt3, which is evt2"):
+        open_events(path, "evt3")
+    lying = swapped(swapped(path, b"% evt 2.0", b"% evt 3.0"), b"EVT2", b"EVT3")
+    with pytest.raises(SpecError, match="which EVT3 does not have; the file is damaged or of another format"):
+        read_all(lying)
+    path = written(many(3000, 1 << 20), "evt3", tmp_path)
+    lying = swapped(swapped(path, b"% evt 3.0", b"% evt 2.0"), b"EVT3", b"EVT2")
+    with pytest.raises(SpecError, match="which EVT2 does not have; the file is damaged or of another format"):
+        read_all(lying)
+
+
+@pytest.mark.parametrize(("header", "dtype", "words"), [
+    ("% evt 3.0\n% geometry 9x9\n% end\n", "<u2", [0x8FF0, 0x6001, 0x0003, 0x2005, 0x8010, 0x2005]),
+    ("% evt 2.0\n% geometry 9x9\n% end\n", "<u4", [0x8FFFFFF0, 0x00000801, 0x80000010, 0x00000801]),
+])  # fmt: skip
+def test_time_that_goes_back_is_no_new_start(header, dtype, words, tmp_path):
+    """A counter that ends starts again near 0; from elsewhere, time goes back."""
+    with pytest.raises(SpecError, match=r"goes back in time \(TIME_HIGH from \d+ to 16\)"):
+        read_all(raw(tmp_path, words, dtype, header))
+
+
+@pytest.mark.parametrize(("content", "told"), [
+    (b"", "of no known event format"),
+    (b"II*\0 a TIFF file", "of no known event format"),
+    (b"% evt 2.1\n% end\n", "has the format 'EVT21'"),
+    (b"% evt 4\n", "has the format '4'"),
+    (b"% format EVT3;height=9999;width=10\n", "has the size 10x9999"),
+    (b"% geometry 0x20\n% evt 3.0\n% end\n", "has the size 0x20"),
+    (b"% evt 3.0\n% end\n", "does not state the size"),
+    (b"#!AER-DAT4.0\r\n", "cut short"),
+    (b"#!AER-DAT3.1\r\n", "not an AEDAT4 file"),
+])  # fmt: skip
+def test_foreign_files_are_told(content, told, tmp_path):
+    path = tmp_path / "foreign"
+    path.write_bytes(content)
+    with pytest.raises(SpecError, match=told):
+        open_events(path)
+
+
+def test_aedat4_with_entities_or_impossible_coordinates(tmp_path, monkeypatch):
+    from hesim_render.exchange import aedat4
+
+    path = written(made((1, 3, 4, 1)), "aedat4", tmp_path)
+    packet = lz4.frame.decompress(path.read_bytes()[aedat4.read_header(path)[3] + 8 :])
+    assert packet[-6:-4] == b"\4\0"  # y, before the polarity and its padding
+    monkeypatch.setattr(aedat4, "_packet", lambda events: packet[:-6] + b"\xff\xff" + packet[-4:])
+    with pytest.raises(SpecError, match=r"event 0 \(x 3, y 65535\) is outside of 1280x720 px"):
+        read_all(written(made((1, 3, 4, 1)), "aedat4", tmp_path))
+    monkeypatch.setattr(aedat4, "_INFO", '<!DOCTYPE dv [<!ENTITY a "aaaa">]>' + aedat4._INFO)
+    with pytest.raises(SpecError, match="declares a document type or entities"):
+        open_events(written(made((1, 3, 4, 1)), "aedat4", tmp_path))
+
+
+@pytest.mark.parametrize(("name", "missing", "told"), [
+    ("evt2", 2, "ends within a word of 32 bits; the file is cut short"),
+    ("evt3", 1, "ends within a word of 16 bits; the file is cut short"),
+    ("aedat4", 1000, "ends before its table of packets; the file is cut short"),
+])  # fmt: skip
+def test_files_cut_short_are_told(name, missing, told, tmp_path):
+    path = written(many(3000, 1 << 20), name, tmp_path)
+    path.write_bytes(path.read_bytes()[:-missing])
+    with pytest.raises(SpecError, match=told):
+        read_all(path)
+
+
+def test_no_file_and_no_such_format(tmp_path):
+    with pytest.raises(SpecError, match=r"missing.*No such file"):
+        open_events(tmp_path / "missing.raw")
+    with pytest.raises(RangeError, match="expected one of evt2"):
+        open_events(DATA / "dv.aedat4", "evt4")
+
+
+def test_headers_of_other_programs_are_read(tmp_path):
+    """Without ``% end``, without geometry, and with a size that the caller knows."""
+    words = [0x8000, 0x6001, 0x0003, 0x2805]
+    expected = made((1, 5, 3, 1))
+    for header in ("% evt 3.0\n% format EVT3;height=720;width=1280\n", "% geometry 1280x720\n% evt 3.0\n% date x y\n"):
+        path = raw(tmp_path, words, header=header)
+        opened = open_events(path)
+        assert opened.shape == SHAPE
+        np.testing.assert_array_equal(next(iter(opened)), expected)
+    path = raw(tmp_path, words, header="% evt 3.0\n")
+    assert read_all(path, None, (10, 10)) == 1
+    with pytest.raises(SpecError, match=r"event 0 \(x 5, y 3\) is outside of 5x10 px"):
+        read_all(path, None, (10, 5))
+
+
+@pytest.mark.parametrize("name", EVENT_FORMATS)
+def test_events_out_of_order_or_outside_are_not_written(name, tmp_path):
+    shape = (200, 200)
+    for events, told in (
+        (made((5, 0, 0, 1), (4, 0, 0, 1)), "event 1, at 4 µs, comes after one at 5 µs"),
+        (made((-1, 0, 0, 1)), "event 0, at -1 µs, lies before 0"),
+        (made((0, 0, 0, 1), (1, 200, 3, 1)), r"event 1 \(x 200, y 3\) is outside of 200x200 px"),
+        (made((0, 3, 200, 1)), r"event 0 \(x 3, y 200\) is outside of 200x200 px"),
+    ):
+        with pytest.raises(SpecError, match=told):
+            written(events, name, tmp_path, shape)
+    blocks = EventStream(lambda: [made((5, 0, 0, 1)), made(), made((4, 0, 0, 1))], shape)
+    with pytest.raises(SpecError, match="event 1, at 4 µs, comes after one at 5 µs"):
+        list(blocks)
+
+
+@pytest.mark.parametrize(("arrays", "told"), [
+    ({"t": [1], "x": [1], "y": [1]}, "holds no array 'polarity'"),
+    ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "four lists of one length"),
+    ({"t": [0.5], "x": [1], "y": [1], "p": [1]}, "t holds float64; expected whole numbers"),
+    ({"t": [1], "x": [-1], "y": [1], "p": [1]}, "x holds -1; expected 0 to 65535"),
+    ({"t": [1], "x": [1], "y": [70000], "p": [1]}, "y holds 70000"),
+    ({"t": [1], "x": [1], "y": [1], "p": [2]}, "p holds 2; expected -1 to 1"),
+])  # fmt: skip
+def test_arrays_that_are_no_events(arrays, told, tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, **{name: np.array(values) for name, values in arrays.items()})
+    with pytest.raises(SpecError, match=told):
+        read_all(path, None, SHAPE)
+
+
+def test_arrays_with_the_other_names_are_read(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, timestamp=[3, 4], x=[1, 2], y=[5, 6], polarity=[-1, 1])
+    np.testing.assert_array_equal(next(iter(open_events(path, shape=SHAPE))), columns([3, 4], [1, 2], [5, 6], [0, 1]))
+
+
+def test_nothing_is_overwritten_unless_asked(tmp_path):
+    recording = recordings.make("davis346", tmp_path / "r")
+    before = (tmp_path / "r" / "events.h5").read_bytes()
+    for name in ("evt3", "dsec"):
+        out = tmp_path / "out.file"
+        out.write_bytes(b"precious")
+        with pytest.raises(OutputError, match="exists; give another name, or overwrite it"):
+            recording.export(name, out)
+        assert out.read_bytes() == b"precious"
+        recording.export(name, out, overwrite=True)
+        assert read_all(out) == 20_000
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="is the file of the events itself"):
+            recording.export("dsec", tmp_path / "r" / "events.h5", overwrite)
+    assert (tmp_path / "r" / "events.h5").read_bytes() == before
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "mine").touch()
+    with pytest.raises(OutputError, match="is a folder"):
+        recording.export("evt2", tmp_path / "folder", overwrite=True)
+    with pytest.raises(OutputError, match="holds other things"):
+        recording.export("tiff", tmp_path / "folder", overwrite=True)
+    # an error on the way leaves the old file, and no other
+    with pytest.raises(SpecError, match="at most 4294967295"):
+        source = written(made((0, 0, 0, 1), (1 << 33, 0, 0, 1)), "evt2", tmp_path)
+        import_events(source, out, overwrite=True)
+    assert read_all(out) == 20_000
+    assert sorted(os.listdir(tmp_path)) == ["events.raw", "folder", "out.file", "r"]
+
+
+def test_what_a_recording_does_not_have(tmp_path):
+    with pytest.raises(RangeError, match="there are no events"):
+        recordings.make("reference-bayer").export("evt3", tmp_path / "e.raw")
+    with pytest.raises(RangeError, match="there are no frames"):
+        recordings.make("davis346", frames=0).export("png", tmp_path / "e")
+    with pytest.raises(RangeError, match=r"did you mean 'tiff'"):
+        recordings.make("davis346").export("tif", tmp_path / "e")
+    assert not os.listdir(tmp_path)
+
+
+def command(*words):
+    program = "import sys; from hesim_render.cli import main; main(sys.argv[1:])"
+    done = subprocess.run([sys.executable, "-c", program, *map(str, words)], capture_output=True, text=True)
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_the_commands(tmp_path):
+    recording = recordings.make("davis346", tmp_path / "r")
+    status, told, _ = command("export", tmp_path / "r", "--format", "evt3", "--out", tmp_path / "e.raw")
+    assert (status, told) == (0, f"20000 events in {tmp_path / 'e.raw'}\n")
+    status, told, _ = command("import", tmp_path / "e.raw", "--out", tmp_path / "e.h5")
+    assert (status, told) == (0, f"events in {tmp_path / 'e.h5'}\n")
+    np.testing.assert_array_equal(np.concatenate(list(open_events(tmp_path / "e.h5"))), recording.events)
+    status, told, error = command("import", tmp_path / "e.raw", "--format", "evt2", "--out", tmp_path / "f.h5")
+    assert (status, told) == (2, "") and error.count("\n") == 1 and "which is evt3" in error
+    status, _, error = command("import", tmp_path / "e.raw", "--size", "12", "--out", tmp_path / "f.h5")
+    assert status == 2 and "expected WIDTHxHEIGHT, such as 1280x720" in error
+    assert not (tmp_path / "f.h5").exists()
+
+
+def test_the_commands_offer_the_formats_that_exist():
+    from hesim_render.cli import exchange
+    from hesim_render.exchange import FRAME_FORMATS, formats
+
+    assert (*EVENT_FORMATS, *FRAME_FORMATS) == exchange._EXPORTS
+    assert exchange._IMPORTS == formats.READABLE == tuple(formats._OPENERS)
+    for name in exchange._EXPORTS:
+        assert f"``{name}``" in hr.Recording.export.__doc__
