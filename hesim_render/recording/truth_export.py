@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,15 @@ from scipy.spatial.transform import Rotation
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
-from hesim_render.recording.recording import Recording
 from hesim_render.recording.truth_file import POSE_STEP_US, images_at
 from hesim_render.recording.truth_kinds import IMAGES
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
+
+if TYPE_CHECKING:
+    from hesim_render.recording.recording import Recording
 
 MARKER = "export.json"
 #: DSEC's flow: 16 bit, 1/128 px, zero at 2¹⁵; interval of its flow, µs.
