@@ -178,7 +178,7 @@ def test_good_frames_give_false_alarms_at_the_stated_rate(tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     "keys",
     [
-        pytest.param(keys, id=name, marks=() if name in ("Poisson", "few electrons") else pytest.mark.slow)
+        pytest.param(keys, id=name, marks=() if name == "Poisson" else pytest.mark.slow)
         for name, keys in GOOD_FRAMES.items()
     ],
 )
