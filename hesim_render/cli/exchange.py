@@ -59,8 +59,9 @@ def export(
             raise ConflictError(name, value, f"only formats of geometric truth take it: {', '.join(_GEOMETRY)}")
     written = loaded.export(format, out, overwrite)
     counts = loaded.manifest["counts"]
-    what = f"{counts['frames']} frames" if written.is_dir() else f"{counts['events']} events"
-    say(f"{what} in {written}")
+    noun = "frame" if written.is_dir() else "event"
+    count = counts[f"{noun}s"]
+    say(f"{count} {noun}{'' if count == 1 else 's'} in {written}")
 
 
 def import_(

@@ -1,5 +1,7 @@
 """e-SFR of rendered edges against the product of closed forms, and the command that measures it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rendering import flux_image, make_scene, mono
@@ -130,3 +132,14 @@ def test_saturated_pixels_are_refused(tmp_path):
     with pytest.raises(RangeError, match="values below saturation"):
         measure_mtf(recording)
     assert measure_mtf(recording, signal="electrons").mtf[25] > 0.8  # the truth is not clipped
+
+
+@pytest.mark.parametrize("page", ["README.md", pytest.param("docs/targets.md", marks=pytest.mark.slow)])
+def test_the_commands_of_the_docs_measure_an_edge(page, tmp_path, monkeypatch, capsys):
+    lines = (Path(__file__).parents[2] / page).read_text(encoding="utf-8").splitlines()
+    starts = "hesim-render simulate slanted-edge", "hesim-render measure mtf"
+    commands = [next(line for line in lines if line.startswith(start)) for start in starts]
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert run(*command.split()[1:]) in (0, None), capsys.readouterr().err
+    assert "MTF50: 0.60" in capsys.readouterr().out and (tmp_path / "mtf.csv").is_file()
