@@ -49,7 +49,7 @@ def simulate(
     samples: int | None = None,
     exact: bool = False,
     max_minutes: float | None = None,
-    truth: Sequence[str] = (),
+    truth: str | Sequence[str] = (),
     truth_every_us: int | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,

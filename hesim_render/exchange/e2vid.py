@@ -108,6 +108,10 @@ def read_arrays_header(path: Path) -> tuple[tuple[int, int] | None, dict[str, st
             raise SpecError(f"{name} holds {headers[name][1].name}; expected whole numbers", file=path)
     shape = None
     if {"width", "height"} <= set(present):
+        for name in ("height", "width"):
+            own, stored = member_header(path, name)
+            if own != () or stored.kind not in "ui":
+                raise SpecError(f"{name} holds {stored.name} {own}; expected one whole number", file=path)
         size = [int(next(stream_member(path, name, 1, ())).astype(np.int64)) for name in ("height", "width")]
         shape = (size[0], size[1])
     return shape, names

@@ -15,8 +15,10 @@ EVENTS = "events"
 TRUTH_KINDS = (*IMAGES, *SERIES, EVENTS)
 
 
-def truth_kinds(names: Iterable[str]) -> tuple[str, ...]:
+def truth_kinds(names: str | Iterable[str]) -> tuple[str, ...]:
     """The kinds that names ask for, in the order of `TRUTH_KINDS`; ``all`` asks for all.
+
+    One text holds names with commas between them, as on the command line.
 
     Raises
     ------
@@ -24,7 +26,7 @@ def truth_kinds(names: Iterable[str]) -> tuple[str, ...]:
         For a name that is not a kind.
     """
     wanted: set[str] = set()
-    for name in names:
+    for name in names.replace(" ", "").split(",") if isinstance(names, str) else names:
         if name == "all":
             wanted.update(TRUTH_KINDS)
         elif name in TRUTH_KINDS:

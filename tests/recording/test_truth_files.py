@@ -108,7 +108,7 @@ def test_nothing_is_written_that_was_not_asked_for(tmp_path):
 
 
 def test_kinds_and_intervals_that_are_none_are_refused_before_rendering():
-    assert truth_kinds(["flow", "depth"]) == ("depth", "flow")
+    assert truth_kinds(["flow", "depth"]) == truth_kinds("flow, depth") == ("depth", "flow")
     with pytest.raises(RangeError, match=r"truth is 'deepth'; expected one of depth, .* \(did you mean 'depth'"):
         simulate(moving_scene(), sensor(), duration_s=0.03, truth=["deepth"])
     with pytest.raises(RangeError, match="truth_every_us"):

@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 import capture_sets
+import event_files
 import numpy as np
 import recordings
 import reset_captures
@@ -225,6 +226,72 @@ def run_pipeline(folder):
     process(raw, load_camera(folder / "c.yaml"), load_pipeline(folder / "p.yaml"))
 
 
+def target_scene(folder):
+    """A hyperspectral picture, meshes of two kinds, and a track from a file; and a chart of measured patches."""
+    import trimesh
+
+    rng = np.random.default_rng(5)
+    np.save(folder / "cube.npy", rng.random((4, 6, 5), dtype=np.float32))
+    box = trimesh.creation.box((1, 1, 0.2))
+    (folder / "a.glb").write_bytes(trimesh.Scene(box).export(file_type="glb"))
+    (folder / "b.stl").write_bytes(box.export(file_type="stl"))
+    (folder / "way.csv").write_text(
+        "t_us,x_m,y_m,z_m,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n500,0.1,0,0,0,0.1,0,1\n1000,0.2,0,0,0,0,0,1\n"
+    )
+    (folder / "way.tum").write_text("# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n0.001 0.1 0 0 0 0 0 1\n")
+    (folder / "patches.csv").write_text("name,400,500,600,700\nwhite,0.9,0.9,0.9,0.9\nred,0.05,0.05,0.5,0.7\n")
+    meshes = "".join(
+        f"  - {{name: {name}, shape: mesh, mesh: {file}, size_m: [0.1, 0.1, 0.1], position_m: [0, 0, 0.2]}}\n"
+        for name, file in (("a", "a.glb"), ("b", "b.stl"))
+    )
+    head = "schema_version: 1\nname: x\ndescription: d\n"
+    (folder / "s.yaml").write_text(
+        f"{head}target: {{type: image, file: cube.npy, wavelength_nm: [400, 475, 550, 625, 700], beyond: hold}}\n"
+        f"objects:\n{meshes}motion:\n  - {{object: a, file: way.csv}}\n  - {{object: b, file: way.tum}}\n"
+        f"{_LIGHT}camera: {{fit: target}}\n"
+    )
+    (folder / "chart.yaml").write_text(
+        f"{head}target: {{type: patch-chart, patches: patches.csv, rows: 1, cols: 2}}\n{_LIGHT}"
+        "camera: {fit: target}\n"
+    )
+
+
+def build_targets(folder):
+    from hesim_render.sources.render.scene.builder import build
+    from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+
+    for name in ("s.yaml", "chart.yaml"):
+        build(mitsuba(), hr.load_scene(folder / name).spec).pose(500)
+
+
+def event_files_of_others(folder):
+    events = event_files.many(300, 40_000, (24, 32))
+    for name in ("evt2", "evt3", "aedat4", "dsec", "npz"):
+        (folder / name).mkdir()
+        event_files.written(events, name, folder / name, (24, 32))
+
+
+def import_events(folder):
+    from hesim_render.exchange import open_events
+
+    for file in sorted(folder.glob("*/events.*")):
+        for events in open_events(file, file.parent.name, (24, 32), keep_stated=True):
+            assert events["x"].max(initial=0) < 32
+
+
+def labelled(folder):
+    """A recording with geometric truth and labels of its events."""
+    made = hr.load_sensor("gen2").crop(16, 16)
+    hr.simulate(hr.load_scene("rotating-star"), made, duration_s=0.04, out=folder / "r", truth="all", quality=4)
+
+
+def read_labelled(folder):
+    loaded = hr.Recording.load(folder / "r")
+    for name in loaded.stored_truth.names:
+        loaded.stored_truth.read(name)
+    loaded.event_labels.counts()
+
+
 #: name: (makes valid files in a folder, reads them, files that are damaged)
 SUBJECTS = {
     "recording": (recording, read_recording, "r/*.json r/events.h5 r/frames/*.dng r/truth/*"),
@@ -240,6 +307,9 @@ SUBJECTS = {
     "array": (array_video, play, "v.npy"),
     "video": (video, play, "v.mkv"),
     "isp": (pipeline, run_pipeline, "p.yaml c.yaml maps.npz"),
+    "targets": (target_scene, build_targets, "s.yaml chart.yaml cube.npy a.glb b.stl way.csv way.tum patches.csv"),
+    "exchange": (event_files_of_others, import_events, "*/events.*"),
+    "labelled": (labelled, read_labelled, "r/truth/*.h5 r/recording.json"),
 }
 
 

@@ -7,8 +7,6 @@ The files follow the OpenEXR layout of Fichet, Pacanowski and Wilkie [fichet2021
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
 from collections.abc import Iterator
 from itertools import pairwise
@@ -20,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, UInt32
 from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.core.output import replacing
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.lens import Lens
 from hesim_render.sensor.sensor import Sensor
@@ -224,16 +223,12 @@ def write_spectral_exr(path: str | Path, radiance: NDArray[np.float32], waveleng
         "spectralLayoutVersion": "1.0",
         "emissiveUnits": EMISSIVE_UNITS,
     }
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        with OpenEXR.File(header, channels) as file:
-            file.write(str(temporary))
-        os.replace(temporary, target)
-    except (OSError, RuntimeError) as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[0]
-        raise OutputError(f"{target}: cannot be written ({reason})") from None
+    with replacing(target) as temporary:
+        try:
+            with OpenEXR.File(header, channels) as file:
+                file.write(str(temporary))
+        except RuntimeError as error:
+            raise OutputError(f"{target}: cannot be written ({str(error).splitlines()[0]})") from None
     return target
 
 
