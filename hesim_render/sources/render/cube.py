@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, UInt32
-from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import replacing
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.lens import Lens
@@ -223,12 +223,8 @@ def write_spectral_exr(path: str | Path, radiance: NDArray[np.float32], waveleng
         "spectralLayoutVersion": "1.0",
         "emissiveUnits": EMISSIVE_UNITS,
     }
-    with replacing(target) as temporary:
-        try:
-            with OpenEXR.File(header, channels) as file:
-                file.write(str(temporary))
-        except RuntimeError as error:
-            raise OutputError(f"{target}: cannot be written ({str(error).splitlines()[0]})") from None
+    with replacing(target) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
     return target
 
 
