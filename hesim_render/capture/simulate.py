@@ -144,7 +144,8 @@ def simulate(
         settings |= {"backend": backend.select().describe(), "camera": _camera_used(flux)}
         rendering = _change_driven_parts(flux)
         wanted = rendering[0].quality if rendering else None
-        plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=EVENTS in kinds)
+        labels = EVENTS in kinds
+        plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=labels and not rendering)
         sample = plain.sample_of_event_blocks() if rendering and not flux.is_static else BlockSample([], 1.0)
         if rendering:
             expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
@@ -165,7 +166,7 @@ def simulate(
         noted = _noted(flux, plain, round(sample.windows), seed) if rendering else None
         capture = plain
         if noted is not None:
-            capture = Capture(noted, flux.sensor, *noise, duration_us, seed, labels=EVENTS in kinds)
+            capture = Capture(noted, flux.sensor, *noise, duration_us, seed, labels=labels)
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
             overwrite=overwrite,

@@ -88,6 +88,8 @@ def exposures(spec: ApsSpec, rows: int, duration_us: int) -> list[Exposure]:
 
 #: Number of intervals between windows in a block; interpolation never crosses the border of a block.
 BLOCK_INTERVALS = 16
+#: Number of stretches of time, of one block of ticks or of cells each, that stand for a run of more of them.
+_STRETCHES = 1024
 #: Sample times of sensors without a tick are computed in cells of this length, µs. Cells begin at its
 #: multiples, which are also sample times.
 CELL_US = 1000
@@ -165,10 +167,6 @@ def blocks_of_run(
     instants = instants_us(cell, cell + CELL_US)
     beyond = int(instants[np.searchsorted(instants, end_us)])
     yield from instant_blocks(instants_us, window_us, first, beyond)
-
-
-#: Number of stretches of time, of one block of ticks or of cells each, that stand for a run of more of them.
-_STRETCHES = 1024
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Literal
 
 from pydantic import Field, model_validator
@@ -20,7 +21,7 @@ class CheckerboardTarget(TwoToneTarget):
     cols: int = Field(12, ge=1, le=10_000)
 
 
-class _Board(PlacedTarget):
+class _Board(PlacedTarget, ABC):
     """A board whose size follows from its parts, with a light margin around them."""
 
     rows: int = Field(ge=1, le=200)
@@ -30,9 +31,9 @@ class _Board(PlacedTarget):
     dark: ReflectanceSpec = SpectrumSpec(flat=0.05)
 
     @property
+    @abstractmethod
     def pattern_m(self) -> tuple[float, float]:
         """Width and height of the pattern without its margin, m."""
-        raise NotImplementedError
 
     @property
     def width_m(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,7 +48,7 @@ class ColorCheckerTarget(SizedTarget):
         return value
 
 
-class FileTarget(SizedTarget):
+class FileTarget(SizedTarget, ABC):
     """A target whose content is in a file."""
 
     folder: Path = Field(Path(), exclude=True)
@@ -68,9 +69,9 @@ class FileTarget(SizedTarget):
         return self
 
     @property
+    @abstractmethod
     def named_file(self) -> str | None:
         """The file, relative to the scene file; None if there is none."""
-        raise NotImplementedError
 
 
 class PatchChartTarget(FileTarget):

@@ -76,7 +76,7 @@ def flakes(count: int, seed: int = 0) -> Scene:
 
 
 def sparks(count: int = 400, seed: int = 1) -> Scene:
-    """Small bright balls, a third of a pixel and less, that fly in all directions before a dark wall."""
+    """Small bright balls, a fifth of a pixel and less, that fly in all directions before a dark wall."""
     rng, objects, motion = np.random.default_rng(seed), [], []
     for k in range(count):
         size = float(rng.uniform(0.0005, 0.004))
