@@ -13,6 +13,7 @@ from hesim_render.calibrate.aps import common_mode
 from hesim_render.calibrate.evs import analysis as event_analysis
 from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import goodness as event_goodness
+from hesim_render.calibrate.evs import output as event_output
 from hesim_render.calibrate.evs.counts import read_static
 from hesim_render.calibrate.moments import Moments
 from hesim_render.calibrate.summary import summary_lines
@@ -128,15 +129,26 @@ def test_groups_of_brightness_hold_enough_pixels_and_events():
 
 
 def test_searches_that_end_elsewhere_are_told(tmp_path):
-    """Starts of which three end 20 standard errors away, put into a calibration of good counts."""
+    """Starts of which three end 20 standard errors away, put into a calibration of good counts.
+
+    Where their counts are far less likely these searches were lost: they say nothing about the counts.
+    """
     broken_captures.events(tmp_path / "set", size=48)
     captures = read_captures(tmp_path / "set")
     result = event_analysis.analyse(captures, read_static(captures))
     assert event_checks.check_events(result, "voltage")[0] == []
-    starts = result.starts.copy()
-    starts[:3, 1] += 20 * result.starts_standard_error[1]
-    (found,), _ = event_checks.check_events(replace(result, starts=starts), "voltage")
+    values = result.ends.values.copy()
+    values[:3, 1] += 20 * result.ends.standard_error[1]
+    apart = replace(result.ends, values=values)
+    (found,), _ = event_checks.check_events(replace(result, ends=apart), "voltage")
     assert found.check == "starts" and found.text.startswith("3 of 200 searches") and found.p_value is None
+    below = result.ends.log_likelihood_below.copy()
+    below[:3] = 27.0
+    lost = replace(result, ends=replace(apart, log_likelihood_below=below))
+    assert event_checks.check_events(lost, "voltage")[0] == []
+    study = event_output.content(captures, lost, None)["multi_start"]
+    assert study["lost"] == 3 and max(study["largest_difference_in_standard_errors"]) < 0.3
+    assert event_output.maps(lost)["figure_starts"].shape == (197, 4)
 
 
 def test_a_flat_field_has_a_chi2(tmp_path):

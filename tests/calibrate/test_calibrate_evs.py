@@ -303,7 +303,7 @@ def test_two_hundred_starts_end_at_one_point(plain, mismatched, tmp_path):
     wide = None, read_calibration(tmp_path / "c.yaml")["evs"], read_maps(tmp_path / "c.yaml", "evs")
     for _, section, maps in (plain, mismatched, wide):
         study = section["multi_start"]
-        assert study["starts"] == 200 and maps["figure_starts"].shape == (200, 4)
+        assert study["starts"] == 200 and study["lost"] == 0 and maps["figure_starts"].shape == (200, 4)
         assert max(study["largest_difference_in_standard_errors"]) < 0.01
 
 

@@ -535,6 +535,7 @@ def test_intervals_cover_the_truth_of_sensors_of_a_kind(tmp_path):
         theta = 0.1515 / 0.00075
         true = {"A": theta * 1e-3 / 2.116e-4, "B": theta * 5e-3 / 2.116e-4, "C": 3.1e-5 / 2.116e-4, "D": 0.0}
         scores.append([(section[n]["value"] - true[n]) / section[n]["standard_error"] for n in "ABCD"])
+        assert section["multi_start"]["lost"] == 0
         assert max(section["multi_start"]["largest_difference_in_standard_errors"][:4]) < 0.01
     square = np.mean(np.square(scores), axis=0)
     covered = np.mean(np.abs(scores) < 1.96, axis=0)

@@ -15,7 +15,7 @@ from hesim_render.calibrate.evs.dispersion import Dispersion, dispersion_in_time
 from hesim_render.calibrate.evs.fitted import NO_FIT, EventFit, best_start, fit_events, with_mismatch_error
 from hesim_render.calibrate.evs.medians import Typical
 from hesim_render.calibrate.evs.model import Law, coefficients, from_natural
-from hesim_render.calibrate.evs.starts import multi_start
+from hesim_render.calibrate.evs.starts import Ends, multi_start
 from hesim_render.calibrate.evs.steps import Steps, read_steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, fit_thresholds, why_not
 from hesim_render.calibrate.moments import Progress
@@ -57,8 +57,7 @@ class EvsCalibration:
     thresholds: Thresholds | None
     steps: Steps | None
     thresholds_reason: str
-    starts: NDArray[np.float64]
-    starts_standard_error: NDArray[np.float64]
+    ends: Ends
 
     @property
     def bad(self) -> NDArray[np.bool_]:
@@ -144,7 +143,7 @@ def analyse(
         best, *fits = (_with_sampling_error(fit, thresholds, good) for fit in (best, *fits))
     tell("200 starts", 0.8)
     averaged = pool_events(static, good, PixelThresholds.unknown(good.shape, spread.value))
-    ends, errors = multi_start(averaged, best, theta_v, seed)
+    ends = multi_start(averaged, best, theta_v, seed)
     return EvsCalibration(
         static=static,
         defects=classify(static, bad, steps),
@@ -159,8 +158,7 @@ def analyse(
         thresholds=thresholds,
         steps=steps,
         thresholds_reason=reason,
-        starts=ends,
-        starts_standard_error=errors,
+        ends=ends,
     )
 
 

@@ -49,16 +49,22 @@ def _counts(result: EvsCalibration) -> Finding | None:
 
 
 def _starts(result: EvsCalibration) -> Finding | None:
-    """Finding of searches from other starts that end elsewhere: several fits describe the counts about equally well."""
-    free = np.array(result.together.free[:4]) & (result.starts_standard_error > 0)
-    away = np.abs(result.starts - np.median(result.starts, axis=0))[:, free] / result.starts_standard_error[free]
+    """Finding of searches from other starts that end elsewhere: several fits describe the counts about equally well.
+
+    A search that was lost on its way and ended where the counts are far less likely says nothing about the counts.
+    """
+    ends = result.ends
+    free = np.array(result.together.free[:4]) & (ends.standard_error > 0)
+    values = ends.values[ends.describe_counts(result.together.goodness.per_dof)]
+    away = np.abs(values - np.median(values, axis=0))[:, free] / ends.standard_error[free]
     apart = np.any(away > _APART, axis=1)
     if not apart.any():
         return None
     return Finding(
         "starts",
         f"{int(apart.sum())} of {apart.size} searches from other starts end elsewhere, by up to {away.max():.2g} "
-        "standard errors: the counts do not tell A … D in one way only. Capture more trials, and brighter scenes.",
+        "standard errors, and are about as likely: the counts do not tell A … D in one way only. Capture more trials, "
+        "and brighter scenes.",
         None,
     )
 

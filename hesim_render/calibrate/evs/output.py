@@ -96,9 +96,11 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     section["trials"] = result.static.trials
     section["bad_pixels"] = int(result.bad.sum())
     section["defects"] = {kind.name.lower(): result.defects.count(kind) for kind in Defect if kind is not Defect.NONE}
-    scatter = np.ptp(result.starts, axis=0) / result.starts_standard_error
+    describes = result.ends.describe_counts(fit.goodness.per_dof)
+    scatter = np.ptp(result.ends.values[describes], axis=0) / result.ends.standard_error
     section["multi_start"] = {
-        "starts": len(result.starts),
+        "starts": describes.size,
+        "lost": int(np.sum(~describes)),
         "largest_difference_in_standard_errors": [s if ok else None for s, ok in zip(scatter, fit.free, strict=False)],
     }
     if bootstrap is not None:
@@ -196,8 +198,8 @@ def _static_figures(result: EvsCalibration, static: StaticCapture) -> dict[str, 
         top = float(edges[-1])
         figures[f"figure_on_off_{name}"] = np.histogram2d(off_map[good], on_map[good], bins=(edges, edges))[0]
         figures[f"figure_on_off_{name}_top"] = np.array(top)
-    figures["figure_starts"] = result.starts
-    figures["figure_starts_error"] = result.starts_standard_error
+    figures["figure_starts"] = result.ends.values[result.ends.describe_counts(result.together.goodness.per_dof)]
+    figures["figure_starts_error"] = result.ends.standard_error
     return figures
 
 

@@ -2,20 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.calibrate.evs.cells import PixelCounts
 from hesim_render.calibrate.evs.fit import search
 from hesim_render.calibrate.evs.fitted import EventFit
-from hesim_render.calibrate.evs.model import from_natural, natural
+from hesim_render.calibrate.evs.model import from_natural, log_likelihood, log_probability, natural
 
 _STARTS = 200
+#: ln L below the best end from which an end does not describe the counts: 4 standard errors of a likelihood ratio.
+_TOO_UNLIKELY = 8.0
 
 
-def multi_start(
-    pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, starts: int = _STARTS
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+@dataclass(frozen=True)
+class Ends:
+    """Where the searches of the multi-start study ended.
+
+    Parameters
+    ----------
+    values : (A, B, C, D) [start, 4].
+    standard_error : [4], from the Fisher information; NaN for what is not free.
+    log_likelihood_below : [start], ln L of the best end minus that of this one.
+    """
+
+    values: NDArray[np.float64]
+    standard_error: NDArray[np.float64]
+    log_likelihood_below: NDArray[np.float64]
+
+    def describe_counts(self, chi2_per_dof: float) -> NDArray[np.bool_]:
+        """Whether each end is about as likely as the best, [start]. The others only say that a search was lost.
+
+        Parameters
+        ----------
+        chi2_per_dof : of the fit. Counts that scatter more than the binomial law has it make ln L differ by more.
+        """
+        return self.log_likelihood_below < _TOO_UNLIKELY * max(1.0, chi2_per_dof)
+
+
+def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, starts: int = _STARTS) -> Ends:
     """Maximum likelihood from many starts: A, B, C vary by e² in either direction, D over (−0.9, 0.9).
 
     Parameters
@@ -28,7 +55,7 @@ def multi_start(
 
     Returns
     -------
-    (A, B, C, D) [start, 4] at the end of each search, and their standard errors [4] from the Fisher information.
+    The ends of the searches.
     """
     rng = np.random.default_rng(seed)
     begin = np.tile(fit.values, (starts, 1))
@@ -38,7 +65,9 @@ def multi_start(
     if free[3]:
         begin[:, 3] = rng.uniform(-0.9, 0.9, starts)
     begin[:, 4:] = np.where(free[4:], 0.0, begin[:, 4:])
-    eta, fisher, _ = search(pixels.cells.coarser(), from_natural(begin), theta_v, fit.law, fit.free)
+    cells = pixels.cells.coarser()
+    eta, fisher, _ = search(cells, from_natural(begin), theta_v, fit.law, fit.free)
     values, covariance = natural(eta, np.linalg.pinv(fisher))
     errors = np.sqrt(np.maximum(np.einsum("fii->fi", covariance)[:, :4], 0))
-    return values[:, :4], np.where(free[:4], np.median(errors, axis=0), np.nan)
+    level = log_likelihood(cells, log_probability(eta, cells, theta_v, fit.law)[0])
+    return Ends(values[:, :4], np.where(free[:4], np.median(errors, axis=0), np.nan), level.max() - level)

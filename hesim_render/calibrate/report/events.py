@@ -154,7 +154,12 @@ def _starts(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
         return ""
     scaled = (starts[:, known] - np.median(starts[:, known], axis=0)) / error[known]
     reach = max(1e-4, 1.2 * float(np.abs(scaled).max()))
-    figure, axes = panel(f"{len(starts)} starts, spread by e² either way", "", "end − median, standard errors")
+    lost = section["multi_start"].get("lost", 0)
+    figure, axes = panel(
+        f"{len(starts)} starts, spread by e² either way" + (f"; {lost} more were lost" if lost else ""),
+        "",
+        "end − median, standard errors",
+    )
     axes.boxplot(scaled, whis=(0, 100), widths=0.3)
     axes.set_xticks(np.arange(1, len(known) + 1), ["ABCD"[k] for k in known])
     axes.set_ylim(-reach, reach)
