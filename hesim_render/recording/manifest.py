@@ -19,7 +19,7 @@ from hesim_render.recording.manifest_spec import RecordingSpec
 from hesim_render.specs.files import content_hash, validate
 from hesim_render.specs.light import mixed_light
 from hesim_render.specs.sensor import SensorSpec
-from hesim_render.specs.target import lamps_of
+from hesim_render.specs.surface import TextureSpec, leaves_of
 
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
@@ -59,9 +59,9 @@ def build(
     """The manifest of a new recording; frames and counts are added as it grows."""
     layout, spec = sensor.layout, sensor.spec
     light = mixed_light(getattr(scene, "lights", ()))
-    lamp = lamps_of(getattr(scene, "target", None))
-    if light is None and lamp is not None:
-        light = lamp.illuminant.load()
+    lamps = getattr(scene, "lamps", ())
+    if light is None and lamps:
+        light = lamps[0].illuminant.load()
     return {
         "schema_version": SCHEMA_VERSION,
         "software": software_versions(),
@@ -103,8 +103,14 @@ def _file_hashes(scene: BaseModel) -> dict[str, str]:
     """
     folder = getattr(scene, "folder", Path())
     mitsuba = getattr(scene, "mitsuba", None)
-    names = [mitsuba.file if mitsuba is not None else None, *(item.mesh for item in getattr(scene, "objects", []))]
-    names.append(getattr(getattr(scene, "target", None), "named_file", None))
+    target, objects = getattr(scene, "target", None), getattr(scene, "objects", [])
+    names = [mitsuba.file if mitsuba is not None else None, *(item.mesh for item in objects)]
+    names += [getattr(target, key, None) for key in ("file", "patches")]
+    names += [getattr(light, "file", None) for light in getattr(scene, "lights", ())]
+    for item in objects:
+        names += [item.texture.file if item.texture is not None else None]
+        names += [texture.file for _, texture in leaves_of(item.material or {}, TextureSpec)]
+        names += [name for key, name in leaves_of(item.material or {}, str) if key.split(".")[-1] == "filename"]
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if name is not None}
 
 

@@ -21,8 +21,7 @@ def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
     if own is not None:
         assert not own.has_level
         return _mitsuba_parts(scene)
-    lamp = lamps_of(scene.spec.target)
-    shining: list[Any] = [*scene.spec.lights, *([lamp] if lamp is not None else [])]
+    shining: list[Any] = [*scene.spec.lights, *scene.spec.lamps]
     flickering = [_flicker(light.waveform) for light in shining]
     if not any(flickering):
         return [(None, scene)]
@@ -33,7 +32,7 @@ def light_parts(scene: Scene) -> list[tuple[Waveform | None, Scene]]:
             for light, has in zip(shining, flickering, strict=True)
         ]
         if any(light.is_lit for light in lit):
-            parts.append((kind.load() if kind else None, _with_lights(scene, lit, lamp is not None)))
+            parts.append((kind.load() if kind else None, _with_lights(scene, lit)))
     return parts or [(None, scene)]
 
 
@@ -51,9 +50,16 @@ def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None
     return found
 
 
-def _with_lights(scene: Scene, lit: Sequence[Any], target_last: bool) -> Scene:
-    """The scene with other lights, of which the last may be the target itself."""
-    update = {"light": tuple(lit[:-1]), "target": lit[-1]} if target_last else {"light": tuple(lit)}
+def _with_lights(scene: Scene, lit: Sequence[Any]) -> Scene:
+    """The scene with other lights: its own, then the target if that shines, then its objects that shine."""
+    left = iter(lit)
+    update: dict[str, Any] = {"light": tuple(next(left) for _ in scene.spec.lights)}
+    if lamps_of(scene.spec.target) is not None:
+        update["target"] = next(left)
+    update["objects"] = [
+        item if item.emission is None else item.model_copy(update={"emission": next(left)})
+        for item in scene.spec.objects
+    ]
     return Scene(scene.spec.model_copy(update=update))
 
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from abc import ABC, abstractmethod
-from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
-    ValidationInfo,
     field_validator,
     model_serializer,
     model_validator,
@@ -18,7 +14,7 @@ from pydantic import (
 
 from hesim_render.specs.geometry import Size
 from hesim_render.specs.light import LampSpec
-from hesim_render.specs.reflectance import PlacedTarget, ReflectanceSpec, SizedTarget
+from hesim_render.specs.reflectance import InFolder, PictureFile, PlacedTarget, ReflectanceSpec, SizedTarget
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.patches import read_patches
 from hesim_render.spectral.spectrum import Spectrum, colorchecker
@@ -48,33 +44,7 @@ class ColorCheckerTarget(SizedTarget):
         return value
 
 
-class FileTarget(SizedTarget, ABC):
-    """A target whose content is in a file."""
-
-    folder: Path = Field(Path(), exclude=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
-        if isinstance(data, dict) and info.context:
-            if "folder" in data:
-                raise ValueError("unknown key 'folder'")
-            data = {**data, "folder": info.context["folder"]}
-        return data
-
-    @model_validator(mode="after")
-    def _is_there(self) -> FileTarget:
-        if self.named_file is not None and not os.path.isfile(self.folder / self.named_file):
-            raise ValueError(f"no such file: {self.folder / self.named_file}")
-        return self
-
-    @property
-    @abstractmethod
-    def named_file(self) -> str | None:
-        """The file, relative to the scene file; None if there is none."""
-
-
-class PatchChartTarget(FileTarget):
+class PatchChartTarget(SizedTarget, InFolder):
     """Patches from a CSV file, row by row from the top left, on a surround.
 
     The file has one line per patch. Its header is ``name`` and wavelengths in nm (reflectances, 0 to 1), or ``name, L,
@@ -93,6 +63,8 @@ class PatchChartTarget(FileTarget):
     def _one_source(self) -> PatchChartTarget:
         if (self.patches is None) == (self.spectra is None):
             raise ValueError("give patches or spectra, exactly one of them")
+        if self.patches is not None and not (self.folder / self.patches).is_file():
+            raise ValueError(f"no such file: {self.folder / self.patches}")
         count = len(self.load())
         if count != self.rows * self.cols:
             raise ValueError(f"there are {count} patches; rows times cols is {self.rows * self.cols}")
@@ -109,11 +81,6 @@ class PatchChartTarget(FileTarget):
                 name: {"wavelength_nm": s.wavelength_nm.tolist(), "value": s.values.tolist()} for name, s in found
             }
         return data
-
-    @property
-    def named_file(self) -> str | None:
-        """The file of the patches, relative to the scene file; None if they stand in the scene file."""
-        return self.patches
 
     def load(self) -> dict[str, Spectrum]:
         """Reflectances of the patches by name, in order."""
@@ -179,26 +146,10 @@ class DeadLeavesTarget(SizedTarget):
         return self
 
 
-class ImageTarget(FileTarget):
-    """A picture: sRGB colours (PNG, JPEG, TIFF), linear sRGB (EXR), or a reflectance at each wavelength.
-
-    Colours of an sRGB picture become the smooth reflectances of Mitsuba's own model [jakob2019]. A cube is an NPY file
-    [row, col, wavelength] with `wavelength_nm`, or a spectral EXR file [fichet2021].
-    """
+class ImageTarget(SizedTarget, PictureFile):
+    """A picture or a hyperspectral cube, from edge to edge."""
 
     type: Literal["image"]
-    file: str = Field(description="picture or cube, relative to this file")
-    wavelength_nm: list[float] | None = Field(None, min_length=2, description="of the planes of an NPY cube")
-    beyond: Literal["refuse", "hold"] = Field(
-        "refuse", description="outside the wavelengths of a cube: an error, or its first and last plane"
-    )
-    scale: float = Field(1.0, gt=0, le=1e9, description="multiplies the values of a cube or an EXR picture")
-    interpolation: Literal["bilinear", "nearest"] = "bilinear"
-
-    @property
-    def named_file(self) -> str:
-        """The file of the picture, relative to the scene file."""
-        return self.file
 
 
 class IntegratingSphereTarget(PlacedTarget, LampSpec):

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, Size, Vector
+from hesim_render.specs.reflectance import InFolder
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.waveform import WaveformSpec
 from hesim_render.spectral.spectrum import Spectrum, scale_to_irradiance, scale_to_lux, summed
@@ -20,7 +21,7 @@ def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:
     return spec
 
 
-class LightSpec(Strict):
+class LightSpec(InFolder):
     """Place and spectrum of a light, and its level on a stated plane.
 
     Exactly one of `illuminance_lux` and `irradiance_w_m2` gives the level on the plane through
@@ -28,13 +29,17 @@ class LightSpec(Strict):
     this light alone. For a light with a waveform the level is the time mean.
     """
 
-    type: Literal["uniform", "point", "area", "directional", "none"]
+    type: Literal["uniform", "point", "area", "directional", "environment", "none"]
     illuminant: Annotated[SpectrumSpec, AfterValidator(_not_negative)] = SpectrumSpec(illuminant="D65")
     illuminance_lux: float | None = Field(None, ge=0, le=1e9)
     irradiance_w_m2: float | None = Field(None, ge=0, le=1e7, description="integrated over the illuminant's table")
     position_m: Vector | None = Field(None, description="point and area lights")
     size_m: tuple[Size, Size] | None = Field(None, description="area light: width, height")
     direction: Direction | None = Field(None, description="directional light: the way the light travels")
+    file: str | None = Field(
+        None, description="environment: equirectangular map (EXR, HDR, PNG), linear sRGB times D65"
+    )
+    rotation_deg: float = Field(0.0, ge=-1e9, le=1e9, description="environment: turn about y")
     plane_point_m: Vector = (0.0, 0.0, 0.0)
     plane_normal: Direction = (0.0, 0.0, 1.0)
     waveform: WaveformSpec | None = Field(None, description="flicker; default steady")
@@ -49,10 +54,17 @@ class LightSpec(Strict):
                 else "a light needs exactly one of illuminance_lux and irradiance_w_m2"
             )
         needs = {"point": ["position_m"], "area": ["position_m", "size_m"], "directional": ["direction"]}
-        for name in ("position_m", "size_m", "direction"):
+        needs["environment"] = ["file"]
+        for name in ("position_m", "size_m", "direction", "file"):
             needed = name in needs.get(self.type, [])
             if needed != (getattr(self, name) is not None):
                 raise ValueError(f"a light of type '{self.type}' {'needs' if needed else 'has no'} {name}")
+        if self.file is not None and not (self.folder / self.file).is_file():
+            raise ValueError(f"no such file: {self.folder / self.file}")
+        if self.type == "environment" and self.illuminant != SpectrumSpec(illuminant="D65"):
+            raise ValueError("a light of type 'environment' has the colours of its file, times D65, and no illuminant")
+        if self.type != "environment" and self.rotation_deg != 0:
+            raise ValueError(f"a light of type '{self.type}' has no rotation_deg")
         if self.type == "none" and self.waveform is not None:
             raise ValueError("a light of type 'none' has no waveform")
         return self

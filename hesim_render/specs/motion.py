@@ -73,10 +73,12 @@ class TrackSpec(Strict):
     about the shared axis, any number of turns, where both keyframes name the same axis (a rotation
     of 0 shares every axis); along the shortest arc otherwise. Before the first and after the last
     keyframe the pose is held, or the track repeats. Objects stand still within slices of time that
-    are short against their speed; the camera's motion is rendered ray by ray.
+    are short against their speed; the camera's motion is rendered ray by ray. With a `parent` the pose is that of the
+    parent times this one.
     """
 
     object: str = Field(min_length=1)
+    parent: str | None = Field(None, min_length=1, description="what it rides on: another object with a track")
     pivot_m: Vector = (0.0, 0.0, 0.0)
     repeat: bool = False
     keyframes: list[KeyframeSpec] = Field(min_length=2)
@@ -84,7 +86,9 @@ class TrackSpec(Strict):
     @model_validator(mode="before")
     @classmethod
     def _from_file(cls, data: Any, info: ValidationInfo) -> Any:
-        """Read the keyframes of ``file``; a dump then holds the numbers."""
+        """Read the keyframes of ``file``; a dump then holds the numbers. What only rides on its parent needs none."""
+        if isinstance(data, dict) and data.get("parent") is not None and not ({"file", "keyframes"} & set(data)):
+            return {**data, "keyframes": [{"t_us": 0}, {"t_us": 1}]}
         if not isinstance(data, dict) or not ({"file", "axes"} & set(data)):
             return data
         name, axes = data.get("file"), data.get("axes", "scene")

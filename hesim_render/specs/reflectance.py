@@ -1,10 +1,11 @@
-"""Reflectances, and the common part of all targets: place, tilt and bend."""
+"""Reflectances, pictures of them, and the common part of all targets: place, tilt and bend."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, Size, Vector
@@ -19,6 +20,43 @@ def _diffuse(spec: SpectrumSpec) -> SpectrumSpec:
 
 
 ReflectanceSpec = Annotated[SpectrumSpec, AfterValidator(_diffuse)]
+
+
+class InFolder(Strict):
+    """Content that names files relative to the folder of the scene file."""
+
+    folder: Path = Field(Path(), exclude=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _where_it_lies(cls, data: Any, info: ValidationInfo) -> Any:
+        if isinstance(data, dict) and info.context:
+            if "folder" in data:
+                raise ValueError("unknown key 'folder'")
+            data = {**data, "folder": info.context["folder"]}
+        return data
+
+
+class PictureFile(InFolder):
+    """A picture: sRGB colours (PNG, JPEG, TIFF), linear sRGB (EXR), or a reflectance at each wavelength.
+
+    Colours of an sRGB picture become the smooth reflectances of Mitsuba's own model [jakob2019]. A cube is an NPY file
+    [row, col, wavelength] with `wavelength_nm`, or a spectral EXR file [fichet2021].
+    """
+
+    file: str = Field(description="picture or cube, relative to this file")
+    wavelength_nm: list[float] | None = Field(None, min_length=2, description="of the planes of an NPY cube")
+    beyond: Literal["refuse", "hold"] = Field(
+        "refuse", description="outside the wavelengths of a cube: an error, or its first and last plane"
+    )
+    scale: float = Field(1.0, gt=0, le=1e9, description="multiplies the values of a cube or an EXR picture")
+    interpolation: Literal["bilinear", "nearest"] = "bilinear"
+
+    @model_validator(mode="after")
+    def _is_a_file(self) -> PictureFile:
+        if not (self.folder / self.file).is_file():
+            raise ValueError(f"no such file: {self.folder / self.file}")
+        return self
 
 
 class PlacedTarget(Strict):

@@ -24,22 +24,21 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
-from hesim_render.specs.light import LightSpec
+from hesim_render.specs.light import LampSpec, LightSpec
 from hesim_render.specs.motion import TrackSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.reflectance import ReflectanceSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.target import TargetSpec
+from hesim_render.specs.surface import Count, MaterialSpec, TextureSpec
+from hesim_render.specs.target import TargetSpec, lamps_of
 from hesim_render.specs.waveform import WaveformSpec
 
 #: Path of a file that a scene names.
 OUTSIDE = "lies outside of the scene's folder; put it there, or let it (--allow-outside, allow_outside=True)"
-#: Number of repetitions.
-Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
 class ObjectSpec(Strict):
-    """A diffuse solid beside or in front of the target."""
+    """A solid beside or in front of the target: matt, with a picture on it, or of a material of Mitsuba."""
 
     name: str = Field(min_length=1)
     shape: Literal["sphere", "box", "rectangle", "mesh"]
@@ -50,6 +49,9 @@ class ObjectSpec(Strict):
     reflectance: ReflectanceSpec = SpectrumSpec(flat=0.5)
     pattern: ReflectanceSpec | None = Field(None, description="second reflectance: checks over the shape's own u, v")
     pattern_count: tuple[Count, Count] = (8, 8)
+    texture: TextureSpec | None = Field(None, description="in place of reflectance: a picture over the shape's u, v")
+    material: MaterialSpec | None = Field(None, description="in place of reflectance: a BSDF of Mitsuba")
+    emission: LampSpec | None = Field(None, description="light that its surface gives, the same in all directions")
     mesh: str | None = Field(None, description="OBJ, PLY, STL, GLB or glTF file, relative to this file")
     materials: Literal["own", "file"] = Field(
         "own", description="of a mesh: the reflectance above, or the materials of a GLB or glTF file"
@@ -61,6 +63,12 @@ class ObjectSpec(Strict):
             raise ValueError("shape 'mesh' and the key 'mesh' go together")
         if self.materials == "file" and not str(self.mesh).lower().endswith((".glb", ".gltf")):
             raise ValueError("materials: only GLB and glTF files have materials that are read")
+        surfaces = self.model_fields_set & {"reflectance", "texture", "material"}
+        surfaces -= {key for key in surfaces if getattr(self, key) is None}
+        if len(surfaces) + (self.materials == "file") > 1:
+            raise ValueError("give one of reflectance, texture, material and materials: file")
+        if self.pattern is not None and (self.texture is not None or self.material is not None):
+            raise ValueError("pattern: it goes with reflectance")
         if min(self.size_m) < 0 or (min(self.size_m) == 0 and self.shape not in ("rectangle", "mesh")):
             raise ValueError("size_m must be above 0")
         if self.shape == "sphere" and len(set(self.size_m)) != 1:
@@ -164,6 +172,19 @@ def _plain(node: Any) -> Any:
     return node.tolist() if isinstance(node, np.ndarray) else str(node)
 
 
+def _check_parents(parents: Mapping[str, str | None]) -> None:
+    """Refuse parents without a track, and objects that are their own ancestors."""
+    for name, parent in parents.items():
+        seen = [name]
+        while parent is not None:
+            if parent not in parents:
+                raise ValueError(f"motion: {parent!r}, the parent of {seen[-1]!r}, has no track")
+            if parent in seen:
+                raise ValueError(f"motion: {' rides on '.join([*seen, parent])}")
+            seen.append(parent)
+            parent = parents[parent]
+
+
 def _one_or_several(light: Any) -> str:
     return "several" if isinstance(light, list | tuple) else "one"
 
@@ -190,7 +211,8 @@ class SceneSpec(Strict):
         None,
         ge=2,
         le=64,
-        description="path length: 2 is direct light, more adds interreflection; default 2, or a Mitsuba scene's own",
+        description="path length: 2 is direct light, more adds interreflection; default 2, 8 where an object has a "
+        "material, or a Mitsuba scene's own",
     )
     folder: Path = Field(Path(), exclude=True)
     file: Path | None = Field(None, exclude=True)
@@ -210,6 +232,7 @@ class SceneSpec(Strict):
         tracks = [track.object for track in self.motion]
         if len(set(tracks)) != len(tracks):
             raise ValueError("motion: one track for each object; put all its keyframes into that")
+        _check_parents({track.object: track.parent for track in self.motion})
         if self.mitsuba is not None:
             if self.target is not None or self.objects or any(light.type != "none" for light in self.lights):
                 raise ValueError("a Mitsuba scene brings its own shapes and lights: drop target, objects and light")
@@ -222,6 +245,9 @@ class SceneSpec(Strict):
             raise ValueError("light is required (type 'none' is darkness)")
         if len(self.lights) > 1 and any(light.type == "none" for light in self.lights):
             raise ValueError("light: type 'none' is darkness and stands alone")
+        kinds = [light.type for light in self.lights]
+        if kinds.count("environment") + ("uniform" in kinds) > 1:
+            raise ValueError("light: one environment, and no uniform light beside it (both come from everywhere)")
         if self.camera is None:
             raise ValueError("camera is required")
         if self.camera.fit == "target" and self.target is None:
@@ -234,6 +260,23 @@ class SceneSpec(Strict):
             if track.object not in known:
                 raise ValueError(f"motion: no object {track.object!r} in the scene; there are {', '.join(known)}")
         return self
+
+    @property
+    def named_lamps(self) -> list[tuple[str, LampSpec]]:
+        """All that shines besides the lights, by key: the target, and objects."""
+        target = lamps_of(self.target)
+        own = [] if target is None else [("target", target)]
+        return own + [(f"objects.{item.name}", item.emission) for item in self.objects if item.emission is not None]
+
+    @property
+    def lamps(self) -> tuple[LampSpec, ...]:
+        """The values of `named_lamps`."""
+        return tuple(lamp for _, lamp in self.named_lamps)
+
+    @property
+    def depth(self) -> int:
+        """Path length of a scene of this project's own objects."""
+        return self.max_depth or (8 if any(item.material for item in self.objects) else 2)
 
     @property
     def lights(self) -> tuple[LightSpec, ...]:
@@ -279,9 +322,9 @@ def read_scene(
     return spec.model_copy(update={"folder": file.parent, "file": file, "allow_outside": allow_outside})
 
 
-def _is_track(location: tuple[Any, ...]) -> bool:
-    """True for the place of the name of a trajectory file."""
-    return len(location) == 3 and location[0] == "motion" and location[2] == "file"
+def _is_file(location: tuple[Any, ...]) -> bool:
+    """True for the place of the name of a trajectory, of a picture on an object, or of one light of several."""
+    return location[-1:] == ("file",) and location[0] in ("motion", "objects", "light")
 
 
 def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], str]]:
@@ -291,6 +334,6 @@ def _named_files(node: Any, location: tuple[Any, ...] = ()) -> Iterator[tuple[tu
             yield from _named_files(value, (*location, key))
     elif isinstance(node, str):
         key = location[-1] if location else None
-        files = ("mitsuba", "file"), ("target", "file"), ("target", "patches")
-        if key in ("csv", "mesh", "filename") or location in files or node.endswith(".csv") or _is_track(location):
+        files = ("mitsuba", "file"), ("target", "file"), ("target", "patches"), ("light", "file")
+        if key in ("csv", "mesh", "filename") or location in files or node.endswith(".csv") or _is_file(location):
             yield location, node

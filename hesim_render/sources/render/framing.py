@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import HesimWarning
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sources.render.camera import View
-from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.specs.scene import SceneSpec
 from hesim_render.targets.points import placement, surface_points
 
@@ -50,17 +50,15 @@ class Framing:
 
 def posed_view(spec: SceneSpec, view: View, t_us: float) -> View:
     """The view at a time, with the motion of the camera."""
-    tracks = [track for track in spec.motion if track.object == "camera"]
-    if not tracks:
-        return view
-    return replace(view, camera_to_world=Trajectory(tracks[0]).matrix(t_us) @ view.camera_to_world)
+    camera = trajectories(spec).get("camera")
+    return view if camera is None else replace(view, camera_to_world=camera.matrix(t_us) @ view.camera_to_world)
 
 
 def _target_pose(spec: SceneSpec, t_us: float) -> NDArray[np.float64]:
     """Pose [4, 4] of the target at a time."""
     assert spec.target is not None
-    tracks = [track for track in spec.motion if track.object == "target"]
-    return Trajectory(tracks[0]).matrix(t_us) @ placement(spec.target) if tracks else placement(spec.target)
+    track = trajectories(spec).get("target")
+    return placement(spec.target) if track is None else track.matrix(t_us) @ placement(spec.target)
 
 
 def framing(spec: SceneSpec, view: View, t_us: float = 0.0) -> Framing | None:

@@ -14,7 +14,7 @@ from hesim_render.sources.render.camera import MITSUBA_AXES, place_camera
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict
-from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.scene.parents import camera_trajectory, trajectories
 from hesim_render.sources.render.specfilm import camera_at, perspective_dict
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
@@ -64,8 +64,7 @@ class FrozenPixels:
         self.view = place_camera(scene.spec, sensor, self._built.mitsuba_sensor())
         sensor = self.view.sensor
         self.is_dark = self._built.is_dark
-        camera_moves = any(track.object == "camera" and Trajectory(track).moves for track in scene.spec.motion)
-        self.is_static = not self._built.trajectories and not camera_moves
+        self.is_static = not self._built.trajectories and camera_trajectory(scene.spec) is None
         self._filter = sensor.layout.filter_index.ravel()
         self._full_index = sensor.layout.full_index.ravel()
         scale = scene.spec.mitsuba.radiance_scale if scene.spec.mitsuba is not None else 1.0
@@ -158,7 +157,7 @@ class FrozenPixels:
         pixels.
         """
         times, farthest = np.linspace(begin_us, end_us, _STEPS), 0.0
-        knots = [frame.t_us for track in self._scene.spec.motion for frame in track.keyframes]
+        knots = [t_us for track in trajectories(self._scene.spec).values() for t_us in track.knots_us]
         inside = [float(t) for t in knots if begin_us < t < end_us]
         times = np.unique(np.concatenate([times, inside]))
         cameras = np.stack([camera_at(self._scene, self.view, float(t)) for t in times])

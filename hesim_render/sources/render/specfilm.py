@@ -18,7 +18,7 @@ from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform, using_variant
-from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.scene import Scene
 
 
@@ -72,10 +72,8 @@ def perspective_dict(
 
 def camera_at(scene: Scene, view: View, t_us: float) -> NDArray[np.float64]:
     """Camera-to-world matrix of a (moving) camera at one time."""
-    for track in scene.spec.motion:
-        if track.object == "camera":
-            return Trajectory(track).matrix(t_us) @ view.camera_to_world
-    return view.camera_to_world
+    camera = trajectories(scene.spec).get("camera")
+    return view.camera_to_world if camera is None else camera.matrix(t_us) @ view.camera_to_world
 
 
 def reference_flux(

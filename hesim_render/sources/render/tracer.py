@@ -19,7 +19,7 @@ from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.sampling.sampler import sampler_class
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
-from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
 
@@ -72,8 +72,7 @@ class Tracer:
         self.built = build(mi, scene.spec, responses)
         self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
         self.sensor = self.view.sensor
-        tracks = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
-        self.camera = next((trajectory for trajectory in tracks if trajectory.moves), None)
+        self.camera = camera_trajectory(scene.spec)
         mitsuba_scene = scene.spec.mitsuba
         self.radiance_scale = 1.0 if mitsuba_scene is None else mitsuba_scene.radiance_scale
         self.rays = RayFactory(self.view)

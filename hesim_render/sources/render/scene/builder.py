@@ -24,17 +24,18 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     transform,
 )
 from hesim_render.sources.render.scene.paint import Paint
+from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.surfaces import area_emitter, is_matt, paint_of, radiance_of, surface_of
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
+from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.specs.surface import leaves_of
 from hesim_render.specs.target import lamps_of
 from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
 from hesim_render.targets.build import placed_pieces
 from hesim_render.targets.piece import Picture, Piece
-
-#: Shapes without an inside; both of their sides are visible.
-_OPEN_SHAPES = ("rectangle", "mesh")
 
 
 @dataclass
@@ -133,12 +134,12 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         content, groups, paints = _describe(mi, spec)
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
-        integrator = path_tracer(mi, spec.max_depth or 2)
+        integrator = path_tracer(mi, spec.depth)
     parameters = mi.traverse(scene)
-    trajectories = {track.object: Trajectory(track) for track in spec.motion if track.object != "camera"}
+    tracks = {name: track for name, track in trajectories(spec).items() if name != "camera"}
     movable: dict[str, list[Movable]] = {}
     shapes = {shape.id(): shape for shape in scene.shapes()}
-    for name in trajectories:
+    for name in tracks:
         prefixes = groups.get(name, [name])
         for prefix in prefixes:
             if prefix not in shapes:
@@ -156,9 +157,9 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         integrator=integrator,
         parameters=parameters,
         groups=movable,
-        trajectories={name: trajectory for name, trajectory in trajectories.items() if trajectory.moves},
+        trajectories={name: track for name, track in tracks.items() if track.moves},
         is_dark=len(scene.emitters()) == 0,
-        paints=paints if (spec.max_depth or 2) == 2 else None,
+        paints=paints if spec.depth == 2 else None,
         exact_because=because,
         camera=camera,
         integrator_plugin=plugin,
@@ -186,20 +187,23 @@ def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[
                 paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
         name = f"object_{number}"
-        placement, bsdf = _placement(item), _bsdf(mi, item)
+        placement, bsdf = _placement(item), surface_of(mi, item, spec)
         if item.shape == "mesh":
             parts = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, spec.allow_outside or spec.file is None)
-            all_matt &= item.materials == "own"
         else:
             parts = {name: _object(mi, item, name, placement, bsdf)}
         content.update(parts)
         groups[item.name] = list(parts)
-        paints += [_paint(item, part) for part in parts]
+        if is_matt(item):
+            paints += [paint_of(item, part) for part in parts]
+        else:
+            all_matt = False
     try:
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
-    return content, groups, paints if all_matt else None
+    has_map = any(light.type == "environment" for light in spec.lights)
+    return content, groups, paints if all_matt and not has_map else None
 
 
 def _target_pieces(spec: SceneSpec) -> list[Piece]:
@@ -218,15 +222,7 @@ def _piece(mi: MitsubaModule, name: str, piece: Piece) -> MitsubaObject:
         bsdf = {"type": "diffuse", "reflectance": picture_texture(mi, piece.reflectance)}
     else:
         bsdf = {"type": "diffuse", "reflectance": spectrum_dict(piece.reflectance)}
-    emitter = None if piece.radiance is None else {"type": "area", "radiance": spectrum_dict(piece.radiance)}
-    return make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf, piece.uv, emitter)
-
-
-def _paint(item: ObjectSpec, name: str) -> Paint:
-    """The paint of an object."""
-    colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
-    u, v = item.pattern_count
-    return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
+    return make_mesh(mi, name, piece.vertices_m, piece.faces, bsdf, piece.uv, area_emitter(piece.radiance))
 
 
 def _placement(item: ObjectSpec) -> NDArray[np.float64]:
@@ -237,31 +233,15 @@ def _placement(item: ObjectSpec) -> NDArray[np.float64]:
     return placement
 
 
-def _bsdf(mi: MitsubaModule, item: ObjectSpec) -> dict[str, Any]:
-    """The matt surface of an object."""
-    texture = spectrum_dict(item.reflectance.load())
-    if item.pattern is not None:
-        scale = np.diag([item.pattern_count[0] / 2, item.pattern_count[1] / 2, 1.0, 1.0])
-        texture = {
-            "type": "checkerboard",
-            "color0": texture,
-            "color1": spectrum_dict(item.pattern.load()),
-            "to_uv": transform(mi, scale),
-        }
-    bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": texture}
-    return {"type": "twosided", "material": bsdf} if item.shape in _OPEN_SHAPES else bsdf
-
-
-def _object(
-    mi: MitsubaModule, item: ObjectSpec, name: str, placement: NDArray[np.float64], bsdf: dict[str, Any]
-) -> MitsubaObject:
-    half = np.array(item.size_m) / 2
+def _object(mi: MitsubaModule, item: ObjectSpec, name: str, placement: NDArray[np.float64], bsdf: Any) -> MitsubaObject:
+    half, emitter = np.array(item.size_m) / 2, area_emitter(radiance_of(item))
     if item.shape == "sphere":
         to_world = transform(mi, placement @ np.diag([half[0]] * 3 + [1.0]))
-        return {"type": "sphere", "to_world": to_world, "bsdf": bsdf}
+        sphere = {"type": "sphere", "to_world": to_world, "bsdf": bsdf}
+        return sphere if emitter is None else {**sphere, "emitter": emitter}
     corners, faces, uv = _box_mesh() if item.shape == "box" else _rectangle_mesh()
     vertices = (corners * half) @ placement[:3, :3].T + placement[:3, 3]
-    return make_mesh(mi, name, vertices, faces, bsdf, uv)
+    return make_mesh(mi, name, vertices, faces, bsdf, uv, emitter)
 
 
 def _rectangle_mesh() -> tuple[NDArray, NDArray, NDArray]:
@@ -292,7 +272,8 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
     The RGB colours of a Mitsuba scene become spectra over the whole visible range, so there is nothing to check.
     """
     lamp = lamps_of(spec.target)
-    if spec.mitsuba is not None or not (any(light.is_lit for light in spec.lights) or (lamp and lamp.is_lit)):
+    is_lit = any(light.is_lit for light in spec.lights) or any(own.is_lit for own in spec.lamps)
+    if spec.mitsuba is not None or not is_lit:
         return
     for number, light in enumerate(spec.lights):
         if light.is_lit:
@@ -307,7 +288,12 @@ def named_spectra(spec: SceneSpec) -> Iterator[tuple[str, Spectrum]]:
                 ends = piece.reflectance.wavelength_nm[[0, -1]].tolist()
                 yield f"target ({piece.name})", constant(1.0, *ends)
     for item in spec.objects:
-        for key, source in (("reflectance", item.reflectance), ("pattern", item.pattern)):
+        own = [("reflectance", item.reflectance), ("pattern", item.pattern)]
+        if item.texture is not None or item.material is not None:
+            own = [(f"material.{key}", source) for key, source in leaves_of(item.material or {}, SpectrumSpec)]
+        if item.emission is not None and item.emission.is_lit:
+            own.append(("emission.illuminant", item.emission.illuminant))
+        for key, source in own:
             if source is not None:
                 yield f"objects.{item.name}.{key}", source.load()
 

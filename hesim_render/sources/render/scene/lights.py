@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.environment import environment
 from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectral.spectrum import Spectrum, summed
@@ -81,7 +82,8 @@ def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
 
     ``uniform``: L = E/π from all directions, as for a plane under a uniform sky, visible behind the scene; several
     become one sky of their sum. ``point``: I = E d²/cos θ. ``directional``: E/cos θ across the beam. ``area``:
-    a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black if it is switched off.
+    a one-sided Lambertian rectangle, L = E / ∫ cos θ dω exactly, black if it is switched off. ``environment``: see
+    there.
 
     Parameters
     ----------
@@ -104,6 +106,9 @@ def emitters(mi: MitsubaModule, given: Sequence[LightSpec]) -> dict[str, Any]:
             continue
         elif light.type == "uniform":
             skies.append(level.scaled(1 / pi))
+        elif light.type == "environment":
+            key = key_of(given, number)
+            entries[name] = environment(mi, light, _plane(light, key)[1], key)
         else:
             entries[name] = _beam(light, level, key_of(given, number))
     if skies:

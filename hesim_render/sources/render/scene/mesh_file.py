@@ -14,6 +14,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
 from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.surfaces import area_emitter, radiance_of
 from hesim_render.specs.scene import OUTSIDE, ObjectSpec
 from hesim_render.spectral.transfer import decode
 from hesim_render.targets.piece import Picture
@@ -26,7 +27,7 @@ def mesh_shapes(
     item: ObjectSpec,
     name: str,
     placement: NDArray[np.float64],
-    bsdf: dict[str, Any],
+    bsdf: Any,
     folder: Path,
     allow_outside: bool,
 ) -> dict[str, Any]:
@@ -42,7 +43,7 @@ def mesh_shapes(
     item : the object.
     name : beginning of the names of the shapes.
     placement : [4, 4], pose of the object at rest.
-    bsdf : surface of the object where `materials` is ``own``.
+    bsdf : surface of the object, or its dictionary, where `materials` is ``own``.
     folder : folder of the scene file.
     allow_outside : let a glTF file name files outside of this folder.
 
@@ -52,6 +53,7 @@ def mesh_shapes(
         If the file is missing, cannot be read, or has no surface.
     """
     path, key = folder / str(item.mesh), f"objects.{item.name}.mesh"
+    emitter = area_emitter(radiance_of(item))
     if not path.is_file():
         raise SpecError(f"no such mesh file: {path}", key=key)
     kind = path.suffix.lower().lstrip(".")
@@ -61,7 +63,8 @@ def mesh_shapes(
         box = shape.bbox()
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         fit = placement @ _fit(item, low, high, int(shape.face_count()), path, key)
-        return {name: {"type": kind, "filename": str(path), "to_world": transform(mi, fit), "bsdf": bsdf}}
+        shape = {"type": kind, "filename": str(path), "to_world": transform(mi, fit), "bsdf": bsdf}
+        return {name: shape if emitter is None else {**shape, "emitter": emitter}}
     if kind not in _OF_TRIMESH:
         known = ", ".join(end.upper() for end in (*_OF_MITSUBA, *_OF_TRIMESH))
         raise SpecError(f"a mesh must be one of {known}, not {path.name}", key=key)
@@ -75,7 +78,7 @@ def mesh_shapes(
         vertices = np.asarray(part.vertices, dtype=np.float64) @ fit[:3, :3].T + fit[:3, 3]
         uv = getattr(part.visual, "uv", None)
         surface = bsdf if item.materials == "own" else _principled(mi, part.visual, uv is not None)
-        found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv)
+        found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv, emitter)
     return found
 
 

@@ -216,13 +216,15 @@ def make_mesh(
     name: str,
     vertices: NDArray[np.float64],
     faces: NDArray[np.uint32],
-    bsdf: dict[str, Any],
+    bsdf: Any,
     texcoords: NDArray[np.float64] | None = None,
     emitter: dict[str, Any] | None = None,
 ) -> MitsubaObject:
-    """A flat-shaded mesh from arrays: vertices [n, 3] in metres, faces [m, 3], texture coordinates [n, 2]."""
+    """A flat-shaded mesh from arrays: vertices [n, 3] in metres, faces [m, 3], texture coordinates [n, 2]; its BSDF or
+    the dictionary of it.
+    """
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
+    properties["bsdf"] = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
     if emitter is not None:
         properties["emitter"] = mi.load_dict(emitter)
     mesh = mi.Mesh(name, len(vertices), len(faces), has_vertex_texcoords=texcoords is not None, props=properties)

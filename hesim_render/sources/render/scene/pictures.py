@@ -1,4 +1,4 @@
-"""Pictures of a target as textures of Mitsuba."""
+"""Pictures of targets and surfaces as textures of Mitsuba."""
 
 from __future__ import annotations
 
@@ -9,14 +9,21 @@ import numpy as np
 
 from hesim_render.core.device_types import Float, Interaction, Mask, MitsubaModule
 from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.mitsuba_version import transform
 from hesim_render.targets.piece import Picture
 
 
-def picture_texture(mi: MitsubaModule, picture: Picture) -> Any:
+def picture_texture(mi: MitsubaModule, picture: Picture, repeat: tuple[int, int] | None = None) -> Any:
     """A texture with the reflectances of a picture.
 
     Grey pictures are the same at all wavelengths. Mitsuba turns sRGB colours into smooth spectra [jakob2019]. Spectral
     pictures are linear between their wavelengths and zero beyond them.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    picture : the reflectances.
+    repeat : how often the picture is seen along u and v, also beyond 0 to 1; None: once, and its rim beyond.
 
     Raises
     ------
@@ -26,15 +33,19 @@ def picture_texture(mi: MitsubaModule, picture: Picture) -> Any:
     if picture.kind == "spectral":
         if mi.variant().startswith("scalar"):
             raise SpecError("a hyperspectral picture is rendered in vectorised variants of Mitsuba only")
-        return _spectral_texture(mi.variant())(picture)
+        return _spectral_texture(mi.variant())(picture, repeat)
     values = np.ascontiguousarray(picture.values[::-1], dtype=np.float32)  # Mitsuba's first row has v = 0
     return {
         "type": "bitmap",
         "bitmap": mi.Bitmap(values[..., 0] if picture.kind == "grey" else values),
         "raw": picture.kind == "grey",
         "filter_type": picture.interpolation,
-        "wrap_mode": "clamp",
+        **({"wrap_mode": "clamp"} if repeat is None else {"wrap_mode": "repeat", "to_uv": _scaled(mi, repeat)}),
     }
+
+
+def _scaled(mi: MitsubaModule, repeat: tuple[int, int]) -> Any:
+    return transform(mi, np.diag([*map(float, repeat), 1.0, 1.0]))
 
 
 @functools.cache
@@ -46,7 +57,7 @@ def _spectral_texture(variant: str) -> type:
     class SpectralPicture(mi.Texture):  # type: ignore[misc, name-defined]
         """A table of reflectances [row, col, wavelength] with linear interpolation between wavelengths."""
 
-        def __init__(self, picture: Picture) -> None:
+        def __init__(self, picture: Picture, repeat: tuple[int, int] | None) -> None:
             mi.Texture.__init__(self, mi.Properties())
             assert picture.wavelength_nm is not None
             rows, cols, planes = picture.values.shape
@@ -55,12 +66,17 @@ def _spectral_texture(variant: str) -> type:
             self._knots = mi.Float(picture.wavelength_nm.astype(np.float32))
             self._ends = mi.Float(float(picture.wavelength_nm[0])), mi.Float(float(picture.wavelength_nm[-1]))
             self._bilinear = picture.interpolation == "bilinear"
+            self._repeats = repeat is not None
+            self._scale = mi.Float(float((repeat or (1, 1))[0])), mi.Float(float((repeat or (1, 1))[1]))
             self._mean = float(picture.values.mean())
-            dr.make_opaque(self._size, self._values, self._knots, self._ends)
+            dr.make_opaque(self._size, self._values, self._knots, self._ends, self._scale)
 
         def eval(self, si: Interaction, active: Mask = True) -> Any:
             rows, cols = self._size
-            x, y = si.uv.x * mi.Float(cols), (1 - si.uv.y) * mi.Float(rows)
+            u, v = si.uv.x * self._scale[0], si.uv.y * self._scale[1]
+            if self._repeats:
+                u, v = u - dr.floor(u), v - dr.floor(v)
+            x, y = u * mi.Float(cols), (1 - v) * mi.Float(rows)
             if not self._bilinear:
                 return self._at(si, dr.floor(y), dr.floor(x), active)
             x, y = x - 0.5, y - 0.5
@@ -73,8 +89,11 @@ def _spectral_texture(variant: str) -> type:
         def _at(self, si: Interaction, row: Float, col: Float, active: Mask) -> Any:
             """Reflectance of a texel at the wavelengths of each lane."""
             (rows, cols), planes = self._size, self._planes
-            inside_row = mi.UInt32(dr.clip(row, 0, mi.Float(rows) - 1))
-            inside_col = mi.UInt32(dr.clip(col, 0, mi.Float(cols) - 1))
+            height, width = mi.Float(rows), mi.Float(cols)
+            if self._repeats:  # neighbours across the rim are those of the next copy
+                row, col = (place - dr.floor(place / size) * size for place, size in ((row, height), (col, width)))
+            inside_row = mi.UInt32(dr.clip(row, 0, height - 1))
+            inside_col = mi.UInt32(dr.clip(col, 0, width - 1))
             first = (inside_row * cols + inside_col) * planes
             found = []
             for wavelength in si.wavelengths:

@@ -102,19 +102,20 @@ class Trajectory:
         segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
         return self.within(segment, (local - knots[segment]) / (knots[segment + 1] - knots[segment]))
 
-    def throughout(self, times_us: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
-        """Segment of a time interval, and poses at times of the interval, [k, 4, 4].
+    def throughout(self, times_us: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """Segments of time intervals [...], and poses at times of each, [..., k, 4, 4], for times of shape [..., k].
 
-        No time of `ends_us` may lie inside the interval. At its end the pose is the one before the jump of a repeating
+        No time of `ends_us` may lie inside an interval. At its end the pose is the one before the jump of a repeating
         track.
         """
-        middle = 0.5 * (times_us[0] + times_us[-1])
-        knots, local = self.knots_us - self.knots_us[0], float(self.local_us(middle))
-        segment = int(np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2))
+        middle = 0.5 * (times_us[..., 0] + times_us[..., -1])
+        knots, local = self.knots_us - self.knots_us[0], self.local_us(middle)
+        segment = np.clip(np.searchsorted(knots, local, side="right") - 1, 0, knots.size - 2)
         if not self.repeat:  # the pose is held before and after
             local = middle - self.knots_us[0]
-        share = (local + times_us - middle - knots[segment]) / (knots[segment + 1] - knots[segment])
-        return segment, self.within(np.full(share.size, segment), np.clip(share, 0.0, 1.0))
+        length = knots[segment + 1] - knots[segment]
+        share = (local[..., None] + times_us - middle[..., None] - knots[segment][..., None]) / length[..., None]
+        return segment, self.within(np.broadcast_to(segment[..., None], share.shape), np.clip(share, 0.0, 1.0))
 
     def within(self, segment: NDArray[np.integer], share: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pose in segments at a share of each, 0 to 1 with both ends included; [..., 4, 4]."""

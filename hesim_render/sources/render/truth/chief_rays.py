@@ -21,6 +21,7 @@ from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.tracer import BLOCK_RAYS
 from hesim_render.sources.render.transport.motion_bounds import stays_in
@@ -90,8 +91,7 @@ class ChiefRays:
         self.built = build(self._mi, scene.spec)
         self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
         self.sensor = self.view.sensor
-        tracks = (Trajectory(track) for track in scene.spec.motion if track.object == "camera")
-        self.camera = next((trajectory for trajectory in tracks if trajectory.moves), None)
+        self.camera = camera_trajectory(scene.spec)
         self.parts = MovingScene(self.built, geometry_only=True)
         self.names = Names.of(self._mi, self.built, self.parts)
         self._rays = RayFactory(self.view)

@@ -17,8 +17,9 @@ class LightLevels:
 
     Parameters
     ----------
-    name : ``light`` or ``lights.N`` of a scene file, or the name of a Mitsuba scene's emitter with a waveform.
-    unit : ``lx``, ``W m^-2``, or ``1`` for the power over its mean.
+    name : ``light`` or ``lights.N`` of a scene file, ``target`` or ``objects.NAME`` for one that shines itself, or the
+        name of a Mitsuba scene's emitter with a waveform.
+    unit : ``lx``, ``W m^-2``, ``cd m^-2``, or ``1`` for the power over its mean.
     mean : time mean.
     level : level at the given times, in the shape of these.
     """
@@ -41,6 +42,9 @@ def light_levels(scene: Scene, t_us: ArrayLike) -> list[LightLevels]:
         mean, unit = (lux, "lx") if lux is not None else (float(light.irradiance_w_m2 or 0.0), "W m^-2")
         power = _power(None if light.waveform is None else light.waveform.load(), times)
         found.append(LightLevels(name, unit, float(mean), mean * power))
+    for name, lamp in scene.spec.named_lamps:
+        power = _power(None if lamp.waveform is None else lamp.waveform.load(), times)
+        found.append(LightLevels(name, "cd m^-2", lamp.luminance_cd_m2, lamp.luminance_cd_m2 * power))
     if scene.spec.mitsuba is not None:
         for name, spec in scene.spec.mitsuba.waveforms.items():
             found.append(LightLevels(name, "1", 1.0, _power(spec.load(), times)))

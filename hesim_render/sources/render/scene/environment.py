@@ -1,0 +1,111 @@
+"""Environment maps: light from everywhere, as a picture of all directions, with a level on a plane."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.device_types import MitsubaModule, MitsubaObject
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import reading
+from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, transform
+from hesim_render.specs.geometry import rotation_about
+from hesim_render.specs.light import LightSpec
+from hesim_render.spectral.spectrum import photopic
+
+#: Wavelengths at which a map is summed up, nm, as many groups as lanes of four wavelengths need.
+_WAVELENGTH_NM = np.linspace(360.0, 830.0, 96)
+#: Directions that are evaluated at once.
+_CHUNK = 1 << 20
+#: Least part of the sphere's power that must fall onto the plane.
+_LEAST = 1e-9
+
+
+def environment(mi: MitsubaModule, light: LightSpec, normal: NDArray[np.float64], key: str) -> dict[str, Any]:
+    """Mitsuba's emitter of an environment map that gives the wanted level on a plane, without shadows.
+
+    The map is equirectangular, its upper edge at +y, its middle column at +z before the turn by `rotation_deg` about y.
+    Colours are linear sRGB, which Mitsuba turns into smooth spectra times that of D65 [jakob2019].
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    light : the light.
+    normal : unit normal of its plane, [3].
+    key : place of the light in the scene file, for errors.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, has negative values, or gives no light to the plane.
+    """
+    if mi.variant().startswith("scalar"):
+        raise SpecError("environment maps of scene files are rendered in vectorised variants of Mitsuba only", key=key)
+    file = light.folder / str(light.file)
+    with as_spec_error(file, f"{key}.file"), reading(file, "as a picture"):
+        picture = mi.Bitmap(str(file)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    values = np.array(picture, dtype=np.float32)
+    if not np.isfinite(values).all() or values.min() < 0 or min(values.shape[:2]) < 2:
+        raise SpecError(
+            "an environment map needs 2x2 pixels or more, with values of 0 or above", file=file, key=f"{key}.file"
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_about((0.0, 1.0, 0.0), light.rotation_deg)
+
+    def plugin(scale: float) -> dict[str, Any]:
+        return {"type": "envmap", "bitmap": mi.Bitmap(values), "scale": scale, "to_world": transform(mi, pose)}
+
+    lit = light.illuminance_lux is not None
+    found = level_on_plane(mi, mi.load_dict(plugin(1.0)), values.shape[:2], pose[:3, :3], normal, in_lux=lit)
+    if not found > _LEAST * max(float(values.max()), 1e-30):
+        raise SpecError("the environment map gives no light to the plane (see plane_normal)", key=key)
+    wanted = light.illuminance_lux if light.illuminance_lux is not None else light.irradiance_w_m2
+    return plugin(float(wanted or 0.0) / found)
+
+
+def level_on_plane(
+    mi: MitsubaModule,
+    emitter: MitsubaObject,
+    shape: tuple[int, int],
+    turn: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    in_lux: bool,
+) -> float:
+    """∫ L cos θ dω over the half sphere above a plane, lx or W m⁻² (360 to 830 nm): the sum over all texels of a map.
+
+    Parameters
+    ----------
+    emitter : the environment.
+    shape : rows and columns of its map, whose rows run from pole to pole.
+    turn : rotation of the map, [3, 3].
+    normal : unit normal of the plane, [3].
+    in_lux : weigh by the luminous efficiency.
+    """
+    import drjit as dr
+
+    rows, cols = shape
+    theta = np.linspace(0.0, np.pi, rows)
+    phi = 2 * np.pi * np.arange(cols) / cols
+    rows_at_once, total = max(1, _CHUNK // cols), 0.0
+    weight_nm = np.full(_WAVELENGTH_NM.size, _WAVELENGTH_NM[1] - _WAVELENGTH_NM[0])
+    weight_nm[[0, -1]] /= 2
+    if in_lux:
+        weight_nm *= LUMINOUS_EFFICACY_LM_PER_W * photopic().at(_WAVELENGTH_NM)
+    for first in range(0, rows, rows_at_once):
+        polar, around = np.meshgrid(theta[first : first + rows_at_once], phi, indexing="ij")
+        own = np.stack([np.sin(around) * np.sin(polar), np.cos(polar), -np.cos(around) * np.sin(polar)])
+        direction = turn @ own.reshape(3, -1)
+        weight = np.maximum(normal @ direction, 0.0) * np.sin(polar).ravel()
+        seen = np.flatnonzero(weight > 0)
+        if seen.size == 0:
+            continue
+        si = dr.zeros(mi.SurfaceInteraction3f, seen.size)
+        si.wi = mi.Vector3f(*(-direction[:, seen]).astype(np.float32))
+        for wavelengths, weights in zip(_WAVELENGTH_NM.reshape(-1, 4), weight_nm.reshape(-1, 4), strict=True):
+            si.wavelengths = type(si.wavelengths)([dr.opaque(mi.Float, float(one)) for one in wavelengths])
+            radiance = np.array(emitter.eval(si), dtype=np.float64).reshape(4, -1)
+            total += float((weights[:, None] * radiance * weight[seen]).sum())
+    return total * (np.pi / (rows - 1)) * (2 * np.pi / cols)

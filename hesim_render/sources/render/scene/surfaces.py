@@ -1,0 +1,136 @@
+"""Surfaces of a scene file's objects: paint, pictures, and materials of Mitsuba."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.device_types import MitsubaModule
+from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, spectrum_dict, transform
+from hesim_render.sources.render.scene.paint import Paint
+from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.plugins import HONOURED, REFUSED
+from hesim_render.specs.scene import ObjectSpec, SceneSpec
+from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.specs.surface import TextureSpec
+from hesim_render.spectral.spectrum import Spectrum
+from hesim_render.targets.image import read_picture
+
+#: Shapes without an inside; both of their sides are visible.
+_OPEN_SHAPES = ("rectangle", "mesh")
+#: Plugins with files that Mitsuba reads itself.
+_NAME_FILES = ("bitmap", "measured", "volume")
+
+
+def is_matt(item: ObjectSpec) -> bool:
+    """True if an object is matt, of one or two colours, and does not shine."""
+    return item.material is None and item.texture is None and item.emission is None and item.materials == "own"
+
+
+def paint_of(item: ObjectSpec, name: str) -> Paint:
+    """The paint of a matt object's shape."""
+    colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
+    u, v = item.pattern_count
+    return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
+
+
+def radiance_of(item: ObjectSpec) -> Spectrum | None:
+    """Radiance that an object's surface gives, W m⁻² sr⁻¹ nm⁻¹; None if it gives none."""
+    return item.emission.radiance() if item.emission is not None and item.emission.is_lit else None
+
+
+def area_emitter(radiance: Spectrum | None) -> dict[str, Any] | None:
+    """The emitter of a surface that gives a radiance in all directions of its outside."""
+    return None if radiance is None else {"type": "area", "radiance": spectrum_dict(radiance)}
+
+
+def surface_of(mi: MitsubaModule, item: ObjectSpec, spec: SceneSpec) -> Any:
+    """BSDF of an object, or its dictionary for Mitsuba. Open shapes that reflect only do so on both sides.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    item : the object.
+    spec : its scene.
+
+    Raises
+    ------
+    SpecError
+        If the material is no BSDF that is rendered, Mitsuba refuses its keys, or a file cannot be read.
+    """
+    key = f"objects.{item.name}.material"
+    if item.material is not None:
+        bsdf = _plugin(mi, item.material, item, spec, key, "BSDF")
+    elif item.texture is not None:
+        bsdf = {"type": "diffuse", "reflectance": _picture(mi, item.texture, f"objects.{item.name}.texture")}
+    else:
+        bsdf = {"type": "diffuse", "reflectance": _colours(mi, item)}
+    is_open = item.shape in _OPEN_SHAPES
+    if item.material is None and item.texture is None:
+        return {"type": "twosided", "material": bsdf} if is_open else bsdf
+    with as_spec_error(spec.file, key):
+        loaded = mi.load_dict(bsdf)
+    if not is_open or bsdf["type"] == "twosided" or mi.has_flag(loaded.flags(), mi.BSDFFlags.Transmission):
+        return loaded
+    return {"type": "twosided", "material": loaded}
+
+
+def _colours(mi: MitsubaModule, item: ObjectSpec) -> dict[str, Any]:
+    """One reflectance, or a checkerboard of two."""
+    texture = spectrum_dict(item.reflectance.load())
+    if item.pattern is None:
+        return texture
+    scale = np.diag([item.pattern_count[0] / 2, item.pattern_count[1] / 2, 1.0, 1.0])
+    return {
+        "type": "checkerboard",
+        "color0": texture,
+        "color1": spectrum_dict(item.pattern.load()),
+        "to_uv": transform(mi, scale),
+    }
+
+
+def _picture(mi: MitsubaModule, texture: TextureSpec, key: str) -> Any:
+    return picture_texture(mi, read_picture(texture, key), texture.repeat)
+
+
+def _plugin(
+    mi: MitsubaModule, node: Mapping[str, Any], item: ObjectSpec, spec: SceneSpec, key: str, kind: str | None = None
+) -> dict[str, Any]:
+    """A description in a scene file as a dictionary for Mitsuba.
+
+    Parameters
+    ----------
+    key : place of the description, for errors.
+    kind : what it must be; None: a BSDF or a texture.
+    """
+    name = node["type"]
+    kinds = ("BSDF", "Texture") if kind is None else (kind,)
+    if not any(name in HONOURED[one] for one in kinds):
+        why = REFUSED["BSDF"].get(str(name))
+        known = ", ".join(sorted(known for one in kinds for known in HONOURED[one]))
+        told = why or f"it is not known here; use one of {known}"
+        raise SpecError(f"{' or '.join(kinds)} {str(name)!r}: {told}", file=spec.file, key=f"{key}.type")
+    content: dict[str, Any] = {}
+    for name_of_key, value in node.items():
+        place = f"{key}.{name_of_key}"
+        if isinstance(value, SpectrumSpec):
+            content[name_of_key] = spectrum_dict(value.load())
+        elif isinstance(value, TextureSpec):
+            content[name_of_key] = _picture(mi, value, place)
+        elif isinstance(value, Mapping):
+            content[name_of_key] = _plugin(mi, value, item, spec, place)
+        elif name_of_key == "filename" and name in _NAME_FILES:
+            file = spec.folder / str(value)
+            if not file.is_file():
+                raise SpecError(f"no such file: {file}", file=spec.file, key=place)
+            content[name_of_key] = str(file)
+        elif isinstance(value, list) and np.shape(value) == (4, 4):
+            content[name_of_key] = transform(mi, value)
+        elif isinstance(value, list):
+            content[name_of_key] = ",".join(f"{float(v):.9g}" for v in value)
+        else:
+            content[name_of_key] = value
+    return content
