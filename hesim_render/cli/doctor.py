@@ -59,9 +59,9 @@ def _lines_of(kind: Kind) -> list[str]:
 
         return illuminant_names()
     if kind is Kind.noise:
-        from hesim_render.capture.noise_terms import NOISE_TERMS
+        from hesim_render.capture.noise_terms import TERMS
 
-        return list(NOISE_TERMS)
+        return list(TERMS)
     if kind is Kind.truth:
         from hesim_render.recording.truth_kinds import TRUTH_KINDS
 

@@ -107,6 +107,7 @@ class _Lens(Strict):
     focal_length_mm: PositiveFloat
     magnification: NonNegativeFloat
     axis_mm: tuple[float, float] = Field((0.0, 0.0), description="recordings of before it was told have it there")
+    effects: dict[str, Any] = Field({}, description="aberrations that are on, as in the sensor file")
 
 
 class _Source(Strict):

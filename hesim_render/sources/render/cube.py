@@ -152,8 +152,10 @@ def _add_slice(
 
     shape = tracer.view.sensor.layout.shape
     pixels = np.arange(tracer.pixel_count, dtype=np.uint32)
-    for first in range(0, bands.size, _BANDS_PER_RAY):
-        group = bands[first : first + _BANDS_PER_RAY]
+    # where a ray's path depends on its wavelength, it has a single one
+    together = 1 if tracer.rays.is_dispersive else _BANDS_PER_RAY
+    for first in range(0, bands.size, together):
+        group = bands[first : first + together]
         padded = np.pad(group, (0, _BANDS_PER_RAY - group.size), mode="edge")
         wavelengths = [dr.opaque(jit().Float, float(band)) for band in padded]
 

@@ -107,10 +107,13 @@ def take_pilot(
     Returns
     -------
     pilot : statistics of all windows. Sites near which nothing moves are traced in the first window only.
-    near : [site], True if a ray came near a moving object within the interval; always True if the camera moves.
+    near : [site], True if a ray came near a moving object within the interval; always True if the camera moves,
+        or if anything moves in front of a lens with a depth of field.
     """
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
-    near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
+    # few rays of a pixel meet an object that is far out of focus
+    knows = tracer.camera is None and not (tracer.rays.has_pupil and tracer.parts.groups)
+    near = found.met if knows else np.ones(sites.size, np.bool_)
     lit, hidden, *others = (np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found))
     pilot = Pilot(lit, hidden, others[0], others[1], others[2])
     moving = np.flatnonzero(near)
