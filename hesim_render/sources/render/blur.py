@@ -112,7 +112,7 @@ class GaussianBlur:
 
 
 class KernelBlur:
-    """Measured kernels, each turned about the axis to the pixel's own direction.
+    """Measured kernels, each turned about the axis to the pixel's own direction, but for the one on the axis.
 
     Parameters
     ----------
@@ -132,6 +132,7 @@ class KernelBlur:
         within = np.cumsum(kernels, axis=2)
         within /= np.maximum(within[..., -1:], 1e-300)
         self._row_sums, self._col_sums = (table(types.Float, values.astype(np.float32)) for values in (by_row, within))
+        self._on_axis = told.image_height_mm[0] == 0
         self._which = _OverHeight(sensor, told.image_height_mm, np.arange(count, dtype=np.float64))
         step_px = told.sample_um / sensor.spec.geometry.pitch_um
         self._step = dr.opaque(types.Float, step_px)
@@ -166,7 +167,8 @@ class KernelBlur:
         out_x = place[0] - dr.opaque(types.Float, (geometry.cols - 1) / 2 + axis_x / pitch_mm)
         out_y = place[1] - dr.opaque(types.Float, (geometry.rows - 1) / 2 + axis_y / pitch_mm)
         far = dr.hypot(out_x, out_y)
-        cosine, sine = (dr.select(far > 0, part / far, unit) for part, unit in ((out_x, 1.0), (out_y, 0.0)))
+        turned = (far > 0) & ((kernel > 0) | (not self._on_axis))
+        cosine, sine = (dr.select(turned, part / far, unit) for part, unit in ((out_x, 1.0), (out_y, 0.0)))
         return y * sine - x * cosine, -x * sine - y * cosine
 
 

@@ -283,6 +283,13 @@ def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera
     camera = scene.camera
     if camera is None:
         return _from_mitsuba(scene, sensor, mitsuba_sensor)
+    fixed = sensor.spec.lens.magnification
+    if sensor.optics.depth_of_field and fixed != "focus" and camera.focus_distance_m is not None:
+        raise sensor.lens_error(
+            f"the lens is focused by a fixed magnification of {fixed:g}, and the scene has a camera.focus_distance_m: "
+            "set the magnification to 'focus', or leave the distance away",
+            "lens.magnification",
+        )
     if camera.fit == "target":
         return _fit_to_target(scene, camera, sensor)
     matrix = look_at(camera.origin_m, camera.target_m, camera.up)
