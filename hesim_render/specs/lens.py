@@ -102,8 +102,8 @@ class GaussianPsf(Strict):
 class MeasuredPsf(Strict):
     """Measured kernels at some image heights, linear between them, constant beyond the last.
 
-    A kernel is an array of an odd number of rows and columns whose middle is the chief ray. One at an image height above
-    0 is given as it looks to the right of the axis; elsewhere it is turned about the axis.
+    A kernel is an array of an odd number of rows and columns whose middle is the chief ray. One at an image height
+    above 0 is given as it looks to the right of the axis; elsewhere it is turned about the axis.
     """
 
     type: Literal["measured"]

@@ -1,4 +1,4 @@
-"""e-SFR of edges through lenses with diffraction and defocus, against closed forms weighted by spectrum and response."""
+"""e-SFR of edges through lenses with diffraction and defocus: closed forms weighted by spectrum and response."""
 
 import functools
 

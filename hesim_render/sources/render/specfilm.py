@@ -72,18 +72,21 @@ def perspective_dict(
     left, right, top, bottom = view.region_mm
     width, height = right - left, bottom - top
     image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
+    # Mitsuba measures the offset of the film's centre from the axis in units of the film's size
+    off = ((left + right) / 2 - axis_x) / width, ((top + bottom) / 2 - axis_y) / height
     lens = view.sensor.lens
-    kind: dict[str, Any] = {"type": "perspective"}
+    kind: dict[str, Any] = {
+        "type": "perspective", "principal_point_offset_x": off[0], "principal_point_offset_y": off[1]
+    }  # fmt: skip
     if view.sensor.optics.depth_of_field:
+        if max(map(abs, off)) > 1e-9:
+            raise SpecError("Mitsuba's thin lens has its axis in the middle: choose a region around the axis")
         focus_m = min(lens.focus_distance_m, 1e5)
         kind = {"type": "thinlens", "aperture_radius": lens.pupil_radius_m, "focus_distance": focus_m}
     return {
         **kind,
         "fov": degrees(2 * atan(width / 2 / image_mm)),
         "fov_axis": "x",
-        # Mitsuba measures the offset of the film's centre from the axis in units of the film's size
-        "principal_point_offset_x": ((left + right) / 2 - axis_x) / width,
-        "principal_point_offset_y": ((top + bottom) / 2 - axis_y) / height,
         "near_clip": max(1e-4, view.near_m),
         "far_clip": 1e5,
         "to_world": transform(mi, camera_to_world @ MITSUBA_AXES),
