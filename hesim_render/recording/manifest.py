@@ -77,7 +77,7 @@ def build(
             "focal_length_mm": sensor.lens.focal_length_mm,
             "magnification": sensor.lens.magnification,
             "axis_mm": list(sensor.lens.axis_mm),
-            "effects": sensor.optics.used_effects(),
+            "effects": spec.lens.without(sensor.lens.off).used_effects(),
         },
         "sensor": {"name": spec.name, "file": sensor.file, "sha256": content_hash(spec), "spec": _dump(spec)},
         "scene": None

@@ -36,13 +36,14 @@ def poses(target, count, seed, fov_deg, tilts_deg, fill):
                "position_m": [float(x), float(y), float(1 - away)]}  # fmt: skip
 
 
-def calibrated(target, model, count, seed, samples=32):
+def calibrated(target, model, count, seed, window=None):
     """Errors of OpenCV's camera: of fx and fy, relative; of cx and cy, over the width; largest error of the
     displacement over the field, over the largest displacement; and the number of boards that were found."""
-    fov_deg, tilts_deg, fill, window = SETUP[model["model"]]
+    fov_deg, tilts_deg, fill, usual = SETUP[model["model"]]
+    window = window or usual
     sensor, views = mono(COLS, ROWS, lens__distortion=model), []
     for number, placed in enumerate(poses(target, count, seed, fov_deg, tilts_deg, fill)):
-        a, b, source = flux_image(board_scene(placed, fov_deg), sensor, samples, seed=100 * seed + number)
+        a, b, source = flux_image(board_scene(placed, fov_deg), sensor, 32, seed=100 * seed + number)
         views.append(found_corners(placed, ((a + b) / (a + b).max() * 255).astype(np.float32), window))
     views = [view for view in views if view is not None]
     objects, images = zip(*views, strict=True)
@@ -96,7 +97,7 @@ def test_opencv_finds_camera_and_distortion_in_19_of_20_seeds(model):
 
 @pytest.mark.slow
 def test_opencv_finds_camera_and_distortion_from_charuco_boards():
-    """Twice the bound of the focal length for checkerboards, as without distortion; see test_boards.py."""
+    """In a search window of 8 px, the markers would be seen beside the corners."""
     for seed in range(3):
-        focal, centre, distortion, count = calibrated(CHARUCO, RADIAL, 20, seed)
-        assert count >= 15 and focal < 2e-3 and centre < 1e-3 and distortion < 0.02
+        focal, centre, distortion, count = calibrated(CHARUCO, RADIAL, 20, seed, window=6)
+        assert count >= 15 and focal < 1e-3 and centre < 1e-3 and distortion < 0.02

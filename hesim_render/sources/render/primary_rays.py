@@ -83,8 +83,8 @@ class RayFactory:
 
     @property
     def can_aim(self) -> bool:
-        """True if `density` is known."""
-        return not isinstance(self._blur, KernelBlur) and not self.is_dispersive
+        """True if `density` is known, and a place in the picture decides which points a ray may meet."""
+        return not (isinstance(self._blur, KernelBlur) or self.is_dispersive or self.has_pupil)
 
     @property
     def blur_px(self) -> float:
