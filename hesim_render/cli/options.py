@@ -48,7 +48,7 @@ Without = Annotated[
     list[str] | None,
     typer.Option(
         metavar="TERM",
-        help="switch one noise term or effect of the lens off, as aps.read (see 'list noise'); repeatable",
+        help="switch one noise term or effect of the lens off, as aps.read (see 'list noise', 'list lens'); repeatable",
         autocompletion=_noise_terms,
     ),
 ]

@@ -137,11 +137,8 @@ class Distortion:
         radius, found = self._radii
         _, _, xx, xy, yy = np.moveaxis(found, -1, 0)
         with np.errstate(all="ignore"):
+            # beyond a pole of the rational model, the first is below 0 as well
             fair = (xx * yy - xy * xy > 0) & (xx + yy > 0)
-            if self.model == "opencv":  # a pole of the rational model is a fold as well
-                k4, k5, k6 = self.coefficients[5:]
-                r2 = radius[:, None] ** 2
-                fair &= 1 + r2 * (k4 + r2 * (k5 + r2 * k6)) > 0
         wrong = np.flatnonzero(~fair.all(axis=1))
         return float(radius[-1] if wrong.size == 0 else radius[max(wrong[0] - 1, 0)])
 

@@ -73,6 +73,42 @@ def test_models_that_fold_in_the_image_are_refused():
         Distortion.of(FisheyeDistortion(model="fisheye"), 1.56)
 
 
+def test_the_model_is_used_beyond_the_image_but_not_to_its_fold():
+    folding = OpenCvDistortion(model="opencv", k1=-0.4)
+    seen, fold = Distortion.of(folding, 0.6).undistorted(np.array([0.6, 0.0]))[0], (1 / 1.2) ** 0.5
+    assert seen < Distortion.of(folding, 0.6).limit < fold - 0.01 * (fold - seen)
+    wide = Distortion.of(folding, 0.2)
+    np.testing.assert_allclose(wide.limit, 1.3 * wide.undistorted(np.array([0.2, 0.0]))[0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_no_direction_moves_faster_in_the_image_than_told(name):
+    """Differences of places for tangents, for shifts over the depth, and for turns of the camera."""
+    spec = MODELS[name]
+    model = Distortion.of(spec, FARTHEST)
+    rng, step = np.random.default_rng(5), 1e-6
+    around = rng.uniform(0, 2 * np.pi, 40_000)
+    tangent = (np.sqrt(rng.uniform(0, 1, 40_000)) * model.limit)[:, None] * np.stack(
+        [np.cos(around), np.sin(around)], 1
+    )
+    here = by_opencv(spec, tangent)
+    way = rng.normal(size=(40_000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    point = np.column_stack([tangent, np.ones(40_000)])
+    across = way[:, :2] / np.linalg.norm(way[:, :2], axis=1, keepdims=True)
+    moved = {
+        0: point + step * np.column_stack([across, np.zeros(40_000)]),
+        1: point + step * way,
+        2: point + step * np.cross(way, point),
+    }
+    for kind, told in enumerate(model.steepest):
+        there = by_opencv(spec, moved[kind][:, :2] / moved[kind][:, 2:])
+        speed = np.linalg.norm(there - here, axis=1) / step
+        assert speed.max() <= told * 1.001
+        assert speed.max() > 0.5 * told  # bounds of the parts are multiplied
+    assert np.linalg.norm(by_opencv(spec, moved[0][:, :2]) - here, axis=1).max() / step > 0.98 * model.steepest[0]
+
+
 def test_the_error_names_file_line_and_key(tmp_path):
     text = (hr.specs.files.data_folder("sensors") / "reference-mono.yaml").read_text(encoding="utf-8")
     file = tmp_path / "mine.yaml"
