@@ -87,6 +87,11 @@ class RayFactory:
         return not (isinstance(self._blur, KernelBlur) or self.is_dispersive or self.has_pupil)
 
     @property
+    def spreads(self) -> bool:
+        """True if few rays of a pixel may meet what changes it: out of focus, or in the skirts of a measured PSF."""
+        return self.has_pupil or isinstance(self._blur, KernelBlur)
+
+    @property
     def blur_px(self) -> float:
         """Radius of the PSF that holds nearly all of it, px."""
         return 0.0 if self._blur is None else self._blur.reach_px

@@ -7,6 +7,7 @@ from scipy import optimize, special, stats
 
 from hesim_render.core.backend import jit
 from hesim_render.sources.render.blur import AiryBlur, GaussianBlur, KernelBlur, airy_radii
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 RAYS = 400_000
 
@@ -121,3 +122,34 @@ def test_a_lopsided_kernel_is_seen_as_it_was_measured():
     shift = (a.sum(axis=0) * col).sum() / a.sum() - (plain.sum(axis=0) * col).sum() / plain.sum()
     assert abs(shift - 2.0) < 0.06
     assert a.sum() == pytest.approx(plain.sum(), rel=0.02)
+
+
+def test_the_skirts_of_a_measured_psf_change_with_what_moves_far_away():
+    """A lamp 12 px away: 3 % of its light lies in a ring of the kernel, which few of a pixel's rays meet."""
+    y, x = np.mgrid[-15:16, -15:16]
+    ring = (np.abs(np.hypot(x, y) - 12) < 2).astype(float)
+    kernel = 0.03 * ring / ring.sum()
+    kernel[15, 15] += 0.97
+    told = {"type": "measured", "kernels": [kernel.tolist()], "sample_um": 5.0}
+    ends = [{"t_us": 0}, {"t_us": 10_000, "translation_m": [0.015, 0, 0]}]
+    scene = rendering.make_scene(
+        objects=[
+            {"name": "spark", "shape": "sphere", "size_m": [0.004] * 3, "position_m": [-0.01, 0, 0.01],
+             "reflectance": 1.0},
+            {"name": "wall", "shape": "rectangle", "size_m": [4, 4, 0], "reflectance": 0.002},
+        ],
+        light={"type": "directional", "illuminance_lux": 10_000, "direction": (0, 0, -1)},
+        motion=[{"object": "spark", "keyframes": ends}], camera={"origin_m": [0, 0, 1], "horizontal_fov_deg": 6},
+    )  # fmt: skip
+    sensor, pixels = rendering.mono(64, 48, lens__psf=told), np.arange(64 * 48, dtype=np.uint32)
+    flux = ChangeDrivenFlux(scene, sensor, 0.5, seed=1)
+    assert not flux.still_pixels(pixels).any()
+    change, wanted = [], []
+    for t_us in (1_000.0, 9_000.0):
+        change.append(sum(np.array(half) for half in flux.mean_flux(pixels, t_us, t_us + 10)) / 2)
+        a, b, _ = rendering.flux_image(scene, sensor, 1024, 9, t_us, t_us + 10)
+        wanted.append(((a + b) / 2).ravel())
+    found, expected = change[1] - change[0], wanted[1] - wanted[0]
+    skirt = np.abs(expected) < 0.02 * np.abs(expected).max()
+    share = np.sum((found * np.sign(expected))[skirt]) / np.sum(np.abs(expected)[skirt])
+    assert skirt.sum() > 1000 and 0.7 < share < 1.1  # noise of the expected values makes their sum a little larger

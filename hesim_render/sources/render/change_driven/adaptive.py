@@ -56,8 +56,7 @@ class AdaptiveRenderer:
     def still(self, role: Role) -> Still:
         """The pixels of a role that are known to be constant, and their flux."""
         if role not in self._kept:
-            # few rays of a pixel meet an object that is far out of focus
-            may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None and not self.tracer.rays.has_pupil
+            may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None and not self.tracer.rays.spreads
             count = self.index.size
             self._kept[role] = Still(
                 _ALWAYS_US if may_rest else None,

@@ -108,11 +108,10 @@ def take_pilot(
     -------
     pilot : statistics of all windows. Sites near which nothing moves are traced in the first window only.
     near : [site], True if a ray came near a moving object within the interval; always True if the camera moves,
-        or if anything moves in front of a lens with a depth of field.
+        or if anything moves in front of a lens that spreads light (`RayFactory.spreads`).
     """
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
-    # few rays of a pixel meet an object that is far out of focus
-    knows = tracer.camera is None and not (tracer.rays.has_pupil and tracer.parts.groups)
+    knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = found.met if knows else np.ones(sites.size, np.bool_)
     lit, hidden, *others = (np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found))
     pilot = Pilot(lit, hidden, others[0], others[1], others[2])
