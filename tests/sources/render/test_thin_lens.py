@@ -6,9 +6,12 @@ import rendering
 from scipy import stats
 
 import hesim_render as hr
+from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render import reference_flux
+from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.reference import WindowReference
 
 WALL = {"name": "wall", "shape": "rectangle", "size_m": [40, 40, 0], "reflectance": 1.0}
@@ -201,3 +204,46 @@ def test_what_moves_far_out_of_focus_changes_every_pixel_of_its_blur():
 def test_a_fixed_magnification_and_a_focus_distance_contradict_each_other():
     with pytest.raises(SpecError, match=r"reference-mono\.yaml:19: lens\.magnification: .* fixed magnification of 0,"):
         rendering.flux_image(furnace(), rendering.mono(4, 4, lens__depth_of_field=True), 4)
+
+
+class Given:
+    """A sampler with known numbers."""
+
+    def __init__(self, u, v):
+        self._pair = jit().Float(u), jit().Float(v)
+
+    def next_2d(self):
+        return self._pair
+
+
+def test_rays_leave_the_pupil_through_the_plane_in_focus_with_the_cosine_of_their_angle_at_the_chip():
+    """Positions in space, written out: the chip is a mirrored picture behind the lens."""
+    sensor = hr.load_sensor("reference-mono", {
+        "lens.f_number": 1.4, "lens.focal_length_mm": 6.0, "lens.magnification": "focus", "lens.depth_of_field": True,
+        "lens.relative_illumination": "cos4"})  # fmt: skip
+    view = place_camera(furnace(0.2).spec, sensor)
+    rng = np.random.default_rng(4)
+    u, v, col, row = rng.random(500), rng.random(500), rng.uniform(0, 1023, 500), rng.uniform(0, 1023, 500)
+    lanes = [jit().Float(values.astype(np.float32)) for values in (col, row)]
+    zero = jit().Float(0)
+    origin, direction, weight = RayFactory(view).through_lens(
+        tuple(lanes), (zero, zero), Given(u.astype(np.float32), v.astype(np.float32))
+    )
+    start, way = np.array(origin, np.float64).T - [0, 0, 1], np.array(direction, np.float64).T
+    image_m = 6e-3 * 200 / 194
+    assert np.all(np.hypot(*start[:, :2].T) <= 3e-3 / 1.4 * (1 + 1e-5)) and np.abs(start[:, 2]).max() < 1e-6
+    # uniform in sin² of the angle at the middle of the chip
+    sine2 = (start[:, :2] ** 2).sum(axis=1)
+    sine2 /= sine2 + image_m**2
+    edge2 = (3e-3 / 1.4 / image_m) ** 2
+    np.testing.assert_allclose(sine2 / (edge2 / (1 + edge2)), u, atol=1e-4)
+    shown = np.column_stack([(col - 511.5) * 5e-6, -(row - 511.5) * 5e-6]) / image_m
+    met = start[:, :2] + way[:, :2] * (-0.2 / way[:, 2])[:, None]
+    np.testing.assert_allclose(met, 0.2 * shown, atol=1e-6)
+    # cos⁴ of the ray over that of the chief ray, and over that of the same pupil point from the middle
+    chip = np.column_stack([-shown * image_m, np.full(500, image_m)])
+    cosine = image_m / np.linalg.norm(start - chip, axis=1)
+    chief = image_m / np.linalg.norm(chip, axis=1)
+    middle = image_m / np.linalg.norm(start - [0, 0, image_m], axis=1)
+    np.testing.assert_allclose(np.array(weight), (cosine / chief / middle) ** 4, rtol=2e-4)
+    assert np.ptp(np.array(weight)) > 0.3
