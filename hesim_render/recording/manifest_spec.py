@@ -128,6 +128,15 @@ class _Source(Strict):
 class _SensorFile(_Source):
     file: str
 
+    @field_validator("spec")
+    @classmethod
+    def _has_its_kernels(cls, spec: dict[str, Any]) -> dict[str, Any]:
+        lens = spec.get("lens")
+        psf = lens.get("psf") if isinstance(lens, Mapping) else None
+        if isinstance(psf, Mapping) and psf.get("file") is not None:
+            raise ValueError("names a file of a PSF; the numbers must stand here")
+        return spec
+
 
 class _SceneFile(_Source):
     files_sha256: dict[str, str] = {}

@@ -1,5 +1,7 @@
 """Veiling glare and lateral chromatic aberration, effects that are switched off, and what recordings say."""
 
+import json
+
 import numpy as np
 import pytest
 import rendering
@@ -176,6 +178,13 @@ def test_a_saved_recording_holds_the_kernels_of_its_lens(tmp_path):
     assert loaded.manifest["sensor"]["spec"]["lens"]["psf"]["kernels"] == kernels.tolist()
     assert loaded.truth.camera().width == 16
     assert saved.manifest["sensor"]["sha256"] == loaded.manifest["sensor"]["sha256"]
+    # a recording from elsewhere reads no other file
+    manifest = json.loads((tmp_path / "rec" / "recording.json").read_text(encoding="utf-8"))
+    np.save(tmp_path / "psf.npy", kernels)
+    manifest["sensor"]["spec"]["lens"]["psf"] |= {"file": str(tmp_path / "psf.npy"), "kernels": None}
+    (tmp_path / "rec" / "recording.json").write_text(json.dumps(manifest), encoding="utf-8")
+    with pytest.raises(SpecError, match=r"sensor\.spec: names a file of a PSF"):
+        hr.Recording.load(tmp_path / "rec")
 
 
 @pytest.mark.parametrize(
