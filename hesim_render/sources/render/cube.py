@@ -74,8 +74,8 @@ def render_cube(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Spectral radiance on a pixel grid at exact wavelengths, at one instant or as the mean over a window of time.
 
-    Each value is the radiance averaged over one pixel pitch (and the lens PSF). Filters and relative
-    illumination are not applied.
+    Each value is the radiance averaged over one pixel pitch, after the lens at that wavelength (PSF, diffraction,
+    chromatic aberration, depth of field). Filters, relative illumination and veiling glare are not applied.
 
     Parameters
     ----------
