@@ -71,8 +71,9 @@ class RenderedFlux(WindowByWindow):
     """Φ = V(x) · ∫ L(x, t, λ) R(λ) dλ in e⁻/s, by path tracing; implements `FluxSource`.
 
     R = A_pix·FF·G·τ_lens·C_f·η·λ/(hc) with G = π/(1 + 4N²(1 + |m|)²) is the pixel's own response. L is
-    averaged over the whole pixel pitch (a box) after the lens, and over the time interval if the camera moves; a part of
-    the light may be spread over the sensor (`VeilingGlare`). Objects stand still within a slice (`slice_edges_us`), at the pose of its middle.
+    averaged over the whole pixel pitch (a box) after the lens, and over the time interval if the camera moves; a part
+    of the light may be spread over the sensor (`VeilingGlare`). Objects stand still within a slice
+    (`slice_edges_us`), at the pose of its middle.
 
     Where the lens has no depth of field, it is a pinhole at the entrance pupil. Random numbers are a pure
     function of (seed, pixel on the full sensor, sample). They do not depend on chunks, order, crop or time.
