@@ -71,6 +71,15 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "sources.render.change_driven.plan": ("tests/sources/render/test_changes.py",),
     "sources.render.change_driven.tuning:Gain": ("tests/sources/render/test_changes.py",),
     "sources.render.sampling.sampler:third_coordinates": ("tests/sources/render/test_renderer_sampling.py",),
+    "sensor.distortion": ("tests/sensor/test_distortion.py", "tests/sources/render/test_projection.py"),
+    "sources.render.blur": ("tests/sources/render/test_blur.py",),
+    "sources.render.primary_rays:RayFactory": (
+        "tests/sources/render/test_thin_lens.py",
+        "tests/sources/render/test_lens_effects.py",
+        "tests/sources/render/test_aimed_rays.py",
+        "tests/sources/render/test_projection.py",
+    ),
+    "sources.render.glare": ("tests/sources/render/test_lens_effects.py",),
     "pixels.normal": ("tests/pixels/test_noise_aps.py", "tests/pixels/test_noise_evs.py"),
 }
 

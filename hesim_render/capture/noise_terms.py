@@ -8,13 +8,16 @@ from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.specs.lens import LENS_TERMS
 
 #: Names of all noise terms that can be switched off.
 NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))
+#: Names of all that can be switched off in a render: noise terms, and effects of the lens.
+TERMS = (*NOISE_TERMS, *LENS_TERMS)
 
 
 def noise_models(
-    sensor: Sensor, clean: bool = False, without: Sequence[str] = ()
+    sensor: Sensor, clean: bool = False, without: Sequence[str] = (), terms: Sequence[str] = NOISE_TERMS
 ) -> tuple[ApsNoise | None, EvsNoise | None]:
     """Both noise models of a sensor, with terms switched off.
 
@@ -23,6 +26,7 @@ def noise_models(
     sensor : the sensor; the model of a pixel kind that it lacks is None.
     clean : switch all terms off.
     without : names of terms to switch off, such as ``aps.read`` or ``evs.leak``; see `NOISE_TERMS`.
+    terms : names that may stand in `without`; those of a lens are no noise.
 
     Returns
     -------
@@ -34,8 +38,8 @@ def noise_models(
         For a name that is not a term.
     """
     for name in without:
-        if name not in NOISE_TERMS:
-            raise RangeError("noise term", name, f"one of {', '.join(NOISE_TERMS)}{did_you_mean(name, NOISE_TERMS)}")
+        if name not in terms:
+            raise RangeError("noise term", name, f"one of {', '.join(terms)}{did_you_mean(name, terms)}")
     aps = sensor.aps if sensor.spec.aps is not None else None
     evs = sensor.evs if sensor.spec.evs is not None else None
     if aps is not None:

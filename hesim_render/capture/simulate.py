@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.noise_terms import TERMS, noise_models
 from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
 from hesim_render.core.progress import Progress, ProgressReport, shown
@@ -30,6 +30,7 @@ from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.sources.scene import Scene
+from hesim_render.specs.lens import LENS_TERMS
 
 #: Default rays per pixel in the exact mode. A static scene is rendered once for the whole run,
 #: a moving one once per slice.
@@ -65,7 +66,8 @@ def simulate(
     seed : seed of the temporal noise and of the render's samples. The fixed maps of the device come from the
         device seed of the sensor file.
     clean : switch every noise term off.
-    without : names of noise terms to switch off, such as ``aps.read`` or ``evs.leak``.
+    without : names of noise terms and of effects of the lens to switch off, such as ``aps.read`` or
+        ``lens.distortion``.
     quality : wanted error of the render, as a fraction of the sensor's own noise; default 0.5. Each pixel gets as
         many rays as this error needs, and only pixels that change are rendered again. An audit measures what this
         misses.
@@ -130,7 +132,8 @@ def simulate(
         raise RangeError("truth_every_us", truth_every_us, f"1 to {duration_us} µs, the length of the run")
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     backend.jit()
-    noise = noise_models(sensor, clean, without)
+    noise = noise_models(sensor, clean, without, TERMS)
+    sensor = sensor.without([term for term in without if term in LENS_TERMS])
     settings: dict[str, Any] = {"clean": clean, "without": list(without)}
     if kinds:
         settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
@@ -191,9 +194,9 @@ def simulate(
 def _camera_used(flux: Any) -> dict[str, Any]:
     """Pose at rest and field of view of the camera in use, as plain values, whether scene or sensor set them."""
     view = flux.view
-    left, right, _, _ = view.region_mm
-    axis, image_mm = view.sensor.lens.axis_mm[0], view.sensor.lens.image_distance_mm
-    across = np.arctan((right - axis) / image_mm) - np.arctan((left - axis) / image_mm)
+    left, right, top, bottom = view.region_mm
+    ends = (view.direction(x, (top + bottom) / 2) for x in (left, right))
+    across = np.diff([np.arctan(x / -z) for x, _, z in ends])[0]
     pose = view.camera_to_world
     return {
         "origin_m": pose[:3, 3].tolist(),

@@ -17,6 +17,7 @@ class Kind(StrEnum):
     sensors = "sensors"
     illuminants = "illuminants"
     noise = "noise"
+    lens = "lens"
     truth = "truth"
 
 
@@ -41,7 +42,7 @@ def doctor() -> None:
 
 def list_(
     kind: Annotated[
-        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise or truth; default all")
+        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise, lens or truth; default all")
     ] = None,
 ) -> None:
     """List the names that can be used."""
@@ -62,6 +63,10 @@ def _lines_of(kind: Kind) -> list[str]:
         from hesim_render.capture.noise_terms import NOISE_TERMS
 
         return list(NOISE_TERMS)
+    if kind is Kind.lens:
+        from hesim_render.specs.lens import LENS_TERMS
+
+        return list(LENS_TERMS)
     if kind is Kind.truth:
         from hesim_render.recording.truth_kinds import TRUTH_KINDS
 

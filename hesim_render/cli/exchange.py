@@ -12,7 +12,7 @@ from hesim_render.cli.terminal import parse_size, say, summary
 from hesim_render.core.errors import ConflictError
 
 _EXPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "txt", "nmnist", "tiff", "png", "npy", "mipi")
-_GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr")
+_GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv")
 _FRAMES = (".dng", ".tif", ".tiff", ".png", ".npy")
 _IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz")
 

@@ -29,9 +29,9 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
 
 
 def _noise_terms(incomplete: str) -> list[str]:
-    from hesim_render.capture.noise_terms import NOISE_TERMS
+    from hesim_render.capture.noise_terms import TERMS
 
-    return [name for name in NOISE_TERMS if name.startswith(incomplete)]
+    return [name for name in TERMS if name.startswith(incomplete)]
 
 
 SENSOR_HELP = "a name (see 'list sensors') or the path of a sensor file"
@@ -48,7 +48,7 @@ Without = Annotated[
     list[str] | None,
     typer.Option(
         metavar="TERM",
-        help="switch one noise term off, as aps.read (see 'list noise'); repeatable",
+        help="switch one noise term or effect of the lens off, as aps.read (see 'list noise', 'list lens'); repeatable",
         autocompletion=_noise_terms,
     ),
 ]

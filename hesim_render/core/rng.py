@@ -45,6 +45,7 @@ class Stream(IntEnum):
     TELEGRAPH_SHARE = 51
     TELEGRAPH_AMPLITUDE = 52
     IMU = 60
+    RENDER_GLARE = 61
 
 
 def stream_key(seed: int, stream: Stream) -> int:

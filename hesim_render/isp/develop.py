@@ -136,5 +136,6 @@ def _illumination(recording: Recording) -> NDArray[np.float32]:
     roi, used = recording.manifest["roi"], recording.manifest["lens"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
     axis_x, axis_y = used.get("axis_mm", (0.0, 0.0))  # older recordings do not state the axis: it is in the middle
-    lens = Lens(used["f_number"], used["focal_length_mm"], used["magnification"], (axis_x, axis_y))
+    off = frozenset(term.removeprefix("lens.") for term in manifests.lens_terms_off(recording.manifest))
+    lens = Lens(used["f_number"], used["focal_length_mm"], used["magnification"], (axis_x, axis_y), off)
     return relative_illumination(layout, lens)

@@ -45,7 +45,8 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
         )
     spec, roi = manifests.sensor_spec(manifest, folder), manifest["roi"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
-    return SceneTruth(scene, Sensor(layout, Lens.of(spec)))
+    sensor = Sensor(layout, Lens.of(spec)).without(manifests.lens_terms_off(manifest))
+    return SceneTruth(scene, sensor)
 
 
 def _scene_of(told: Mapping[str, Any], file: Path | None) -> Scene:

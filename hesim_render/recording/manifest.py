@@ -17,6 +17,7 @@ from hesim_render.core.guard import inside, read_text, reading
 from hesim_render.mosaic import description as mosaic
 from hesim_render.recording.manifest_spec import RecordingSpec
 from hesim_render.specs.files import content_hash, validate
+from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
 from hesim_render.specs.sensor import SensorSpec
 from hesim_render.specs.surface import TextureSpec, leaves_of
@@ -76,6 +77,7 @@ def build(
             "focal_length_mm": sensor.lens.focal_length_mm,
             "magnification": sensor.lens.magnification,
             "axis_mm": list(sensor.lens.axis_mm),
+            "effects": spec.lens.without(sensor.lens.off).used_effects(),
         },
         "sensor": {"name": spec.name, "file": sensor.file, "sha256": content_hash(spec), "spec": _dump(spec)},
         "scene": None
@@ -157,6 +159,11 @@ def read(folder: Path) -> dict[str, Any]:
     if found != SCHEMA_VERSION or isinstance(found, bool):
         raise SpecError(f"schema_version is {found!r}; this version reads {SCHEMA_VERSION}", file=file)
     return validate(RecordingSpec, manifest, file, {}).model_dump(mode="json", exclude_unset=True)
+
+
+def lens_terms_off(manifest: Mapping[str, Any]) -> list[str]:
+    """Effects of the lens that were switched off in a run, such as ``lens.distortion``."""
+    return [term for term in manifest["settings"].get("without", []) if term in LENS_TERMS]
 
 
 def sensor_spec(manifest: Mapping[str, Any], folder: Path | None = None) -> SensorSpec:

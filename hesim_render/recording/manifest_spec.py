@@ -107,6 +107,7 @@ class _Lens(Strict):
     focal_length_mm: PositiveFloat
     magnification: NonNegativeFloat
     axis_mm: tuple[float, float] = Field((0.0, 0.0), description="recordings of before it was told have it there")
+    effects: dict[str, Any] = Field({}, description="aberrations that are on, as in the sensor file")
 
 
 class _Source(Strict):
@@ -126,6 +127,15 @@ class _Source(Strict):
 
 class _SensorFile(_Source):
     file: str
+
+    @field_validator("spec")
+    @classmethod
+    def _has_its_kernels(cls, spec: dict[str, Any]) -> dict[str, Any]:
+        lens = spec.get("lens")
+        psf = lens.get("psf") if isinstance(lens, Mapping) else None
+        if isinstance(psf, Mapping) and psf.get("file") is not None:
+            raise ValueError("names a file of a PSF; the numbers must stand here")
+        return spec
 
 
 class _SceneFile(_Source):

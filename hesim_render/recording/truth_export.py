@@ -1,4 +1,4 @@
-"""Geometric truth in formats that others read: EXR, flow of DSEC, trajectories of TUM, calibration of Kalibr.
+"""Geometric truth in formats that others read: EXR, flow of DSEC, trajectories of TUM, cameras for Kalibr and OpenCV.
 
 Every format is a folder with ``export.json``, which states what was written. docs/ground-truth.md has the conventions.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
+from hesim_render.recording.camera_files import write_kalibr_camchain, write_opencv_camera, write_yaml
 from hesim_render.recording.truth_file import POSE_STEP_US, images_at
 from hesim_render.recording.truth_kinds import IMAGES
 from hesim_render.sources.render.truth.imu import ImuModel
-from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
@@ -43,7 +43,7 @@ def export_truth(
     ----------
     recording : the recording.
     format_ : ``exr``: images of every frame; ``dsec-flow``: forward flow of the event pixels; ``tum``: trajectories of
-        camera and objects; ``kalibr``: cameras and the inertial unit.
+        camera and objects; ``kalibr``: cameras and the inertial unit; ``opencv``: cameras for `cv2.FileStorage`.
     out : folder to write.
     every_us : interval of flow (default 100 000) or of poses (default 1000), µs.
     overwrite : replace an existing export.
@@ -205,53 +205,24 @@ def _tum(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | 
     return {"files": {name: what for name, (what, _) in files.items()}}
 
 
-# ---- Kalibr --------------------------------------------------------------------------------------------------------
+# ---- cameras --------------------------------------------------------------------------------------------------------
 
 
-def _kalibr_camera(
-    camera: CameraModel, topic: str, from_imu: NDArray[np.float64], from_previous: NDArray[np.float64] | None
-) -> dict[str, Any]:
-    k = camera.k
-    entry = {
-        "camera_model": "pinhole",
-        "intrinsics": [k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
-        "distortion_model": "radtan",
-        "distortion_coeffs": [*camera.distortion, 0.0, 0.0, 0.0, 0.0][:4],
-        "resolution": [camera.width, camera.height],
-        "rostopic": topic,
-        "T_cam_imu": from_imu.tolist(),
-        "timeshift_cam_imu": 0.0,
-    }
-    return entry if from_previous is None else {**entry, "T_cn_cnm1": from_previous.tolist()}
+def _grids(truth: SceneTruth) -> list[Grid]:
+    """Grids that a sensor has."""
+    grids: list[Grid] = ["mosaic"] if truth.sensor.spec.aps is not None else []
+    return grids + (["events"] if 0 not in truth.sensor.layout.evs_shape else [])
 
 
-def write_kalibr_camchain(path: str | Path, truths: Sequence[SceneTruth], grids: Sequence[Grid]) -> Path:
-    """Write the cameras of a rig for Kalibr; the inertial unit is in the first one.
-
-    Parameters
-    ----------
-    path : YAML file to write.
-    truths : scene of each camera, as from `rig_scenes`.
-    grids : grid of each, ``mosaic`` or ``events``.
-
-    Returns
-    -------
-    The file.
-    """
-    target, poses = Path(path), [truth.camera_pose(0.0) for truth in truths]
-    chain = {}
-    for number, (truth, grid, pose) in enumerate(zip(truths, grids, poses, strict=True)):
-        before = None if number == 0 else np.linalg.inv(pose) @ poses[number - 1]
-        topic, from_imu = f"/cam{number}/image_raw", np.linalg.inv(pose) @ poses[0]
-        chain[f"cam{number}"] = _kalibr_camera(truth.camera(grid), topic, from_imu, before)
-    with output_errors(target):
-        _write_yaml(target, chain)
-    return target
+def _opencv(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+    names = {grid: f"camera_{grid}.yaml" for grid in _grids(truth)}
+    for grid, name in names.items():
+        write_opencv_camera(folder / name, truth.camera(grid))
+    return {"files": {name: f"camera of the grid {grid!r}" for grid, name in names.items()}}
 
 
 def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
-    grids: list[Grid] = ["mosaic"] if truth.sensor.spec.aps is not None else []
-    grids += ["events"] if 0 not in truth.sensor.layout.evs_shape else []
+    grids = _grids(truth)
     write_kalibr_camchain(folder / "camchain.yaml", [truth] * len(grids), grids)
     model = ImuModel()
     unit = {
@@ -262,49 +233,8 @@ def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int
         "gyroscope_noise_density": model.gyro_noise_density,
         "gyroscope_random_walk": model.gyro_random_walk,
     }
-    _write_yaml(folder / "imu.yaml", unit)
+    write_yaml(folder / "imu.yaml", unit)
     return {"cameras": {f"cam{number}": grid for number, grid in enumerate(grids)}}
-
-
-def write_kalibr_aprilgrid(
-    path: str | Path, tag_cols: int, tag_rows: int, tag_size_m: float, tag_spacing: float
-) -> Path:
-    """Write the description of an AprilGrid for Kalibr.
-
-    Parameters
-    ----------
-    path : YAML file to write.
-    tag_cols, tag_rows : number of tags.
-    tag_size_m : edge of a tag, m.
-    tag_spacing : gap between tags over their edge.
-
-    Returns
-    -------
-    The file.
-
-    Raises
-    ------
-    RangeError
-        If a number is not above 0.
-    """
-    values = {"tagCols": tag_cols, "tagRows": tag_rows, "tagSize": tag_size_m, "tagSpacing": tag_spacing}
-    for name, value in values.items():
-        if not 0 < value < float("inf"):
-            raise RangeError(name, value, "a number above 0")
-    target = Path(path)
-    with output_errors(target):
-        _write_yaml(target, {"target_type": "aprilgrid", **values})
-    return target
-
-
-def _write_yaml(path: Path, content: dict[str, Any]) -> None:
-    from ruamel.yaml import YAML
-
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 200
-    with path.open("w", encoding="utf-8") as stream:
-        yaml.dump(json.loads(json.dumps(content)), stream)
 
 
 #: Writers by the name of their format.
@@ -313,4 +243,5 @@ FORMATS: dict[str, Callable[[Recording, SceneTruth, Path, int | None], dict[str,
     "dsec-flow": _dsec_flow,
     "tum": _tum,
     "kalibr": _kalibr,
+    "opencv": _opencv,
 }

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from math import pi
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.units import M_PER_UM, MM_PER_M, photons_per_joule
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs.sensor import IlluminationTable, SensorSpec
+from hesim_render.specs.lens import IlluminationTable
+from hesim_render.specs.sensor import SensorSpec
 from hesim_render.spectral.spectrum import INTEGRATION_STEP_NM, Spectrum, constant, merged_grid
 
 
@@ -25,12 +27,14 @@ class Lens:
     magnification : m (only |m| matters); the image distance is f (1 + |m|).
     axis_mm : point where the optical axis meets the chip (the principal point), relative to the centre of the full
         sensor, mm: to the right and downwards in the image.
+    off : effects of the lens that are switched off, such as ``distortion`` (`LensSpec.without`).
     """
 
     f_number: float
     focal_length_mm: float
     magnification: float
     axis_mm: tuple[float, float] = (0.0, 0.0)
+    off: frozenset[str] = frozenset()
 
     @classmethod
     def of(
@@ -40,6 +44,7 @@ class Lens:
         f_number: float | None = None,
         focal_length_mm: float | None = None,
         focus_distance_m: float | None = None,
+        off: Iterable[str] = (),
     ) -> Lens:
         """The lens of a sensor file, with a scene's own f-number, focal length and focus distance.
 
@@ -50,7 +55,7 @@ class Lens:
         if magnification == "focus":
             distance = None if focus_distance_m is None else focus_distance_m * MM_PER_M
             magnification = 0.0 if distance is None or distance <= focal else focal / (distance - focal)
-        return cls(f_number or spec.lens.f_number, focal, abs(float(magnification)))
+        return cls(f_number or spec.lens.f_number, focal, abs(float(magnification)), off=frozenset(off))
 
     @property
     def solid_angle_sr(self) -> float:
@@ -62,6 +67,23 @@ class Lens:
     def image_distance_mm(self) -> float:
         """Image distance f (1 + |m|), mm."""
         return self.focal_length_mm * (1 + self.magnification)
+
+    @property
+    def working_f_number(self) -> float:
+        """N (1 + |m|): the image distance over the diameter of the pupil."""
+        return self.f_number * (1 + self.magnification)
+
+    @property
+    def pupil_radius_m(self) -> float:
+        """Half of f/N, m."""
+        return self.focal_length_mm / (2 * self.f_number * MM_PER_M)
+
+    @property
+    def focus_distance_m(self) -> float:
+        """Distance from the pupil to the plane in focus, f (1 + 1/|m|), m; infinite at m = 0."""
+        if self.magnification == 0:
+            return inf
+        return self.focal_length_mm * (1 + 1 / self.magnification) / MM_PER_M
 
 
 def pixel_centres_mm(layout: Layout) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -88,7 +110,7 @@ def relative_illumination_at(
     spec: SensorSpec, lens: Lens, row: NDArray[np.integer], col: NDArray[np.integer]
 ) -> NDArray[np.float32]:
     """V(x) at the centres of pixels of the full sensor, in the shape of `row` and `col` together."""
-    geometry, kind = spec.geometry, spec.lens.relative_illumination
+    geometry, kind = spec.geometry, spec.lens.without(lens.off).relative_illumination
     pitch_mm = geometry.pitch_um * 1e-3
     x, y = (
         (place + 0.5 - count / 2) * pitch_mm - axis

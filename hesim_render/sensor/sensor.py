@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,9 @@ from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.measured import require_region
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.lens import Lens
+from hesim_render.specs.files import load_yaml, locate
+from hesim_render.specs.lens import LensSpec
+from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor import SensorSpec, read_sensor
 from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 
@@ -132,7 +135,46 @@ class Sensor(PlainState):
         -------
         The sensor with the new lens.
         """
-        return replace(self, lens=Lens.of(self.spec, **changes))
+        return replace(self, lens=Lens.of(self.spec, **changes, off=self.lens.off))
+
+    def without(self, terms: Iterable[str]) -> Sensor:
+        """The same sensor with effects of its lens switched off.
+
+        Parameters
+        ----------
+        terms : such as ``lens.distortion`` (`LENS_TERMS`).
+
+        Returns
+        -------
+        The sensor; this one if nothing is listed.
+        """
+        off = frozenset(term.removeprefix("lens.") for term in terms)
+        return replace(self, lens=replace(self.lens, off=self.lens.off | off)) if off else self
+
+    @property
+    def optics(self) -> LensSpec:
+        """The lens of the sensor file, without the effects that are switched off."""
+        return self.spec.lens.without(self.lens.off)
+
+    def lens_error(self, message: str, key: str) -> SpecError:
+        """An error about a key of the lens, with the file, and the line where the file has the key.
+
+        Parameters
+        ----------
+        message : what is wrong.
+        key : dotted key in the sensor file.
+
+        Returns
+        -------
+        The error, to be raised.
+        """
+        if not self.file:
+            return SpecError(message, key=key)
+        try:
+            file = locate(self.file, "sensors")
+            return SpecError(message, file=file, line=line_of(load_yaml(file), key.split(".")), key=key)
+        except SpecError:
+            return SpecError(message, file=self.file, key=key)
 
     @cached_property
     def responses(self) -> dict[str, Spectrum]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field, PositiveInt, field_validator, model_validator
 
@@ -18,6 +18,7 @@ from hesim_render.specs.calibrated import apply_calibration
 from hesim_render.specs.calibration import NoiseFile, NoisePart
 from hesim_render.specs.defects import EventDefectSpec, TelegraphSpec
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.lens import LensSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 from hesim_render.specs.problems import line_of
 from hesim_render.specs.sensor_checks import sensor_problems, unused
@@ -54,37 +55,6 @@ class EvsGridSpec(Strict):
 
     rows_per_tile: PositiveInt
     cols_per_tile: PositiveInt
-
-
-class IlluminationTable(Strict):
-    """Relative illumination against image height, linear between points, constant beyond the last."""
-
-    image_height_mm: list[float] = Field(min_length=2)
-    relative: list[float] = Field(min_length=2)
-
-    @model_validator(mode="after")
-    def _check(self) -> IlluminationTable:
-        heights = self.image_height_mm
-        if len(heights) != len(self.relative):
-            raise ValueError(f"{len(heights)} heights but {len(self.relative)} values; they must be equally many")
-        if any(b <= a for a, b in zip(heights[:-1], heights[1:], strict=True)) or heights[0] < 0:
-            raise ValueError("image_height_mm must start at 0 or above and increase strictly")
-        if any(not 0 <= value <= 1 for value in self.relative):
-            raise ValueError("relative illumination must lie in [0, 1]")
-        return self
-
-
-class LensSpec(Strict):
-    """Solid angle of the cone at the sensor: G = π / (1 + 4 N² (1 + |m|)²) sr."""
-
-    f_number: float = Field(ge=0.1, le=1000)
-    focal_length_mm: float = Field(ge=0.01, le=1e5)
-    transmittance: SpectrumSpec = SpectrumSpec(flat=1.0)
-    magnification: Annotated[float, Field(ge=-100, le=100)] | Literal["focus"] = Field(
-        "focus", description="m; 'focus' derives it from focal length and the scene's focus distance"
-    )
-    relative_illumination: Literal["cos4", "none"] | IlluminationTable = "cos4"
-    psf_fwhm_um: float = Field(0.0, ge=0, le=1e4, description="Gaussian point-spread function on the sensor")
 
 
 class ApsSpec(Strict):

@@ -4,6 +4,7 @@ import json
 import struct
 import zlib
 
+import cv2
 import h5py
 import numpy as np
 import OpenEXR
@@ -14,8 +15,10 @@ from ruamel.yaml import YAML
 import hesim_render as hr
 from hesim_render.capture.simulate import simulate
 from hesim_render.core.errors import OutputError, RangeError, SpecError
-from hesim_render.recording.truth_export import dsec_flow_image, export_truth, tum_lines, write_kalibr_aprilgrid
+from hesim_render.recording.camera_files import write_kalibr_aprilgrid, write_kalibr_camchain, write_opencv_camera
+from hesim_render.recording.truth_export import dsec_flow_image, export_truth, tum_lines
 from hesim_render.recording.truth_kinds import TRUTH_KINDS, truth_kinds
+from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 GEOMETRY = TRUTH_KINDS[:-1]
 
@@ -286,6 +289,47 @@ def test_calibration_of_kalibr(recorded, tmp_path):
     assert grid == {"target_type": "aprilgrid", "tagCols": 6, "tagRows": 5, "tagSize": 0.03, "tagSpacing": 0.3}
     with pytest.raises(RangeError, match="tagSize"):
         write_kalibr_aprilgrid(tmp_path / "grid.yaml", 6, 5, 0.0, 0.3)
+
+
+def test_cameras_of_opencv(recorded, tmp_path):
+    folder = export_truth(recorded, "opencv", tmp_path / "opencv")
+    for grid in ("mosaic", "events"):
+        camera = recorded.truth.camera(grid)
+        storage = cv2.FileStorage(str(folder / f"camera_{grid}.yaml"), cv2.FileStorage_READ)
+        np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), camera.k)
+        np.testing.assert_array_equal(storage.getNode("distortion_coefficients").mat(), np.zeros((1, 5)))
+        assert storage.getNode("image_width").real() == camera.width
+    assert storage.getNode("distortion_model").string() == "none"
+
+
+def test_cameras_with_distortion_in_both_formats(tmp_path):
+    def truth(model):
+        scene = rendering.make_scene(light=rendering.FURNACE, camera={"origin_m": [0, 0, 1]}, objects=[
+            {"name": "wall", "shape": "rectangle", "size_m": [4, 4, 0]}])  # fmt: skip
+        return SceneTruth(scene, hr.load_sensor("eiger", {"lens.distortion": model}))
+
+    radial = truth({"model": "opencv", "k1": -0.2, "k2": 0.03, "p1": 1e-3, "p2": 2e-3})
+    wide = truth({"model": "fisheye", "k1": -0.02, "k2": 0.003, "k3": 4e-4, "k4": -5e-5})
+    chain = YAML(typ="safe").load(write_kalibr_camchain(tmp_path / "chain.yaml", [radial, wide], ["mosaic", "events"]))
+    assert chain["cam0"]["distortion_model"] == "radtan"
+    assert chain["cam0"]["distortion_coeffs"] == [-0.2, 0.03, 1e-3, 2e-3]
+    assert chain["cam1"]["distortion_model"] == "equidistant"
+    assert chain["cam1"]["distortion_coeffs"] == [-0.02, 0.003, 4e-4, -5e-5]
+    k = wide.camera("events").k
+    assert chain["cam1"]["intrinsics"] == [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+    rational = truth({"model": "opencv", "k1": 0.1, "p2": 2e-3, "k4": 0.2})
+    file = write_opencv_camera(tmp_path / "camera.yaml", rational.camera())
+    storage = cv2.FileStorage(str(file), cv2.FileStorage_READ)
+    found = storage.getNode("distortion_coefficients").mat()
+    np.testing.assert_array_equal(found, [[0.1, 0, 0, 2e-3, 0, 0.2, 0, 0]])
+    # both programs put a point where the truth has it
+    point = np.array([0.11, 0.07, 0.1])
+    local = np.linalg.inv(rational.camera_pose(0.0)) @ [*point, 1]
+    there, _ = cv2.projectPoints(local[:3], np.zeros(3), np.zeros(3), rational.camera().k, found)
+    np.testing.assert_allclose(there.ravel(), rational.project(point, 0.0), atol=1e-6)
+    with pytest.raises(SpecError, match="radtan has k1, k2, p1 and p2 only"):
+        write_kalibr_camchain(tmp_path / "none.yaml", [rational], ["mosaic"])
+    assert not (tmp_path / "none.yaml").exists()
 
 
 def test_exports_that_cannot_be_made_leave_nothing(recorded, tmp_path):

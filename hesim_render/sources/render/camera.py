@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.units import MM_PER_M
+from hesim_render.sensor.distortion import Distortion
 from hesim_render.sensor.lens import pixel_centres_mm
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.projection import Projection
@@ -23,6 +24,8 @@ from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector
 
+#: Points along each side of a target whose images must fit into the picture, and steps towards a fit.
+_FIT_POINTS, _FIT_STEPS = 33, 20
 #: From this camera's axes to Mitsuba's (x to the left, looking along +z), and back.
 MITSUBA_AXES = np.diag([-1.0, 1.0, -1.0, 1.0])
 
@@ -63,7 +66,15 @@ class View:
     @cached_property
     def projection(self) -> Projection:
         """Geometry of the lens: places on the full sensor and directions in camera space."""
-        return Projection.of(self.sensor)
+        return Projection.of(self.sensor, self.followed_mm)
+
+    def direction(self, x_mm: float, y_mm: float) -> NDArray[np.float64]:
+        """Chief ray of a place on the chip, measured as in `region_mm`, in camera space; of any length."""
+        image_mm, (axis_x, axis_y) = self.sensor.lens.image_distance_mm, self.sensor.lens.axis_mm
+        if self.projection.distortion is None:
+            return np.array([x_mm - axis_x, axis_y - y_mm, -image_mm])
+        x, y = self.projection.undistorted(np.array([x_mm - axis_x, y_mm - axis_y]) / image_mm)
+        return np.array([x, -y, -1.0])
 
     def project(self, points: NDArray[np.float64], camera_to_world: NDArray[np.float64] | None = None) -> NDArray:
         """Column and row of world points [..., 3], in pixels of this region with (0, 0) at its left top corner;
@@ -87,7 +98,17 @@ class View:
         px_per_m : [k, n], pixels per metre across the axis at that depth.
         """
         local = _in_front(points, camera_to_world)
-        return self.projection.project(local) + 0.5, self.projection.focal_px / -local[..., 2]
+        model = self.projection.distortion
+        steepest = self.projection.focal_px * (1.0 if model is None else model.steepest[0])
+        return self.projection.project(local) + 0.5, steepest / -local[..., 2]
+
+    def defocus_px(self, px_per_m: NDArray[np.float64]) -> float:
+        """Largest radius of the blur of points out of focus, by the px_per_m of `project_on_sensor`, px."""
+        if not self.sensor.optics.depth_of_field:
+            return 0.0
+        lens, model = self.sensor.lens, self.projection.distortion
+        steepest = self.projection.focal_px * (1.0 if model is None else model.steepest[0])
+        return float(lens.pupil_radius_m * np.abs(px_per_m - steepest / lens.focus_distance_m).max())
 
     def unproject(self, depth_m: NDArray[np.float64], camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """World points of a 5×5 grid over the picture, at each depth along the axis; [25 · depths, 3]."""
@@ -156,8 +177,7 @@ def _turned_to_region(view: View, towards: tuple[float, float] = (0.0, 0.0)) -> 
     towards : direction of the centre instead of −z: tangents to the right and downwards.
     """
     left, right, top, bottom = view.region_mm
-    image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
-    looks = np.array([(left + right) / 2 - axis_x, axis_y - (top + bottom) / 2, -image_mm])
+    looks = view.direction((left + right) / 2, (top + bottom) / 2)
     wanted = np.array([towards[0], -towards[1], -1.0])
     looks, wanted = looks / np.linalg.norm(looks), wanted / np.linalg.norm(wanted)
     axis = np.cross(looks, wanted)
@@ -181,8 +201,19 @@ def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View
     width_mm, height_mm = _region_size_mm(sensor)
     target = scene.target
     needed = camera.fit_margin * min(width_mm / (target.width_m * MM_PER_M), height_mm / (target.height_m * MM_PER_M))
+    view, gain = _at_magnification(camera, sensor, needed), 1.0
+    if sensor.optics.distortion is not None:
+        for _ in range(_FIT_STEPS):
+            # a barrel shows more than its centre promises: come nearer until the target fills the picture
+            gain *= camera.fit_margin / _filled(view, target.width_m, target.height_m)
+            view = _at_magnification(camera, sensor, needed * gain)
+    return view
+
+
+def _at_magnification(camera: CameraSpec, sensor: Sensor, needed: float) -> View:
+    """A camera on which the plane z = 0 is imaged at a magnification on the axis; its region looks at the origin."""
     if camera.horizontal_fov_deg is not None:
-        image_mm = width_mm / 2 / tan(radians(camera.horizontal_fov_deg) / 2)
+        image_mm = _image_distance_mm(sensor, camera.horizontal_fov_deg)
         sensor = _with_image_distance(sensor, camera, image_mm, image_mm / needed)
     else:
         focal = camera.focal_length_mm or sensor.spec.lens.focal_length_mm
@@ -192,12 +223,35 @@ def _fit_to_target(scene: SceneSpec, camera: CameraSpec, sensor: Sensor) -> View
     distance_m = image_mm / needed / MM_PER_M
     view = View(np.eye(4), sensor, of_region=True)
     left, right, top, bottom = view.region_mm
-    view.camera_to_world[:3, 3] = [
-        -(left + right) / 2 / image_mm * distance_m,
-        (top + bottom) / 2 / image_mm * distance_m,
-        distance_m,
-    ]
+    if view.projection.distortion is None:
+        across = (left + right) / 2 / image_mm * distance_m, -(top + bottom) / 2 / image_mm * distance_m
+    else:
+        x, y, _ = view.direction((left + right) / 2, (top + bottom) / 2) * distance_m
+        across = float(x), float(y)
+    view.camera_to_world[:3, 3] = [-across[0], -across[1], distance_m]
     return view
+
+
+def _filled(view: View, width_m: float, height_m: float) -> float:
+    """Part of the region that a target around the origin fills, in the direction in which it fills more."""
+    side = np.linspace(-0.5, 0.5, _FIT_POINTS)
+    rim = [(x, y, 0) for end in (-0.5, 0.5) for pair in ((side, 0 * side + end), (0 * side + end, side))
+           for x, y in zip(*pair, strict=True)]  # fmt: skip
+    place = view.project(np.array(rim) * [width_m, height_m, 0])
+    middle = np.array([view.sensor.cols, view.sensor.rows]) / 2
+    return float((np.abs(place - middle).max(axis=0) / middle).max())
+
+
+def _image_distance_mm(sensor: Sensor, horizontal_fov_deg: float) -> float:
+    """Image distance at which the width of the region, if it were centred on the axis, shows a field of view."""
+    tangent = tan(radians(horizontal_fov_deg) / 2)
+    model, half_mm = sensor.optics.distortion, _region_size_mm(sensor)[0] / 2
+    if model is None:
+        return half_mm / tangent
+    try:
+        return half_mm / Distortion.height_at(model, tangent)
+    except SpecError as error:
+        raise sensor.lens_error(str(error).removeprefix(f"{error.key}: "), "lens.distortion") from None
 
 
 def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera | None = None) -> View:
@@ -229,12 +283,19 @@ def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera
     camera = scene.camera
     if camera is None:
         return _from_mitsuba(scene, sensor, mitsuba_sensor)
+    fixed = sensor.spec.lens.magnification
+    if sensor.optics.depth_of_field and fixed != "focus" and camera.focus_distance_m is not None:
+        raise sensor.lens_error(
+            f"the lens is focused by a fixed magnification of {fixed:g}, and the scene has a camera.focus_distance_m: "
+            "set the magnification to 'focus', or leave the distance away",
+            "lens.magnification",
+        )
     if camera.fit == "target":
         return _fit_to_target(scene, camera, sensor)
     matrix = look_at(camera.origin_m, camera.target_m, camera.up)
     away_m = float(np.linalg.norm(np.subtract(camera.origin_m, camera.target_m)))
     if camera.horizontal_fov_deg is not None:
-        image_mm = _region_size_mm(sensor)[0] / 2 / tan(radians(camera.horizontal_fov_deg) / 2)
+        image_mm = _image_distance_mm(sensor, camera.horizontal_fov_deg)
         placed = View(matrix, _with_image_distance(sensor, camera, image_mm, away_m * MM_PER_M), of_region=True)
         return _turned_to_region(placed)
     focus_m = camera.focus_distance_m or away_m

@@ -74,8 +74,8 @@ def render_cube(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32]]:
     """Spectral radiance on a pixel grid at exact wavelengths, at one instant or as the mean over a window of time.
 
-    Each value is the radiance averaged over one pixel pitch (and the lens PSF). Filters and relative
-    illumination are not applied.
+    Each value is the radiance averaged over one pixel pitch, after the lens at that wavelength (PSF, diffraction,
+    chromatic aberration, depth of field). Filters, relative illumination and veiling glare are not applied.
 
     Parameters
     ----------
@@ -152,8 +152,10 @@ def _add_slice(
 
     shape = tracer.view.sensor.layout.shape
     pixels = np.arange(tracer.pixel_count, dtype=np.uint32)
-    for first in range(0, bands.size, _BANDS_PER_RAY):
-        group = bands[first : first + _BANDS_PER_RAY]
+    # where a ray's path depends on its wavelength, it has a single one
+    together = 1 if tracer.rays.is_dispersive else _BANDS_PER_RAY
+    for first in range(0, bands.size, together):
+        group = bands[first : first + together]
         padded = np.pad(group, (0, _BANDS_PER_RAY - group.size), mode="edge")
         wavelengths = [dr.opaque(jit().Float, float(band)) for band in padded]
 

@@ -12,6 +12,7 @@ from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.glare import VeilingGlare
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.timeline import Timeline
 from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
@@ -70,10 +71,11 @@ class RenderedFlux(WindowByWindow):
     """Φ = V(x) · ∫ L(x, t, λ) R(λ) dλ in e⁻/s, by path tracing; implements `FluxSource`.
 
     R = A_pix·FF·G·τ_lens·C_f·η·λ/(hc) with G = π/(1 + 4N²(1 + |m|)²) is the pixel's own response. L is
-    averaged over the whole pixel pitch (a box) after the lens PSF, and over the time interval if
-    the camera moves. Objects stand still within a slice (`slice_edges_us`), at the pose of its middle.
+    averaged over the whole pixel pitch (a box) after the lens, and over the time interval if the camera moves; a part
+    of the light may be spread over the sensor (`VeilingGlare`). Objects stand still within a slice
+    (`slice_edges_us`), at the pose of its middle.
 
-    The lens is a pinhole at the entrance pupil: everything is in focus. Random numbers are a pure
+    Where the lens has no depth of field, it is a pinhole at the entrance pupil. Random numbers are a pure
     function of (seed, pixel on the full sensor, sample). They do not depend on chunks, order, crop or time.
 
     Parameters
@@ -124,6 +126,10 @@ class RenderedFlux(WindowByWindow):
         self._filter = types.UInt32(self.sensor.layout.filter_index.ravel().astype(np.uint32))
         illumination = self.sensor.relative_illumination.ravel() * np.float32(self._tracer.radiance_scale)
         self._illumination = types.Float(illumination)
+        self._glare: VeilingGlare | None = None
+        if self.sensor.optics.veiling_glare > 0 and not self._tracer.built.is_dark:
+            filters = np.unique(self.sensor.layout.filter_index).tolist()
+            self._glare = VeilingGlare(self._tracer, self._wavelengths, filters, seed)
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval at which moving objects take their next pose, µs."""
@@ -151,8 +157,17 @@ class RenderedFlux(WindowByWindow):
         if pixels.size == 0 or self._tracer.built.is_dark:
             zeros = dr.zeros(jit().Float, pixels.size)
             return zeros, dr.zeros(jit().Float, pixels.size)
-        self._tracer.pose(self._timeline.pose_time_us(float(np.min(begin_us)), float(np.max(end_us))))
+        pose_us = self._timeline.pose_time_us(float(np.min(begin_us)), float(np.max(end_us)))
+        self._tracer.pose(pose_us)
         ((half_a, half_b),) = self._tracer.trace(pixels, begin_us, end_us, self._choose, self._weigh)
+        if self._glare is not None:
+            part = self.sensor.optics.veiling_glare
+            begin, end = (np.broadcast_to(np.asarray(v, dtype=np.float64), pixels.shape) for v in (begin_us, end_us))
+            more = self._glare.added(pixels, begin, end, pose_us)
+            half_a, half_b = (
+                dr.fma(jit().Float(1 - part), own, dr.opaque(jit().Float, part) * even)
+                for own, even in zip((half_a, half_b), more, strict=True)
+            )
         require_finite(half_a, half_b, self.scene, self.sensor.layout, pixels)
         return half_a, half_b
 

@@ -13,11 +13,12 @@ from math import ceil, log2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.errors import RangeError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.render.frozen import FrozenPixels, Work
 from hesim_render.sources.render.scene.mitsuba_version import using_variant
+from hesim_render.sources.render.specfilm import require_plain_lens
 from hesim_render.sources.scene import Scene
 
 VARIANT = "scalar_spectral"
@@ -75,7 +76,7 @@ class WindowReference:
     Raises
     ------
     SpecError
-        If the scene is not valid or the lens blurs (Mitsuba's camera has no PSF).
+        If the scene is not valid, or the lens has effects that Mitsuba's cameras lack.
     RangeError
         If a number is out of range.
     """
@@ -95,8 +96,7 @@ class WindowReference:
             raise RangeError("repeats", repeats, "2 or more")
         if most_rays < samples:
             raise RangeError("most_rays", most_rays, f"{samples} or more")
-        if sensor.spec.lens.psf_fwhm_um > 0:
-            raise SpecError("the reference renders no lens PSF; set it to 0", key="lens.psf_fwhm_um")
+        require_plain_lens(sensor)
         self._samples, self._repeats, self._most_rays = samples, repeats, most_rays
         with using_variant(VARIANT) as mi:
             self._parts = [FrozenPixels(mi, waveform, part, sensor) for waveform, part in light_parts(scene)]

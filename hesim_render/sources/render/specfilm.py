@@ -21,6 +21,9 @@ from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, tra
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.scene import Scene
 
+#: Effects that Mitsuba's cameras have, or that are factors on their pictures.
+_MITSUBA_HAS = ("relative_illumination", "depth_of_field")
+
 
 @dataclass(frozen=True)
 class ReferenceFlux:
@@ -48,20 +51,42 @@ class ReferenceFlux:
         return np.take_along_axis(flux, choose, axis=0)[0], np.take_along_axis(stderr, choose, axis=0)[0]
 
 
+def require_plain_lens(sensor: Sensor) -> None:
+    """Refuse effects of a lens that Mitsuba's own cameras do not have.
+
+    Raises
+    ------
+    SpecError
+        Names the key of the first of them.
+    """
+    for name in sensor.optics.used_effects():
+        if name not in _MITSUBA_HAS:
+            key = "psf_fwhm_um" if name == "psf" and sensor.optics.psf is None else name
+            raise SpecError("cameras of Mitsuba do not have this effect; leave it away", key=f"lens.{key}")
+
+
 def perspective_dict(
     mi: MitsubaModule, view: View, camera_to_world: NDArray[np.float64], film: dict[str, Any]
 ) -> dict[str, Any]:
-    """Mitsuba's perspective sensor over exactly the read-out region."""
+    """Mitsuba's perspective or thin-lens sensor over exactly the read-out region."""
     left, right, top, bottom = view.region_mm
     width, height = right - left, bottom - top
     image_mm, (axis_x, axis_y) = view.sensor.lens.image_distance_mm, view.sensor.lens.axis_mm
+    # Mitsuba measures the offset of the film's centre from the axis in units of the film's size
+    off = ((left + right) / 2 - axis_x) / width, ((top + bottom) / 2 - axis_y) / height
+    lens = view.sensor.lens
+    kind: dict[str, Any] = {
+        "type": "perspective", "principal_point_offset_x": off[0], "principal_point_offset_y": off[1]
+    }  # fmt: skip
+    if view.sensor.optics.depth_of_field:
+        if max(map(abs, off)) > 1e-9:
+            raise SpecError("Mitsuba's thin lens has its axis in the middle: choose a region around the axis")
+        focus_m = min(lens.focus_distance_m, 1e5)
+        kind = {"type": "thinlens", "aperture_radius": lens.pupil_radius_m, "focus_distance": focus_m}
     return {
-        "type": "perspective",
+        **kind,
         "fov": degrees(2 * atan(width / 2 / image_mm)),
         "fov_axis": "x",
-        # Mitsuba measures the offset of the film's centre from the axis in units of the film's size
-        "principal_point_offset_x": ((left + right) / 2 - axis_x) / width,
-        "principal_point_offset_y": ((top + bottom) / 2 - axis_y) / height,
         "near_clip": max(1e-4, view.near_m),
         "far_clip": 1e5,
         "to_world": transform(mi, camera_to_world @ MITSUBA_AXES),
@@ -107,7 +132,7 @@ def reference_flux(
     Raises
     ------
     SpecError
-        If the scene is not valid, the variant is missing, or the lens blurs (there is no PSF here).
+        If the scene is not valid, the variant is missing, or the lens has effects that Mitsuba's cameras lack.
     RangeError
         If `samples` is below 1 or `repeats` below 2.
     """
@@ -115,8 +140,7 @@ def reference_flux(
         raise RangeError("samples", samples, "1 or more")
     if repeats < 2:
         raise RangeError("repeats", repeats, "2 or more")
-    if sensor.spec.lens.psf_fwhm_um > 0:
-        raise SpecError("the reference estimator renders no lens PSF; set it to 0", key="lens.psf_fwhm_um")
+    require_plain_lens(sensor)
     scene, _ = in_absolute_light(scene)
     parts = [(1.0 if w is None else float(w.mean(t_us, t_us)), part) for w, part in light_parts(scene)]
     view: View | None = None

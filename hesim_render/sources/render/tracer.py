@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Bands, Float, Halves, UInt32
+from hesim_render.core.device_types import Bands, Float, Halves, UInt32, UInt64
 from hesim_render.core.errors import RangeError
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
@@ -127,7 +127,9 @@ class PixelTracer(Tracer):
         self.samples = samples
         self._full_index = self.sensor.layout.full_index.ravel()
         self._posed_us: float | None = None
-        self._key = dr.opaque(jit().UInt64, stream_key(seed, Stream.RENDER))
+        self._key, self._elsewhere_key = (
+            dr.opaque(jit().UInt64, stream_key(seed, stream)) for stream in (Stream.RENDER, Stream.RENDER_GLARE)
+        )
 
     @property
     def pixel_count(self) -> int:
@@ -146,6 +148,7 @@ class PixelTracer(Tracer):
         end_us: ArrayLike,
         wavelengths: Wavelengths,
         values: Values,
+        elsewhere: NDArray[np.uint32] | None = None,
     ) -> list[Halves]:
         """Averages over the rays of each listed pixel. The camera moves through the pixel's own interval.
 
@@ -155,6 +158,8 @@ class PixelTracer(Tracer):
         begin_us, end_us : [n] or scalar, µs.
         wavelengths : draws the wavelengths of a ray.
         values : map radiance to the quantities to average.
+        elsewhere : [n], numbers of pixels on the full sensor, with random numbers of their own, instead of those of the
+            region; `pixel` then is their number in this list.
 
         Returns
         -------
@@ -169,7 +174,8 @@ class PixelTracer(Tracer):
 
         mitsuba()  # the variant may have been changed by other code
         begin, end = np.asarray(begin_us, dtype=np.float64), np.asarray(end_us, dtype=np.float64)
-        if pixel.size and int(pixel.max()) >= self.pixel_count:
+        full, key = (self._full_index, self._key) if elsewhere is None else (elsewhere, self._elsewhere_key)
+        if pixel.size and int(pixel.max()) >= full.size:
             raise RangeError("pixel", int(pixel.max()), f"0 to {self.pixel_count - 1}, inside the region")
         if not np.all(end >= begin):
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
@@ -183,7 +189,7 @@ class PixelTracer(Tracer):
         for first in range(0, pixel.size, room):
             part = slice(first, first + room)
             spread = None if times is None else [values[part] for values in times]
-            parts.append(self._block(pixel[part], spread, wavelengths, values))
+            parts.append(self._block(pixel[part], full[pixel[part]], key, spread, wavelengths, values))
             self._report(pixel[part].size * self.samples)
         if len(parts) == 1:
             return parts[0]
@@ -193,6 +199,8 @@ class PixelTracer(Tracer):
     def _block(
         self,
         pixels: NDArray[np.uint32],
+        full_index: NDArray[np.uint32],
+        key: UInt64,
         times: list[NDArray[np.float32]] | None,
         wavelengths: Wavelengths,
         values: Values,
@@ -208,9 +216,10 @@ class PixelTracer(Tracer):
         place = ray - lane * self.samples
         half = dr.select(place >= per_half, types.UInt32(1), types.UInt32(0))
         pixel = spread_out(types.UInt32, pixels, lane)
-        index = spread_out(types.UInt32, self._full_index[pixels], lane)
+        index = spread_out(types.UInt32, full_index, lane)
         spread = None if times is None else [spread_out(types.Float, table, lane) for table in times]
-        quantities = self._rays_of(pixel, index, half, place - half * per_half, spread, wavelengths, values)
+        sample = place - half * per_half
+        quantities = self._rays_of(pixel, index, half, sample, key, spread, wavelengths, values)
         sums = [dr.block_sum(quantity, per_half) * (1 / per_half) for quantity in quantities]
         dr.eval(*sums)
         self._sampler.rest()
@@ -225,24 +234,39 @@ class PixelTracer(Tracer):
         index: UInt32,
         half: UInt32,
         sample: UInt32,
+        key: UInt64,
         spread: list[Float] | None,
         wavelengths: Wavelengths,
         values: Values,
     ) -> list[Float]:
         """The wanted quantities of one ray per lane."""
+        import drjit as dr
+
         mi, types = self.built.mi, jit()
         row, col = self._row_and_col(index)
         sampler = self._sampler
-        sampler.setup(self._key, index, half, sample, self.samples // 2)
+        sampler.setup(key, index, half, sample, self.samples // 2)
         aperture, moment = sampler.next_3d()
-        blur = sampler.next_2d() if self.rays.has_psf else None
-        choice = sampler.next_1d()
-        origin, direction = self.rays.rays(types.Float(row), types.Float(col), aperture, blur)
+        blur = self.rays.blur_numbers(sampler)
+        choice, single = sampler.next_1d(), None
+        place = types.Float(col), types.Float(row)
+        offset = self.rays.offset(aperture, blur, place)
+        if self.rays.is_dispersive:
+            # a single wavelength from the law of all four: the k-th one belongs to the k-th quarter of the numbers
+            quarter = dr.minimum(types.UInt32(choice * 4), 3)
+            four = wavelengths(pixel, choice * 4 - types.Float(quarter))
+            single = four[3]
+            for k in range(3):
+                single = dr.select(quarter == k, four[k], single)
+            offset = self.rays.diffracted(sampler, *offset, single)
+        origin, direction, weight = self.rays.through_lens(place, offset, sampler, single)
         if spread is not None:
             assert self.camera is not None
             pose = self.camera.pose_at(spread[0] + moment * spread[1])
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
-        bands = mi.UnpolarizedSpectrum(*wavelengths(pixel, choice))
+        bands = mi.UnpolarizedSpectrum(*(wavelengths(pixel, choice) if single is None else [single] * 4))
         primary = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
         radiance, _, _ = self.built.integrator.sample(self.built.scene, sampler, primary)
+        if weight is not None:
+            radiance = radiance * weight
         return values(pixel, radiance)

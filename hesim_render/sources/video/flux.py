@@ -158,6 +158,9 @@ class VideoFlux(WindowByWindow):
                 "the sensor's event pixels are asynchronous: their ln x goes in a straight line from the middle of one "
                 "picture to that of the next, so that events are not half a picture late; frames see held pictures"
             )
+        effects = [name for name in self.sensor.optics.used_effects() if name != "relative_illumination"]
+        if effects:
+            found.append(f"the pictures are the image on the chip: {', '.join(effects)} of the lens are not applied")
         if self._is_irregular:
             found.append("the video's time stamps are irregular and were kept; fps makes them regular")
         return found

@@ -7,7 +7,7 @@ from ruamel.yaml import YAML
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.recording.truth_export import write_kalibr_camchain
+from hesim_render.recording.camera_files import write_kalibr_camchain
 
 RIGHT = np.array([[0.99619470, 0, -0.08715574, 0.08], [0, 1, 0, 0.01], [0.08715574, 0, 0.99619470, 0.0], [0, 0, 0, 1]])
 

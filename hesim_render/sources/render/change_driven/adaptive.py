@@ -47,13 +47,16 @@ class AdaptiveRenderer:
         self.counts = Counts()
         self._sensor = tracer.sensor
         self.index = self._sensor.layout.full_index.ravel()
-        self.zoom = Zoom(tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning)
+        rays = tracer.rays
+        self.zoom = Zoom(
+            tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning, rays.can_aim, rays.blur_px
+        )
         self._kept: dict[Role, Still] = {}
 
     def still(self, role: Role) -> Still:
         """The pixels of a role that are known to be constant, and their flux."""
         if role not in self._kept:
-            may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None
+            may_rest = bool(self.tracer.parts.groups) and self.tracer.camera is None and not self.tracer.rays.spreads
             count = self.index.size
             self._kept[role] = Still(
                 _ALWAYS_US if may_rest else None,

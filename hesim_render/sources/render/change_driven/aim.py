@@ -237,7 +237,7 @@ class Aim:
         state = dr.zeros(types.UInt32, dr.width(x)), dr.zeros(types.Float, dr.width(x))
         _, density = dr.while_loop(state, lambda k, _: k < lanes.count, add, label="aimed rays")
         density = density / lanes.count
-        pixel = self._rays.density(x, y)
+        pixel = self._rays.density(x, y, centre)
         # an aimed ray whose object is not there at this instant finds nothing
         found = (pixel > 0) & (~lanes.is_aimed | (own.density > 0))
         weight = dr.select(found, 2 * pixel / (pixel + density), 0)

@@ -59,11 +59,11 @@ class PairTracer(Tracer):
         progress: Callable[[int], None] | None = None,
         block_rays: int = BLOCK_RAYS,
     ) -> None:
-        super().__init__(scene, sensor, responses, progress, block_rays)
         import drjit as dr
 
-        types = jit()
-        self._seed = seed
+        super().__init__(scene, sensor, responses, progress, block_rays)
+        types, self._seed = jit(), seed
+        self.rays.require_one_path()
         self.parts = MovingScene(self.built)
         self._integrator: MattIntegrator | PathIntegrator
         if self.built.paints is not None:
@@ -311,16 +311,16 @@ class PairTracer(Tracer):
         sampler = self._sampler
         aperture, moment = sampler.next_3d()
         widened = (aperture - 0.5) * footprint + 0.5
-        blur = sampler.next_2d() if self.rays.has_psf else None
+        blur = self.rays.blur_numbers(sampler)
         centre = types.Float(col), types.Float(row)
-        (x, y), weight, slot = self.rays.offset(widened, blur), None, types.UInt32(0)
+        (x, y), weight, slot = self.rays.offset(widened, blur, centre), None, types.UInt32(0)
         if aims is not None:
             slot, moment = self._aim.choose(aims, moment)
         now = moments.at(window, moment)
         pose = None if self.camera is None else self.camera.pose_at(now.local_us(len(self.parts.groups)))
         if aims is not None:
             x, y, weight = self._aim.place(aims, slot, now, pose, centre, (x, y), aperture)
-        origin, direction = self.rays.towards(centre[1], centre[0], x, y)
+        origin, direction, weight = self.rays.through_lens(centre, (x, y), sampler, weight=weight)
         if pose is not None:
             origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
         tile_row = row - row // self._tile_rows * self._tile_rows

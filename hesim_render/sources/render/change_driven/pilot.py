@@ -107,10 +107,12 @@ def take_pilot(
     Returns
     -------
     pilot : statistics of all windows. Sites near which nothing moves are traced in the first window only.
-    near : [site], True if a ray came near a moving object within the interval; always True if the camera moves.
+    near : [site], True if a ray came near a moving object within the interval; always True if the camera moves,
+        or if anything moves in front of a lens that spreads light (`RayFactory.spreads`).
     """
     found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
-    near = found.met if tracer.camera is None else np.ones(sites.size, np.bool_)
+    knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
+    near = found.met if knows else np.ones(sites.size, np.bool_)
     lit, hidden, *others = (np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found))
     pilot = Pilot(lit, hidden, others[0], others[1], others[2])
     moving = np.flatnonzero(near)

@@ -59,8 +59,12 @@ class MotionClock:
         axis_x, axis_y = lens.axis_mm
         reach = max(axis_x - left, right - axis_x), max(axis_y - top, bottom - axis_y)
         corner = np.array(reach) / lens.image_distance_mm
-        #: 1/cos of the view angle of the farthest corner of the region.
+        #: Largest motion in the image, in units of the image distance, for a shift over the depth, and for a turn, rad:
+        #: powers of 1/cos of the view angle of the farthest corner of the region.
         self._stretch = float(np.sqrt(1 + corner @ corner))
+        self._turned = self._stretch**2
+        if view.projection.distortion is not None:
+            _, self._stretch, self._turned = view.projection.distortion.steepest
         self._speed_of = lru_cache(maxsize=1024)(self._per_metre)
 
     def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
@@ -84,10 +88,10 @@ class MotionClock:
             turn = fastest_turn_rad_per_s(self._camera, begin_us, end_us)
             shift = fastest_m_per_s(self._view.camera_to_world[None, :3, 3], self._camera, begin_us, end_us)
         resting, nearest = self._speed_of(int(begin_us // (CELL_US * _CELLS)))
-        fastest = turn * self._stretch**2 + shift * resting
+        fastest = turn * self._turned + shift * resting
         for group, per_metre in zip(self._groups, nearest, strict=True):
             own = fastest_m_per_s(group.corners, group.trajectory, begin_us, end_us)
-            fastest = max(fastest, turn * self._stretch**2 + (shift + own) * per_metre)
+            fastest = max(fastest, turn * self._turned + (shift + own) * per_metre)
         return fastest * self._px_per_rad * S_PER_US * (end_us - begin_us)
 
     def _per_metre(self, number: int) -> tuple[float, list[float]]:

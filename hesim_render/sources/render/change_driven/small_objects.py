@@ -26,6 +26,8 @@ from hesim_render.sources.render.transport.moving_scene import Group
 
 #: Begin and end of a window are rounded outwards to this part of its length.
 _PARTS = 8
+#: Points along an edge that a lens with distortion images as a curve.
+_ALONG = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 
 
 @dataclass(frozen=True)
@@ -83,10 +85,19 @@ class Zoom:
     groups : moving objects.
     is_matt : True if all surfaces are matt; large objects then need no extra rays.
     tuning : constants.
+    can_aim : False if rays of this lens cannot be aimed.
+    blur_px : radius of the PSF that holds nearly all of it, px.
     """
 
     def __init__(
-        self, view: View, camera: Trajectory | None, groups: list[Group], is_matt: bool, tuning: Tuning
+        self,
+        view: View,
+        camera: Trajectory | None,
+        groups: list[Group],
+        is_matt: bool,
+        tuning: Tuning,
+        can_aim: bool = True,
+        blur_px: float = 0.0,
     ) -> None:
         self._view, self._camera, self._groups = view, camera, groups
         self._is_matt, self._tuning = is_matt, tuning
@@ -97,8 +108,8 @@ class Zoom:
         middle = np.array([geometry.cols / 2, geometry.rows / 2])
         self._low, self._high = np.array([left, top]) + middle, np.array([right, bottom]) + middle
         # from the centre of a pixel to its corners, and the blur
-        psf_px = view.sensor.spec.lens.psf_fwhm_um / geometry.pitch_um
-        self._aim_margin_px = 0.5**0.5 + psf_px
+        self._aim_margin_px = 0.5**0.5 + blur_px
+        self._aim_px = tuning.aim_px if can_aim else 0.0
 
     def _outlines_in(self, begin_us: float, end_us: float) -> list[tuple[list[Outline], int, bool]]:
         """Outlines in one window, the number of pilot rays of a pixel inside any of them, and whether they are
@@ -136,10 +147,10 @@ class Zoom:
             found = places_seen(group.corners, group.trajectory, self._camera, begin_us, end_us)
         for corners, margin in found:
             rest = np.broadcast_to(self._view.camera_to_world, (len(corners), 4, 4))
-            seen, px_per_m = self._view.project_on_sensor(corners, rest)
+            seen, px_per_m = self._view.project_on_sensor(self._along_edges(corners), rest)
             points.append(seen.reshape(-1, 2))
             extents.append(np.ptp(seen, axis=1))
-            wider = max(wider, margin * float(px_per_m.max()))
+            wider = max(wider, margin * float(px_per_m.max()) + self._view.defocus_px(px_per_m))
         every = np.concatenate(points)
         low, high = every.min(axis=0) - wider, every.max(axis=0) + wider
         if np.any(high < self._low) or np.any(low > self._high) or not np.all(np.isfinite(every)):
@@ -151,7 +162,16 @@ class Zoom:
             sides = np.empty((0, 3))
         extent = np.concatenate(extents)
         is_small = bool(extent.min() <= self._tuning.small_px)
-        return Outline(low, high, sides, is_small, number if extent.max() <= self._tuning.aim_px else None)
+        return Outline(low, high, sides, is_small, number if extent.max() <= self._aim_px else None)
+
+    def _along_edges(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Corners [k, n, 3], and points between each two of a box where the lens images straight edges as curves."""
+        if self._view.projection.distortion is None or corners.shape[1] % 8:
+            return corners
+        boxes = corners.reshape(len(corners), -1, 8, 3)
+        first, second = np.triu_indices(8, 1)
+        between = [boxes[:, :, first] * (1 - share) + boxes[:, :, second] * share for share in _ALONG]
+        return np.concatenate([boxes, *between], axis=2).reshape(len(corners), -1, 3)
 
     def sites(
         self, row: NDArray[np.int64], col: NDArray[np.int64], windows: Windows, numbers: NDArray[np.int64]

@@ -21,14 +21,16 @@ VISION_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 @dataclass(frozen=True)
 class CameraModel:
     """Intrinsics of a grid; column and row (x, y) of a point [X, Y, Z] in front of the camera are
-    (fx·X/Z + cx, fy·Y/Z + cy). Whole numbers are centres of pixels, as in OpenCV.
+    (fx·x' + cx, fy·y' + cy), with (x', y') = (X/Z, Y/Z) after distortion. Whole numbers are centres of pixels, as in
+    OpenCV. Where a lens has lateral chromatic aberration, this is at wavelengths at which it is 0.
 
     Parameters
     ----------
     k : [3, 3], [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px of the grid.
     width, height : size of the grid.
-    distortion_model : ``none``; the lens is a pinhole.
-    distortion : coefficients of that model.
+    distortion_model : ``none``, ``opencv`` (`cv2.projectPoints`) or ``fisheye`` (`cv2.fisheye.projectPoints`).
+    distortion : coefficients of that model, in OpenCV's order: k1, k2, p1, p2, k3 and, for the rational model, k4, k5,
+        k6; or k1 to k4 of the fisheye.
     is_even : False if some pixels lie beside the grid's own places (event pixels at uneven places of the tile).
     """
 
@@ -63,7 +65,9 @@ def camera_model(rays: ChiefRays, raster: Raster) -> CameraModel:
             [0.0, 0.0, 1.0],
         ]
     )
-    return CameraModel(k, width, height, "none", (), raster.is_even)
+    told = rays.sensor.optics.distortion
+    model, coefficients = ("none", ()) if told is None else (told.model, told.coefficients)
+    return CameraModel(k, width, height, model, coefficients, raster.is_even)
 
 
 def inverse(pose: NDArray[np.float64]) -> NDArray[np.float64]:
