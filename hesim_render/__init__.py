@@ -45,6 +45,7 @@ _HOMES = {
     "rig_scenes": "hesim_render.sources.render.truth.rig",
     "simulate": "hesim_render.capture.simulate",
     "simulate_video": "hesim_render.capture.simulate_video",
+    "study": "hesim_render.studies.run",
     "write_spectral_exr": "hesim_render.sources.render.cube",
 }
 
@@ -63,6 +64,7 @@ __all__ = [
     "rig_scenes",
     "simulate",
     "simulate_video",
+    "study",
     "write_spectral_exr",
 ]
 
@@ -77,6 +79,7 @@ if TYPE_CHECKING:
     from hesim_render.sources.render.truth.rig import rig_scenes
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene, load_scene
+    from hesim_render.studies.run import study
 
 
 def __getattr__(name: str) -> Any:

@@ -18,6 +18,9 @@ class Kind(StrEnum):
     illuminants = "illuminants"
     noise = "noise"
     truth = "truth"
+    filter_sets = "filter_sets"
+    palettes = "palettes"
+    study_specs = "study_specs"
 
 
 def doctor() -> None:
@@ -41,7 +44,7 @@ def doctor() -> None:
 
 def list_(
     kind: Annotated[
-        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise or truth; default all")
+        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise, truth, filter_sets, palettes or study_specs")
     ] = None,
 ) -> None:
     """List the names that can be used."""

@@ -16,7 +16,9 @@ from hesim_render.studies.colour_noise import (
     output_noise,
 )
 from hesim_render.studies.colour_samples import REFLECTANCE_SETS, ColourSamples, colour_samples, reflectance_set
+from hesim_render.studies.filter_sets import with_filter_set
 from hesim_render.studies.subspace import LutherResidual, filter_quality, luther_residual, observer, vora_value
+from hesim_render.studies.table import Table
 
 __all__ = [
     "REFLECTANCE_SETS",
@@ -26,6 +28,7 @@ __all__ = [
     "LutherResidual",
     "MetamerismIndex",
     "OutputNoise",
+    "Table",
     "channel_noise",
     "colour_differences",
     "colour_samples",
@@ -39,4 +42,5 @@ __all__ = [
     "output_noise",
     "reflectance_set",
     "vora_value",
+    "with_filter_set",
 ]

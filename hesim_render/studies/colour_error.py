@@ -13,10 +13,10 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.spectral.spectrum import colour_science
 from hesim_render.studies.colour_samples import ColourSamples
-from hesim_render.studies.subspace import require_colour
+from hesim_render.studies.subspace import rank
 
 #: How a matrix is fitted: least squares in XYZ, or the least mean colour difference from there on.
 MatrixMethod = Literal["least_squares_xyz", "least_delta_e_ab", "least_delta_e_2000"]
@@ -136,7 +136,12 @@ def fit_matrix(
     if expansion not in get_args(Expansion):
         raise RangeError("expansion", expansion, f"one of {', '.join(get_args(Expansion))}")
     terms = expanded(samples.camera, expansion)
-    require_colour(samples.camera, "the camera's channels under this light")
+    found_rank = rank(samples.camera)
+    if found_rank < 3:
+        raise SpecError(
+            f"the channels see these surfaces in {found_rank} of the 3 dimensions that colour needs; add a filter, or "
+            "other surfaces"
+        )
     if len(terms) < terms.shape[1]:
         raise RangeError("surfaces", len(terms), f"at least {terms.shape[1]}, the number of terms of the matrix")
     start, *_ = np.linalg.lstsq(terms, samples.xyz, rcond=1e-9)

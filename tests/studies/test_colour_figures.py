@@ -193,7 +193,7 @@ def test_bad_sets_are_one_clear_line():
     two = responses(NIKON)[:2]
     samples = colour_samples([*two, two[0].scaled(0.5)], D65, PATCHES)
     assert rank(samples.camera) == 2
-    with pytest.raises(SpecError, match=r"filters span 2 of the 3 dimensions"):
+    with pytest.raises(SpecError, match=r"see these surfaces in 2 of the 3 dimensions"):
         fit_matrix(samples)
     with pytest.raises(SpecError, match=r"the light covers 420-700 nm"):
         colour_samples(responses(NIKON), constant(1.0, 420, 700), PATCHES)

@@ -1,0 +1,82 @@
+"""Colour errors over the pixels of a cube, against a calculation of all pixels at once."""
+
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render.core.errors import SpecError
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.studies import ColourSamples, colour_differences, colour_samples, cube_colour, fit_matrix
+from hesim_render.studies.colour_samples import reflectance_set
+
+BANDS = np.arange(360.0, 831.0, 5.0)
+STUDY = {"schema_version": 1, "name": "cube", "sensors": ["reference-bayer"], "figures": ["colour"]}
+
+
+def smooth_cube(rows, cols, seed=1):
+    """Reflectances of the training set, mixed."""
+    table = np.array([each.at(BANDS) for each in reflectance_set("colorchecker").values()])
+    weights = np.random.default_rng(seed).dirichlet(np.full(len(table), 0.3), (rows, cols))
+    return (weights @ table).astype(np.float32)
+
+
+def responses():
+    return list(hr.load_sensor("reference-bayer").responses.values())
+
+
+def expected(cube, light, level=1.0):
+    chart = list(reflectance_set("colorchecker").values())
+    matrix = fit_matrix(colour_samples(responses(), light, chart)).matrix
+    grid = np.arange(360.0, 831.0)
+    surfaces = [np.interp(grid, BANDS, pixel) for pixel in cube.reshape(-1, BANDS.size)]
+    curves = np.column_stack([each.at(grid) for each in responses()])
+    functions = np.column_stack([each.at(grid) for each in spectra.colour_matching_functions()])
+    samples = ColourSamples.of_tables(curves, light.at(grid), np.array(surfaces).T / level, functions)
+    return colour_differences(samples, matrix)
+
+
+def test_a_cube_of_reflectances_in_blocks(tmp_path, monkeypatch):
+    cube = smooth_cube(23, 11)
+    np.save(tmp_path / "cube.npy", cube)
+    surfaces = [{"cube": str(tmp_path / "cube.npy"), "wavelength_nm": BANDS.tolist()}]
+    study = {**STUDY, "surfaces": surfaces, "illuminants": ["A"]}
+    row = hr.study(study).row(0)
+    errors = expected(cube, spectra.illuminant("A"))
+    assert row["delta_e_cube_mean"] == pytest.approx(errors.mean(), rel=2e-3)
+    assert row["delta_e_cube_p95"] == pytest.approx(np.quantile(errors, 0.95), abs=0.05)
+    assert row["delta_e_cube_max"] == pytest.approx(errors.max(), rel=1e-2)
+    assert row["cube_pixels"] == 253 and row["surfaces"] == "cube"
+    monkeypatch.setattr(cube_colour, "_BLOCK_VALUES", 4 * 11 * BANDS.size)  # four rows at a time
+    again = hr.study(study).row(0)
+    for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
+        assert again[key] == pytest.approx(row[key], rel=1e-6)
+
+
+def test_a_cube_of_radiances_has_its_own_light_and_any_unit(tmp_path):
+    light = spectra.illuminant("D65")
+    cube = smooth_cube(20, 20, 3)
+    cube[:2] = 1.0  # white in a tenth of the pixels
+    radiance = (cube * light.at(BANDS) * 37.0).astype(np.float32)
+    np.save(tmp_path / "radiance.npy", radiance)
+    item = {"cube": str(tmp_path / "radiance.npy"), "wavelength_nm": BANDS.tolist(), "quantity": "radiance"}
+    row = hr.study({**STUDY, "surfaces": [item]}).row(0)
+    assert row["delta_e_cube_mean"] == pytest.approx(expected(cube, light).mean(), rel=0.01)
+    item |= {"scale": 1e-3}
+    assert hr.study({**STUDY, "surfaces": [item]}).row(0)["delta_e_cube_mean"] == pytest.approx(
+        row["delta_e_cube_mean"], rel=3e-3
+    )
+
+
+def test_bad_cubes_are_one_clear_line(tmp_path):
+    np.save(tmp_path / "cube.npy", smooth_cube(3, 3)[..., 20:60])
+    item = {"cube": str(tmp_path / "cube.npy"), "wavelength_nm": BANDS[20:60].tolist()}
+    with pytest.raises(SpecError, match=r"bands from 460 to 655 nm do not cover .*beyond: hold"):
+        hr.study({**STUDY, "surfaces": [item]})
+    assert hr.study({**STUDY, "surfaces": [item | {"beyond": "hold"}]}).row(0)["delta_e_cube_mean"] > 0
+    np.save(tmp_path / "percent.npy", 100 * smooth_cube(3, 3))
+    item = {"cube": str(tmp_path / "percent.npy"), "wavelength_nm": BANDS.tolist()}
+    with pytest.raises(SpecError, match=r"reflectances must lie in \[0, 1\]; these run from .* \(see scale"):
+        hr.study({**STUDY, "surfaces": [item]})
+    assert hr.study({**STUDY, "surfaces": [item | {"scale": 0.01}]}).row(0)["delta_e_cube_mean"] > 0
+    with pytest.raises(SpecError, match="no such file"):
+        hr.study({**STUDY, "surfaces": [{"cube": str(tmp_path / "none.hdr")}]})
