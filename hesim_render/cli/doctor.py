@@ -44,7 +44,8 @@ def doctor() -> None:
 
 def list_(
     kind: Annotated[
-        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise, truth, filter_sets, palettes or study_specs")
+        Kind | None,
+        typer.Argument(help="scenes, sensors, illuminants, noise, truth, filter_sets, palettes or study_specs"),
     ] = None,
 ) -> None:
     """List the names that can be used."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.sensor.photocurrent import band_weights
+from hesim_render.sources.cube.planes import blocks, integration_weights
 from hesim_render.specs.study import Method, NamedLight, SurfacesSpec
 from hesim_render.spectral.spectrum import Spectrum, colour_matching_functions, product
 from hesim_render.studies.colour_error import delta_e_2000, fit_matrix, lab
@@ -17,8 +17,6 @@ from hesim_render.studies.colour_samples import colour_samples
 from hesim_render.studies.table import Cell
 from hesim_render.targets.cube_file import CubeFile, open_cube
 
-#: Values of a cube that are read at a time.
-_BLOCK_VALUES = 16_000_000
 #: Histogram of colour differences: width of a bin and largest difference.
 _BIN, _MOST = 0.01, 200.0
 #: Part of the pixels whose luminance is below that of white, where a cube holds radiance.
@@ -35,37 +33,6 @@ def open_surfaces(item: SurfacesSpec) -> CubeFile:
     """
     assert item.cube is not None
     return open_cube(Path(item.beside(item.cube, shipped=False)), item.wavelength_nm)
-
-
-def integration_weights(spectra: Sequence[Spectrum], cube: CubeFile, hold: bool) -> NDArray[np.float64]:
-    """Weights of the bands in the integrals of a cube with each spectrum, [band, spectrum].
-
-    Parameters
-    ----------
-    spectra : what is integrated with the cube.
-    cube : supplies the wavelengths.
-    hold : the first and the last plane hold beyond their wavelengths; else the cube must cover 99.9 % of each spectrum.
-
-    Raises
-    ------
-    SpecError
-        If the cube does not cover a spectrum.
-    """
-    bands = cube.wavelength_nm
-    assert bands is not None
-    wide = np.concatenate([[min(300.0, bands[0] - 1)], bands, [max(1100.0, bands[-1] + 1)]]) if hold else bands
-    found = []
-    for spectrum in spectra:
-        try:
-            weights = band_weights(spectrum, wide)
-        except SpecError as error:
-            raise SpecError(f"{error}; or let its ends hold (beyond: hold)", file=cube.file, key="cube") from None
-        if hold:
-            weights[1] += weights[0]
-            weights[-2] += weights[-1]
-            weights = weights[1:-1]
-        found.append(weights)
-    return np.stack(found, axis=1)
 
 
 def cube_figures(
@@ -109,7 +76,7 @@ def cube_figures(
     white_xyz = white[-3:] / white[-2]
     histograms = np.zeros((len(sets), round(_MOST / _BIN)), dtype=np.int64)
     total, largest = np.zeros(len(sets)), np.zeros(len(sets))
-    for values in _blocks(cube):
+    for values in blocks(cube):
         if is_reflectance:
             _check_reflectance(values, item, cube)
         signals = values.reshape(-1, values.shape[2]) @ (weights * scale).astype(np.float32)
@@ -130,13 +97,6 @@ def cube_figures(
         }  # fmt: skip
 
 
-def _blocks(cube: CubeFile) -> Iterator[NDArray[np.float32]]:
-    rows, cols, bands = cube.shape
-    step = max(1, _BLOCK_VALUES // (cols * bands))
-    for first in range(0, rows, step):
-        yield cube.rows(first, min(first + step, rows))
-
-
 def _check_reflectance(values: NDArray[np.float32], item: SurfacesSpec, cube: CubeFile) -> None:
     low, high = float(values.min()) * item.scale, float(values.max()) * item.scale
     if low < -1e-6 or high > 1 + 1e-6:
@@ -150,7 +110,7 @@ def _white_luminance(cube: CubeFile, weights: NDArray[np.float64]) -> float:
     """Luminance below which most pixels stay, on a logarithmic histogram of 0.2 % steps."""
     edges = np.exp(np.arange(-60.0, 40.0, 0.002))
     counts = np.zeros(edges.size - 1, dtype=np.int64)
-    for values in _blocks(cube):
+    for values in blocks(cube):
         counts += np.histogram(values @ weights.astype(np.float32), edges)[0]
     if not counts.sum():
         raise SpecError("holds no light", file=cube.file)

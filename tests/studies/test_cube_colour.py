@@ -5,8 +5,9 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
+from hesim_render.sources.cube import planes
 from hesim_render.spectral import spectrum as spectra
-from hesim_render.studies import ColourSamples, colour_differences, colour_samples, cube_colour, fit_matrix
+from hesim_render.studies import ColourSamples, colour_differences, colour_samples, fit_matrix
 from hesim_render.studies.colour_samples import reflectance_set
 
 BANDS = np.arange(360.0, 831.0, 5.0)
@@ -46,7 +47,7 @@ def test_a_cube_of_reflectances_in_blocks(tmp_path, monkeypatch):
     assert row["delta_e_cube_p95"] == pytest.approx(np.quantile(errors, 0.95), abs=0.05)
     assert row["delta_e_cube_max"] == pytest.approx(errors.max(), rel=1e-2)
     assert row["cube_pixels"] == 253 and row["surfaces"] == "cube"
-    monkeypatch.setattr(cube_colour, "_BLOCK_VALUES", 4 * 11 * BANDS.size)  # four rows at a time
+    monkeypatch.setattr(planes, "_BLOCK_VALUES", 4 * 11 * BANDS.size)  # four rows at a time
     again = hr.study(study).row(0)
     for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
         assert again[key] == pytest.approx(row[key], rel=1e-6)
