@@ -84,6 +84,7 @@ def photocurrent(
     *,
     filter: str | None = None,
     quadrature: Quadrature = "trapezoid",
+    responses: NDArray | Float | None = None,
 ) -> NDArray[np.float64] | Float:
     """I_c of Eq. 1: mean electrons of an exposure to a spectral radiance.
 
@@ -101,6 +102,9 @@ def photocurrent(
     filter : name of one filter that all elements are seen through, on the optical axis (V = 1). The
         leading shape is then free.
     quadrature : see `band_weights`.
+    responses : [filter, band], responses P_c·C_f at the bands in place of those of the sensor, in the order of
+        `sensor.layout.filters` ([band] with `filter`), e⁻/s per W m⁻² sr⁻¹ nm⁻¹; linear between the bands, as the
+        radiance, whose product is then integrated exactly. NumPy, or a Dr.Jit TensorXf for derivatives.
 
     Examples
     --------
@@ -116,8 +120,8 @@ def photocurrent(
 
     Returns
     -------
-    Electrons, with the shape of the radiance without its last axis; NumPy float64 for NumPy input, a
-    Dr.Jit TensorXf (differentiable with respect to the radiance) for Dr.Jit input.
+    Electrons, with the shape of the radiance without its last axis; NumPy float64 for NumPy input, a Dr.Jit TensorXf
+    (differentiable with respect to radiance and responses) if one of both is a Dr.Jit tensor.
 
     Raises
     ------
@@ -141,11 +145,62 @@ def photocurrent(
         raise RangeError(
             "spectral_radiance.shape", shape, f"({sensor.rows}, {sensor.cols}, {bands.size}), or a 'filter' argument"
         )
+    exposure_s = exposure_us * S_PER_US
+    if responses is not None:
+        expected = (bands.size,) if filter is not None else (len(names), bands.size)
+        if tuple(responses.shape) not in (expected, (len(names), bands.size)):
+            raise RangeError("responses.shape", tuple(responses.shape), f"{expected}, at the bands of the radiance")
+        widths = _own_widths(bands, quadrature) * exposure_s
+        if isinstance(spectral_radiance, np.ndarray) and isinstance(responses, np.ndarray):
+            given = responses.reshape(-1, bands.size).astype(np.float64)
+            return _numpy(spectral_radiance, _of_own(given, widths), sensor, filter)
+        return _drjit(_tensor(spectral_radiance), _own_table(_tensor(responses), widths), sensor, filter)
     weights = np.stack([band_weights(sensor.responses[name], bands, quadrature) for name in names])
-    weights *= exposure_us * S_PER_US
+    weights *= exposure_s
     if isinstance(spectral_radiance, np.ndarray):
         return _numpy(spectral_radiance, weights, sensor, filter)
-    return _drjit(spectral_radiance, weights, sensor, filter)
+    return _drjit(spectral_radiance, jit().Float(weights.astype(np.float32).ravel()), sensor, filter)
+
+
+def _own_widths(bands: NDArray[np.float64], quadrature: Quadrature) -> NDArray[np.float64]:
+    """Factors of R(λ_b−1), R(λ_b) and R(λ_b+1) in the weight of L(λ_b), [3, band], nm.
+
+    With R and L linear between bands of distance h, ∫ R L = Σ h/6 (2 R₀L₀ + R₀L₁ + R₁L₀ + 2 R₁L₁).
+    """
+    step = np.diff(bands)
+    if quadrature == "rectangle":
+        if not np.allclose(step, step[0], rtol=1e-9):
+            raise SpecError("quadrature 'rectangle' needs evenly spaced wavelengths")
+        return np.stack([np.zeros(bands.size), np.full(bands.size, step[0]), np.zeros(bands.size)])
+    before, after = np.append(0.0, step), np.append(step, 0.0)
+    return np.stack([before, 2 * (before + after), after]) / 6
+
+
+def _of_own(responses: NDArray[np.float64], widths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights [filter, band] of responses [filter, band]."""
+    padded = np.pad(responses, ((0, 0), (1, 1)))
+    return widths[0] * padded[:, :-2] + widths[1] * responses + widths[2] * padded[:, 2:]
+
+
+def _own_table(responses: Float, widths: NDArray[np.float64]) -> Float:
+    """The same on Dr.Jit, flat; differentiable."""
+    import drjit as dr
+
+    types = jit()
+    count = int(np.prod(responses.shape))
+    bands = widths.shape[1]
+    values = types.Float(responses.array)
+    place = dr.arange(types.UInt32, count)
+    band = place % bands
+    factors = [dr.gather(types.Float, types.Float(row.astype(np.float32)), band) for row in widths]
+    # at the ends the factor is 0, so that the neighbour does not matter
+    before = dr.gather(types.Float, values, dr.select(band > 0, place - 1, place))
+    after = dr.gather(types.Float, values, dr.select(band < bands - 1, place + 1, place))
+    return factors[0] * before + factors[1] * values + factors[2] * after
+
+
+def _tensor(values: NDArray | Float) -> Float:
+    return jit().TensorXf(values.astype(np.float32)) if isinstance(values, np.ndarray) else values
 
 
 def _numpy(radiance: NDArray, weights: NDArray, sensor: Sensor, filter: str | None) -> NDArray[np.float64]:
@@ -159,14 +214,13 @@ def _numpy(radiance: NDArray, weights: NDArray, sensor: Sensor, filter: str | No
     return electrons * sensor.relative_illumination
 
 
-def _drjit(radiance: Float, weights: NDArray, sensor: Sensor, filter: str | None) -> Float:
+def _drjit(radiance: Float, table: Float, sensor: Sensor, filter: str | None) -> Float:
     import drjit as dr
 
     types = jit()
     shape = tuple(radiance.shape)
     bands = shape[-1]
     count = int(np.prod(shape[:-1], dtype=np.int64))
-    table = types.Float(weights.astype(np.float32).ravel())
     if filter is None:
         offset = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32)) * bands
         vignetting = types.Float(sensor.relative_illumination.ravel())
