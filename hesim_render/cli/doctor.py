@@ -21,6 +21,8 @@ class Kind(StrEnum):
     filter_sets = "filter_sets"
     palettes = "palettes"
     study_specs = "study_specs"
+    design_specs = "design_specs"
+    sweep_specs = "sweep_specs"
 
 
 def doctor() -> None:
@@ -45,7 +47,7 @@ def doctor() -> None:
 def list_(
     kind: Annotated[
         Kind | None,
-        typer.Argument(help="scenes, sensors, illuminants, noise, truth, filter_sets, palettes or study_specs"),
+        typer.Argument(help="one of the kinds; default all"),
     ] = None,
 ) -> None:
     """List the names that can be used."""

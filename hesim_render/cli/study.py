@@ -26,15 +26,19 @@ class StudyKind(StrEnum):
     """What can be studied."""
 
     cfa = "cfa"
+    design = "design"
 
 
 def study(
-    kind: Annotated[StudyKind, typer.Argument(help="cfa (colour filter arrays)")],
-    spec: Annotated[str, typer.Argument(metavar="SPEC", help="name of a shipped study, or the path of its file")],
+    kind: Annotated[StudyKind, typer.Argument(help="cfa (compare colour filter arrays) or design (of filters)")],
+    spec: Annotated[str, typer.Argument(metavar="SPEC", help="name of a shipped study or design, or a file")],
     out: Annotated[Path, typer.Option(help="folder to write tables and report to")],
     overwrite: Overwrite = False,
 ) -> None:
-    """Compare filter sets: colour, noise and event figures, as tables and a report."""
+    """Compare filter sets, or design filters: colour, noise and event figures, as tables and a report."""
+    if kind is StudyKind.design:
+        _design(spec, out, overwrite)
+        return
     from hesim_render.studies.run import MARKER
 
     check_target(out, MARKER, overwrite)
@@ -62,3 +66,23 @@ def _text(value: object) -> str:
     if value is None:
         return "-"
     return f"{value:.4g}" if isinstance(value, int | float) else str(value)
+
+
+def _design(spec: str, out: Path, overwrite: bool) -> None:
+    from hesim_render.studies.design_run import MARKER, design
+
+    check_target(out, MARKER, overwrite)
+    with progress_report("study design") as progress:
+        found = design(spec, out=out, overwrite=overwrite, progress=progress)
+    costs = found.result.costs
+    say(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
+    for verdict in found.verdicts:
+        ratios = ", ".join(
+            f"{value:.3f} at {key.split('_')[2]} lx" for key, value in verdict.items() if key.startswith("ysnr_ratio")
+        )
+        say(
+            f"against {verdict['against']}: cost {verdict['cost']:.3f} in place of {verdict['cost_against']:.3f} "
+            f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), mean ΔE2000 "
+            f"{verdict['delta_e_mean']:.3f} in place of {verdict['delta_e_mean_against']:.3f}, YSNR times {ratios}"
+        )
+    say(f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}")

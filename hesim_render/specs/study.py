@@ -19,7 +19,7 @@ _Lux = Annotated[float, Field(gt=0, le=1e9)]
 _Exposure = Annotated[int, Field(ge=1, le=10**9)]
 
 
-class _InFolder(Strict):
+class InFolder(Strict):
     """A part of a file that names others, relative to it."""
 
     folder: Path = Field(Path(), exclude=True)
@@ -39,7 +39,7 @@ class _InFolder(Strict):
         return str(self.folder / name) if is_path or not shipped else name
 
 
-class SurfacesSpec(_InFolder):
+class SurfacesSpec(InFolder):
     """What is looked at: a set of reflectances, or a hyperspectral cube."""
 
     reflectances: str | None = Field(None, description="name of a set, or a CSV file of patches")
@@ -85,7 +85,7 @@ class NamedLight(Strict):
         return self
 
 
-class SetUseSpec(_InFolder):
+class SetUseSpec(InFolder):
     """A filter set with its palette."""
 
     set: str = Field(description="name of a shipped filter set, or a file")
@@ -106,7 +106,7 @@ class NoiseStudySpec(Strict):
     seed: int = Field(1, ge=0, lt=2**63)
 
 
-class StudySpec(_InFolder):
+class StudySpec(InFolder):
     """A study of filter sets."""
 
     schema_version: Literal[1]

@@ -227,7 +227,7 @@ def _noise_row(
         "delta_e_mean_noise_aware": float(errors.mean()),
     }
     if spec.noise.repeats:
-        row |= _simulated(spec, seen, light, chart, lux, exposure_us, white_e, rgb)
+        row |= _simulated(spec, seen, light, chart, lux, exposure_us, white_e, aware)
     return row
 
 
@@ -243,7 +243,7 @@ def _luminance_row(
 
 def _simulated(
     spec: StudySpec, seen: Seen, light: Spectrum, chart: list[Spectrum], lux: float, exposure_us: float,
-    white_e: NDArray[np.float64], rgb: NDArray[np.float64],
+    white_e: NDArray[np.float64], aware: NDArray[np.float64],
 ) -> dict[str, Cell]:  # fmt: skip
     """Figures of noisy frames, each with its 95 % interval over repeats."""
     assert seen.colour is not None
@@ -257,6 +257,12 @@ def _simulated(
     )  # fmt: skip
     balanced = noisy.balanced(white_e, spec.area_px)
     row: dict[str, Cell] = {}
-    for name, found in measured_figures(balanced, rgb, seen.colour.matrix, seen.samples).items():
-        row |= {f"{name}_simulated": found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+    for end, matrix in (("", seen.colour.matrix), ("_noise_aware", aware)):
+        rgb = to_srgb(matrix, seen.samples.white_xyz)
+        for name, found in measured_figures(balanced, rgb, matrix, seen.samples).items():
+            row |= {
+                f"{name}{end}_simulated": found.value,
+                f"{name}{end}_low": found.low,
+                f"{name}{end}_high": found.high,
+            }
     return row

@@ -122,6 +122,8 @@ REFLECTANCE_SETS: Mapping[str, str] = {
     "colorchecker": "24 patches of the ColorChecker, as ISO 17321-1 has them",
     "colorchecker-chromatic": "its first 18 patches, without the greys",
     "rawtoaces": "190 training reflectances of rawtoaces (A.M.P.A.S.)",
+    "rawtoaces-even": "every second one of these, from the first on",
+    "rawtoaces-odd": "the others",
     "cie-tcs": "test colour samples 1 to 14 of CIE 13.3",
 }
 
@@ -156,13 +158,15 @@ def reflectance_set(name: str) -> dict[str, Spectrum]:
         if name == "colorchecker-chromatic":
             return {key: held(each) for key, each in list(chart.items())[:18]}
     colour = spectra.colour_science()
-    if name == "rawtoaces":
+    if name in ("rawtoaces", "rawtoaces-even", "rawtoaces-odd"):
         table = colour.characterisation.read_training_data_rawtoaces_v1()
         grid, values = np.asarray(table.wavelengths), np.asarray(table.values)
-        return {
+        found = {
             str(label): held(Spectrum(grid, np.maximum(column, 0.0)))
             for label, column in zip(table.labels, values.T, strict=True)
         }
+        first, step = {"rawtoaces": (0, 1), "rawtoaces-even": (0, 2), "rawtoaces-odd": (1, 2)}[name]
+        return dict(list(found.items())[first::step])
     if name == "cie-tcs":
         samples = colour.quality.datasets.SDS_TCS["CIE 1995"]
         return {
