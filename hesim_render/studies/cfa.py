@@ -43,6 +43,9 @@ from hesim_render.studies.subspace import (
 from hesim_render.studies.surfaces import reflectances_of
 from hesim_render.studies.table import Cell, Table
 
+#: Most pictures of demosaiced patterns that a study keeps.
+MOST_PICTURES = 48
+
 
 @dataclass(frozen=True, eq=False)
 class Seen:
@@ -76,10 +79,12 @@ class StudyResult:
     ----------
     table : a row for each combination.
     seen : each candidate under each light, for drawings.
+    pictures : captions and pictures of the demosaiced patterns, linear sRGB.
     """
 
     table: Table
     seen: list[Seen]
+    pictures: list[tuple[str, NDArray[np.float32]]]
 
 
 def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
@@ -105,6 +110,7 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
     reference = light_throughput(tried[0].sensor)
     rows: list[dict[str, Cell]] = []
     every: list[Seen] = []
+    pictures: list[tuple[str, NDArray[np.float32]]] = []
     done = 0
     for item in spec.surfaces:
         for light in spec.illuminants:
@@ -114,9 +120,9 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
                     progress(done, total, f"{candidate.set_name} on {candidate.sensor_name}")
                 spectrum = light.spectrum.load()
                 every.append(_seen(spec, candidate, item.label, light.name, spectrum, surfaces))
-                rows += _rows(spec, every[-1], spectrum, surfaces, more, reference)
+                rows += _rows(spec, every[-1], spectrum, surfaces, more, reference, pictures)
                 done += 1
-    return StudyResult(Table(rows), every)
+    return StudyResult(Table(rows), every, pictures)
 
 
 def _surfaces(
@@ -137,8 +143,9 @@ def _surfaces(
 
 
 def _rows(
-    spec: StudySpec, seen: Seen, spectrum: Spectrum, chart: list[Spectrum], more: dict[str, Cell], reference: float
-) -> Iterator[dict[str, Cell]]:
+    spec: StudySpec, seen: Seen, spectrum: Spectrum, chart: list[Spectrum], more: dict[str, Cell], reference: float,
+    pictures: list[tuple[str, NDArray[np.float32]]],
+) -> Iterator[dict[str, Cell]]:  # fmt: skip
     candidate = seen.candidate
     for lux in spec.illuminance_lux:
         rate = white_rate(candidate.responses, spectrum, lux)
@@ -162,6 +169,12 @@ def _rows(
                 row |= seen.row | more
                 if aps is not None and "noise" in spec.figures:
                     row |= _noise_row(spec, seen, spectrum, chart, rate, lux, exposure_us)
+                if aps is not None and "demosaic" in spec.figures:
+                    found, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
+                    row |= found
+                    if len(pictures) < MOST_PICTURES:
+                        text = f"{candidate.set_name}, {seen.light_name}, {lux:g} lx, equal {equal}"
+                        pictures.append((text, picture))
                 yield row | events
 
 
@@ -176,15 +189,16 @@ def _seen(
     if candidate.event_filters:
         events = ColourSamples(both.camera[:, count:], both.xyz, both.white_xyz)
     colour, row, errors = None, {}, np.empty(0)
-    if "colour" in spec.figures:
+    if {"colour", "demosaic"} & set(spec.figures):
         colour = fit_matrix(samples, spec.matrix)
+        errors = colour_differences(samples, colour.matrix)
+    if colour is not None and "colour" in spec.figures:
         is_determined = len(chart) >= count * (count + 1)  # twice as many surfaces as terms
         root = fit_matrix(samples, spec.matrix, "root_polynomial") if is_determined else None
         curves, wanted = sampled(candidate.responses, SPACE_NM), observer(SPACE_NM)
         checker = list(reflectance_set("colorchecker").values())
         method: MatrixMethod = "least_squares_xyz" if spec.matrix == "least_squares_xyz" else "least_delta_e_ab"
         index = metamerism_index(colour_samples(candidate.responses, light, checker, light_name), method)
-        errors = colour_differences(samples, colour.matrix)
         row = {
             **candidate.spaces, "vora_light": vora_value(curves, wanted, light.at(SPACE_NM)),
             "matrix": spec.matrix,
@@ -229,6 +243,22 @@ def _noise_row(
     if spec.noise.repeats:
         row |= _simulated(spec, seen, light, chart, lux, exposure_us, white_e, aware)
     return row
+
+
+def _detail(
+    spec: StudySpec, seen: Seen, light: Spectrum, rate: NDArray[np.float64], lux: float, exposure_us: float
+) -> tuple[dict[str, Cell], NDArray[np.float32]]:
+    """Figures of patterns after demosaicing, and their picture."""
+    from hesim_render.studies.demosaic_figures import demosaic_figures
+
+    assert seen.colour is not None
+    sensor = seen.candidate.sensor
+    every = [sensor.responses[name] for name in sensor.spec.filters]
+    return demosaic_figures(
+        sensor, light, to_srgb(seen.colour.matrix, seen.samples.white_xyz), electrons(rate, exposure_us),
+        electrons(white_rate(every, light, lux), exposure_us), exposure_us, seen.candidate.crosstalk,
+        spec.noise.repeats, spec.noise.seed,
+    )  # fmt: skip
 
 
 def _luminance_row(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.report.drawing import report_style
 from hesim_render.calibrate.report.parts import PAGE_STYLE, number, row_of, table
 from hesim_render.specs.study import StudySpec
+from hesim_render.spectral.colorimetry import encode_srgb
 from hesim_render.studies.cfa import Seen, StudyResult
 from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot
 from hesim_render.studies.table import Table
@@ -27,26 +28,28 @@ _COLUMNS = {
     "noise_amplification": "noise ampl.", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
     "delta_e_noisy_simulated": "ΔE2000 with noise", "ysnr_noise_aware": "YSNR, noise-aware",
     "delta_e_mean_noise_aware": "ΔE2000, noise-aware", "snr10_lux": "SNR10, lx", "dynamic_range_db": "DR, dB",
-    "white_saturation": "white / saturation", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, ΔE*ab",
-    "zipper": "zipper, %", "star_error": "star, %", "zone_plate_colour": "zone plate, ΔE*ab",
+    "white_saturation": "white / saturation", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
+    "zipper": "zipper, %", "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
+    "picture_error_simulated": "rms error with noise",
     "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz",
     "event_seen": "steps seen", "event_seen_isoluminant": "isoluminant steps seen",
 }  # fmt: skip
 #: Columns that a table leaves out if they say the same in every row.
 _BORING = ("sensor", "crosstalk", "exposure_us")
 #: Figures with an interval: ends of the columns of its limits.
-_INTERVALS = {"ysnr_simulated": "ysnr", "delta_e_noisy_simulated": "delta_e_noisy"}
+_INTERVALS = {
+    "ysnr_simulated": "ysnr", "delta_e_noisy_simulated": "delta_e_noisy", "picture_error_simulated": "picture_error",
+}  # fmt: skip
 #: Most groups that are drawn.
 _MOST_GROUPS = 24
 
 
-def report_page(spec: StudySpec, result: StudyResult, pictures: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
+def report_page(spec: StudySpec, result: StudyResult) -> str:
     """The page of a study.
 
     Parameters
     ----------
     spec, result : the study and its results.
-    pictures : further pictures with their captions.
 
     Returns
     -------
@@ -57,9 +60,12 @@ def report_page(spec: StudySpec, result: StudyResult, pictures: Sequence[tuple[s
         parts += ["<h2>Filter sets</h2>", row_of(*map(response_plot, _first_of_each_set(result.seen)))]
         parts += _groups(result.table)
         parts += _patches(result.seen)
-    if pictures:
-        parts.append("<h2>Pictures</h2>")
-        parts.append(row_of(*(f"{_png(image)}<figcaption>{escape(text)}</figcaption>" for text, image in pictures)))
+    if result.pictures:
+        parts.append("<h2>Patterns after demosaicing</h2>")
+        figures = (
+            f"{_png(encode_srgb(image))}<figcaption>{escape(text)}</figcaption>" for text, image in result.pictures
+        )
+        parts.append(row_of(*figures))
     parts.append(_method(spec))
     body = "\n".join(part for part in parts if part)
     return (
