@@ -146,8 +146,11 @@ def test_differences_are_those_of_colour_science():
     assert fit.p95 == pytest.approx(np.percentile(expected, 95))
 
 
-@pytest.mark.parametrize("method", ("least_delta_e_2000", "least_delta_e_ab"))
-@pytest.mark.parametrize("camera", (NIKON, SIGMA))
+@pytest.mark.parametrize(("camera", "method"), [
+    (NIKON, "least_delta_e_2000"), (NIKON, "least_delta_e_ab"),
+    pytest.param(SIGMA, "least_delta_e_2000", marks=pytest.mark.slow),
+    pytest.param(SIGMA, "least_delta_e_ab", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_no_other_search_finds_a_better_matrix(camera, method):
     """Nelder and Mead's from there on, and from the least squares: within 0.2 %."""
     from scipy.optimize import minimize

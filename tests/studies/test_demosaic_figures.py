@@ -66,6 +66,7 @@ def test_mosaics_cost_what_their_sampling_says():
         assert table[figure][1] > 1.5 * table[figure][0]
 
 
+@pytest.mark.slow
 def test_crosstalk_blurs_and_noise_adds_to_the_error():
     table = hr.study({**STUDY, "filter_sets": ["rggb"], "illuminance_lux": [20, 2000], "crosstalk": [0, 0.2],
                       "noise": {"repeats": 2}})  # fmt: skip
