@@ -40,10 +40,16 @@ class InFolder(Strict):
 
 
 class SurfacesSpec(InFolder):
-    """What is looked at: a set of reflectances, or a hyperspectral cube."""
+    """What is looked at: a set of reflectances, a hyperspectral cube, or a scene that is rendered into one."""
 
     reflectances: str | None = Field(None, description="name of a set, or a CSV file of patches")
     cube: str | None = Field(None, description="file of a hyperspectral cube")
+    scene: str | None = Field(None, description="name or file of a scene; its cube holds radiance")
+    size_px: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] = Field(
+        (96, 64), description="width and height of the rendered cube"
+    )
+    bands_nm: tuple[float, float, float] = Field((380.0, 780.0, 10.0), description="first, last and step of its bands")
+    samples: int = Field(64, ge=2, le=65_536, description="rays per pixel and four bands")
     quantity: Literal["reflectance", "radiance"] = Field("reflectance", description="what the cube holds")
     wavelength_nm: list[float] | None = Field(None, min_length=2, description="of a cube whose file has none")
     beyond: Literal["refuse", "hold"] = Field("refuse", description="outside the wavelengths of the cube")
@@ -57,14 +63,22 @@ class SurfacesSpec(InFolder):
 
     @model_validator(mode="after")
     def _one(self) -> SurfacesSpec:
-        if (self.reflectances is None) == (self.cube is None):
-            raise ValueError("surfaces are either 'reflectances' or a 'cube'")
+        if sum(given is not None for given in (self.reflectances, self.cube, self.scene)) != 1:
+            raise ValueError("surfaces are either 'reflectances', a 'cube' or a 'scene'")
+        first, last, step = self.bands_nm
+        if not (360 <= first < last <= 830 and step > 0 and (last - first) / step < 1000):
+            raise ValueError("bands_nm: expected first, last and step within 360 to 830 nm")
         return self
+
+    @property
+    def is_reflectance(self) -> bool:
+        """True if a cube holds reflectances; a rendered one never does."""
+        return self.scene is None and self.quantity == "reflectance"
 
     @property
     def label(self) -> str:
         """Name in the results."""
-        return self.name or self.reflectances or Path(self.cube or "").stem
+        return self.name or self.reflectances or self.scene or Path(self.cube or "").stem
 
 
 class NamedLight(Strict):

@@ -129,7 +129,7 @@ def _surfaces(
     item: SurfacesSpec, tried: Sequence[Candidate], light: NamedLight, spec: StudySpec
 ) -> Iterator[tuple[list[Spectrum], dict[str, Cell]]]:
     """For each candidate the reflectances that its matrix is fitted to, and figures of a cube."""
-    if item.cube is None:
+    if item.reflectances is not None:
         chart = list(reflectances_of(item).values())
         yield from ((chart, {}) for _ in tried)
         return

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.cube.planes import blocks, integration_weights
+from hesim_render.sources.render.cube import render_cube
+from hesim_render.sources.scene import load_scene
 from hesim_render.specs.study import Method, NamedLight, SurfacesSpec
 from hesim_render.spectral.spectrum import Spectrum, colour_matching_functions, product
 from hesim_render.studies.colour_error import delta_e_2000, fit_matrix, lab
@@ -24,13 +26,21 @@ _WHITE_QUANTILE = 0.995
 
 
 def open_surfaces(item: SurfacesSpec) -> CubeFile:
-    """The cube of a study.
+    """The cube of a study, from its file or rendered.
 
     Raises
     ------
     SpecError
-        If it cannot be read.
+        If it cannot be read, or the scene cannot be rendered.
     """
+    if item.scene is not None:
+        first, last, step = item.bands_nm
+        bands = first + step * np.arange(int((last - first) / step + 1e-9) + 1, dtype=np.float64)
+        width, height = item.size_px
+        scene = load_scene(item.beside(item.scene))
+        _, radiance, _ = render_cube(scene, (height, width), bands, item.samples)
+        shape = height, width, bands.size
+        return CubeFile(Path(item.scene), shape, bands, lambda a, b: radiance[a:b], "rendered")
     assert item.cube is not None
     return open_cube(Path(item.beside(item.cube, shipped=False)), item.wavelength_nm)
 
@@ -63,7 +73,7 @@ def cube_figures(
     """
     cube = open_surfaces(item)
     spectrum = light.spectrum.load()
-    is_reflectance = item.quantity == "reflectance"
+    is_reflectance = item.is_reflectance
     every = [response for responses in sets for response in responses]
     seen = [*every, *colour_matching_functions()]
     if is_reflectance:

@@ -81,3 +81,15 @@ def test_bad_cubes_are_one_clear_line(tmp_path):
     assert hr.study({**STUDY, "surfaces": [item | {"scale": 0.01}]}).row(0)["delta_e_cube_mean"] > 0
     with pytest.raises(SpecError, match="no such file"):
         hr.study({**STUDY, "surfaces": [{"cube": str(tmp_path / "none.hdr")}]})
+
+
+def test_a_scene_is_rendered_into_a_cube(tmp_path):
+    """It has the figures of the cube that `render_cube` makes of it."""
+    bands, radiance, _ = hr.render_cube(hr.load_scene("colorchecker"), (16, 24), np.arange(380, 781, 40), 16)
+    hr.write_spectral_exr(tmp_path / "rendered.exr", radiance, bands)
+    scene = {"scene": "colorchecker", "size_px": [24, 16], "bands_nm": [380, 780, 40], "samples": 16, "beyond": "hold"}
+    stored = {"cube": str(tmp_path / "rendered.exr"), "quantity": "radiance", "beyond": "hold"}
+    rows = hr.study({**STUDY, "surfaces": [scene, stored]})
+    assert rows["surfaces"].tolist() == ["colorchecker", "rendered"]
+    for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
+        assert rows[key][0] == pytest.approx(rows[key][1], rel=1e-9) and rows[key][0] > 0.1

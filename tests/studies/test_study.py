@@ -218,7 +218,7 @@ BAD = [
     ({"illuminants": [{"name": "dark", "spectrum": {"flat": -1}}]}, "must not be negative"),
     ({"surfaces": ["macbeth"]}, r"no set of reflectances named 'macbeth'; known are colorchecker"),
     ({"surfaces": [{"reflectances": "missing.csv"}]}, "missing.csv: no such file"),
-    ({"surfaces": [{"name": "neither"}]}, "either 'reflectances' or a 'cube'"),
+    ({"surfaces": [{"name": "neither"}]}, "either 'reflectances', a 'cube' or a 'scene'"),
     ({"figures": ["color"]}, "figures"),
     ({"equal": ["white", "white"]}, "an entry is there twice"),
     ({"noise": {"repeats": 2, "patch_px": 512}}, r"32 patches fit on 1536x1024 px"),
