@@ -29,6 +29,8 @@ _KNOWN_BANDS = {
     ("reflectances", 31): (410.0, 10.0), ("cube", 31): (400.0, 10.0), ("rad", 31): (400.0, 10.0),
     ("CAVE", 31): (400.0, 10.0),
 }  # fmt: skip
+#: Attribute emissiveUnits of spectral EXR files in absolute units.
+RADIANCE_UNITS = "W.m^-2.sr^-1.nm^-1"
 _WAVELENGTHS = ("bands", "wavelength", "wavelength_nm", "wavelengths", "wave")
 _CUBES = ("cube", "rad", "ref", "reflectances", "photons", "data", "mcCOEF")
 #: Largest MATLAB v5 file that is loaded whole, as numbers of float64, bytes.
@@ -49,6 +51,7 @@ class CubeFile:
     read : float32 [row, col, band] of the rows from the first number up to the second.
     layout : what was recognised.
     illuminant : [band], light on the scene in the unit of the cube, where the file has it.
+    is_absolute : True if the file says that its values are radiance in W m⁻² sr⁻¹ nm⁻¹.
     """
 
     file: Path
@@ -57,6 +60,7 @@ class CubeFile:
     read: Rows
     layout: str
     illuminant: NDArray[np.float64] | None = None
+    is_absolute: bool = False
 
     def whole(self) -> NDArray[np.float32]:
         """All rows; refused if they do not fit into memory."""
@@ -153,6 +157,7 @@ def _exr(file: Path) -> CubeFile:
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = opened.channels()
+        is_absolute = opened.header().get("emissiveUnits") == RADIANCE_UNITS
         for pattern in _EXR_CHANNELS:
             found = sorted(
                 (float(match[1].replace(",", ".")), name) for name in channels if (match := pattern.fullmatch(name))
@@ -161,7 +166,7 @@ def _exr(file: Path) -> CubeFile:
                 planes = [channels[name].pixels for _, name in found]
                 shape = (*planes[0].shape, len(planes))
                 bands = np.array([wavelength for wavelength, _ in found])
-                return CubeFile(file, shape, bands, _of_planes(planes), "EXR")
+                return CubeFile(file, shape, bands, _of_planes(planes), "EXR", is_absolute=is_absolute)
         some = ", ".join(sorted(channels)[:8])
     raise SpecError(f"expected channels T.550,0nm … or w550nm … (a picture: R, G, B); found {some}", file=file)
 

@@ -36,8 +36,8 @@ def set_on(sensor, name, palette="dyes"):
 
 
 @pytest.mark.parametrize(("filters", "crosstalk"), [
-    ("rggb", 0.0), ("rgbw", 0.08),
-    pytest.param("quad-bayer", 0.08, marks=pytest.mark.slow), pytest.param("cygm", 0.0, marks=pytest.mark.slow),
+    ("rggb", 0.0), ("quad-bayer", 0.08),
+    pytest.param("rgbw", 0.08, marks=pytest.mark.slow), pytest.param("cygm", 0.0, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_closed_forms_are_those_of_the_full_simulation(filters, crosstalk):
     """Noisy RAW frames with crosstalk, full well and ADC: amplification and YSNR within 3 %.

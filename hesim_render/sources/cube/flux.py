@@ -72,7 +72,7 @@ class CubeFlux(WindowByWindow):
         options, sensor = self.options, self.sensor
         responses = [sensor.responses[name] for name in sensor.layout.filters]
         hold = options.beyond == "hold"
-        factor = options.scale
+        factor = 1.0 if options.scale is None else options.scale
         if options.quantity == "reflectance":
             assert options.illuminance_lux is not None
             irradiance = scale_to_lux(options.illuminant.load(), options.illuminance_lux)
@@ -83,6 +83,11 @@ class CubeFlux(WindowByWindow):
             if not mean > 0:
                 raise SpecError("holds no light", file=self.cube.file)
             factor = options.mean_luminance_cd_m2 / (LUMINOUS_EFFICACY_LM_PER_W * mean)
+        elif options.scale is None and not self.cube.is_absolute:
+            raise SpecError(
+                "does not say the unit of its radiance: give scale (to W m^-2 sr^-1 nm^-1) or mean_luminance_cd_m2",
+                file=self.cube.file,
+            )
         planes = integrated(self.cube, integration_weights(responses, self.cube, hold) * factor, self._shrink)
         if options.quantity == "reflectance":
             # a reflectance of 1 everywhere gives the most

@@ -18,7 +18,8 @@ class CubeOptions(Strict):
     quantity : ``reflectance`` (0 to 1, lit by `illuminant`) or ``radiance``.
     wavelength_nm : of the bands, where the file does not say.
     beyond : outside the wavelengths of the cube: ``refuse``, or ``hold`` its first and last plane.
-    scale : multiplies the values; makes radiance W m⁻² sr⁻¹ nm⁻¹.
+    scale : multiplies the values; makes radiance W m⁻² sr⁻¹ nm⁻¹. A radiance whose file does not say its unit needs
+        it, or `mean_luminance_cd_m2`.
     illuminant : light on reflectances, and the white of colour views.
     illuminance_lux : of reflectances, lx.
     mean_luminance_cd_m2 : of a cube of radiance in unknown units, in place of `scale`.
@@ -31,7 +32,7 @@ class CubeOptions(Strict):
     quantity: Literal["reflectance", "radiance"] = "reflectance"
     wavelength_nm: list[float] | None = Field(None, min_length=2)
     beyond: Literal["refuse", "hold"] = "refuse"
-    scale: float = Field(1.0, gt=0, le=1e12)
+    scale: float | None = Field(None, gt=0, le=1e12)
     illuminant: SpectrumSpec = SpectrumSpec(illuminant="D65")
     illuminance_lux: float | None = Field(None, gt=0, le=1e9)
     mean_luminance_cd_m2: float | None = Field(None, gt=0, le=1e9)

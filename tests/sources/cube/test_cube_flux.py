@@ -52,7 +52,14 @@ def test_a_still_cube_is_eq_1_of_its_radiance(tmp_path):
     path = saved(tmp_path, radiance)
     own = {"quantity": "radiance", "illuminance_lux": None, "fit": "pixel"}
     expected = hr.photocurrent(radiance, BANDS, sensor, 1e6)
-    np.testing.assert_allclose(image(flux_of(path, sensor, **own)), expected, rtol=2e-4)
+    np.testing.assert_allclose(image(flux_of(path, sensor, **own, scale=1.0)), expected, rtol=2e-4)
+    np.testing.assert_allclose(image(flux_of(path, sensor, **own, scale=2.5)), 2.5 * expected, rtol=2e-4)
+    with pytest.raises(SpecError, match="does not say the unit of its radiance"):
+        flux_of(path, sensor, **own)
+    # a file of the renderer says it
+    hr.write_spectral_exr(tmp_path / "cube.exr", radiance, BANDS)
+    told = image(flux_of(tmp_path / "cube.exr", sensor, **own, wavelength_nm=None))
+    np.testing.assert_allclose(told, expected, rtol=2e-4)
     luminance = 683.002 * np.trapezoid(radiance * spectra.photopic().at(BANDS), BANDS).mean()
     np.testing.assert_allclose(
         image(flux_of(path, sensor, **own, mean_luminance_cd_m2=40.0)), expected * 40 / luminance, rtol=2e-3
