@@ -7,8 +7,10 @@ import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.cube import planes
 from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.studies import ColourSamples, colour_differences, colour_samples, fit_matrix
 from hesim_render.studies.colour_samples import reflectance_set
+from hesim_render.targets.cube_file import open_cube
 
 BANDS = np.arange(360.0, 831.0, 5.0)
 STUDY = {"schema_version": 1, "name": "cube", "sensors": ["reference-bayer"], "figures": ["colour"]}
@@ -66,6 +68,19 @@ def test_a_cube_of_radiances_has_its_own_light_and_any_unit(tmp_path):
     assert hr.study({**STUDY, "surfaces": [item]}).row(0)["delta_e_cube_mean"] == pytest.approx(
         row["delta_e_cube_mean"], rel=3e-3
     )
+
+
+def test_planes_that_hold_are_constant_beyond_their_wavelengths(tmp_path):
+    """Weights sum to the whole integral, and each end has what lies beyond it."""
+    np.save(tmp_path / "cube.npy", np.ones((2, 2, 4), np.float32))
+    cube = open_cube(tmp_path / "cube.npy", [450, 500, 550, 600])
+    triangle = Spectrum(np.array([400.0, 525.0, 650.0]), np.array([0.0, 1.0, 0.0]))
+    weights = planes.integration_weights([triangle], cube, hold=True)[:, 0]
+    assert weights.sum() == pytest.approx(125, rel=1e-4)
+    np.testing.assert_allclose(weights, weights[::-1], rtol=1e-6)
+    # below 450 nm lie 0.4·50/2 = 10; from 450 to 500 nm the first plane falls from 1 to 0
+    inside = np.trapezoid((0.4 + 0.4 * np.linspace(0, 1, 2001)) * np.linspace(1, 0, 2001), np.linspace(0, 50, 2001))
+    assert weights[0] == pytest.approx(10 + inside, rel=1e-3)
 
 
 def test_bad_cubes_are_one_clear_line(tmp_path):

@@ -36,6 +36,10 @@ def test_a_perfect_picture_has_perfect_figures():
     assert perfect["mtf50_cy_per_px"] == pytest.approx(0.603, abs=0.01)  # sinc f = 1/2
     assert perfect["zipper"] == 0 and perfect["star_error"] < 1e-12
     assert abs(perfect["false_colour"]) < 0.02 and perfect["zone_plate_colour"] < 0.02
+    # a cast over the whole picture is no false colour of the edge
+    even = np.full((*reflectance.shape, 3), 0.5) * [1.2, 1.0, 0.8]
+    even[:, :, :] *= np.where(reflectance > 0.4, 1.0, 0.999)[..., None]
+    assert abs(_figures(even, reflectance)["false_colour"]) < 0.05
     # one channel moved by a pixel: coloured fringes on the edge, of both signs; luminance hardly changes
     shifted = np.repeat(reflectance[..., None], 3, axis=2)
     shifted[..., 2] = np.roll(shifted[..., 2], 1, axis=1)
