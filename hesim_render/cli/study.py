@@ -47,7 +47,8 @@ def study(
     with progress_report(f"study {kind.value}") as progress:
         table = hr.study(spec, out=out, overwrite=overwrite, progress=progress)
     shown = {name: title for name, title in _SHOWN.items() if name in table.columns}
-    keys = [name for name in ("illuminant", "illuminance_lux", "equal") if len({row[name] for row in table}) > 1]
+    every = ("surfaces", "illuminant", "illuminance_lux", "sensor", "crosstalk", "equal")
+    keys = [name for name in every if len({row[name] for row in table}) > 1]
     lines = [[*keys, *shown.values()]]
     for row in list(table)[:_MOST]:
         lines.append([_text(row[name]) for name in (*keys, *shown)])

@@ -54,7 +54,9 @@ def pareto_plot(rows: Table, title: str) -> str:
 def response_plot(seen: Seen) -> str:
     """SVG of the responses of one filter set, the largest at 1; event pixels dashed."""
     candidate = seen.candidate
-    figure, axes = panel(candidate.set_name, "wavelength, nm", "response, relative", (300, 210))
+    figure, axes = panel(
+        f"{candidate.set_name}, {candidate.sensor_name}", "wavelength, nm", "response, relative", (300, 210)
+    )
     curves = [(name, each, "-") for name, each in zip(candidate.channels, candidate.responses, strict=True)]
     curves += [
         (f"{name} (events)", each, "--")
@@ -85,7 +87,7 @@ def patch_plot(group: Sequence[Seen]) -> str:
     # a mesh and no picture: programs that show SVG smooth pictures
     image = axes.pcolormesh(table, cmap="cividis", vmin=0, vmax=max(float(table.max()), 1e-9), linewidth=0)
     axes.invert_yaxis()
-    axes.set_yticks(np.arange(len(group)) + 0.5, [each.candidate.set_name for each in group])
+    axes.set_yticks(np.arange(len(group)) + 0.5, seen_labels(group))
     axes.set(title=f"ΔE2000 of each surface, {group[0].surfaces} under {group[0].light_name}", xlabel="surface")
     axes.grid(False)
     figure.colorbar(image, ax=axes)
@@ -118,6 +120,17 @@ def chart_picture(seen: Seen, across: int = 6, size_px: int = 26) -> NDArray[np.
         cell = np.where(lower[..., None], camera[number], true[number])
         out[top : top + size_px - 2, left : left + size_px - 2] = cell[:-2, :-2]
     return out
+
+
+def seen_labels(group: Sequence[Seen]) -> list[str]:
+    """Names of the filter sets, with sensor and crosstalk where there are several."""
+    several = len({each.candidate.sensor_name for each in group}) > 1
+    crossed = len({each.candidate.crosstalk for each in group}) > 1
+    return [
+        each.candidate.set_name + (f", {each.candidate.sensor_name}" if several else "")
+        + (f", crosstalk {each.candidate.crosstalk:g}" if crossed else "")
+        for each in group
+    ]  # fmt: skip
 
 
 def _labels(rows: Table) -> list[str]:

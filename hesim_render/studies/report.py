@@ -16,7 +16,7 @@ from hesim_render.calibrate.report.parts import PAGE_STYLE, number, row_of, tabl
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
 from hesim_render.studies.cfa import Seen, StudyResult
-from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot
+from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
 from hesim_render.studies.table import Table
 
 #: Columns of the report's tables: name in the results, heading.
@@ -139,9 +139,8 @@ def _patches(seen: Sequence[Seen]) -> list[str]:
     for _, group in groupby(coloured, key=key):
         some = list(group)
         parts.append(row_of(patch_plot(some)))
-        charts = (
-            f"{_png(chart_picture(each))}<figcaption>{escape(each.candidate.set_name)}</figcaption>" for each in some
-        )
+        named = zip(some, seen_labels(some), strict=True)
+        charts = (f"{_png(chart_picture(each))}<figcaption>{escape(text)}</figcaption>" for each, text in named)
         parts.append(row_of(*charts))
     parts.append(
         "<p>Upper left half of a patch: its true colour. Lower right half: after the matrix of the filter set, without "
