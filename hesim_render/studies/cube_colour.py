@@ -74,6 +74,8 @@ def cube_figures(
     cube = open_surfaces(item)
     spectrum = light.spectrum.load()
     is_reflectance = item.is_reflectance
+    if is_reflectance:
+        cube.require_reflectance()
     every = [response for responses in sets for response in responses]
     seen = [*every, *colour_matching_functions()]
     if is_reflectance:

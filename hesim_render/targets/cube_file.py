@@ -62,6 +62,19 @@ class CubeFile:
     illuminant: NDArray[np.float64] | None = None
     is_absolute: bool = False
 
+    def require_reflectance(self) -> None:
+        """Refuse a file that says that it holds radiance.
+
+        Raises
+        ------
+        SpecError
+            If it does.
+        """
+        if self.is_absolute:
+            raise SpecError(
+                "holds radiance, as it says, and no reflectance (quantity: radiance, --radiance)", file=self.file
+            )
+
     def whole(self) -> NDArray[np.float32]:
         """All rows; refused if they do not fit into memory."""
         rows, cols, bands = self.shape

@@ -105,6 +105,8 @@ def test_a_scene_is_rendered_into_a_cube(tmp_path):
     scene = {"scene": "colorchecker", "size_px": [24, 16], "bands_nm": [380, 780, 40], "samples": 16, "beyond": "hold"}
     stored = {"cube": str(tmp_path / "rendered.exr"), "quantity": "radiance", "beyond": "hold"}
     rows = hr.study({**STUDY, "surfaces": [scene, stored]})
+    with pytest.raises(SpecError, match="holds radiance, as it says"):
+        hr.study({**STUDY, "surfaces": [stored | {"quantity": "reflectance"}]})
     assert rows["surfaces"].tolist() == ["colorchecker", "rendered"]
     for key in ("delta_e_cube_mean", "delta_e_cube_p95", "delta_e_cube_max"):
         assert rows[key][0] == pytest.approx(rows[key][1], rel=1e-9) and rows[key][0] > 0.1

@@ -74,6 +74,7 @@ class CubeFlux(WindowByWindow):
         hold = options.beyond == "hold"
         factor = 1.0 if options.scale is None else options.scale
         if options.quantity == "reflectance":
+            self.cube.require_reflectance()
             assert options.illuminance_lux is not None
             irradiance = scale_to_lux(options.illuminant.load(), options.illuminance_lux)
             responses = [product(each, irradiance).scaled(1 / np.pi) for each in responses]

@@ -58,6 +58,8 @@ def test_a_still_cube_is_eq_1_of_its_radiance(tmp_path):
         flux_of(path, sensor, **own)
     # a file of the renderer says it
     hr.write_spectral_exr(tmp_path / "cube.exr", radiance, BANDS)
+    with pytest.raises(SpecError, match="holds radiance, as it says"):
+        flux_of(tmp_path / "cube.exr", sensor, wavelength_nm=None)
     told = image(flux_of(tmp_path / "cube.exr", sensor, **own, wavelength_nm=None))
     np.testing.assert_allclose(told, expected, rtol=2e-4)
     luminance = 683.002 * np.trapezoid(radiance * spectra.photopic().at(BANDS), BANDS).mean()
@@ -153,7 +155,8 @@ def test_recordings_of_cubes_have_frames_and_events(tmp_path, capsys):
             "expose", str(path), "--sensor", "gen2", "--roi", "64x48", "--out", str(tmp_path / "rec"), "--lux", "500",
             "--bands", "360:830:10", "--pan", "300,0", "--rotate", "20", "--zoom", "1.1", "--duration", "0.12",
         ])  # fmt: skip
-    assert stop.value.code == 0, capsys.readouterr().err
+    shown = capsys.readouterr()
+    assert stop.value.code == 0 and "cube.npy seen by gen2" in shown.out, shown.err
     recording = hr.Recording.load(tmp_path / "rec")
     assert recording.manifest["settings"]["cube"]["pan_px_per_s"] == [300, 0] and len(recording.frames) >= 1
 
