@@ -44,7 +44,9 @@ _HOMES = {
     "render_cube": "hesim_render.sources.render.cube",
     "rig_scenes": "hesim_render.sources.render.truth.rig",
     "simulate": "hesim_render.capture.simulate",
+    "simulate_cube": "hesim_render.capture.simulate_cube",
     "simulate_video": "hesim_render.capture.simulate_video",
+    "study": "hesim_render.studies.run",
     "write_spectral_exr": "hesim_render.sources.render.cube",
 }
 
@@ -62,12 +64,15 @@ __all__ = [
     "render_cube",
     "rig_scenes",
     "simulate",
+    "simulate_cube",
     "simulate_video",
+    "study",
     "write_spectral_exr",
 ]
 
 if TYPE_CHECKING:
     from hesim_render.capture.simulate import simulate
+    from hesim_render.capture.simulate_cube import simulate_cube
     from hesim_render.capture.simulate_video import simulate_video
     from hesim_render.recording.recording import Recording
     from hesim_render.sensor.photocurrent import photocurrent
@@ -77,6 +82,7 @@ if TYPE_CHECKING:
     from hesim_render.sources.render.truth.rig import rig_scenes
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
     from hesim_render.sources.scene import Scene, load_scene
+    from hesim_render.studies.run import study
 
 
 def __getattr__(name: str) -> Any:

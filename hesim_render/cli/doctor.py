@@ -19,6 +19,11 @@ class Kind(StrEnum):
     noise = "noise"
     lens = "lens"
     truth = "truth"
+    filter_sets = "filter_sets"
+    palettes = "palettes"
+    study_specs = "study_specs"
+    design_specs = "design_specs"
+    sweep_specs = "sweep_specs"
 
 
 def doctor() -> None:
@@ -42,7 +47,8 @@ def doctor() -> None:
 
 def list_(
     kind: Annotated[
-        Kind | None, typer.Argument(help="scenes, sensors, illuminants, noise, lens or truth; default all")
+        Kind | None,
+        typer.Argument(help="one of the kinds; default all"),
     ] = None,
 ) -> None:
     """List the names that can be used."""

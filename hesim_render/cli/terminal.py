@@ -89,6 +89,8 @@ def summary(recording: Recording) -> str:
     counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
     video = manifest["settings"].get("video")
     scene = Path(video["source"]).name if video else (manifest.get("scene") or {}).get("name", "no scene file")
+    if "cube" in manifest["settings"]:
+        scene = manifest["settings"]["cube"]["file"]
     lines = [
         f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}"
     ]

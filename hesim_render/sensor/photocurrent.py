@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.tables import table as device_table
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.spectral.spectrum import (
@@ -84,6 +85,7 @@ def photocurrent(
     *,
     filter: str | None = None,
     quadrature: Quadrature = "trapezoid",
+    responses: NDArray | Float | None = None,
 ) -> NDArray[np.float64] | Float:
     """I_c of Eq. 1: mean electrons of an exposure to a spectral radiance.
 
@@ -92,7 +94,7 @@ def photocurrent(
 
     Parameters
     ----------
-    spectral_radiance : [..., band], W m⁻² sr⁻¹ nm⁻¹; a NumPy array, or a Dr.Jit TensorXf for
+    spectral_radiance : [..., band], W m⁻² sr⁻¹ nm⁻¹; a NumPy array, or a Dr.Jit TensorXf or TensorXf64 for
         derivatives. Without `filter` it must be [row, col, band] with the rows and columns of the sensor;
         each pixel then applies its own filter and its relative illumination V.
     wavelength_nm : [band], increasing, nm.
@@ -101,6 +103,9 @@ def photocurrent(
     filter : name of one filter that all elements are seen through, on the optical axis (V = 1). The
         leading shape is then free.
     quadrature : see `band_weights`.
+    responses : [filter, band], responses P_c·C_f at the bands in place of those of the sensor, in the order of
+        `sensor.layout.filters` ([band] with `filter`), e⁻/s per W m⁻² sr⁻¹ nm⁻¹; linear between the bands, as the
+        radiance, whose product is then integrated exactly. NumPy, or a Dr.Jit tensor for derivatives.
 
     Examples
     --------
@@ -116,8 +121,8 @@ def photocurrent(
 
     Returns
     -------
-    Electrons, with the shape of the radiance without its last axis; NumPy float64 for NumPy input, a
-    Dr.Jit TensorXf (differentiable with respect to the radiance) for Dr.Jit input.
+    Electrons, with the shape of the radiance without its last axis; NumPy float64 for NumPy input, a Dr.Jit tensor
+    (differentiable with respect to radiance and responses) if one of both is one, of 64 bits if one of both is.
 
     Raises
     ------
@@ -141,11 +146,71 @@ def photocurrent(
         raise RangeError(
             "spectral_radiance.shape", shape, f"({sensor.rows}, {sensor.cols}, {bands.size}), or a 'filter' argument"
         )
+    exposure_s = exposure_us * S_PER_US
+    if responses is not None:
+        expected = (bands.size,) if filter is not None else (len(names), bands.size)
+        if tuple(responses.shape) not in (expected, (len(names), bands.size)):
+            raise RangeError("responses.shape", tuple(responses.shape), f"{expected}, at the bands of the radiance")
+        widths = _own_widths(bands, quadrature) * exposure_s
+        if isinstance(spectral_radiance, np.ndarray) and isinstance(responses, np.ndarray):
+            given = responses.reshape(-1, bands.size).astype(np.float64)
+            return _numpy(spectral_radiance, _of_own(given, widths), sensor, filter)
+        is_double = any(isinstance(given, jit().TensorXf64) for given in (spectral_radiance, responses))
+        radiance, own = (_tensor(given, is_double) for given in (spectral_radiance, responses))
+        return _drjit(radiance, _own_table(own, widths), sensor, filter)
     weights = np.stack([band_weights(sensor.responses[name], bands, quadrature) for name in names])
-    weights *= exposure_us * S_PER_US
+    weights *= exposure_s
     if isinstance(spectral_radiance, np.ndarray):
         return _numpy(spectral_radiance, weights, sensor, filter)
-    return _drjit(spectral_radiance, weights, sensor, filter)
+    kind = jit().Float64 if isinstance(spectral_radiance, jit().TensorXf64) else jit().Float
+    return _drjit(spectral_radiance, kind(weights.ravel()), sensor, filter)
+
+
+def _own_widths(bands: NDArray[np.float64], quadrature: Quadrature) -> NDArray[np.float64]:
+    """Factors of R(λ_b−1), R(λ_b) and R(λ_b+1) in the weight of L(λ_b), [3, band], nm.
+
+    With R and L linear between bands of distance h, ∫ R L = Σ h/6 (2 R₀L₀ + R₀L₁ + R₁L₀ + 2 R₁L₁).
+    """
+    step = np.diff(bands)
+    if quadrature == "rectangle":
+        if not np.allclose(step, step[0], rtol=1e-9):
+            raise SpecError("quadrature 'rectangle' needs evenly spaced wavelengths")
+        return np.stack([np.zeros(bands.size), np.full(bands.size, step[0]), np.zeros(bands.size)])
+    before, after = np.append(0.0, step), np.append(step, 0.0)
+    return np.stack([before, 2 * (before + after), after]) / 6
+
+
+def _of_own(responses: NDArray[np.float64], widths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights [filter, band] of responses [filter, band]."""
+    padded = np.pad(responses, ((0, 0), (1, 1)))
+    return widths[0] * padded[:, :-2] + widths[1] * responses + widths[2] * padded[:, 2:]
+
+
+def _own_table(responses: Float, widths: NDArray[np.float64]) -> Float:
+    """The same on Dr.Jit, flat; differentiable."""
+    import drjit as dr
+
+    types = jit()
+    count = int(np.prod(responses.shape))
+    bands = widths.shape[1]
+    values = responses.array
+    kind = type(values)
+    place = dr.arange(types.UInt32, count)
+    band = place % bands
+    factors = [dr.gather(kind, device_table(kind, row), band) for row in widths]
+    # at the ends the factor is 0, so that the neighbour does not matter
+    before = dr.gather(kind, values, dr.select(band > 0, place - 1, place))
+    after = dr.gather(kind, values, dr.select(band < bands - 1, place + 1, place))
+    return factors[0] * before + factors[1] * values + factors[2] * after
+
+
+def _tensor(values: NDArray | Float, is_double: bool) -> Float:
+    """A Dr.Jit tensor of 32-bit or 64-bit numbers."""
+    types = jit()
+    kind = types.TensorXf64 if is_double else types.TensorXf
+    if isinstance(values, np.ndarray):
+        return kind(np.ascontiguousarray(values, dtype=np.float64 if is_double else np.float32))
+    return values if isinstance(values, kind) else kind(values)
 
 
 def _numpy(radiance: NDArray, weights: NDArray, sensor: Sensor, filter: str | None) -> NDArray[np.float64]:
@@ -159,22 +224,22 @@ def _numpy(radiance: NDArray, weights: NDArray, sensor: Sensor, filter: str | No
     return electrons * sensor.relative_illumination
 
 
-def _drjit(radiance: Float, weights: NDArray, sensor: Sensor, filter: str | None) -> Float:
+def _drjit(radiance: Float, table: Float, sensor: Sensor, filter: str | None) -> Float:
     import drjit as dr
 
     types = jit()
     shape = tuple(radiance.shape)
     bands = shape[-1]
     count = int(np.prod(shape[:-1], dtype=np.int64))
-    table = types.Float(weights.astype(np.float32).ravel())
+    kind = type(radiance.array)
     if filter is None:
         offset = types.UInt32(sensor.layout.filter_index.ravel().astype(np.uint32)) * bands
-        vignetting = types.Float(sensor.relative_illumination.ravel())
+        vignetting = kind(sensor.relative_illumination.ravel())
     else:
-        offset, vignetting = dr.zeros(types.UInt32, count), types.Float(1.0)
-    source = types.Float(radiance.array)
+        offset, vignetting = dr.zeros(types.UInt32, count), kind(1.0)
+    source = radiance.array
     first = dr.arange(types.UInt32, count) * bands
-    electrons = dr.zeros(types.Float, count)
+    electrons = dr.zeros(kind, count)
     for band in range(bands):
-        electrons += dr.gather(types.Float, source, first + band) * dr.gather(types.Float, table, offset + band)
-    return types.TensorXf(electrons * vignetting, shape=shape[:-1])
+        electrons += dr.gather(kind, source, first + band) * dr.gather(kind, table, offset + band)
+    return type(radiance)(electrons * vignetting, shape=shape[:-1])

@@ -205,6 +205,22 @@ class EvsSpec(Strict):
         return self
 
 
+def tile_text(value: Any) -> str:
+    """The drawing of a tile: one line of letters per row, without blanks.
+
+    Raises
+    ------
+    ValueError
+        If it is no text, or its rows differ in length.
+    """
+    if not isinstance(value, str):
+        raise ValueError("the tile is drawn as text, one letter a pixel, one line a row")
+    rows = ["".join(line.split()) for line in value.strip().splitlines()]
+    if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
+        raise ValueError("every line of the tile must hold the same number of letters")
+    return "\n".join(rows)
+
+
 class SensorSpec(Strict):
     """A whole sensor file."""
 
@@ -227,18 +243,8 @@ class SensorSpec(Strict):
 
     @field_validator("tile", mode="before")
     @classmethod
-    def _tile_text(cls, value: Any) -> Any:
-        if not isinstance(value, str):
-            raise ValueError("the tile is drawn as text, one letter a pixel, one line a row")
-        return value
-
-    @field_validator("tile")
-    @classmethod
-    def _tile_shape(cls, value: str) -> str:
-        rows = ["".join(line.split()) for line in value.strip().splitlines()]
-        if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
-            raise ValueError("every line of the tile must hold the same number of letters")
-        return "\n".join(rows)
+    def _tile_shape(cls, value: Any) -> str:
+        return tile_text(value)
 
     @property
     def tile_rows(self) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -17,8 +17,36 @@ from pydantic import (
 
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
+from hesim_render.spectral import physical
 from hesim_render.spectral import spectrum as spectra
-from hesim_render.spectral.spectrum import Spectrum
+from hesim_render.spectral.spectrum import Spectrum, product
+
+_Wavelength = Annotated[float, Field(ge=100, le=3000)]
+_Density = Annotated[float, Field(ge=0, le=20)]
+
+
+class DyeSpec(Strict):
+    """A dye: absorbance as a sum of bands [peak nm, FWHM nm, density] and edges [nm, width nm, density]."""
+
+    bands: list[tuple[_Wavelength, Annotated[float, Field(gt=0, le=2000)], _Density]] = []
+    edges: list[tuple[_Wavelength, Annotated[float, Field(ge=-500, le=500)], _Density]] = []
+
+    @model_validator(mode="after")
+    def _check(self) -> DyeSpec:
+        if any(width == 0 for _, width, _ in self.edges):
+            raise ValueError("edges: the width of an edge must not be 0")
+        return self
+
+
+class ThinFilmSpec(Strict):
+    """A stack of thin films without absorption; its first layer is that on the side of the light."""
+
+    layers: list[tuple[Annotated[float, Field(ge=1, le=6)], Annotated[float, Field(gt=0, le=1e5)]]] = Field(
+        min_length=1, max_length=400, description="refractive index and thickness in nm of each layer"
+    )
+    incidence: float = Field(1.0, ge=1, le=6, description="refractive index in front")
+    substrate: float = Field(1.52, ge=1, le=6, description="refractive index behind")
+    angle_deg: float = Field(0.0, ge=0, lt=90)
 
 
 class SpectrumSpec(Strict):
@@ -46,6 +74,13 @@ class SpectrumSpec(Strict):
     blackbody_k: float | None = Field(None, gt=0, description="Planck radiator of this temperature")
     peak_nm: float | None = Field(None, description="centre of a Gaussian")
     fwhm_nm: float | None = Field(None, gt=0, description="full width at half maximum of that Gaussian")
+    dye: DyeSpec | None = Field(None, description="transmittance of a dye by its absorbance")
+    thin_film: ThinFilmSpec | None = Field(None, description="transmittance of a stack of thin films")
+    silicon_depth_um: float | None = Field(
+        None, gt=0, le=1e4, description="quantum efficiency of a silicon layer of this depth"
+    )
+    surface: Literal["coated", "bare"] = Field("coated", description="of the silicon: no reflection, or that in air")
+    product: list[SpectrumSpec] | None = Field(None, min_length=2, max_length=20, description="of several spectra")
     scale: float = Field(1.0, description="multiplies all values")
     folder: Path = Field(Path(), exclude=True)
     _table: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(None)  # the table of `csv`, read once
@@ -76,6 +111,10 @@ class SpectrumSpec(Strict):
             "wavelength_nm": self.wavelength_nm,
             "blackbody_k": self.blackbody_k,
             "peak_nm": self.peak_nm,
+            "dye": self.dye,
+            "thin_film": self.thin_film,
+            "silicon_depth_um": self.silicon_depth_um,
+            "product": self.product,
         }
         given = [name for name, value in sources.items() if value is not None]
         if len(given) != 1:
@@ -139,7 +178,22 @@ class SpectrumSpec(Strict):
             return spectra.camera_sensitivity(self.camera, str(self.channel))
         if self.wavelength_nm is not None:
             return Spectrum(np.array(self.wavelength_nm), np.array(self.value))
-        grid = np.arange(300.0, 1101.0, 1.0)
+        if self.product is not None:
+            return product(*(part.load() for part in self.product))
+        return self._computed()
+
+    def _computed(self) -> Spectrum:
+        if self.dye is not None:
+            return physical.dye_transmittance(self.dye.bands, self.dye.edges)
+        if self.thin_film is not None:
+            film = self.thin_film
+            indices, thicknesses = zip(*film.layers, strict=True)
+            return physical.thin_film_transmittance(
+                indices, thicknesses, film.incidence, film.substrate, film.angle_deg
+            )
+        if self.silicon_depth_um is not None:
+            return physical.silicon_quantum_efficiency(self.silicon_depth_um, self.surface)
+        grid = physical.GRID_NM
         if self.blackbody_k is not None:
             # Planck's law in relative units; c2 = h c / k_B = 1.438777e7 nm K (CODATA 2018)
             power = grid**-5 / np.expm1(1.438776877e7 / (grid * self.blackbody_k))

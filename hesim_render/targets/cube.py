@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,11 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading, require_memory
+from hesim_render.targets.cube_file import READERS as CUBE_READERS
+from hesim_render.targets.cube_file import open_cube
 
-#: Name of a channel of a spectral EXR file: reflectance or emission at a wavelength [fichet2021].
-_CHANNEL = re.compile(r"(?:T|S0)\.(\d+(?:,\d+)?)nm")
+#: Ends of the names of files with hyperspectral cubes.
+_CUBES = tuple(CUBE_READERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,33 +45,22 @@ def read_cube(file: Path, wavelength_nm: Sequence[float] | None = None) -> Cube:
     SpecError
         If the file cannot be read, or wavelengths are missing, or given for a file that has its own.
     """
+    if file.suffix.lower() == ".npy" and wavelength_nm is None:
+        raise SpecError("a .npy file needs wavelength_nm beside it", file=file, key="target.wavelength_nm")
+    if file.suffix.lower() in _CUBES and not _is_rgb(file):
+        opened = open_cube(file, wavelength_nm)
+        return Cube(opened.whole(), opened.wavelength_nm)
+    if wavelength_nm is not None:
+        raise SpecError(f"a {file.suffix} file takes no wavelength_nm", file=file, key="target.wavelength_nm")
     reader = READERS.get(file.suffix.lower())
     if reader is None:
-        raise SpecError(f"a picture must be one of {', '.join(READERS)}, not {file.suffix!r}", file=file)
-    if (wavelength_nm is not None) != (reader is _npy):
-        what = "needs wavelength_nm beside it" if reader is _npy else "takes no wavelength_nm"
-        raise SpecError(f"a {file.suffix} file {what}", file=file, key="target.wavelength_nm")
+        known = ", ".join(dict.fromkeys([*READERS, *_CUBES]))
+        raise SpecError(f"a picture must be one of {known}, not {file.suffix!r}", file=file)
     with reading(file, "as a picture"):
         cube = reader(file)
-    if wavelength_nm is not None:
-        cube = Cube(cube.values, np.asarray(wavelength_nm, dtype=np.float64))
-        if cube.values.shape[2] != len(wavelength_nm):
-            raise SpecError(
-                f"the cube has {cube.values.shape[2]} planes and wavelength_nm {len(wavelength_nm)} values", file=file
-            )
-    if cube.wavelength_nm is not None and not np.all(np.diff(cube.wavelength_nm) > 0):
-        raise SpecError("the wavelengths of a cube must increase", file=file, key="target.wavelength_nm")
     if not np.isfinite(cube.values).all():
         raise SpecError("holds values that are not finite", file=file)
     return cube
-
-
-def _npy(file: Path) -> Cube:
-    mapped = np.load(file, mmap_mode="r", allow_pickle=False)
-    if mapped.ndim != 3 or mapped.dtype.kind not in "fui" or mapped.shape[2] < 2 or 0 in mapped.shape:
-        raise SpecError(f"expected numbers [row, col, wavelength], found {mapped.dtype} {mapped.shape}", file=file)
-    require_memory(4 * mapped.size, "the cube", file)
-    return Cube(np.array(mapped, dtype=np.float32), None)
 
 
 def _codes(file: Path) -> Cube:
@@ -88,21 +78,23 @@ def _codes(file: Path) -> Cube:
     return Cube(table[codes], None)
 
 
+def _is_rgb(file: Path) -> bool:
+    """True for an EXR file with channels R, G, B and no spectral ones."""
+    if file.suffix.lower() != ".exr" or not file.is_file():
+        return False
+    import OpenEXR
+
+    with reading(file, "as a picture"), OpenEXR.File(str(file), separate_channels=True, header_only=True) as opened:
+        names = {channel.name for channel in opened.header()["channels"]}
+    return {"R", "G", "B"} <= names
+
+
 def _exr(file: Path) -> Cube:
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = opened.channels()
-        spectral = sorted(
-            (float(match[1].replace(",", ".")), name) for name in channels if (match := _CHANNEL.fullmatch(name))
-        )
-        if len(spectral) >= 2:
-            planes = [channels[name].pixels for _, name in spectral]
-            return Cube(np.stack(planes, axis=-1).astype(np.float32), np.array([value for value, _ in spectral]))
-        if all(name in channels for name in "RGB"):
-            return Cube(np.stack([channels[name].pixels for name in "RGB"], axis=-1).astype(np.float32), None)
-        found = ", ".join(sorted(channels)[:8])
-    raise SpecError(f"expected channels R, G, B or T.550,0nm …; found {found}", file=file)
+        return Cube(np.stack([channels[name].pixels for name in "RGB"], axis=-1).astype(np.float32), None)
 
 
 #: Reader for each end of a file name.
@@ -113,5 +105,4 @@ READERS: dict[str, Callable[[Path], Cube]] = {
     ".tif": _codes,
     ".tiff": _codes,
     ".exr": _exr,
-    ".npy": _npy,
 }

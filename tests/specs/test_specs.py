@@ -228,14 +228,16 @@ def test_shipped_scene_files_load(name):
     assert spec.name == name and spec.description
 
 
-def keys_of(model):
+def keys_of(model, within=()):
     """Every key that a file can hold, through lists, alternatives and dictionaries."""
     found = set()
+    if model in within:  # a product of spectra holds spectra
+        return found
     for name, field in model.model_fields.items():
         if not field.exclude:
             found.add(name)
             for inner in models_in(field.annotation):
-                found |= keys_of(inner)
+                found |= keys_of(inner, (*within, model))
     return found
 
 

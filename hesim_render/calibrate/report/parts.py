@@ -6,6 +6,18 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
+#: Style of an HTML report.
+PAGE_STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;color:#1b1b1b;max-width:1320px;margin:2rem auto;padding:0 1rem}
+h1{font-size:1.6rem}h2{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px solid #ccc}
+.row{display:flex;flex-wrap:wrap;gap:18px;align-items:flex-start}figure{margin:0}
+figcaption{font-size:.85rem;color:#555;max-width:52rem}
+table{border-collapse:collapse;font-size:.85rem;margin:.6rem 0}
+td,th{padding:.15rem .6rem;border-bottom:1px solid #ddd;text-align:left;font-variant-numeric:tabular-nums}
+svg{stroke-linejoin:round;stroke-linecap:butt}
+.findings{border-left:4px solid #d55e00;background:#fdf3ec;padding:.3rem .9rem;margin:.8rem 0}
+"""
+
 
 def findings(section: Mapping[str, Any]) -> str:
     """The findings of a section, one line each; empty for a calibration without checks."""

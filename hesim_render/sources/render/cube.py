@@ -31,8 +31,8 @@ from hesim_render.sources.scene import Scene
 from hesim_render.specs.sensor import read_sensor
 from hesim_render.spectral.spectrum import RENDERABLE_NM
 from hesim_render.spectral.waveform import Waveform
+from hesim_render.targets.cube_file import RADIANCE_UNITS
 
-EMISSIVE_UNITS = "W.m^-2.sr^-1.nm^-1"
 _CHANNEL = re.compile(r"S0\.(\d*,?\d*(?:[eE][+-]?\d+)?)nm")
 _BANDS_PER_RAY = 4
 
@@ -223,7 +223,7 @@ def write_spectral_exr(path: str | Path, radiance: NDArray[np.float32], waveleng
         "compression": OpenEXR.PIZ_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "spectralLayoutVersion": "1.0",
-        "emissiveUnits": EMISSIVE_UNITS,
+        "emissiveUnits": RADIANCE_UNITS,
     }
     with replacing(target) as temporary, OpenEXR.File(header, channels) as file:
         file.write(str(temporary))

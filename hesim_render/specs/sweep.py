@@ -1,0 +1,105 @@
+"""The file of a sweep: keys that vary, seeds, and what is tabulated of every run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.study import InFolder
+
+#: Most runs of a sweep.
+MOST_RUNS = 100_000
+_Scalar = str | float | int | bool
+Metric = Literal["frames", "electrons", "raw_mean", "raw_variance", "snr", "events", "event_rate", "mtf50"]
+
+
+class RangeSpec(Strict):
+    """Evenly spaced values, on a linear or logarithmic scale."""
+
+    first: float
+    last: float
+    count: int = Field(ge=2, le=10_000)
+    scale: Literal["linear", "log"] = "linear"
+
+    @model_validator(mode="after")
+    def _check(self) -> RangeSpec:
+        if self.scale == "log" and (self.first <= 0 or self.last <= 0):
+            raise ValueError("a logarithmic range needs ends above 0")
+        return self
+
+    def values(self) -> list[float]:
+        """The values, both ends included."""
+        import numpy as np
+
+        space = np.geomspace if self.scale == "log" else np.linspace
+        return [float(f"{value:.12g}") for value in space(self.first, self.last, self.count)]
+
+
+class SweepSpec(InFolder):
+    """A sweep over keys of scene and sensor files."""
+
+    schema_version: Literal[1]
+    name: str = Field(min_length=1)
+    description: str = ""
+    scenes: list[str] = Field(min_length=1)
+    sensors: list[str] = Field(min_length=1)
+    roi: str | None = Field(None, description="part of the sensor: WIDTHxHEIGHT, px")
+    duration_s: float = Field(0.1, gt=0, le=1e6)
+    vary: dict[str, list[Any] | RangeSpec] = Field(
+        {}, description="keys as in --set (light.illuminance_lux, sensor.aps.exposure_us): values or a range"
+    )
+    seeds: list[Annotated[int, Field(ge=0, lt=2**64)]] = Field([7], min_length=1)
+    options: dict[str, _Scalar] = Field({}, description="quality, samples, exact or clean, as for simulate")
+    metrics: list[Metric] = Field(["electrons", "snr", "event_rate"], min_length=1)
+    keep: bool = Field(False, description="keep the recordings, not only their figures")
+
+    @field_validator("vary", mode="before")
+    @classmethod
+    def _values(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        found = {}
+        for key, values in value.items():
+            if isinstance(values, dict):
+                try:
+                    values = RangeSpec.model_validate(values)
+                except ValidationError as error:
+                    problem = error.errors(include_url=False)[0]
+                    place = ".".join(map(str, (key, *problem["loc"])))
+                    raise ValueError(f"{place}: {problem['msg'].removeprefix('Value error, ')}") from None
+            elif isinstance(values, list) and not values:
+                raise ValueError(f"{key}: a list of values is empty")
+            found[key] = values
+        return found
+
+    @field_validator("options")
+    @classmethod
+    def _known(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for key in value:
+            if key not in ("quality", "samples", "exact", "clean"):
+                raise ValueError(f"{key}: expected quality, samples, exact or clean")
+        return value
+
+    @model_validator(mode="after")
+    def _countable(self) -> SweepSpec:
+        total = len(self.scenes) * len(self.sensors) * len(self.seeds)
+        for values in self.vary.values():
+            total *= values.count if isinstance(values, RangeSpec) else len(values)
+        if total > MOST_RUNS:
+            raise ValueError(f"vary: makes {total} runs, more than {MOST_RUNS}")
+        return self
+
+
+def read_sweep(name_or_path: str | Path) -> SweepSpec:
+    """A sweep's file.
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of all that is wrong.
+    """
+    file = locate(name_or_path, "sweep_specs")
+    return validate(SweepSpec, load_yaml(file), file, {})

@@ -1,0 +1,128 @@
+"""What a study compares: sensors with filter sets, at a crosstalk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from hesim_render.core.errors import HesimError, SpecError
+from hesim_render.sensor.sensor import Sensor, load_sensor
+from hesim_render.specs.filter_set import PaletteSpec, read_filter_set, read_palette
+from hesim_render.specs.study import StudySpec, set_label
+from hesim_render.spectral.spectrum import Spectrum
+from hesim_render.studies.filter_sets import effective_responses, filters_of, with_filter_set
+from hesim_render.studies.subspace import (
+    filter_quality,
+    luther_residual,
+    observer,
+    require_colour,
+    sampled,
+    vora_value,
+)
+from hesim_render.studies.table import Cell
+
+#: Grid on which spaces are compared, nm.
+SPACE_NM = np.arange(380.0, 781.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A sensor with a filter set, at one crosstalk.
+
+    Parameters
+    ----------
+    sensor : the whole sensor.
+    sensor_name, set_name : names in the results.
+    crosstalk : part of a pixel's electrons that its neighbours collect.
+    """
+
+    sensor: Sensor
+    sensor_name: str
+    set_name: str
+    crosstalk: float
+
+    @cached_property
+    def channels(self) -> list[str]:
+        """Filters of the frame pixels."""
+        return filters_of(self.sensor, "aps")
+
+    @cached_property
+    def event_filters(self) -> list[str]:
+        """Filters of the event pixels."""
+        return filters_of(self.sensor, "evs")
+
+    @cached_property
+    def responses(self) -> list[Spectrum]:
+        """Of the frame pixels' filters, crosstalk included."""
+        return effective_responses(self.sensor, self.channels, "aps", self.crosstalk)
+
+    @cached_property
+    def event_responses(self) -> list[Spectrum]:
+        """Of the event pixels' filters, crosstalk included."""
+        return effective_responses(self.sensor, self.event_filters, "evs", self.crosstalk)
+
+    @cached_property
+    def spaces(self) -> dict[str, Cell]:
+        """Figures of the curves alone."""
+        curves, wanted = sampled(self.responses, SPACE_NM), observer(SPACE_NM)
+        quality = filter_quality(curves, wanted)
+        return {
+            "vora": vora_value(curves, wanted),
+            "luther_residual": luther_residual(curves, wanted).total,
+            "filter_quality_min": min(quality),
+        }
+
+
+def candidates(spec: StudySpec) -> list[Candidate]:
+    """All sensors with all filter sets of a study.
+
+    Raises
+    ------
+    SpecError
+        If a file is not valid, a set does not fit a sensor, or cannot tell three primaries apart where colour is
+        wanted; all sets are told together.
+    """
+    palettes: dict[str, PaletteSpec] = {}
+
+    def palette(name: str) -> PaletteSpec:
+        if name not in palettes:
+            palettes[name] = read_palette(spec.beside(name))
+        return palettes[name]
+
+    found, problems = [], []
+    for name in spec.sensors:
+        base = load_sensor(spec.beside(name))
+        sets: Sequence[Any] = spec.filter_sets or [None]
+        for number, use in enumerate(sets):
+            try:
+                if use is None:
+                    label, sensor = "own", base
+                else:
+                    label = set_label(use, spec.palette)
+                    filters = read_filter_set(use.beside(use.set))
+                    sensor = with_filter_set(base, filters, palette(use.palette or spec.palette))
+                parts = spec.crosstalk or [sensor.spec.geometry.crosstalk]
+                for crosstalk in parts:
+                    candidate = Candidate(sensor, base.name, label, crosstalk)
+                    _check(candidate, spec)
+                    found.append(candidate)
+            except HesimError as error:
+                if isinstance(error, SpecError) and error.file is not None:
+                    raise
+                key = f"sensors ({name})" if use is None else f"filter_sets.{number}"
+                problems.append(SpecError(str(error), key=key))
+    if problems:
+        raise SpecError.together(problems)
+    return found
+
+
+def _check(candidate: Candidate, spec: StudySpec) -> None:
+    frames = {"colour", "noise", "demosaic"} & set(spec.figures)
+    if frames and not candidate.channels:
+        raise SpecError(f"{candidate.set_name} on {candidate.sensor_name}: no frame pixels, but figures of frames")
+    if "colour" in spec.figures or "demosaic" in spec.figures:
+        require_colour(sampled(candidate.responses, SPACE_NM), f"{candidate.set_name} on {candidate.sensor_name}")

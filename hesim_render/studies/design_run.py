@@ -1,0 +1,169 @@
+"""Run a design from its file, judge the result by full simulation, and write all of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from ruamel.yaml import YAML
+
+from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.core.progress import Progress, shown
+from hesim_render.specs.design import DesignSpec, read_design
+from hesim_render.specs.files import validate
+from hesim_render.specs.filter_set import read_palette
+from hesim_render.specs.study import StudySpec
+from hesim_render.studies.cfa import run_study
+from hesim_render.studies.design import DesignResult, Problem, designed_palette, designed_sensor, optimise
+from hesim_render.studies.report import report_page
+from hesim_render.studies.table import Table
+
+#: File that marks the folder of a design.
+MARKER = "design.json"
+#: Name of the designed set in the results.
+DESIGNED = "designed"
+#: Half a 95 % interval over standard errors.
+_Z95 = 1.96
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A finished design.
+
+    Parameters
+    ----------
+    result : filters and costs of the optimiser.
+    table : figures of the designed set and of those it is compared with, by full simulation.
+    verdicts : for each set of the comparison, how the designed one differs.
+    """
+
+    result: DesignResult
+    table: Table
+    verdicts: list[dict[str, Any]]
+
+
+def design(
+    spec: str | Path | Mapping[str, Any] | DesignSpec,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    progress: Progress | Literal[False] | None = None,
+) -> Design:
+    """Design filters by gradients, and judge them by full simulation with noise.
+
+    Parameters
+    ----------
+    spec : name of a shipped design, path of a file, or its content as a dictionary (``docs/studies.md``).
+    out : folder for ``sensor.yaml``, ``palette.yaml``, ``design.json``, ``results.csv`` and ``report.html``.
+    overwrite : replace the results of another design in `out`.
+    progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
+
+    Returns
+    -------
+    The filters, the table of the judgement, and verdicts.
+
+    Raises
+    ------
+    SpecError
+        If a file is not valid, or parts do not fit.
+    OutputError
+        If `out` exists or cannot be written. No partial output is left.
+    """
+    if isinstance(spec, Mapping):
+        read: DesignSpec = validate(DesignSpec, dict(spec), None, {})
+    else:
+        read = spec if isinstance(spec, DesignSpec) else read_design(spec)
+    folder = OutputFolder(out, MARKER, overwrite)
+    try:
+        with shown(progress, read.name) as told:
+            problem = Problem(read)
+            result = optimise(problem, told)
+            _write_yaml(folder.path / "palette.yaml", designed_palette(problem, result))
+            palette = read_palette(folder.path / "palette.yaml")
+            sensor = designed_sensor(problem, palette).spec.model_dump(mode="json", exclude_none=True)
+            sensor |= {"description": palette.description, "sources": {}, "assumptions": palette.assumptions}
+            _write_yaml(folder.path / "sensor.yaml", sensor)
+            judged = _judgement(read, folder.path / "palette.yaml")
+            found = run_study(judged, told)
+        verdicts = _verdicts(read, found.table)
+        with output_errors(folder.target):
+            found.table.write(folder.path / "results.csv")
+            content = {
+                "design": json.loads(read.model_dump_json()), "cost": result.cost, "costs": result.costs.tolist(),
+                "evaluations": result.evaluations, "verdicts": verdicts,
+            }  # fmt: skip
+            (folder.path / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            (folder.path / "report.html").write_text(report_page(judged, found), encoding="utf-8")
+        folder.commit()
+    except BaseException:
+        folder.discard()
+        raise
+    return Design(result, found.table, verdicts)
+
+
+def _judgement(spec: DesignSpec, palette: Path) -> StudySpec:
+    """The study that judges the result."""
+    own = {"set": spec.filter_set.beside(spec.filter_set.set), "palette": str(palette.resolve()), "name": DESIGNED}
+    others = [
+        {
+            "set": use.beside(use.set), "palette": use.beside(use.palette or spec.palette),
+            "name": use.name or f"{Path(use.set).stem} ({Path(use.palette or spec.palette).stem})",
+        }
+        for use in spec.compare
+    ]  # fmt: skip
+    exposure = [] if spec.exposure_us is None else [spec.exposure_us]
+    data = {
+        "schema_version": 1, "name": spec.name, "description": spec.description, "sensors": [spec.beside(spec.sensor)],
+        "palette": spec.beside(spec.palette), "filter_sets": [own, *others],
+        "surfaces": [spec.judge.surfaces()], "illuminants": spec.judge.illuminants,
+        "illuminance_lux": spec.illuminance_lux, "exposures_us": exposure, "area_px": spec.area_px,
+        "noise": {"repeats": spec.repeats, "patch_px": 24, "seed": 1},
+    }  # fmt: skip
+    return StudySpec.model_validate(data, context={"folder": spec.folder})
+
+
+def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
+    """The designed set against each other one: ratios of figures, and the difference of the cost with its interval.
+
+    The cost of the judgement is that of the design with measured figures: mean ΔE2000 without noise, and with the noise
+    of simulated frames after the noise-aware matrix, the mean over lights and levels.
+    """
+    weights = spec.cost
+    own = table.where(filter_set=DESIGNED)
+    found = []
+    for name in dict.fromkeys(table["filter_set"]):
+        if name == DESIGNED:
+            continue
+        other = table.where(filter_set=name)
+        parts = []
+        for each in (own, other):
+            cost = weights.colour * each["delta_e_mean"] + weights.noise * each["delta_e_noisy_noise_aware_simulated"]
+            if weights.events and "event_contrast_on" in each.columns:
+                cost = cost + weights.events * np.nan_to_num(each["event_contrast_on"])
+            half = each["delta_e_noisy_noise_aware_high"] - each["delta_e_noisy_noise_aware_simulated"]
+            parts.append((float(cost.mean()), weights.noise * float(np.sqrt(np.sum(half**2))) / len(each)))
+        difference = parts[0][0] - parts[1][0]
+        half_width = float(np.hypot(parts[0][1], parts[1][1]))
+        verdict: dict[str, Any] = {
+            "against": name, "cost": parts[0][0], "cost_against": parts[1][0], "cost_difference": difference,
+            "cost_difference_low": difference - half_width, "cost_difference_high": difference + half_width,
+            "delta_e_mean": float(own["delta_e_mean"].mean()),
+            "delta_e_mean_against": float(other["delta_e_mean"].mean()),
+        }  # fmt: skip
+        for lux in spec.illuminance_lux:
+            pair = [each.where(illuminance_lux=lux)["ysnr_simulated"].mean() for each in (own, other)]
+            verdict[f"ysnr_ratio_{lux:g}_lux"] = float(pair[0] / pair[1])
+        found.append(verdict)
+    return found
+
+
+def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
+    writer = YAML()  # keeps the order
+    writer.default_flow_style = None
+    writer.width = 120
+    with output_errors(path), path.open("w", encoding="utf-8") as file:
+        writer.dump(dict(content), file)

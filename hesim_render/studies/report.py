@@ -1,0 +1,171 @@
+"""The HTML report of a study: one file that needs no other file."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from html import escape
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.report.drawing import report_style
+from hesim_render.calibrate.report.parts import PAGE_STYLE, number, row_of, table
+from hesim_render.specs.study import StudySpec
+from hesim_render.spectral.colorimetry import encode_srgb
+from hesim_render.studies.cfa import Seen, StudyResult
+from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
+from hesim_render.studies.table import Table
+
+#: Columns of the report's tables: name in the results, heading.
+_COLUMNS = {
+    "filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, µs",
+    "delta_e_mean": "ΔE2000 mean", "delta_e_p95": "95 %", "delta_e_max": "max",
+    "delta_e_mean_root_polynomial": "root polynomial", "smi": "SMI", "vora": "Vora",
+    "luther_residual": "Luther residual",
+    "noise_amplification": "noise ampl.", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
+    "delta_e_noisy_simulated": "ΔE2000 with noise", "ysnr_noise_aware": "YSNR, noise-aware",
+    "delta_e_mean_noise_aware": "ΔE2000, noise-aware", "snr10_lux": "SNR10, lx", "dynamic_range_db": "DR, dB",
+    "white_saturation": "white / saturation", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
+    "zipper": "zipper, %", "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
+    "picture_error_simulated": "rms error with noise",
+    "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz",
+    "event_seen": "steps seen", "event_seen_isoluminant": "isoluminant steps seen",
+}  # fmt: skip
+#: Columns that a table leaves out if they say the same in every row.
+_BORING = ("sensor", "crosstalk", "exposure_us")
+#: Figures with an interval: ends of the columns of its limits.
+_INTERVALS = {
+    "ysnr_simulated": "ysnr", "delta_e_noisy_simulated": "delta_e_noisy", "picture_error_simulated": "picture_error",
+}  # fmt: skip
+#: Most groups that are drawn.
+_MOST_GROUPS = 24
+
+
+def report_page(spec: StudySpec, result: StudyResult) -> str:
+    """The page of a study.
+
+    Parameters
+    ----------
+    spec, result : the study and its results.
+
+    Returns
+    -------
+    HTML.
+    """
+    parts = [f"<h1>{escape(spec.name)}</h1>", f"<p>{escape(spec.description)}</p>" if spec.description else ""]
+    with report_style():
+        parts += ["<h2>Filter sets</h2>", row_of(*map(response_plot, _first_of_each_set(result.seen)))]
+        parts += _groups(result.table)
+        parts += _patches(result.seen)
+    if result.pictures:
+        parts.append("<h2>Patterns after demosaicing</h2>")
+        figures = (
+            f"{_png(encode_srgb(image))}<figcaption>{escape(text)}</figcaption>" for text, image in result.pictures
+        )
+        parts.append(row_of(*figures))
+    parts.append(_method(spec))
+    body = "\n".join(part for part in parts if part)
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f"<title>{escape(spec.name)}</title><style>{PAGE_STYLE}</style></head><body>{body}</body></html>\n"
+    )
+
+
+def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
+    found: dict[tuple[str, str], Seen] = {}
+    for each in seen:
+        found.setdefault((each.candidate.sensor_name, each.candidate.set_name), each)
+    return list(found.values())
+
+
+def _groups(rows: Table) -> list[str]:
+    """Drawing and table of each group of rows in which only sensors, filter sets and crosstalk differ."""
+    keys = [
+        name
+        for name in ("surfaces", "illuminant", "illuminance_lux", "nominal_exposure_us", "equal")
+        if name in rows.columns
+    ]
+    order = sorted(rows, key=lambda row: [str(row[name]) for name in keys])
+    parts = []
+    for number_, (values, group) in enumerate(groupby(order, key=lambda row: [row[name] for name in keys])):
+        if number_ == _MOST_GROUPS:
+            parts.append("<p>More groups of rows are in results.csv.</p>")
+            break
+        some = Table(group)
+        named = dict(zip(keys, values, strict=True))
+        title = f"{named['surfaces']}, {named['illuminant']}, {named['illuminance_lux']:g} lx, equal {named['equal']}"
+        parts.append(f"<h2>{escape(title)}</h2>")
+        if {"delta_e_mean", "ysnr"} <= set(some.columns):
+            parts.append(row_of(pareto_plot(some, "Colour against noise")))
+        parts.append(_table(some))
+    return parts
+
+
+def _table(rows: Table) -> str:
+    shown = [
+        name for name in _COLUMNS
+        if name in rows.columns and not (name in _BORING and len({row[name] for row in rows}) == 1)
+        and any(row[name] is not None for row in rows)
+    ]  # fmt: skip
+    lines = []
+    for row in rows:
+        cells = []
+        for name in shown:
+            text = _cell(row[name])
+            if name in _INTERVALS and row[name] is not None:
+                low, high = (row.get(f"{_INTERVALS[name]}_{end}") for end in ("low", "high"))
+                if isinstance(low, float) and isinstance(high, float) and low == low:
+                    text += f" ({number(low)} to {number(high)})"
+            cells.append(text)
+        lines.append(cells)
+    return table([_COLUMNS[name] for name in shown], lines)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "–"
+    return number(float(value)) if isinstance(value, int | float) else str(value)
+
+
+def _patches(seen: Sequence[Seen]) -> list[str]:
+    coloured = [each for each in seen if each.colour is not None]
+    if not coloured:
+        return []
+    parts = ["<h2>Colours</h2>"]
+    key = lambda each: (each.surfaces, each.light_name)  # noqa: E731
+    for _, group in groupby(coloured, key=key):
+        some = list(group)
+        parts.append(row_of(patch_plot(some)))
+        named = zip(some, seen_labels(some), strict=True)
+        charts = (f"{_png(chart_picture(each))}<figcaption>{escape(text)}</figcaption>" for each, text in named)
+        parts.append(row_of(*charts))
+    parts.append(
+        "<p>Upper left half of a patch: its true colour. Lower right half: after the matrix of the filter set, without "
+        "noise.</p>"
+    )
+    return parts
+
+
+def _png(image: NDArray[np.uint8]) -> str:
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, format="PNG")
+    text = base64.b64encode(stream.getvalue()).decode("ascii")
+    return f'<img alt="" src="data:image/png;base64,{text}">'
+
+
+def _method(spec: StudySpec) -> str:
+    noisy = (
+        f"Simulated figures are means of {spec.noise.repeats} noisy frames, with 95 % intervals (Student's t)."
+        if spec.noise.repeats
+        else "Noise figures are closed forms."
+    )
+    return (
+        f"<h2>Method</h2><p>Matrix: {escape(spec.matrix)}. Output pixels are those of {spec.area_px:g} pixels of the "
+        f"mosaic. YSNR and SNR10 are of the luminance 0.299 R + 0.587 G + 0.114 B on an 18 % grey card, without fixed "
+        f"patterns. {noisy} <i>Noise-aware</i>: with the matrix of the least squared error, noise included.</p>"
+    )

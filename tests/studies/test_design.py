@@ -1,0 +1,277 @@
+"""Design of filters: families against other programs, cost and gradients against central differences on float64."""
+
+import json
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render import cli
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import SpecError
+from hesim_render.specs.design import DesignSpec, read_design
+from hesim_render.specs.files import list_names
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral.physical import dye_transmittance, thin_film_transmittance
+from hesim_render.studies import ChannelNoise, reflectance_set
+from hesim_render.studies.colour_error import delta_e_2000, lab
+from hesim_render.studies.colour_samples import colour_samples
+from hesim_render.studies.design import Problem, optimise
+from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
+from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
+from hesim_render.studies.design_run import design
+
+BANDS = np.arange(360.0, 831.0, 10.0)
+FAMILIES = {"dye": Dyes(BANDS, 2, 0.95), "film": ThinFilms(BANDS, 5, 0.97), "free": FreeCurves(BANDS, 0.01, 0.95)}
+
+
+def numbers(values):
+    return [jit().Float64(float(value)) for value in values]
+
+
+def drawn(family, seed=1):
+    low, high = np.array(family.bounds()).T
+    return np.random.default_rng(seed).uniform(low + 0.1 * (high - low), high - 0.1 * (high - low))
+
+
+def test_families_are_the_filters_that_files_name():
+    values = drawn(FAMILIES["dye"])
+    expected = 0.95 * dye_transmittance(values.reshape(2, 3), grid_nm=BANDS).values
+    np.testing.assert_allclose(FAMILIES["dye"].transmittance(numbers(values)).numpy(), expected, rtol=2e-5, atol=1e-7)
+    values = drawn(FAMILIES["film"])
+    indices = [2.35 if k % 2 == 0 else 1.46 for k in range(5)]
+    expected = 0.97 * thin_film_transmittance(indices, values, 1.52, 1.52, grid_nm=BANDS).values
+    np.testing.assert_allclose(FAMILIES["film"].transmittance(numbers(values)).numpy(), expected, rtol=2e-5)
+    values = drawn(FAMILIES["free"])
+    expected = np.interp(BANDS, FAMILIES["free"].knots_nm, values)
+    np.testing.assert_allclose(FAMILIES["free"].transmittance(numbers(values)).numpy(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
+def test_starts_lie_within_bounds_and_near_what_is_wanted(family):
+    wanted = np.where(BANDS > 580, 0.9, 0.05)
+    low, high = np.array(family.bounds()).T
+    for seed in range(5):
+        values = family.start(wanted, np.random.default_rng(seed))
+        assert np.all(values >= low) and np.all(values <= high)
+
+
+def test_weights_are_the_derivative_of_colour_differences():
+    """Against ΔE2000 of small changes: its rotation term and its stretch of a* are left out, so 15 % (greys: 50 %)."""
+    patches = list(reflectance_set("colorchecker").values())
+    d65 = spectra.illuminant("D65")
+    samples = colour_samples([d65], d65, patches)
+    weights = difference_weights(samples.xyz, samples.white_xyz)
+    rng = np.random.default_rng(2)
+    ratios = []
+    for _ in range(20):
+        change = 1e-4 * rng.normal(size=samples.xyz.shape) * samples.xyz
+        exact = delta_e_2000(lab(samples.xyz + change, samples.white_xyz), lab(samples.xyz, samples.white_xyz))
+        ratios.append(np.linalg.norm(np.einsum("sij,sj->si", weights, change), axis=1) / exact)
+    ratios = np.array(ratios)
+    assert abs(np.median(ratios[:, :18]) - 1) < 0.15 and np.all((ratios > 0.5) & (ratios < 2))
+    # without the weights of ΔE2000 it is ΔE*ab: of a pure change of lightness both are dL/S_L
+    lighter = 1e-5 * samples.xyz[20:21]
+    step = np.linalg.norm(weights[20] @ lighter[0])
+    exact = delta_e_2000(
+        lab(samples.xyz[20:21] + lighter, samples.white_xyz), lab(samples.xyz[20:21], samples.white_xyz)
+    )
+    assert step == pytest.approx(float(exact[0]), rel=0.02)
+
+
+def test_the_best_matrix_is_that_of_a_general_minimiser():
+    from scipy.optimize import minimize
+
+    rng = np.random.default_rng(3)
+    electrons, xyz = rng.uniform(10, 100, (12, 4)), rng.uniform(0.1, 1, (12, 3))
+    weights, variance = rng.normal(size=(12, 3, 3)), rng.uniform(5, 30, (12, 4))
+
+    def cost(values):
+        matrix = values.reshape(3, 4) / 50
+        off = np.einsum("sij,sj->si", weights, electrons @ matrix.T - xyz)
+        gain = np.sum(np.einsum("sij,jc->sic", weights, matrix) ** 2, axis=1)
+        return np.sum(off**2) + np.sum(gain * variance)
+
+    found = minimize(cost, np.zeros(12), method="BFGS", options={"gtol": 1e-9})
+    np.testing.assert_allclose(best_matrix(electrons, variance, xyz, weights) * 50, found.x.reshape(3, 4), atol=1e-4)
+
+
+def cost_of(weights, events=True):
+    sensor = hr.load_sensor("eiger").crop(8, 8)
+    patches = list(reflectance_set("colorchecker").values())
+    conditions = [Condition.of(patches, spectra.illuminant(name), BANDS) for name in ("D65", "A")]
+    noise = ChannelNoise(np.array([30.0, 25.0, 30.0]), np.ones(3), np.array([1e-5] * 3), np.array([1.0, 2.0, 1.0]))
+    return DesignCost(
+        sensor, BANDS, conditions, (20.0, 1000.0), 10_000.0, noise, (0, 1, 2), (1,) if events else (),
+        (0.22, 12.0), 1000.0, weights,
+    )  # fmt: skip
+
+
+def test_the_cost_is_that_of_its_formula():
+    """All written out again in NumPy, with the matrix of a least-squares solver."""
+    rng = np.random.default_rng(5)
+    curves = np.exp(-(((BANDS - np.array([[600], [540], [460]])) / 50) ** 2)) * 1e7 * rng.uniform(0.8, 1.2, (3, 1))
+    for weights in (Weights(1, 0, 0), Weights(0, 1, 0), Weights(0, 0, 1), Weights(0.3, 0.5, 0.2)):
+        cost = cost_of(weights)
+        found = float(cost([jit().Float64(curve) for curve in curves])[0])
+        assert found == pytest.approx(reference(cost, curves), rel=2e-4)
+
+
+def reference(cost, curves):
+    """The cost on float64."""
+    total = 0.0
+    for condition in cost.conditions:
+        electrons = np.stack([
+            hr.photocurrent(condition.radiance, BANDS, cost.sensor, cost.exposure_us,
+                            filter=cost.sensor.layout.filters[0], responses=curve)
+            for curve in curves
+        ], axis=1)  # fmt: skip
+        patches, grey = electrons[:-1], electrons[-1]
+
+        def root(c, noisy, condition=condition):
+            variance = cost.noise.variance_e2(c) if noisy else np.full_like(c, 1e-3)
+            rows, wanted = [], []
+            for s in range(len(c)):
+                rows.append(np.einsum("ij,c->ijc", condition.weights[s], c[s]).reshape(3, -1))
+                wanted.append(condition.weights[s] @ condition.xyz[s])
+                for k in range(c.shape[1]):
+                    part = np.zeros((3, 3, c.shape[1]))
+                    part[:, :, k] = condition.weights[s] * np.sqrt(variance[s, k])
+                    rows.append(part.reshape(3, -1))
+                    wanted.append(np.zeros(3))
+            a, b = np.concatenate(rows), np.concatenate(wanted)
+            size = np.linalg.norm(a, axis=0)
+            solution = np.linalg.lstsq(a / size, b, rcond=None)[0] / size
+            return np.sqrt(np.sum((a @ solution - b) ** 2) / len(c))
+
+        if cost.weights.colour:
+            total += cost.weights.colour * root(patches * 1e4 / patches.mean(axis=0).max(), False) / 2
+        for lux in cost.illuminance_lux:
+            total += cost.weights.noise * root(patches * lux, True) / 4
+            if cost.events:
+                window = grey[list(cost.events)] * lux * cost.event_window_us / cost.exposure_us
+                total += cost.weights.events * np.mean(0.22 * (1 + 12.0 / window)) / 4
+    return total
+
+
+@pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
+def test_gradients_of_the_cost_are_central_differences(family):
+    """Through filters, Eq. 1 and the best matrix: 1e-3 of the gradient's norm, on a float64 copy of everything."""
+    cost = cost_of(Weights(0.3, 0.5, 0.2))
+    values = [drawn(family, seed) for seed in (11, 12, 13)]
+    scale = 1e7 * np.exp(-(((BANDS - 560) / 140) ** 2))
+
+    def on_host(parameters):
+        curves = []
+        for own in parameters:
+            if isinstance(family, Dyes):
+                filters = 0.95 * dye_transmittance(own.reshape(-1, 3), grid_nm=BANDS).values
+            elif isinstance(family, ThinFilms):
+                filters = (
+                    0.97
+                    * thin_film_transmittance([2.35, 1.46, 2.35, 1.46, 2.35], own, 1.52, 1.52, grid_nm=BANDS).values
+                )
+            else:
+                filters = np.interp(BANDS, family.knots_nm, own)
+            curves.append(filters * scale)
+        return reference(cost, curves)
+
+    tensors = [numbers(own) for own in values]
+    for own in tensors:
+        dr.enable_grad(own)
+    curves = [family.transmittance(own) * jit().Float64(scale) for own in tensors]
+    dr.backward(cost(curves))
+    found = np.array([float(dr.grad(value)[0]) for own in tensors for value in own])
+    expected = np.empty_like(found)
+    flat = np.concatenate(values)
+    for k in range(flat.size):
+        step = np.zeros(flat.size)
+        step[k] = 1e-4 * max(abs(flat[k]), 0.1)
+        ends = [on_host(np.split(flat + sign * step, 3)) for sign in (1, -1)]
+        expected[k] = (ends[0] - ends[1]) / (2 * step[k])
+    # parameters differ in unit: each is weighed by its range
+    low, high = np.array(family.bounds() * 3).T
+    assert np.linalg.norm((found - expected) * (high - low)) < 1e-3 * np.linalg.norm(expected * (high - low))
+
+
+SMALL = {
+    "schema_version": 1, "name": "small", "sensor": "reference-bayer", "filter_set": "rggb",
+    "palette": "nikon-5100-silicon", "family": "dye", "bands": 3, "starts": 1, "steps": 40,
+    "fit": {"reflectances": "colorchecker", "illuminants": ["D65"]},
+    "judge": {"reflectances": "cie-tcs", "illuminants": ["A"]}, "repeats": 4,
+    "compare": [{"set": "rggb", "palette": "nikon-5100-silicon", "name": "Nikon"}],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("family", [
+    "dye", pytest.param("thin_film", marks=pytest.mark.slow), pytest.param("free", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_every_family_lowers_the_cost_within_its_constraints(family):
+    spec = DesignSpec.model_validate({**SMALL, "family": family, "slope_max_per_nm": 0.02, "transmittance_min": 0.02})
+    problem = Problem(spec)
+    result = optimise(problem)
+    before, after = result.costs[0]
+    assert after < 0.8 * before
+    for curve in result.filters.values():
+        assert curve.min() >= (0.02 if family == "free" else 0) - 1e-9 and curve.max() <= 0.95 + 1e-6
+        # the penalty is soft: a tenth above at most
+        assert np.abs(np.diff(curve)).max() / 5 < 0.022 if family != "thin_film" else True
+
+
+def test_fresh_parameters_compile_nothing():
+    """Numbers that change from step to step are data of the kernels, not parts of their code."""
+    problem = Problem(DesignSpec.model_validate(SMALL))
+    start = problem.starts()[0]
+    rng = np.random.default_rng(3)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for number in range(3):
+            dr.kernel_history_clear()
+            problem(np.clip(start + 0.05 * rng.normal(size=start.size), 0, 1))
+            new = [entry for entry in dr.kernel_history() if not entry.get("cache_hit", True)]
+            assert number == 0 or not new
+
+
+@pytest.mark.parametrize("steps", (5, pytest.param(100, marks=pytest.mark.slow)))
+def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
+    """Three dyes against a camera, on colours and a light that they were not fitted to; few steps do not win yet."""
+    file = tmp_path / "small.yaml"
+    file.write_text(json.dumps({**SMALL, "starts": 2 if steps > 5 else 1, "steps": steps}))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["study", "design", str(file), "--out", str(tmp_path / "out")])
+    assert stop.value.code == 0, capsys.readouterr().err
+    assert "against Nikon" in capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "design.json").read_text())
+    verdict = found["verdicts"][0]
+    assert verdict["cost_difference_low"] < verdict["cost_difference"] < verdict["cost_difference_high"]
+    if steps > 5:
+        assert verdict["cost_difference_high"] < 0 and verdict["delta_e_mean"] < verdict["delta_e_mean_against"]
+    sensor = hr.load_sensor(tmp_path / "out" / "sensor.yaml")
+    assert sensor.spec.tile == "RG\nGB" and list(sensor.spec.filters) == ["red", "green", "blue"]
+    # the figures of the file are those of the judgement
+    table = hr.study({**STUDY, "sensors": [str(tmp_path / "out" / "sensor.yaml")]})
+    own = (tmp_path / "out" / "results.csv").read_text().splitlines()
+    column = own[0].split(",").index("delta_e_mean")
+    assert table["delta_e_mean"][0] == pytest.approx(float(own[1].split(",")[column]), rel=1e-6)
+
+
+STUDY = {"schema_version": 1, "name": "again", "surfaces": ["cie-tcs"], "illuminants": ["A"], "figures": ["colour"]}
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"vary": ["read"]}, "vary: no filter 'read'.*did you mean 'red'"),
+    ({"cost": {"colour": 0, "noise": 0}}, "at least one weight"),
+    ({"transmittance_min": 0.97}, "must be below transmittance_max"),
+    ({"family": "glass"}, "family"),
+    ({"filter_set": "cygm"}, "the palette 'nikon-5100-silicon' has no filter 'cyan'"),
+    ({"fit": {"reflectances": "none", "illuminants": ["D65"]}}, "no set of reflectances named 'none'"),
+])  # fmt: skip
+def test_bad_designs_are_one_clear_line(tmp_path, changes, message):
+    with pytest.raises(SpecError, match=message) as caught:
+        design({**SMALL, **changes}, out=tmp_path / "out")
+    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
+
+
+def test_shipped_designs_load():
+    for name in list_names("design_specs"):
+        assert Problem(read_design(name)).starts()

@@ -1,0 +1,115 @@
+"""Noise after colour correction: hand calculations, and samples of the noise model."""
+
+import math
+
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render.core.errors import RangeError
+from hesim_render.studies import ChannelNoise, channel_noise, dynamic_range_db, light_for_snr, output_noise
+from hesim_render.studies.colour_noise import saturation_e
+
+MATRIX = np.array([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.7, 1.7]])
+
+
+def test_amplification_and_snr_by_hand():
+    """Shot noise of unequal channels: every variance written out."""
+    white = np.array([5000.0, 10000.0, 4000.0])
+    noise = ChannelNoise.of_photons(3, read_noise_e=3.0, count=[1, 2, 1])
+    found = output_noise(MATRIX, white, noise, 0.18)
+    var = [(0.18 * 5000 + 9) / 5000**2, (0.18 * 10000 + 9) / 2 / 10000**2, (0.18 * 4000 + 9) / 4000**2]
+    red = 1.7**2 * var[0] + 0.5**2 * var[1] + 0.2**2 * var[2]
+    green = 0.3**2 * var[0] + 1.6**2 * var[1] + 0.3**2 * var[2]
+    blue = 0.7**2 * var[1] + 1.7**2 * var[2]
+    np.testing.assert_allclose(np.diag(found.covariance), [red, green, blue], rtol=1e-12)
+    assert found.amplification == pytest.approx(math.sqrt((red + green + blue) / sum(var)), rel=1e-12)
+    weights = [
+        0.299 * 1.7 - 0.587 * 0.3,
+        -0.299 * 0.5 + 0.587 * 1.6 - 0.114 * 0.7,
+        -0.299 * 0.2 - 0.587 * 0.3 + 0.114 * 1.7,
+    ]
+    sigma = math.sqrt(sum(w**2 * v for w, v in zip(weights, var, strict=True)))
+    assert found.ysnr == pytest.approx(0.18 / sigma, rel=1e-12)  # rows sum to 1: grey stays grey
+    np.testing.assert_allclose(found.rgb, 0.18, rtol=1e-12)
+
+
+def test_snr10_of_a_textbook_sensor():
+    """One channel, 3200 e⁻ per lux of white, 18 %: N² = 100 (N + σ²) solved by the schoolbook."""
+    for read in (0.0, 2.0, 50.0):
+        electrons = (100 + math.sqrt(100**2 + 400 * read**2)) / 2
+        assert electrons**2 == pytest.approx(100 * (electrons + read**2))
+        lux = light_for_snr(10, [1.0], [3200.0], ChannelNoise.of_photons(1, read))
+        assert lux == pytest.approx(electrons / (0.18 * 3200), rel=1e-12)
+    # the light found gives the SNR asked for, also with a quadratic part and several pixels
+    noise = ChannelNoise(np.array([9.0, 16.0]), np.ones(2), np.array([1e-4, 0.0]), np.array([2.0, 1.0]))
+    per_lux, weights = np.array([40.0, 90.0]), np.array([0.4, 0.2])
+    lux = light_for_snr(7, weights, per_lux, noise, 0.3)
+    signal = 0.3 * per_lux * lux
+    variance = weights[0] ** 2 * (9 + signal[0] + 1e-4 * signal[0] ** 2) / 2 + weights[1] ** 2 * (16 + signal[1])
+    assert weights @ signal / math.sqrt(variance) == pytest.approx(7, rel=1e-12)
+    assert light_for_snr(300, [1, 0], per_lux, noise, 0.3) == math.inf  # 1 % of the signal in two pixels: never 300
+    with pytest.raises(RangeError):
+        light_for_snr(0, [1], [1], ChannelNoise.of_photons(1))
+    with pytest.raises(RangeError):
+        light_for_snr(10, [-1], [1], ChannelNoise.of_photons(1))
+
+
+def test_noise_of_a_sensor_is_that_of_its_model_and_its_tile():
+    sensor = hr.load_sensor("reference-bayer", {"aps.dark_current_e_per_s": 500.0, "aps.residual_noise_dn": 0.5})
+    noise = channel_noise(sensor, ["red", "green", "blue"], 20_000, area_px=4)
+    constant = 2**2 + 500 * 0.02 + (0.5 / 0.25) ** 2 + (1 / 12) / 0.25**2
+    np.testing.assert_allclose(noise.constant, constant, rtol=1e-9)
+    np.testing.assert_allclose(noise.linear, 1, rtol=1e-9)
+    np.testing.assert_allclose(noise.quadratic, 0, atol=1e-12)
+    assert noise.count.tolist() == [1, 2, 1]
+    assert channel_noise(sensor, ["green"], 20_000).count.tolist() == [1]
+    # a polynomial of its own for each position: β3 and β4 too
+    beta = np.array([[[2.0, 0.25, 3.0, 1e-4, 0.5, 1.0]] * 2] * 2)
+    beta[0, 1, 0] = 4.0
+    own = hr.load_sensor("reference-bayer", {"aps.beta": beta.tolist()})
+    noise = channel_noise(own, ["red", "green"], 10_000)
+    rest = 3.0 * 0.01 + 1.0 * 1e-4 + 1 / 12
+    np.testing.assert_allclose(noise.constant, [(2 + rest) * 16, (3 + rest) * 16], rtol=1e-9)
+    np.testing.assert_allclose(noise.linear, (0.25 + 0.005) / 0.25, rtol=1e-6)
+    np.testing.assert_allclose(noise.quadratic, 1e-4, rtol=1e-6)
+    with pytest.raises(RangeError, match="filter of the frame pixels"):
+        channel_noise(hr.load_sensor("gen2"), ["white"], 10_000)
+
+
+def test_the_closed_form_is_the_noise_of_samples():
+    """A grey field through the noise model, channels of a tile averaged, balanced and mixed: covariance and YSNR.
+
+    49152 tiles: a standard deviation is known to 0.32 %, 3 % are nine of these.
+    """
+    sensor = hr.load_sensor("reference-bayer").crop(512, 384)
+    per_white = np.array([2000.0, 4000.0, 1500.0])
+    image = 0.18 * per_white[sensor.layout.filter_index]
+    dn = sensor.aps.sample(image, 10_000, seed=5).astype(float)
+    electrons = (dn - 64) / 0.25
+    tile = electrons.reshape(192, 2, 256, 2).swapaxes(1, 2)
+    channels = np.stack([tile[..., 0, 0], (tile[..., 0, 1] + tile[..., 1, 0]) / 2, tile[..., 1, 1]], axis=-1)
+    balanced = (channels / per_white).reshape(-1, 3)
+    rgb = balanced @ MATRIX.T
+    found = output_noise(MATRIX, per_white, channel_noise(sensor, ["red", "green", "blue"], 10_000, area_px=4))
+    np.testing.assert_allclose(np.cov(rgb.T), found.covariance, atol=0.03 * np.diag(found.covariance).max())
+    measured = np.sqrt(rgb.var(axis=0).mean() / balanced.var(axis=0).mean())
+    assert found.amplification == pytest.approx(measured, rel=0.03)
+    luminance = rgb @ [0.299, 0.587, 0.114]
+    assert found.ysnr == pytest.approx(luminance.mean() / luminance.std(), rel=0.03)
+
+
+def test_dynamic_range_by_hand():
+    sensor = hr.load_sensor("reference-mono", {"aps.dark_current_e_per_s": 1000.0})
+    spec = sensor.spec.aps
+    top = min(spec.full_well_e, (2**spec.bit_depth - 1 - spec.black_level_dn) / spec.system_gain_dn_per_e) - 10
+    assert saturation_e(sensor, 10_000) == pytest.approx(top)
+    dark = spec.read_noise_e**2 + 10 + 1 / 12 / spec.system_gain_dn_per_e**2
+    assert dynamic_range_db(sensor, 10_000) == pytest.approx(20 * math.log10(top / (math.sqrt(dark + 0.25) + 0.5)))
+
+
+def test_a_matrix_of_another_size_is_refused():
+    with pytest.raises(RangeError, match=r"\(3, 2\)"):
+        output_noise(MATRIX, [1.0, 2.0], ChannelNoise.of_photons(2))
+    with pytest.raises(RangeError, match="above 0"):
+        output_noise(MATRIX, [1.0, 2.0, 0.0], ChannelNoise.of_photons(3))

@@ -1,0 +1,299 @@
+"""The study of filter sets: its rows against full simulation and hand calculations, its files, its errors."""
+
+import csv
+import io
+import json
+import math
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render import cli
+from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
+from hesim_render.sources.crosstalk import mixed
+from hesim_render.specs.files import list_names
+from hesim_render.specs.filter_set import read_filter_set, read_palette
+from hesim_render.specs.study import read_study
+from hesim_render.spectral import spectrum as spectra
+from hesim_render.studies import Table, channel_noise, with_filter_set
+from hesim_render.studies.filter_sets import filters_of, mixing
+from hesim_render.studies.plots import pareto_front
+from hesim_render.studies.run import study
+from hesim_render.studies.table import has_parquet
+
+BASE = {"schema_version": 1, "name": "test", "sensors": ["reference-bayer"]}
+
+
+def run(**changes):
+    return study({**BASE, **changes})
+
+
+def set_on(sensor, name, palette="dyes"):
+    return with_filter_set(hr.load_sensor(sensor), read_filter_set(name), read_palette(palette))
+
+
+@pytest.mark.parametrize(("filters", "crosstalk"), [
+    ("rggb", 0.0), ("quad-bayer", 0.08),
+    pytest.param("rgbw", 0.08, marks=pytest.mark.slow), pytest.param("cygm", 0.0, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_closed_forms_are_those_of_the_full_simulation(filters, crosstalk):
+    """Noisy RAW frames with crosstalk, full well and ADC: amplification and YSNR within 3 %.
+
+    36,000 output pixels or more (Quad-Bayer: 9000): standard deviations are known to 0.4 % (0.8 %), so 3 % are four
+    standard errors at least; luminance and colour noise of one set are not independent.
+    """
+    row = run(filter_sets=[filters], crosstalk=[crosstalk], illuminance_lux=[30], figures=["colour", "noise"],
+              noise={"repeats": 8, "patch_px": 48}).row(0)  # fmt: skip
+    assert row["noise_amplification_simulated"] == pytest.approx(row["noise_amplification"], rel=0.03)
+    assert row["ysnr_simulated"] == pytest.approx(row["ysnr"], rel=0.03)
+    assert row["ysnr_low"] < row["ysnr_simulated"] < row["ysnr_high"]
+    assert row["delta_e_noisy_simulated"] > row["delta_e_mean"]
+
+
+def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_says():
+    """Luminance SNR of mono, RCCC, RGBW and RGB sets of one pixel at 1 lux, from electrons and read noise."""
+    names = ["mono", "rccc", "rgbw-half", "rgbw", "rggb"]
+    table = run(filter_sets=names, illuminance_lux=[1.0], exposures_us=[30_000], figures=["noise"])
+    assert table["filter_set"].tolist() == names and "smi" not in table.columns
+    d65, grey = spectra.illuminant("D65"), np.arange(360.0, 831.0)
+    power = d65.at(grey) / np.trapezoid(d65.at(grey) * spectra.photopic().at(grey), grey) / LUMINOUS_EFFICACY_LM_PER_W
+    patches = np.array([each.at(np.clip(grey, *each.support_nm)) for each in spectra.colorchecker().values()])
+    observed = spectra.colour_matching_functions()[1].at(grey) * power
+    expected = []
+    for name in names:
+        sensor = set_on("reference-bayer", name)
+        channels = filters_of(sensor, "aps")
+        response = np.array([sensor.spectral_response(grey)[channel] for channel in channels])
+        white = 0.03 * np.trapezoid(response * power, grey) / np.pi
+        camera = 0.03 * np.trapezoid(patches[:, None] * response * power, grey) / np.pi
+        luminance = np.trapezoid(patches * observed, grey) / np.trapezoid(observed, grey)
+        tile = [sensor.spec.pixels[letter].filter for letter in "".join(sensor.spec.tile_rows)]
+        count = np.array([4 * tile.count(channel) / len(tile) for channel in channels])
+        signal = 0.18 * white
+        # the best estimate of the luminance, noise included
+        noise = ((camera + 2**2 + 4**2 / 12) / count).sum(axis=0) / white**2
+        normal = (camera / white).T @ (camera / white) + np.diag(noise)
+        weights = np.linalg.solve(normal, (camera / white).T @ luminance) / white
+        variance = np.sum(weights**2 * (signal + 2**2 + 4**2 / 12) / count)
+        expected.append(weights @ signal / math.sqrt(variance))
+    np.testing.assert_allclose(table["ysnr"], expected, rtol=3e-3)
+    assert list(table["ysnr"]) == sorted(table["ysnr"], reverse=True)
+    # one clear pixel: photons and read noise alone
+    n = (
+        0.18
+        * 0.03
+        * np.trapezoid(set_on("reference-bayer", "mono").spectral_response(grey)["clear"] * power, grey)
+        / np.pi
+    )
+    assert table["ysnr"][0] == pytest.approx(2 * n / math.sqrt(n + 4 + 16 / 12), rel=3e-3)
+
+
+def test_exposures_are_equal_in_what_the_study_says():
+    table = study({
+        **BASE, "sensors": ["reference-bayer", "eiger"], "exposures_us": [8000], "figures": ["noise"],
+        "equal": ["exposure", "light", "white"], "illuminance_lux": [50],
+    })  # fmt: skip
+    first, other = (table.where(sensor=name) for name in ("reference-bayer", "eiger"))
+    assert all(part.where(equal="exposure").row(0)["exposure_us"] == 8000 for part in (first, other))
+    # f/4 without loss against f/2 with a transmittance of 0.9: the cone is π/(1 + 4N²)
+    expected = 8000 * (1 + 4 * 2**2) / (1 + 4 * 4**2) / 0.9
+    assert first.where(equal="light").row(0)["exposure_us"] == pytest.approx(8000, rel=1e-12)
+    assert other.where(equal="light").row(0)["exposure_us"] == pytest.approx(expected, rel=1e-9)
+    for part in (first, other):
+        assert part.where(equal="white")["white_saturation"][0] == pytest.approx(0.9, rel=1e-12)
+
+
+def test_crosstalk_mixes_as_the_source_does():
+    sensor = set_on("reference-bayer", "rgbw-half").crop(32, 32)
+    rates = np.array([10.0, 20.0, 5.0, 40.0])[: len(sensor.spec.filters)]
+    image = mixed(rates[sensor.layout.filter_index], 0.12)
+    channels = filters_of(sensor, "aps")
+    shares = mixing(sensor, channels, "aps", 0.12)
+    inner = np.zeros(image.shape, bool)
+    inner[4:-4, 4:-4] = True
+    names = np.array(list(sensor.spec.filters))[sensor.layout.filter_index]
+    for name, share in zip(channels, shares, strict=True):
+        assert share @ rates == pytest.approx(image[inner & (names == name)].mean(), rel=1e-12)
+        assert share.sum() == pytest.approx(1)
+
+
+def test_event_figures_are_those_of_the_noise_model():
+    names = ["quad-bayer-rgb-events", "quad-bayer-white-event"]
+    table = study({**BASE, "sensors": ["eiger"], "filter_sets": names, "illuminance_lux": [5, 500]})
+    for name in names:
+        sensor = set_on("eiger", name)
+        spec = sensor.spec.evs
+        light = spectra.scale_to_lux(spectra.illuminant("D65"), 500)
+        event = filters_of(sensor, "evs")
+        rates = {f: spectra.integrate_product(sensor.responses[f], light) / np.pi for f in event}
+        row = table.where(filter_set=name, illuminance_lux=500).row(0)
+        rate, contrast = [], []
+        for k, (i, j) in enumerate(sensor.spec.positions("evs")):
+            grey = 0.18 * rates[sensor.spec.pixels[sensor.spec.tile_rows[i][j]].filter] * spec.window_us * 1e-6
+            # mismatch widens the thresholds: the noise model gives the same with its spread as noise
+            x = 1e-3 * 0.16 * 10_000 / spec.window_us * grey + 5e-3
+            s2 = (3.1e-5 * 0.16 * 10_000 / spec.window_us * grey) ** 2 + 2.116e-4**2
+            sigma = np.sqrt(2 * s2 / x**2 + (spec.threshold_mismatch_std * np.array([0.1981, 0.2019])) ** 2)
+            rate.append(
+                sum(0.5 * math.erfc(t / s / math.sqrt(2)) for t, s in zip((0.1981, 0.2019), sigma, strict=True))
+                / 1239e-6
+            )
+            rise = row["event_contrast_on"]
+            p_on, _ = sensor.evs.event_probability(grey, grey * (1 + rise), position=k)
+            contrast.append(float(p_on))
+        assert row["event_noise_rate_hz"] == pytest.approx(np.mean(rate), rel=1e-6)
+        if len(contrast) == 1:
+            assert contrast[0] == pytest.approx(0.5, abs=1e-6)
+        assert 0 < row["event_seen_isoluminant"] < row["event_seen"] < 1
+    bright, dim = (table.where(illuminance_lux=lux) for lux in (500, 5))
+    assert np.all(dim["event_contrast_on"] > bright["event_contrast_on"])
+    assert bright.row(0)["event_seen"] > bright.row(1)["event_seen"]  # three colours tell more than one clear pixel
+    asynchronous = study({**BASE, "sensors": ["davis346"], "figures": ["events"]}).row(0)
+    assert asynchronous["event_noise_rate_hz"] is None and asynchronous["event_contrast_on"] > 0
+
+
+def test_every_shipped_filter_set_stands_before_a_sensor():
+    for name in list_names("filter_sets"):
+        spec = read_filter_set(name)
+        sensor = set_on("eiger" if spec.evs_grid else "reference-bayer", name)
+        assert sensor.spec.tile == spec.tile and (sensor.spec.evs is not None) == (spec.evs_grid is not None)
+        assert channel_noise(sensor, filters_of(sensor, "aps"), 1000, 4).count.sum() <= 4
+    for name in list_names("study_specs"):
+        assert len(read_study(name).filter_sets) + len(read_study(name).sensors) > 2
+    palette = read_palette("dyes")
+    # the infrared cut keeps what cannot be rendered out
+    assert float(palette.quantum_efficiency.load().at(720)) < 1e-3
+
+
+def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, capsys):
+    file = tmp_path / "mine.yaml"
+    (tmp_path / "curve.csv").write_text("nm,t\n380,0\n430,0.8\n480,0\n")
+    (tmp_path / "own.yaml").write_text(
+        "schema_version: 1\nname: own\ndescription: mine\ntile: |\n  R G\n  G V\npixels:\n"
+        "  R: {filter: red, roles: [aps]}\n  G: {filter: green, roles: [aps]}\n  V: {filter: violet, roles: [aps]}\n"
+        "filters:\n  violet: {csv: curve.csv}\n"
+    )
+    (tmp_path / "patches.csv").write_text(
+        "name,380,550,780\ndark,0.1,0.1,0.1\nwarm,0.2,0.4,0.9\ncool,0.8,0.5,0.3\nleaf,0.1,0.5,0.1\n"
+    )
+    file.write_text(
+        "schema_version: 1\nname: a <study>\nsensors: [reference-bayer]\nfilter_sets: [rggb, own.yaml]\n"
+        "surfaces: [colorchecker, patches.csv]\nnoise: {repeats: 2, patch_px: 8}\n"
+    )
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["study", "cfa", str(file), "--out", str(tmp_path / "out")])
+    assert stop.value.code == 0
+    assert "4 rows in" in capsys.readouterr().out
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"results.csv", "results.json", "report.html"} <= names
+    assert ("results.parquet" in names) == has_parquet()
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "out" / "results.csv").read_text())))
+    stored = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert len(rows) == len(stored["rows"]) == 4 and stored["study"]["name"] == "a <study>"
+    for row, other in zip(rows, stored["rows"], strict=True):
+        assert float(row["ysnr"]) == other["ysnr"] and row["filter_set"] == other["filter_set"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<h1>a &lt;study&gt;</h1>" in page and page.count("<svg") >= 6 and 'src="http' not in page
+    HTMLParser().feed(page)
+    # again: refused, then replaced, with the same figures
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["study", "cfa", str(file), "--out", str(tmp_path / "out")])
+    assert stop.value.code == 2 and "exists" in capsys.readouterr().err
+    before = (tmp_path / "out" / "results.csv").read_text()
+    assert study(file, out=tmp_path / "out", overwrite=True).to_csv() == before
+
+
+BAD = [
+    ({"filter_sets": ["rccc"]}, r"filter_sets\.0: rccc on reference-bayer: its filters span 2 of the 3 dimensions"),
+    ({"filter_sets": ["rggb", "mono"]}, r"filter_sets\.1: mono on reference-bayer: its filters span 1 of"),
+    ({"filter_sets": ["rgb"]}, r"no filter_set named 'rgb'; shipped are .*did you mean"),
+    ({"filter_sets": ["cygm"], "palette": "nikon-5100"}, r"the palette 'nikon-5100' has no filter 'cyan'"),
+    ({"filter_sets": ["quad-bayer-white-event"]}, r"the set has event pixels, and the sensor has no 'evs' section"),
+    ({"filter_sets": ["rggb", "rggb"]}, r"two have the name 'rggb'"),
+    ({"illuminants": [{"name": "short", "spectrum": {"flat": 1, "band_nm": [420, 700]}}]},
+     "short covers 420-700"),
+    ({"illuminants": [{"name": "dark", "spectrum": {"flat": -1}}]}, "must not be negative"),
+    ({"surfaces": ["macbeth"]}, r"no set of reflectances named 'macbeth'; known are colorchecker"),
+    ({"surfaces": [{"reflectances": "missing.csv"}]}, "missing.csv: no such file"),
+    ({"surfaces": [{"name": "neither"}]}, "either 'reflectances', a 'cube' or a 'scene'"),
+    ({"figures": ["color"]}, "figures"),
+    ({"equal": ["white", "white"]}, "an entry is there twice"),
+    ({"noise": {"repeats": 2, "patch_px": 512}}, r"32 patches fit on 1536x1024 px"),
+    ({"sensors": ["davis346"]}, r"its filters span 1 of the 3"),
+    ({"exposure": 5}, "unknown key"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_bad_studies_are_one_clear_line(changes, message):
+    with pytest.raises((SpecError, RangeError), match=message) as caught:
+        run(**changes)
+    assert "\n" not in str(caught.value)
+
+
+SET = """schema_version: 1
+name: own
+description: mine
+tile: |
+  R G
+  G B
+pixels:
+  R: {filter: red, roles: [aps]}
+  G: {filter: green, roles: [aps]}
+  B: {filter: blue, roles: [aps]}
+"""
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("  G B\n", "  G G\n", r"own.yaml:10: pixels.B: no pixel of the tile has this letter"),
+    ("  G B\n", "  G X\n", r"tile: the letter 'X' is not defined"),
+    ("  G B\n", "  G\n", "same number of letters"),
+    ("pixels:", "filters: {spare: 0.5}\npixels:", r"filters.spare: no pixel has this filter"),
+    ("{filter: red,", "{filter: rad,", "has no filter 'rad' .did you mean 'red'"),
+    ("pixels:", "filters: {red: 1.5}\npixels:", r"transmittance must lie in \[0, 1\]"),
+    ("pixels:", "filters: {red: -0.5}\npixels:", r"transmittance must lie in \[0, 1\]"),
+])  # fmt: skip
+def test_bad_filter_sets_are_one_clear_line(tmp_path, old, new, message):
+    file = tmp_path / "own.yaml"
+    assert old in SET
+    file.write_text(SET.replace(old, new))
+    with pytest.raises(SpecError, match=message):
+        run(filter_sets=[str(file)])
+
+
+def test_a_set_does_not_inherit_noise_of_other_positions(tmp_path):
+    beta = [[[2.0, 0.25, 0.0, 0.0, 0.0, 0.0]] * 2] * 2
+    sensor = hr.load_sensor("reference-bayer", {"aps.beta": beta})
+    with pytest.raises(SpecError, match="measured for the positions of its own tile"):
+        with_filter_set(sensor, read_filter_set("rggb"), read_palette("dyes"))
+
+
+def test_tables(tmp_path):
+    table = Table([{"a": 1, "b": "x"}, {"a": 2.5, "c": True}, {"a": None, "b": "x, y"}])
+    assert table.columns == ["a", "b", "c"] and len(table) == 3
+    np.testing.assert_array_equal(table["a"], [1, 2.5, np.nan])
+    assert table["b"].tolist() == ["x", None, "x, y"]
+    assert list(csv.reader(io.StringIO(table.to_csv())))[1:] == [["1", "x", ""], ["2.5", "", "True"], ["", "x, y", ""]]
+    assert [row["a"] for row in table.sorted_by("a", descending=True)] == [2.5, 1, None]
+    assert len(table.where(b="x")) == 1 and len(table.where(b="z")) == 0
+    assert json.loads(Table([{"a": math.inf}]).to_json())["rows"] == [{"a": "inf"}]
+    with pytest.raises(RangeError, match="did you mean"):
+        Table([{"ysnr": 1}])["ysrn"]
+    path = table.write(tmp_path / "t.csv")
+    assert path.read_text() == table.to_csv()
+    with pytest.raises(OutputError, match="exists"):
+        table.write(path)
+    with pytest.raises(OutputError, match=r"\.csv, \.json or \.parquet"):
+        table.write(tmp_path / "t.xls")
+    if not has_parquet():
+        with pytest.raises(OutputError, match="pyarrow"):
+            table.write(tmp_path / "t.parquet")
+        assert not (tmp_path / "t.parquet").exists()
+
+
+def test_pareto_fronts():
+    cost, gain = np.array([1.0, 2.0, 3.0, 1.0, 2.5]), np.array([1.0, 3.0, 3.0, 1.0, 2.0])
+    assert pareto_front(cost, gain).tolist() == [True, True, False, True, False]
