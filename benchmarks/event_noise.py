@@ -7,6 +7,9 @@ white noise through two equal poles that are -3 dB at 1/period together, exact a
 them, its amplitude scaled so that the time average of its variance is 1: the law of the simulator, written out again.
 Each entry is the mean over the last two thirds of 3000 periods, from at least 6000 events or 16384 pixels. With equal
 thresholds and a dead time below 0.1 periods the level wanders slowly, and longer runs differ by up to 40 %.
+
+A pixel without a dead time (the last column) moves its level of comparison by exactly a or b with each event. Its rate
+falls for as long as one looks: the entries are means over the 900 periods after the first 100.
 """
 
 from __future__ import annotations
@@ -21,7 +24,10 @@ from hesim_render.core.backend import jit
 MEAN = (0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5)
 DIFFERENCE = (0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6, 3.6)
 DEAD_PERIODS = (0.01, 0.03, 0.055, 0.1, 0.17, 0.3, 0.6, 1.0, 3.0)
-NODES, PERIODS, ENOUGH, MOST_PIXELS = 16, 3000, 6000, 16384
+NO_DEAD_TIME = -1.0
+NODES, ENOUGH, MOST_PIXELS = 16, 6000, 16384
+#: First and last period of the mean, with and without a dead time.
+SPAN, SPAN_NO_DEAD_TIME = (1000, 3000), (100, 1000)
 #: Smallest threshold: larger differences of low thresholds are cut to it.
 LEAST = 0.4
 
@@ -38,16 +44,17 @@ def simulate(entries: list[tuple[float, float, float]], pixels: int, seed: int) 
     (s00, s01), (s10, s11) = step.tolist()
     each = np.repeat(np.array(entries, np.float32), pixels, axis=0)
     on, off, dead = (types.Float(np.ascontiguousarray(column)) for column in (each * [1, 1, NODES]).T.astype("f4"))
-    last = types.UInt32(NODES * PERIODS)
-    first = last // 3
+    moves = entries[0][2] < 0  # all entries are of the same kind
+    span = SPAN_NO_DEAD_TIME if moves else SPAN
+    first, last = (types.UInt32(NODES * period) for period in span)
     generator = sys.modules[types.Float.__module__].PCG32(size=len(each), initstate=seed)
 
-    def normals(generator):  # noqa: ANN001, ANN202
+    def normals(generator):
         radius = dr.sqrt(-2 * dr.log(1 - generator.next_float32()))
         sine, cosine = dr.sincos(math.tau * generator.next_float32())
         return radius * sine, radius * cosine
 
-    def node(number, level, speed, reference, ready, count, generator):  # noqa: ANN001, ANN202
+    def node(number, level, speed, reference, ready, count, generator):
         z, w = normals(generator)
         following = s00 * level + s01 * speed + f00 * z
         speed = s10 * level + s11 * speed + f10 * z + f11 * w
@@ -58,6 +65,9 @@ def simulate(entries: list[tuple[float, float, float]], pixels: int, seed: int) 
             hit = (ready <= 1) & (up | (following - reference <= -off))
             part = dr.maximum((reference + dr.select(up, on, -off) - level) / travel, dr.maximum(ready, 0))
             count += dr.select(hit & (number >= first), 1, 0)
+            if moves:
+                reference += dr.select(hit, dr.select(up, on, -off), 0.0)
+                continue
             ready = dr.select(hit, part + dead, ready)
             reference = dr.select(hit & (ready <= 1), dr.fma(travel, ready, level), reference)
         return number + 1, following, speed, reference, ready - 1, count, generator
@@ -67,7 +77,7 @@ def simulate(entries: list[tuple[float, float, float]], pixels: int, seed: int) 
     start = (zero, level, speed, types.Float(level), dr.full(types.Float, -1.0, len(each)), zero, generator)
     end = dr.while_loop(start, lambda number, *_: number < last, node, label="noise")
     events = np.array(end[5]).reshape(len(entries), pixels).sum(axis=1)
-    return events, events / (pixels * PERIODS * 2 / 3)
+    return events, events / (pixels * (span[1] - span[0]))
 
 
 def row(mean: float, dead: float) -> list[float]:
@@ -77,7 +87,7 @@ def row(mean: float, dead: float) -> list[float]:
         half = min(difference / 2, mean - LEAST)
         entries.append((mean - half, mean + half, dead))
     rates = np.zeros(len(entries))
-    left, pixels, seed = list(range(len(entries))), 256, round(1000 * mean + 100 * dead)
+    left, pixels, seed = list(range(len(entries))), 256, round(1000 * mean + 100 * abs(dead))
     while left and pixels <= MOST_PIXELS:
         events, found = simulate([entries[k] for k in left], pixels, seed)
         rates[left] = found
@@ -91,14 +101,20 @@ def main() -> None:
     print('"""Events per period of noisy asynchronous pixels; made by ``benchmarks/event_noise.py``."""\n')
     print("#: Mean of both thresholds, and their difference, over σ; dead time times the bandwidth of the noise.")
     print(f"MEAN = {MEAN}\nDIFFERENCE = {DIFFERENCE}\nDEAD_PERIODS = {DEAD_PERIODS}")
-    print("#: ON and OFF events per period, [mean, difference, dead time].\nEVENTS = (")
-    for mean in MEAN:
-        columns = np.array([row(mean, dead) for dead in DEAD_PERIODS]).T
-        print("    (")
-        for rates in columns:
-            print(f"        ({', '.join(f'{rate:.4g}' for rate in rates)}),")
-        print("    ),", flush=True)
-    print(")")
+    print(
+        "#: ON and OFF events per period, [mean, difference, dead time], and without a dead time, [mean, difference]."
+    )
+    columns = {"EVENTS": DEAD_PERIODS, "EVENTS_NO_DEAD_TIME": (NO_DEAD_TIME,)}
+    for name, dead_times in columns.items():
+        print(f"{name} = (")
+        for mean in MEAN:
+            rates = np.array([row(mean, dead) for dead in dead_times])
+            lines = [", ".join(f"{rate:.4g}" for rate in line) for line in (rates.T if len(rates) > 1 else rates)]
+            if len(lines) == 1:
+                print(f"    ({lines[0]}),", flush=True)
+            else:
+                print("\n".join(["    (", *(f"        ({line})," for line in lines), "    ),"]), flush=True)
+        print(")")
 
 
 if __name__ == "__main__":

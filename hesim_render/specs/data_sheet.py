@@ -61,7 +61,7 @@ class DataSheetSpec(Strict):
             raise ValueError("dark_lux follows from two background rates: leave one of them out")
         if len(self.background) == 1 and self.dark_lux is None:
             raise ValueError("background at one illuminance needs dark_lux, or a second illuminance")
-        if self.speed and not self.background and self.dark_lux is None:
+        if self.speed and self.dark_lux is None:
             raise ValueError("speed needs dark_lux: the pixel's speed in the dark is that of its dark current")
         if self.noise_bandwidth_hz is None and not self.speed:
             raise ValueError("noise_bandwidth_hz is needed where no speed is given")
@@ -88,7 +88,9 @@ class V2eSpec(Strict):
     sigma_thres: float = Field(0.0, ge=0, le=10, description="std of both over pixels, ln units")
     cutoff_hz: float = Field(0.0, ge=0, le=1e6, description="photoreceptor at white; 0: unlimited")
     leak_rate_hz: float = Field(0.0, ge=0, le=1e6, description="ON events per pixel, 1/s")
-    shot_noise_rate_hz: float = Field(0.0, ge=0, le=1e6, description="ON and OFF events in the dark; a quarter at white")
+    shot_noise_rate_hz: float = Field(
+        0.0, ge=0, le=1e6, description="ON and OFF events in the dark; a quarter at white"
+    )
     refractory_period_s: float = Field(0.0, ge=0, le=1000, description="dead time; 0: none")
     white_lux: float = Field(ge=1e-3, le=1e7, description="illuminance on the sensor that is white (255) in v2e")
     light: SpectrumSpec = Field(SpectrumSpec(illuminant="D65"), description="light of that illuminance")

@@ -93,7 +93,7 @@ class Figures:
 
     @classmethod
     def of_data_sheet(cls, sheet: DataSheetSpec) -> Figures:
-        """Figures of a data sheet. A latency is that of an ON event, of the light after the step."""
+        """Figures of a data sheet. A latency is that of an ON event; the corner is that of the light after the step."""
         contrasts = [0.01 * value for value in (sheet.threshold_on_percent, sheet.threshold_off_percent)]
         on, off = (math.log1p(contrast) for contrast in contrasts)
         # dθ = dc/(1 + c)
@@ -104,7 +104,9 @@ class Figures:
             if level.bandwidth_hz is not None:
                 corners.append((level.lux, level.bandwidth_hz))
             elif level.latency_us is not None:
-                corners.append((level.lux * (1 + step), corner_of_latency_hz(level.latency_us, on, math.log1p(step))))
+                assert sheet.dark_lux is not None
+                change = math.log1p(step * level.lux / (level.lux + sheet.dark_lux))
+                corners.append((level.lux * (1 + step), corner_of_latency_hz(level.latency_us, on, change)))
         return cls(
             (on, off), spread / ((on + off) / 2), [(b.lux, b.rate_hz - sheet.leak_hz) for b in sheet.background],
             sheet.dark_lux, sheet.noise_bandwidth_hz, bool(sheet.speed), sheet.leak_hz, corners, sheet.refractory_us,
@@ -171,7 +173,7 @@ def electrons_per_s_lux(spec: SensorSpec, filter_name: str, light: Spectrum) -> 
     return area_m2 * integrate_product(scale_to_lux(light, 1.0), per_joule)
 
 
-def placeholders(data: CommentedMap, changes: dict[str, Any], file: Path) -> bool:
+def placeholders(data: CommentedMap, changes: Mapping[str, Any], file: Path) -> bool:
     """Add values to a file with a data sheet that stand for those that follow from it.
 
     Returns
@@ -194,8 +196,15 @@ def placeholders(data: CommentedMap, changes: dict[str, Any], file: Path) -> boo
     ]  # fmt: skip
     if problems:
         raise SpecError.together(problems)
-    evs.update({key: value for key, value in DERIVED.items() if value is not None})
+    evs.update({key: _as_read(value) for key, value in DERIVED.items() if value is not None})
     return True
+
+
+def _as_read(value: Any) -> Any:
+    """A copy as if it had been read from a file, so that changes by `--set` reach into it."""
+    if isinstance(value, dict):
+        return CommentedMap({key: _as_read(inner) for key, inner in value.items()})
+    return CommentedSeq([_as_read(inner) for inner in value]) if isinstance(value, list) else value
 
 
 def derive(data: CommentedMap, spec: SensorSpec, file: Path) -> None:
@@ -222,7 +231,7 @@ def derive(data: CommentedMap, spec: SensorSpec, file: Path) -> None:
     evs = data["evs"]
     for key in DERIVED:
         evs.pop(key, None)
-    evs.update({key: value for key, value in values.items() if value is not None})
+    evs.update({key: _as_read(value) for key, value in values.items() if value is not None})
 
 
 def _values(spec: SensorSpec) -> dict[str, Any]:
@@ -252,8 +261,8 @@ def _values(spec: SensorSpec) -> dict[str, Any]:
         "contrast_threshold_on": figures.thresholds[0],
         "contrast_threshold_off": figures.thresholds[1],
         "threshold_mismatch_std": figures.mismatch,
-        "signal_reference": CommentedMap({**reference, "filter": "own" if len(names) == 1 else names[0]}),
-        "coefficients": CommentedSeq([CommentedMap(beta)]),
+        "signal_reference": {**reference, "filter": "own" if len(names) == 1 else names[0]},
+        "coefficients": [beta],
         "shot_law": figures.shot_law,
         "leak_rate_hz": figures.leak_hz,
         "photoreceptor_cutoff_hz": bandwidth_hz,
@@ -299,16 +308,16 @@ def _noise(figures: Figures, bandwidth_hz: float, photoreceptor: Mapping[str, fl
     return dark, math.sqrt(scale), math.sqrt(scale * dark)
 
 
-def _photoreceptor(figures: Figures) -> CommentedMap:
+def _photoreceptor(figures: Figures) -> dict[str, Any]:
     """Corner proportional to the light through the darker of two levels, up to that of the brighter one; empty where
     nothing limits the speed.
     """
     if not figures.corners:
-        return CommentedMap()
+        return {}
     (lux, corner), (brighter_lux, highest) = min(figures.corners), max(figures.corners)
     if highest < corner or highest / corner > brighter_lux / lux * (1 + 1e-9):
         raise SpecError(
             f"speed: corners of {corner:.4g} Hz at {lux:g} lx and {highest:.4g} Hz at {brighter_lux:g} lx: in between "
             "the corner can rise at most as fast as the light, and not fall"
         )
-    return CommentedMap({"cutoff_hz": highest, "signal_dn": lux * highest / corner})
+    return {"cutoff_hz": highest, "signal_dn": lux * highest / corner}
