@@ -97,5 +97,5 @@ def test_every_shipped_sensor_simulates(name, capsys, tmp_path):
     assert recording.manifest["counts"]["frames"] == len(recording.frames)
     # what the data sheet became is in the recording
     if spec.evs is not None and spec.evs.data_sheet is not None:
-        stored = recording.manifest["sensor"]["evs"]
+        stored = recording.manifest["sensor"]["spec"]["evs"]
         assert stored["coefficients"][0]["beta3"] == spec.evs.coefficients[0].beta3
