@@ -55,6 +55,7 @@ __all__ = [
     "SceneTruth",
     "Sensor",
     "__version__",
+    "events",
     "load_scene",
     "load_sensor",
     "photocurrent",
@@ -67,6 +68,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from hesim_render import events
     from hesim_render.capture.simulate import simulate
     from hesim_render.capture.simulate_video import simulate_video
     from hesim_render.recording.recording import Recording
@@ -82,6 +84,8 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name in _moved.MOVED:
         return importlib.import_module(f"hesim_render.{name}")
+    if name == "events":  # a package of functions, used as hr.events.voxel_grid
+        return importlib.import_module("hesim_render.events")
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'hesim_render' has no attribute {name!r}")
