@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hesim_render.calibrate.report.drawing import COLOURS, new_figure, report_style
-from hesim_render.calibrate.report.parts import tick_text
+from hesim_render.core.drawing import COLOURS, new_figure, report_style
 from hesim_render.core.errors import RangeError
+from hesim_render.core.html import tick_text
 from hesim_render.core.output import replacing
 from hesim_render.describe.curves import event_curves, photon_transfer, s_curve
 from hesim_render.sensor.sensor import Sensor

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import integrate, special
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
@@ -90,6 +90,24 @@ def test_rates_in_dim_light_fall_with_the_pixels_speed():
     assert np.all(slope < 2.2) and slope[-1] == pytest.approx(1.0, abs=0.3)
     # never below the shot noise of the electrons themselves
     assert np.all(curves.sigma > curves.shot_limit)
+
+
+def test_the_shot_limit_is_white_noise_through_two_poles():
+    sensor = hr.load_sensor("imx636")
+    light, lux = illuminant("LED-B2"), 200.0  # where the noise has its full bandwidth of 60 Hz
+    flux = lux * electrons_per_s_lux(sensor.spec, "clear", light)
+    pole_hz = 60 / math.sqrt(math.sqrt(2) - 1)
+    # one-sided density 2/Φ of ln of the light, times |H|² = 1/(1 + (f/f0)²)²
+    power = integrate.quad(lambda f: 2 / flux / (1 + (f / pole_hz) ** 2) ** 2, 0, np.inf)[0]
+    assert event_curves(sensor, [lux]).shot_limit[0] == pytest.approx(math.sqrt(power), rel=1e-6)
+    fixed = hr.load_sensor("gen2")
+    counted = electrons(fixed, 3.0).numpy()[0]
+    row, col = fixed.spec.positions("evs")[0]
+    name = fixed.spec.pixels[fixed.spec.tile_rows[row][col]].filter
+    counted *= electrons_per_s_lux(fixed.spec, name, illuminant("D65")) / electrons_per_s_lux(
+        fixed.spec, next(iter(fixed.spec.filters)), illuminant("D65")
+    )
+    assert event_curves(fixed, [3.0]).shot_limit[0] == pytest.approx(1 / math.sqrt(counted), rel=1e-4)
 
 
 def test_threshold_and_mismatch_of_a_data_sheet_are_those_of_simulated_s_curves():

@@ -96,6 +96,17 @@ def test_noise_is_the_inverse_of_its_rate():
     )
 
 
+def test_the_mean_over_pixels_has_the_rare_ones_of_low_threshold():
+    rng = np.random.default_rng(2)
+    for mismatch, sigmas in ((0.25, 4.0), (0.1, 5.0)):
+        on, off = sigmas * np.maximum(1 + mismatch * rng.standard_normal((2, 400_000)), 0.05)
+        drawn = events_per_period(on, off, 0.08)
+        quadrature = sum(noise_rates_hz((sigmas, sigmas), mismatch, 1.0, 1.0, 0.08))
+        # standard error of the mean of the draws below 0.5 %
+        assert drawn.std() / math.sqrt(drawn.size) < 0.005 * drawn.mean()
+        assert quadrature == pytest.approx(drawn.mean(), rel=0.02)
+
+
 def test_electrons_per_lux_by_an_independent_sum():
     spec = read_sensor("imx636")
     wavelength_nm = np.arange(360.0, 830.5, 0.5)

@@ -7,25 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render.calibrate.report.asynchronous import asynchronous_section
-from hesim_render.calibrate.report.drawing import report_style
 from hesim_render.calibrate.report.events import evs_section
 from hesim_render.calibrate.report.frames import aps_section
-from hesim_render.calibrate.report.parts import plain_text, table
+from hesim_render.calibrate.report.parts import plain_text
 from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning
+from hesim_render.core.drawing import report_style
+from hesim_render.core.html import PAGE_STYLE, table
 from hesim_render.core.output import alone_in, replacing
 from hesim_render.specs.calibration import as_written
 from hesim_render.specs.calibration_spec import SECTIONS
-
-_STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;color:#1b1b1b;max-width:1320px;margin:2rem auto;padding:0 1rem}
-h1{font-size:1.6rem}h2{font-size:1.25rem;margin-top:2.2rem;border-bottom:1px solid #ccc}
-.row{display:flex;flex-wrap:wrap;gap:18px;align-items:flex-start}figure{margin:0}
-figcaption{font-size:.85rem;color:#555;max-width:52rem}
-table{border-collapse:collapse;font-size:.85rem;margin:.6rem 0}
-td,th{padding:.15rem .6rem;border-bottom:1px solid #ddd;text-align:left;font-variant-numeric:tabular-nums}
-svg{stroke-linejoin:round;stroke-linecap:butt}
-.findings{border-left:4px solid #d55e00;background:#fdf3ec;padding:.3rem .9rem;margin:.8rem 0}
-"""
 
 
 def write_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:
@@ -56,7 +46,7 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
     body = "\n".join(parts)
     page = (
         f'{report_beginning(calibration)}"><title>Noise calibration</title>'
-        f"<style>{_STYLE}</style></head><body>{body}</body></html>\n"
+        f"<style>{PAGE_STYLE}</style></head><body>{body}</body></html>\n"
     )
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")

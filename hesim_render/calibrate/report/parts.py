@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from typing import Any
+
+from hesim_render.core.html import number
 
 
 def findings(section: Mapping[str, Any]) -> str:
@@ -59,24 +61,3 @@ def parameter_row(name: str, item: Any) -> tuple[str, str, str, str]:
     note = item.get("note", "")
     between = f"{interval[0]:.5g} to {interval[1]:.5g}" if interval else ""
     return name, f"{item['value']:.5g}", between, " ".join(t for t in (item.get("unit", ""), note) if t)
-
-
-def number(value: float) -> str:
-    """A number with few digits."""
-    if value == 0:
-        return "0"
-    if 1e3 <= abs(value) < 1e5:
-        return f"{value:.0f}"
-    return f"{value:.3g}" if 1e-3 <= abs(value) < 1e5 else f"{value:.1e}".replace("e-0", "e-").replace("e+0", "e")
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """An HTML table; text is escaped."""
-    header = "".join(f"<th>{escape(h)}</th>" for h in head)
-    body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{header}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def tick_text(value: float, _: float) -> str:
-    """Text of a number on an axis: the formatter of logarithmic axes, whose own writes mathematics."""
-    return number(value).replace(".0e", "e")
