@@ -32,8 +32,8 @@ def _app(
 
 
 for _command in (
-    doctor.doctor, doctor.list_, simulate.simulate, video.video, simulate.demo, calibrate.lab, calibrate.calibrate,
-    look.isp, look.view, exchange.export, exchange.import_, cube.cube, measure.measure,
+    doctor.doctor, doctor.list_, simulate.simulate, video.video, simulate.rerun, simulate.demo, calibrate.lab,
+    calibrate.calibrate, look.isp, look.view, exchange.export, exchange.import_, cube.cube, measure.measure,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
 
