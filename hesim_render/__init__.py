@@ -57,6 +57,7 @@ __all__ = [
     "SceneTruth",
     "Sensor",
     "__version__",
+    "events",
     "load_scene",
     "load_sensor",
     "photocurrent",
@@ -71,6 +72,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from hesim_render import events
     from hesim_render.capture.simulate import simulate
     from hesim_render.capture.simulate_cube import simulate_cube
     from hesim_render.capture.simulate_video import simulate_video
@@ -88,6 +90,8 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name in _moved.MOVED:
         return importlib.import_module(f"hesim_render.{name}")
+    if name == "events":  # a package of functions, used as hr.events.voxel_grid
+        return importlib.import_module("hesim_render.events")
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'hesim_render' has no attribute {name!r}")

@@ -20,7 +20,6 @@ MOVED = {
     "dng": "recording.dng",
     "errors": "core.errors",
     "eventfile": "exchange.dsec",
-    "events": "pixels.evs.events",
     "evs": "pixels.evs.stage",
     "flicker": "sources.flicker",
     "flux": "sources.protocol",

@@ -7,7 +7,20 @@ from typing import Annotated
 import typer
 
 from hesim_render import __version__
-from hesim_render.cli import calibrate, cube, doctor, exchange, expose, look, measure, simulate, study, sweep, video
+from hesim_render.cli import (
+    calibrate,
+    cube,
+    doctor,
+    exchange,
+    expose,
+    look,
+    measure,
+    sensor,
+    simulate,
+    study,
+    sweep,
+    video,
+)
 from hesim_render.cli.terminal import say
 
 app = typer.Typer(
@@ -32,8 +45,10 @@ def _app(
 
 
 for _command in (
-    doctor.doctor, doctor.list_, simulate.simulate, video.video, expose.expose, simulate.demo, calibrate.lab,
-    calibrate.calibrate, look.isp, look.view, exchange.export, exchange.import_, cube.cube, measure.measure,
-    study.study, sweep.sweep,
+    doctor.doctor, doctor.list_, simulate.simulate, video.video, expose.expose, simulate.rerun, simulate.demo,
+    calibrate.lab, calibrate.calibrate, look.isp, look.view, exchange.export, exchange.import_, cube.cube,
+    measure.measure, study.study, sweep.sweep,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
+
+app.add_typer(sensor.app, name="sensor")

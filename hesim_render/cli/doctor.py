@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -80,8 +81,26 @@ def _lines_of(kind: Kind) -> list[str]:
     from hesim_render.specs.files import data_folder, list_names, load_yaml
 
     names = list_names(kind.value)
-    width = max((len(name) for name in names), default=0)
-    files = (data_folder(kind.value) / f"{name}.yaml" for name in names)
-    return [
-        f"{name:<{width}}  {load_yaml(file).get('description', '')}" for name, file in zip(names, files, strict=True)
+    files = [load_yaml(data_folder(kind.value) / f"{name}.yaml") for name in names]
+    columns = [
+        [name, *(_sensor_columns(file) if kind is Kind.sensors else ())]
+        for name, file in zip(names, files, strict=True)
     ]
+    widths = [max(map(len, column)) for column in zip(*columns, strict=True)]
+    return [
+        "  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=True)), file.get("description", "")])
+        for row, file in zip(columns, files, strict=True)
+    ]
+
+
+def _sensor_columns(file: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Pixels that give frames, pixels that give events, and pitch of a shipped sensor."""
+    geometry, tile = file["geometry"], file["tile"].split()
+    roles = [file["pixels"][letter]["roles"] for letter in "".join(tile)]
+    frames = f"frames {geometry['cols']}x{geometry['rows']}" if any("aps" in role for role in roles) else "no frames"
+    if grid := file.get("evs_grid"):
+        rows = len(file["tile"].strip().splitlines())
+        cols = len("".join(tile)) // rows
+        size = geometry["cols"] // cols * grid["cols_per_tile"], geometry["rows"] // rows * grid["rows_per_tile"]
+        return frames, f"events {size[0]}x{size[1]}", f"{geometry['pitch_um']:>5g} µm"
+    return frames, "no events", f"{geometry['pitch_um']:>5g} µm"

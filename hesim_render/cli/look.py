@@ -40,7 +40,8 @@ def isp(
 
 
 def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:
-    """Summarise a recording and write its previews anew."""
+    """Summarise a recording, and write its previews and recording.html: parameters, pictures and plots."""
+    from hesim_render.recording.page import write_page
     from hesim_render.recording.recording import Recording
     from hesim_render.recording.showcase import write_previews
 
@@ -48,4 +49,5 @@ def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")
     assert loaded.path is not None
     with output_errors(loaded.path):
         write_previews(loaded, loaded.path)
-    say(summary(loaded))
+        page = write_page(loaded, loaded.path)
+    say(f"{summary(loaded)}\n  page: {page}")

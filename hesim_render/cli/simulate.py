@@ -122,6 +122,36 @@ def _look(
     say(f"{found.target or 'the scene has no target'}\nframing in {target}")
 
 
+def rerun(
+    recording: Annotated[Path, typer.Argument(help="folder of a recording of a scene")],
+    out: Annotated[Path, typer.Option(help="folder to write the new recording to")],
+    scene: Annotated[
+        str | None, typer.Option(help="the scene file, if it needs files that the recording does not hold")
+    ] = None,
+    yes: Yes = False,
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
+    ] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a recording again from its recording.json: the same bytes, on the same versions and backend."""
+    check_output(out, overwrite)
+    from hesim_render.capture.again import simulate_again
+    from hesim_render.recording.recording import Recording
+    from hesim_render.sources.scene import load_scene
+
+    loaded = Recording.load(recording)
+    given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
+    with progress_report(f"{recording} again") as progress:
+        again = simulate_again(
+            loaded, out, given, overwrite=overwrite, progress=progress, on_estimate=told_beside(progress),
+            max_minutes=None if yes else LONG_MINUTES,
+        )  # fmt: skip
+    say(summary(again))
+    if is_short_of_wish(again.manifest["settings"].get("render", {}).get("audit")):
+        raise typer.Exit(_NOT_MET)
+
+
 def demo(
     out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
 ) -> None:

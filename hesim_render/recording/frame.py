@@ -40,6 +40,11 @@ class Frame:
         rows, cols = self.raw.shape
         return f"<Frame {self.index}: {cols}x{rows} px, t_us={self.t_us}, exposure_us={self.exposure_us}>"
 
+    def _repr_html_(self) -> str:
+        from hesim_render.recording.outline import frame_summary
+
+        return frame_summary(self.raw, [(name, f"{value:g}") for name, value in self.times.items()])
+
     @property
     def row_times_us(self) -> NDArray[np.float64]:
         """Middle of each row's exposure, [row], µs: the time at which geometric truth of a frame is given."""

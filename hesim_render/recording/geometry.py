@@ -38,7 +38,7 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     if told is None:
         raise SpecError("the recording was made from a video, which has no geometry", file=file)
     if scene is None:
-        scene = _scene_of(told, file)
+        scene = scene_of(told, file, "recording.truth_with(load_scene(PATH))")
     elif content_hash(scene.spec) != told["sha256"]:
         raise SpecError(
             f"scene {scene.name!r} is not the one of the recording, {told['name']!r}, or was changed since", file=file
@@ -49,11 +49,24 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     return SceneTruth(scene, sensor)
 
 
-def _scene_of(told: Mapping[str, Any], file: Path | None) -> Scene:
+def scene_of(told: Mapping[str, Any], file: Path | None, remedy: str) -> Scene:
+    """The scene that a manifest holds.
+
+    Parameters
+    ----------
+    told : the manifest's section on the scene.
+    file : the manifest, for errors.
+    remedy : how a scene that needs other files can be given.
+
+    Raises
+    ------
+    SpecError
+        If the scene needs files that a manifest does not hold, or is not valid.
+    """
     if told.get("files_sha256"):
         raise SpecError(
             f"the scene needs files that are not in the recording ({', '.join(sorted(told['files_sha256']))}): give "
-            "the scene, recording.truth_with(load_scene(PATH))",
+            f"the scene, {remedy}",
             file=file,
             key="scene.files_sha256",
         )

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -35,6 +36,8 @@ from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.label_file import LABEL_FILE, read_labels
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from hesim_render.pixels.evs.events import EventLabels
     from hesim_render.recording.truth_file import StoredTruth
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
@@ -114,6 +117,24 @@ class Recording:
     ) -> None:
         self.frames, self.manifest, self.path, self._scene = frames, manifest, path, scene
         self._events, self._event_truth, self._labels = events, event_truth, labels
+
+    def __repr__(self) -> str:
+        from hesim_render.recording.outline import text_summary
+
+        return text_summary(self)
+
+    def _repr_html_(self) -> str:
+        return import_module("hesim_render.recording.page").html_summary(self)
+
+    def plot(self) -> Figure:
+        """Draw the middle frame, the events around it, the event rates over time, and the histogram of RAW values.
+
+        Returns
+        -------
+        A matplotlib figure, which notebooks show; `savefig` writes it.
+        """
+        # by name: what draws recordings knows them, a recording does not depend on what draws it
+        return import_module("hesim_render.recording.plots").figure_of(self)
 
     @property
     def events(self) -> NDArray:

@@ -65,8 +65,8 @@ def _middle(recording: Recording) -> Frame:
     return recording.frames[len(recording.frames) // 2]
 
 
-def contact_sheet(recording: Recording) -> Image.Image:
-    """Colour view, events over it, the RAW mosaic whole and magnified, with captions."""
+def middle_views(recording: Recording) -> list[Panel]:
+    """Colour view of the middle frame and the events around it; empty where there are neither."""
     panels: list[Panel] = []
     mosaic = recording.mosaic
     begin_us, end_us = recording.manifest["time"]["begin_us"], recording.manifest["time"]["end_us"]
@@ -87,12 +87,18 @@ def contact_sheet(recording: Recording) -> Image.Image:
         events = recording.event_slice(first, last + 1)
         picture = preview.events_picture(colour, events, recording.event_shape)
         panels.append(Panel(picture, f"{_count(events.size, 'event')} in {_ms(last - first)}: ON orange, OFF blue"))
+    return panels
+
+
+def contact_sheet(recording: Recording) -> Image.Image:
+    """Colour view, events over it, the RAW mosaic whole and magnified, with captions."""
+    panels, mosaic = middle_views(recording), recording.mosaic
     roi = recording.manifest["roi"]
     width_px, step = preview.panel_width(roi["width_px"], mosaic.tile_shape[1])
     if len(recording.frames):
-        panels += _mosaic_panels(frame, recording, colour, width_px, step)
+        panels += _mosaic_panels(_middle(recording), recording, panels[0].picture, width_px, step)
     if not panels:
-        panels.append(Panel(colour, "no frames and no event pixels"))
+        panels.append(Panel(_black(recording), "no frames and no event pixels"))
     counts = recording.manifest["counts"]
     scene = (recording.manifest.get("scene") or {}).get("name", "")
     title = "  ·  ".join(

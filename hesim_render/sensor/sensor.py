@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.html import table
 from hesim_render.core.plain import PlainState
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.model import ApsNoise
@@ -81,6 +82,10 @@ class Sensor(PlainState):
             parts.append("no frames")
         parts.append(f"f/{lens.f_number:g}, {lens.focal_length_mm:g} mm")
         return f"<Sensor {self.name!r}: {'; '.join(parts)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [("sensor", self.name), ("description", self.spec.description), ("read out", repr(self)[1:-1])]
+        return table(("", ""), rows)
 
     @property
     def spec(self) -> SensorSpec:

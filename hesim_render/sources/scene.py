@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.html import table
 from hesim_render.specs.motion import TrackSpec
 from hesim_render.specs.problems import spec_error
 from hesim_render.specs.scene import CameraSpec, SceneSpec, read_scene
@@ -49,6 +50,10 @@ class Scene:
         if len(parts) > _MOST_PARTS:
             parts = [*parts[: _MOST_PARTS - 1], f"{len(parts) - _MOST_PARTS + 1} more"]
         return f"<Scene {self.name!r}: {'; '.join(parts)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [("scene", self.name), ("description", self.spec.description), ("content", repr(self)[1:-1])]
+        return table(("", ""), rows)
 
     @property
     def name(self) -> str:

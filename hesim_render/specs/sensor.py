@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, PositiveInt, field_validator, model_validator
+from ruamel.yaml.comments import CommentedMap
 
 from hesim_render.core.errors import HesimWarning, SpecError
 from hesim_render.specs.calibrated import apply_calibration
 from hesim_render.specs.calibration import NoiseFile, NoisePart
+from hesim_render.specs.data_sheet import DataSheetSpec, V2eSpec
 from hesim_render.specs.defects import EventDefectSpec, TelegraphSpec
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.from_data_sheet import derive, placeholders
 from hesim_render.specs.lens import LensSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 from hesim_render.specs.problems import line_of
@@ -171,6 +174,8 @@ class EvsSpec(Strict):
     leak_rate_hz: float = Field(0.0, ge=0, le=1e6, description="Poisson process of ON events, per pixel")
     photoreceptor_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="noise bandwidth (last_event)")
     photoreceptor: PhotoreceptorSpec | None = Field(None, description="bandwidth of the signal; default unlimited")
+    data_sheet: DataSheetSpec | None = Field(None, description="figures that the values above follow from")
+    v2e: V2eSpec | None = Field(None, description="options of v2e that they follow from")
     defects: EventDefectSpec | None = Field(None, description="stuck, hot and flickering pixels; default none")
     refractory_period_us: int | None = Field(
         None, ge=1, le=10**9, description="no event so long after a pixel's last one"
@@ -197,6 +202,15 @@ class EvsSpec(Strict):
                 raise ValueError(f"{key} must be at least {_LEAST_THRESHOLD:g} with reference 'last_event'")
         if self.refractory_period_us is not None and self.reference != "last_event":
             raise ValueError("refractory_period_us belongs to reference 'last_event'; a fixed tick has none")
+        if self.photoreceptor is not None and self.photoreceptor.filters_noise:
+            if self.reference != "last_event":
+                raise ValueError("photoreceptor.filters_noise belongs to reference 'last_event'")
+            if (self.photoreceptor_cutoff_hz or 0.0) > self.photoreceptor.cutoff_hz:
+                raise ValueError("photoreceptor_cutoff_hz is above photoreceptor.cutoff_hz, which filters the noise")
+        if self.data_sheet is not None and self.v2e is not None:
+            raise ValueError("data_sheet and v2e say the same in two ways: leave one of them out")
+        if (self.data_sheet or self.v2e) is not None and self.reference != "last_event":
+            raise ValueError("data_sheet and v2e describe asynchronous pixels: they need reference 'last_event'")
         if self.readout_buffer_events is not None and self.readout_max_events_per_s is None:
             raise ValueError("readout_buffer_events needs readout_max_events_per_s")
         follows_light = self.photoreceptor is not None and self.photoreceptor.follows_light
@@ -292,11 +306,11 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
         if not isinstance(given, Mapping) or not isinstance(given.get("file"), str):
             raise SpecError("expected the path of a calibration.yaml", file=file, key="noise")
         data.pop("noise", None)
-        validate(SensorSpec, data, file, changes)
+        _read(data, file, changes)
         noise = validate(NoisePart, {"noise": {**given, "folder": folder}}, file, {}).noise
         calibration = apply_calibration(data, noise)
         data["noise"] = {**given, "folder": folder}
-    spec = validate(SensorSpec, data, file, changes)
+    spec = validate(SensorSpec, data, file, changes) if calibration is not None else _read(data, file, changes)
     if spec.noise is not None and calibration is not None:
         spec.noise.keep_maps(calibration)  # read the maps now: the sensor needs no file afterwards
     problems = [SpecError(text, file=file, line=line_of(data, key.split(".")), key=key) for key, text in unused(spec)]
@@ -304,4 +318,14 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
         raise SpecError.together(problems)
     for problem in problems:  # after an override this may be intended: the replaced part stays in the file
         warnings.warn(str(problem), HesimWarning, stacklevel=3)
+    return spec
+
+
+def _read(data: CommentedMap, file: Path, changes: Mapping[str, Any]) -> SensorSpec:
+    """Check the content of a file and replace a data sheet by what follows from it, in place."""
+    derived = placeholders(data, changes, file)
+    spec = validate(SensorSpec, data, file, changes)
+    if derived:
+        derive(data, spec, file)
+        spec = validate(SensorSpec, data, file, changes)
     return spec

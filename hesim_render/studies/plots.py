@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.drawing import COLOURS, legend_below, new_figure, panel, svg
+from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, svg
 from hesim_render.spectral.colorimetry import encode_srgb, xyz_to_linear_srgb
 from hesim_render.studies.cfa import Seen
 from hesim_render.studies.table import Table

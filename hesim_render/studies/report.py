@@ -11,8 +11,8 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.drawing import report_style
-from hesim_render.calibrate.report.parts import PAGE_STYLE, number, row_of, table
+from hesim_render.core.drawing import report_style
+from hesim_render.core.html import PAGE_STYLE, number, row_of, table
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
 from hesim_render.studies.cfa import Seen, StudyResult

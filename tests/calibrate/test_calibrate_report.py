@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
-from hesim_render.calibrate.report import drawing
-from hesim_render.calibrate.report.parts import number
 from hesim_render.calibrate.result import plain
+from hesim_render.core import drawing
 from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.core.html import number
 
 
 @pytest.fixture(scope="module")

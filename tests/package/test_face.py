@@ -101,5 +101,5 @@ def test_shells_complete_commands_and_names():
 
     assert completed("sim") == ["simulate"]
     assert completed("simulate", "color") == ["colorchecker"]
-    assert completed("simulate", "dark", "--sensor", "dav") == ["davis346"]
+    assert completed("simulate", "dark", "--sensor", "davis3") == ["davis346"]
     assert completed("video", "x", "--without", "evs.m") == ["evs.mismatch"]

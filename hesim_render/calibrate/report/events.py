@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.drawing import COLOURS, legend_below, panel, picture, points, svg
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row, row_of, table, tick_text
+from hesim_render.calibrate.report.parts import findings, p_text, parameter_row
+from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
+from hesim_render.core.html import row_of, table, tick_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.drawing import COLOURS, legend_below, new_figure, panel, picture, points, svg
-from hesim_render.calibrate.report.parts import findings, number, p_text, parameter_row, row_of, table
+from hesim_render.calibrate.report.parts import findings, p_text, parameter_row
+from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, picture, points, svg
+from hesim_render.core.html import number, row_of, table
 from hesim_render.pixels.aps.formulas import polynomial
 
 

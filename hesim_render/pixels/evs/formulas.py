@@ -115,7 +115,9 @@ def log_level(k: Coefficients, signal: Values, law: ShotLaw, xp: Namespace) -> t
     return xp.log(x), voltage_variance(k, shot_root(signal, law, xp), xp) / (x * x)
 
 
-def noise_equivalent(k: Coefficients, signal: Values, least_change: Values, law: ShotLaw, xp: Namespace) -> Values:
+def noise_equivalent(
+    k: Coefficients, signal: Values, least_change: Values, law: ShotLaw, xp: Namespace, share: Values = 1.0
+) -> Values:
     """Change of the signal that equals s, or `least_change` of ln x if that is larger.
 
     Parameters
@@ -125,12 +127,13 @@ def noise_equivalent(k: Coefficients, signal: Values, least_change: Values, law:
     least_change : least change of ln x.
     law : shot law.
     xp : functions of the arrays' library.
+    share : part of the variance s² that the photoreceptor leaves.
 
     Returns
     -------
     Change, in the unit of the signal.
     """
-    noise = xp.sqrt(voltage_variance(k, shot_root(signal, law, xp), xp))
+    noise = xp.sqrt(voltage_variance(k, shot_root(signal, law, xp), xp) * share)
     return xp.maximum(noise, least_change * voltage(k, signal)) / k.slope
 
 
@@ -138,6 +141,10 @@ def corner_hz(
     k: Coefficients, log: Values, reference_level: Values, least_hz: float, largest_hz: float, xp: Namespace
 ) -> Values:
     """Corner frequency of a photoreceptor that follows the light: proportional to the signal, between two limits.
+
+    White noise before the photoreceptor has a variance behind it that is proportional to the corner. With all
+    frequencies over the largest bandwidth of the noise, and 1 as the largest, this is the part of the variance that
+    is left.
 
     Parameters
     ----------

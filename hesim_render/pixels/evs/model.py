@@ -27,6 +27,7 @@ from hesim_render.pixels.evs.formulas import Coefficients
 from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
 from hesim_render.pixels.terms import switched_off
+from hesim_render.specs.event_noise import LEAST_THRESHOLD_REL
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 from hesim_render.specs.sensor import EvsCoefficients, EvsSpec
 
@@ -36,9 +37,6 @@ EVS_TERMS = (
     *("shot", "dark_current", "mismatch", "leak", "bandwidth", "refractory", "readout_limit", "crosstalk"),
     *_DEFECTS,
 )
-
-#: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
-LEAST_THRESHOLD_REL = 0.05
 
 #: Least noise with which deviations of the clean signal are compared, in thresholds.
 LEAST_NOISE_THETA = 0.05
@@ -171,10 +169,45 @@ class EvsNoise(PlainState):
     def on_device(self) -> EventPixels:
         """Parameters of the event pixels on the device, for the event stage."""
         thresholds = self.threshold_on_map, self.threshold_off_map
+        return EventPixels(
+            self.layout, self.table, self.spec.shot_law, thresholds, self._reference_level, self._noise_level
+        )
+
+    @property
+    def _reference_level(self) -> NDArray[np.float64] | None:
+        """x above its baseline at the photoreceptor's reference signal, β1·signal_dn [position]; None without one."""
         reference = None if self.photoreceptor is None else self.photoreceptor.signal_dn
-        # x above its baseline at the reference signal: β1·signal_dn
-        level = None if reference is None else self.table.slope / self._dn_per_electron * reference
-        return EventPixels(self.layout, self.table, self.spec.shot_law, thresholds, level)
+        return None if reference is None else self.table.slope / self._dn_per_electron * reference
+
+    @property
+    def filters_noise(self) -> bool:
+        """True where the photoreceptor filters the noise as well as the signal."""
+        return self.photoreceptor is not None and self.photoreceptor.filters_noise
+
+    @property
+    def _noise_level(self) -> tuple[NDArray[np.float64], float] | None:
+        """x above its baseline [position] at which the corner is the noise's own bandwidth; least corner over it."""
+        spec, level, bandwidth_hz = self.photoreceptor, self._reference_level, self.spec.photoreceptor_cutoff_hz
+        if not self.filters_noise or spec is None or level is None or bandwidth_hz is None:
+            return None
+        assert spec.min_cutoff_hz is not None
+        return level * (bandwidth_hz / spec.cutoff_hz), min(spec.min_cutoff_hz / bandwidth_hz, 1.0)
+
+    def noise_share(self, electrons: NDArray, position: NDArray[np.integer] | int) -> NDArray | float:
+        """Part of the variance of ln x that the photoreceptor leaves, 1 where it does not filter the noise.
+
+        Parameters
+        ----------
+        electrons : [..., n], noise-free electrons of the window.
+        position : [n], event positions, counted in reading order of the tile.
+        """
+        if self._noise_level is None:
+            return 1.0
+        kind = np.result_type(electrons, np.float32)
+        k = self.table.each(lambda values: values.astype(kind)[position])
+        log = np.log(formulas.voltage(k, np.maximum(electrons, kind.type(0))))
+        level, least = self._noise_level
+        return formulas.corner_hz(k, log, level.astype(kind)[position], least, 1.0, NUMPY)
 
     # ---- the model ----------------------------------------------------------------------------------
 
@@ -206,7 +239,9 @@ class EvsNoise(PlainState):
         k = self.table.each(lambda values: values.astype(kind)[position])
         theta = min(self.spec.contrast_threshold_on, self.spec.contrast_threshold_off)
         counted = np.maximum(electrons, kind.type(0))
-        return formulas.noise_equivalent(k, counted, kind.type(LEAST_NOISE_THETA * theta), self.spec.shot_law, NUMPY)
+        least = kind.type(LEAST_NOISE_THETA * theta)
+        share = self.noise_share(electrons, position)
+        return formulas.noise_equivalent(k, counted, least, self.spec.shot_law, NUMPY, share)
 
     def log_signal(self, electrons_per_s: NDArray[np.float64], event_pixel: NDArray[np.integer]) -> NDArray[np.float64]:
         """ln x, noise-free, of a flux.

@@ -30,6 +30,8 @@ class EventPixels:
     thresholds : θ₊ and θ₋ in ln units, maps or numbers.
     reference_level : [position], β1 times the signal at which the photoreceptor's corner is largest; None where no
         corner follows the light.
+    noise_level : [position], β1 times the signal above which the photoreceptor leaves the noise as it is, and least
+        part of its variance that it leaves; None where it does not filter the noise.
 
     Attributes
     ----------
@@ -44,6 +46,7 @@ class EventPixels:
         law: ShotLaw,
         thresholds: tuple[Map, Map],
         reference_level: NDArray[np.float64] | None,
+        noise_level: tuple[NDArray[np.float64], float] | None,
     ) -> None:
         self._law = law
         self.key: UInt32 = jit().UInt32(layout.full_index.ravel()[layout.evs_pixel.ravel()])
@@ -51,10 +54,15 @@ class EventPixels:
         of_position = _by_position(layout)
         self._coefficients = table.each(of_position)
         self._reference_level: Float = None if reference_level is None else of_position(reference_level)
+        self._noise_level = None if noise_level is None else (of_position(noise_level[0]), noise_level[1])
 
     def log_level(self, electrons: Float) -> tuple[Float, Float]:
         """`EvsNoise.log_level`."""
-        return formulas.log_level(self._coefficients, electrons, self._law, device_namespace())
+        xp = device_namespace()
+        log, variance = formulas.log_level(self._coefficients, electrons, self._law, xp)
+        if self._noise_level is not None:
+            variance *= formulas.corner_hz(self._coefficients, log, *self._noise_level, 1.0, xp)
+        return log, variance
 
     def corner_hz(self, log: Float, spec: PhotoreceptorSpec) -> Float:
         """Corner of each pixel's photoreceptor at ln x: f_c·I/signal_dn between the file's two limits."""

@@ -61,6 +61,11 @@ class Photoreceptor:
         spec = self._spec
         return _rate(self._noise.on_device.corner_hz(log, spec) if spec.follows_light else spec.cutoff_hz)
 
+    @property
+    def rate_per_us(self) -> Float:
+        """a of both poles up to the next node, 1/µs: a number, or one per pixel."""
+        return self._rate
+
     def _node_at(self, t_us: float) -> int:
         return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding
 

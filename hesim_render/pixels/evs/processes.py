@@ -17,6 +17,7 @@ from hesim_render.core.device_types import Float, Float64, UInt32
 from hesim_render.core.rng import Stream, philox, stream_key
 from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.normal import normal_pair
 
 #: Nodes of the noise per period of the photoreceptor's cut-off frequency.
@@ -33,11 +34,20 @@ class BandNoise:
 
     The state (u, u'/a) steps from node to node with its exact transition matrix. Between nodes the interpolated
     variance averages (2 + ρ)/3, with ρ the correlation of neighbouring nodes. The amplitude is scaled to compensate.
+
+    Where the photoreceptor filters the noise, a is at most its rate at each node, one per pixel. In the units of the
+    state the stationary law is the same for every a, so that the variance stays 1 while a changes.
+
+    Parameters
+    ----------
+    noise : noise model of the pixels.
+    seed : seed of the noise.
+    photoreceptor : gives the rate a of each pixel; None where the noise has the same bandwidth in all.
     """
 
     STATE = ("_node", "_value", "_state")
 
-    def __init__(self, noise: EvsNoise, seed: int) -> None:
+    def __init__(self, noise: EvsNoise, seed: int, photoreceptor: Photoreceptor | None = None) -> None:
         cutoff_hz = noise.spec.photoreceptor_cutoff_hz
         assert cutoff_hz is not None
         self._key, self._seed = noise.on_device.key, seed
@@ -48,6 +58,9 @@ class BandNoise:
         # in the stationary state u and u'/a are independent, each of variance 1
         fresh = np.eye(2) - self._transition @ self._transition.T
         self._fresh = self._amplitude * np.linalg.cholesky(fresh)
+        self._photoreceptor, self._largest = photoreceptor, h
+        if photoreceptor is not None:
+            self._amplitude = 1.0  # each pixel has its own, see `_scale`
         self._node = 0  # the last node at or before the present
         self._value: Float = None  # u at that node
         self._state: tuple[Float, Float] = (None, None)  # u and u'/a at the next one
@@ -62,6 +75,10 @@ class BandNoise:
 
         self._value, speed = self._state
         z = self._deviates(self._node + 1)
+        if self._photoreceptor is not None:
+            self._state = _step(self._value, speed, self._angle(), z)
+            dr.schedule(self._state)
+            return
         self._state = tuple(
             float(f[0]) * self._value + float(f[1]) * speed + float(g[0]) * z[0] + float(g[1]) * z[1]
             for f, g in zip(self._transition, self._fresh, strict=True)
@@ -92,7 +109,51 @@ class BandNoise:
             self._node += 1
             self._advance()
             part = max(t_us / self._period_us - self._node, 0.0)
-        return dr.fma(self._state[0] - self._value, dr.opaque(jit().Float, part), self._value)
+        value = dr.fma(self._state[0] - self._value, dr.opaque(jit().Float, part), self._value)
+        return value if self._photoreceptor is None else value * self._scale()
+
+    def _angle(self) -> Float:
+        """h = a·period of each pixel."""
+        import drjit as dr
+
+        assert self._photoreceptor is not None
+        return dr.minimum(self._photoreceptor.rate_per_us * self._period_us, self._largest)
+
+    def _scale(self) -> Float:
+        """Amplitude that compensates the interpolation, for each pixel's own rate."""
+        import drjit as dr
+
+        h = self._angle()
+        return dr.sqrt(3.0 / dr.fma(1.0 + h, dr.exp(-h), 2.0))
+
+
+#: Below this 2h, the variance that a step adds to u is a difference of nearly equal numbers; the series of six terms
+#: is accurate to 1e-6 there.
+_SERIES_BELOW = 0.3
+
+
+def _step(value: Float, speed: Float, h: Float, z: tuple[Float, Float]) -> tuple[Float, Float]:
+    """One step of the state (u, u'/a) with h = a·Δt of each pixel, and two normal deviates.
+
+    With E = exp(−h) and x = 2h, what the step adds has Var u = 1 − E²(1 + x + x²/2) = ½ x³ Σ (−x)^k / (k! (k + 3)),
+    covariance E² x²/2, and Var u'/a = 1 − E²(1 − x + x²/2).
+    """
+    import drjit as dr
+
+    decay = dr.exp(-h)
+    x, squared = 2.0 * h, decay * decay
+    series = dr.fma(x, -1 / 960, 1 / 168)
+    for term in (-1 / 36, 1 / 10, -1 / 4, 1 / 3):
+        series = dr.fma(x, series, term)
+    exact = 1.0 - squared * dr.fma(x, dr.fma(x, 0.5, 1.0), 1.0)
+    own = dr.select(x < _SERIES_BELOW, 0.5 * x * x * x * series, exact)
+    both = 0.5 * squared * x * x
+    rest = 1.0 - squared * dr.fma(x, dr.fma(x, 0.5, -1.0), 1.0) - both * both / own
+    root = dr.sqrt(own)
+    return (
+        decay * dr.fma(h, value + speed, value) + root * z[0],
+        decay * (speed - h * (value + speed)) + both / root * z[0] + dr.sqrt(dr.maximum(rest, 0.0)) * z[1],
+    )
 
 
 class LeakProcess:

@@ -230,8 +230,10 @@ class _LastEvent:
         self._spread: Float = None  # s/x of the last sample
         self._level: Float = None  # ln x with its noise, at the end of the last segment
         self._reference: Float = None  # level of the last event
-        self._band_noise = None if noise.is_noiseless else BandNoise(noise, seed)
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
+        self._band_noise: BandNoise | None = None
+        if not noise.is_noiseless:
+            self._band_noise = BandNoise(noise, seed, self._photoreceptor if noise.filters_noise else None)
         self._refractory: Refractory | None = None
         if noise.refractory_period_us is not None:
             self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))

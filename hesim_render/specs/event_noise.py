@@ -1,0 +1,145 @@
+"""Rate of noise events of an asynchronous pixel in steady light, from its thresholds and its noise, and the inverse.
+
+The noise of ln x is Gaussian, white noise through two equal poles that are −3 dB at f together
+(`hesim_render.pixels.evs.processes.BandNoise`). After an event and its dead time the pixel compares with the level of
+that instant. How often the noise then crosses a threshold has no closed form. Level crossings [rice1945] are the rate
+of a pixel that always compares with the mean; it is ten to fifty times lower at thresholds of four σ, because the level
+of comparison itself wanders with the noise. The tables have the rates of such pixels by simulation
+(``benchmarks/event_noise.py``), as events per period 1/f, of the mean and the difference of both thresholds over σ and
+of the dead time. Between entries log(rate) is linear in the square of the mean threshold, in the difference and in the
+log of the dead time.
+
+A pixel without a dead time moves its level of comparison by exactly a threshold with each event. Its rate falls for as
+long as one looks; the table has the mean of the 100th to the 1000th period.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize
+from scipy.interpolate import RegularGridInterpolator
+
+from hesim_render.core.errors import RangeError
+from hesim_render.specs.event_noise_table import DEAD_PERIODS, DIFFERENCE, EVENTS, EVENTS_NO_DEAD_TIME, MEAN
+
+#: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
+LEAST_THRESHOLD_REL = 0.05
+
+#: Largest mean threshold over σ; there, and long before, noise events are too rare for any pixel to have one.
+_LARGEST_MEAN = 400.0
+#: Points of the normal distribution of each threshold over pixels, and their weights: the trapezoid rule, which for a
+#: smooth integrand is exact to the tails that it leaves out. Rare pixels of low threshold have much of the noise.
+_DEVIATES = np.linspace(-4.0, 4.0, 33)
+_WEIGHTS = np.exp(-0.5 * _DEVIATES**2) / np.sum(np.exp(-0.5 * _DEVIATES**2))
+
+
+@cache
+def _table(has_dead_time: bool) -> RegularGridInterpolator:
+    axes: tuple[NDArray[np.float64], ...] = np.square(MEAN), np.asarray(DIFFERENCE)
+    axes += (np.log(DEAD_PERIODS),) if has_dead_time else ()
+    values = np.log(EVENTS if has_dead_time else EVENTS_NO_DEAD_TIME)
+    return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=None)
+
+
+def events_per_period(on_sigma: ArrayLike, off_sigma: ArrayLike, dead_periods: float) -> NDArray[np.float64]:
+    """ON and OFF events together of a pixel, per period 1/f of the noise bandwidth.
+
+    Parameters
+    ----------
+    on_sigma, off_sigma : θ₊/σ and θ₋/σ, any shapes that go together.
+    dead_periods : dead time times f; 0 for none.
+
+    Returns
+    -------
+    Events per period. Means of both thresholds above 5.5 σ are extrapolated.
+    """
+    on, off = np.broadcast_arrays(np.asarray(on_sigma, np.float64), np.asarray(off_sigma, np.float64))
+    mean, difference = (on + off) / 2, np.abs(on - off)
+    where = [np.maximum(mean, MEAN[0]) ** 2, np.minimum(difference, DIFFERENCE[-1])]
+    if dead_periods > 0:
+        dead = min(max(dead_periods, DEAD_PERIODS[0]), DEAD_PERIODS[-1])
+        where.append(np.full(on.shape, math.log(dead)))
+    return np.exp(_table(dead_periods > 0)(np.stack(where, axis=-1))).reshape(on.shape)
+
+
+def noise_rates_hz(
+    thresholds: tuple[float, float], mismatch: float, sigma: float, bandwidth_hz: float, dead_s: float
+) -> tuple[float, float]:
+    """Rates of ON and of OFF noise events of a pixel, mean over pixels, in steady light.
+
+    In the long run both directions travel equally far: the rates are inverse to the thresholds, each with the distance
+    that the level goes beyond it during the dead time.
+
+    Parameters
+    ----------
+    thresholds : θ₊, θ₋, ln units.
+    mismatch : relative standard deviation of each over pixels.
+    sigma : standard deviation of ln x, time average.
+    bandwidth_hz : −3 dB frequency of the noise, Hz.
+    dead_s : dead time after an event, s; 0 for none.
+
+    Returns
+    -------
+    ON, OFF, in Hz.
+    """
+    if sigma <= 0:
+        return 0.0, 0.0
+    deviates, weights = (_DEVIATES, _WEIGHTS) if mismatch > 0 else (np.zeros(1), np.ones(1))
+    spread = np.maximum(1 + mismatch * deviates, LEAST_THRESHOLD_REL)
+    on, off = np.meshgrid(thresholds[0] * spread / sigma, thresholds[1] * spread / sigma)
+    dead_periods = dead_s * bandwidth_hz
+    rates = bandwidth_hz * events_per_period(on, off, dead_periods) * np.outer(weights, weights)
+    beyond = _beyond((on + off) / 2, dead_periods)
+    share = np.clip((off + beyond) / (on + off + 2 * beyond), 0.0, 1.0)
+    return float(np.sum(rates * share)), float(np.sum(rates * (1 - share)))
+
+
+def _beyond(mean: NDArray[np.float64], dead_periods: float) -> NDArray[np.float64]:
+    """Mean travel of the level beyond a threshold at the end of the dead time, in σ; negative where it is on its way
+    back. Of the same simulations: within 0.3 of them for means of 2.5 to 4.5.
+    """
+    if dead_periods <= 0:
+        return np.zeros_like(mean)
+    at = np.log(np.clip(dead_periods, DEAD_PERIODS[0], DEAD_PERIODS[-1]))
+    fixed, growing = (np.interp(at, np.log(_BEYOND[0]), values) for values in _BEYOND[1:])
+    return fixed + growing * mean
+
+
+#: Dead time in periods; travel with it: a constant, and a part proportional to the mean threshold.
+_BEYOND = ((0.01, 0.03, 0.1, 0.3, 1.0), (0.12, 0.33, 0.7, 1.17, 1.52), (0.0, 0.0, 0.0, -0.65, -1.05))
+
+
+def noise_sigma(
+    rate_hz: float, thresholds: tuple[float, float], mismatch: float, bandwidth_hz: float, dead_s: float
+) -> float:
+    """Standard deviation of ln x that gives a rate of noise events, ON and OFF together; inverse of `noise_rates_hz`.
+
+    Parameters
+    ----------
+    rate_hz : events of a pixel, mean over pixels, Hz.
+    thresholds, mismatch, bandwidth_hz, dead_s : as for `noise_rates_hz`.
+
+    Raises
+    ------
+    RangeError
+        If no noise of this bandwidth gives the rate.
+    """
+    mean = sum(thresholds) / 2
+
+    def excess(log_sigma: float) -> float:
+        sigma = math.exp(log_sigma)
+        found = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s))
+        return math.log(max(found, 1e-300) / rate_hz)
+
+    lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / MEAN[0])
+    if excess(highest) < 0:
+        most = sum(noise_rates_hz(thresholds, mismatch, math.exp(highest), bandwidth_hz, dead_s))
+        raise RangeError(
+            "rate of noise events", f"{rate_hz:g} Hz", f"at most {most:.3g} Hz with a noise bandwidth of "
+            f"{bandwidth_hz:g} Hz; a larger bandwidth gives more"
+        )  # fmt: skip
+    return math.exp(float(optimize.brentq(excess, lowest, highest, xtol=1e-6)))

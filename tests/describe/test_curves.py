@@ -1,0 +1,203 @@
+"""What a description of a sensor says, against simulations of the sensor."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import integrate, special
+
+import hesim_render as hr
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import RangeError
+from hesim_render.describe import event_curves, figures_of, photon_transfer, s_curve, table_lines
+from hesim_render.describe.table import TABLE_LUX
+from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.specs.files import list_names
+from hesim_render.specs.from_data_sheet import electrons_per_s_lux
+from hesim_render.spectral.spectrum import illuminant
+
+#: A pixel of 20 Hz, which is quick to simulate, written as a data sheet.
+SLOW = {
+    "evs.data_sheet.noise_bandwidth_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
+    "evs.data_sheet.speed": [{"lux": 5, "bandwidth_hz": 20}], "evs.data_sheet.refractory_us": 5000,
+}  # fmt: skip
+
+
+def electrons(sensor, lux):
+    """Electrons of a window of every event pixel at an illuminance in the data sheet's light."""
+    sheet = sensor.spec.evs.data_sheet or sensor.spec.evs.v2e
+    light = sheet.light.load() if sheet else illuminant("D65")
+    flux = electrons_per_s_lux(sensor.spec, next(iter(sensor.spec.filters)), light)
+    window_s = sensor.spec.evs.window_us * 1e-6
+    return jit().Float(np.full(math.prod(sensor.layout.evs_shape), lux * flux * window_s, np.float32))
+
+
+def simulated_rates(sensor, lux, begin_s, seconds, seed=3):
+    """ON and OFF events per second and pixel in steady light, from `begin_s` on."""
+    stage, light = EvsStage(sensor.evs, seed), electrons(sensor, lux)
+    stage.step(light, 0)
+    found = [stage.step(light, t) for t in range(100_000, round((begin_s + seconds) * 1e6) + 1, 100_000)]
+    events = np.concatenate(found)
+    late = events["polarity"][events["t_us"] > begin_s * 1e6]
+    scale = seconds * math.prod(sensor.layout.evs_shape)
+    return np.sum(late > 0) / scale, np.sum(late < 0) / scale
+
+
+def after_step(sensor, lux, contrast, wait_us, without=()):
+    """First event of each pixel after a step of contrast: µs after the step, and polarity."""
+    stage, begin_us = EvsStage(sensor.evs.without(*without), 3), 1000
+    for t_us, level in ((0, lux), (begin_us, lux), (begin_us + 1, lux * (1 + contrast))):
+        stage.step(electrons(sensor, level), t_us)
+    events = stage.step(electrons(sensor, lux * (1 + contrast)), begin_us + wait_us)
+    place = events["y"].astype(np.int64) * sensor.cols + events["x"]
+    first = events[np.unique(place, return_index=True)[1]]
+    return first["t_us"] - begin_us, first["polarity"]
+
+
+def test_the_background_of_a_data_sheet_is_what_the_sensor_gives():
+    sensor = hr.load_sensor("imx636", SLOW).crop(64, 64)
+    on, off = simulated_rates(sensor, 5, 4.0, 2.0)  # after 80 periods of the noise the level has settled
+    curves = event_curves(sensor, [5.0])
+    assert curves.on_hz[0] + curves.off_hz[0] == pytest.approx(4.0, rel=1e-3)
+    # 32,000 events of 4096 pixels with thresholds of their own: standard error 1.2 %
+    assert on + off == pytest.approx(4.0, rel=0.05)
+    assert on == pytest.approx(curves.on_hz[0], rel=0.05) and off == pytest.approx(curves.off_hz[0], rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "lux", "pixels", "begin_s", "seconds"),
+    [("imx636", 5, 64, 0.5, 1.5), ("v2e-noisy", 0, 240, 3, 6), ("v2e-noisy", 100, 240, 3, 6)],
+)
+def test_the_background_of_shipped_sensors_is_what_they_give(name, lux, pixels, begin_s, seconds):
+    sensor = hr.load_sensor(name).crop(pixels, pixels)
+    found = sum(simulated_rates(sensor, lux, begin_s, seconds))
+    options = sensor.spec.evs.v2e
+    stated = 10.0 if options is None else options.shot_noise_rate_hz * (1 if lux == 0 else 0.25) + 0.1
+    # 60,000 events or more; the draw of 4096 (57,600) pixels adds 1 % (2 % where rare pixels have most of the noise)
+    assert found == pytest.approx(stated, rel=0.05)
+
+
+def test_rates_in_dim_light_fall_with_the_pixels_speed():
+    """Above the illuminance where the photoreceptor limits the noise the rate falls with the noise itself, below it
+    with the bandwidth: between them is the maximum that measured rates of event cameras have."""
+    curves = event_curves(hr.load_sensor("imx636"), np.geomspace(0.2, 100, 40))
+    rate = curves.off_hz
+    peak = int(np.argmax(rate))
+    assert 3 < curves.lux[peak] < 7
+    assert np.all(np.diff(rate[: peak + 1]) > 0) and np.all(np.diff(rate[peak:]) < 0)
+    slope = np.diff(np.log(rate[:peak])) / np.diff(np.log(curves.lux[:peak]))
+    assert np.all(slope < 2.2) and slope[-1] == pytest.approx(1.0, abs=0.3)
+    # never below the shot noise of the electrons themselves
+    assert np.all(curves.sigma > curves.shot_limit)
+
+
+def test_the_shot_limit_is_white_noise_through_two_poles():
+    sensor = hr.load_sensor("imx636")
+    light, lux = illuminant("LED-B2"), 200.0  # where the noise has its full bandwidth of 60 Hz
+    flux = lux * electrons_per_s_lux(sensor.spec, "clear", light)
+    pole_hz = 60 / math.sqrt(math.sqrt(2) - 1)
+    # one-sided density 2/Φ of ln of the light, times |H|² = 1/(1 + (f/f0)²)²
+    power = integrate.quad(lambda f: 2 / flux / (1 + (f / pole_hz) ** 2) ** 2, 0, np.inf)[0]
+    assert event_curves(sensor, [lux]).shot_limit[0] == pytest.approx(math.sqrt(power), rel=1e-6)
+    fixed = hr.load_sensor("gen2")
+    counted = electrons(fixed, 3.0).numpy()[0]
+    row, col = fixed.spec.positions("evs")[0]
+    name = fixed.spec.pixels[fixed.spec.tile_rows[row][col]].filter
+    counted *= electrons_per_s_lux(fixed.spec, name, illuminant("D65")) / electrons_per_s_lux(
+        fixed.spec, next(iter(fixed.spec.filters)), illuminant("D65")
+    )
+    assert event_curves(fixed, [3.0]).shot_limit[0] == pytest.approx(1 / math.sqrt(counted), rel=1e-4)
+
+
+def test_threshold_and_mismatch_of_a_data_sheet_are_those_of_simulated_s_curves():
+    sensor = hr.load_sensor("imx636", SLOW).crop(128, 128)
+    bright = 50_000.0
+    for sign in (1, -1):
+        # contrasts between the 2nd and the 98th percentile of the thresholds
+        percent = np.linspace(20.5, 29.5, 7) if sign > 0 else 100 * (1 - 1 / (1 + np.linspace(0.205, 0.295, 7)))
+        share = []
+        for contrast in sign * percent / 100:
+            wait_us, polarity = after_step(sensor, bright, contrast, 100_000)
+            share.append(np.mean(polarity == sign) * len(wait_us) / 128**2)
+        theta = np.abs(np.log1p(sign * percent / 100))
+        slope, offset = np.polyfit(theta, special.ndtri(share), 1)
+        centre, width = -offset / slope, 1 / slope
+        # 16,384 pixels: standard errors 0.1 % of the centre and 0.7 % of the width
+        assert centre == pytest.approx(math.log(1.25), rel=0.01)
+        assert width == pytest.approx(0.025 / 1.25, rel=0.05)
+        # one comparison: without the noise and the leak, which give a pixel more chances while it settles
+        share = [
+            np.sum(after_step(sensor, bright, contrast, 100_000, ("leak", "shot", "dark_current"))[1] == sign) / 128**2
+            for contrast in sign * percent / 100
+        ]
+        predicted = s_curve(sensor, bright, sign * percent / 100)
+        np.testing.assert_allclose(predicted, share, atol=0.0156)  # four standard errors at most
+
+
+@pytest.mark.parametrize(("lux", "stated_us"), [(1000, 100), (5, 1000)])
+def test_latencies_of_a_data_sheet_are_those_of_simulated_steps(lux, stated_us):
+    sensor = hr.load_sensor("imx636").crop(8, 8)
+    wait_us, polarity = after_step(sensor, lux, 1.0, 5000, ("shot", "dark_current", "mismatch", "leak"))
+    assert len(wait_us) == 64 and np.all(polarity == 1)
+    assert np.median(wait_us) == pytest.approx(stated_us, rel=0.05)
+    assert event_curves(sensor, [float(lux)]).latency_us[0] == pytest.approx(stated_us, rel=0.01)
+
+
+def test_rates_at_a_fixed_tick_against_the_stage():
+    changes = {"evs.contrast_threshold_on": 0.05, "evs.contrast_threshold_off": 0.06}
+    sensor = hr.load_sensor("reference-mono", changes).crop(256, 256)
+    lux = 0.5
+    curves = event_curves(sensor, [lux])
+    stage, light = EvsStage(sensor.evs, 3), electrons(sensor, lux)
+    ticks, tick_us = 60, sensor.spec.evs.tick_us
+    events = np.concatenate([stage.step(light, tick_us * (k + 1)) for k in range(ticks + 1)])
+    scale = ticks * 256**2 * tick_us * 1e-6
+    on, off = (np.sum(events["polarity"] == sign) / scale for sign in (1, -1))
+    assert min(on, off) * scale > 2000
+    # at least 2000 events; successive comparisons share a sample: standard error below 3 %
+    assert on == pytest.approx(curves.on_hz[0], rel=0.12) and off == pytest.approx(curves.off_hz[0], rel=0.12)
+
+
+def test_photon_transfer_is_that_of_the_emva_standard():
+    sensor = hr.load_sensor("imx250")
+    electrons_, mean, deviation = photon_transfer(sensor)
+    gain, read, dark = 0.347, 2.4, 3.0 * 0.005
+    np.testing.assert_allclose(mean, gain * (electrons_ + dark), rtol=1e-6)
+    np.testing.assert_allclose(deviation**2, gain**2 * (electrons_ + dark + read**2) + 1 / 12, rtol=1e-6)
+    figures = {row.name: row.value for row in figures_of(sensor)["frames"]}
+    # the source of the preset states 40.3 dB and 71.2 dB
+    assert figures["largest SNR"] == pytest.approx(40.3, abs=0.1)
+    assert figures["dynamic range"] == pytest.approx(71.2, abs=2.0)
+
+
+@pytest.mark.parametrize("name", list_names("sensors"))
+def test_every_shipped_sensor_can_be_described(name):
+    sensor = hr.load_sensor(name)
+    figures = figures_of(sensor)
+    assert ("frames" in figures) == (sensor.spec.aps is not None)
+    assert ("events" in figures) == (sensor.spec.evs is not None)
+    for row in (row for rows in figures.values() for row in rows):
+        assert math.isfinite(row.value) or row.name.startswith("latency")
+        if row.stated is not None:
+            assert row.value == pytest.approx(row.stated, rel=2e-3), row.name
+    lines = list(table_lines(figures))
+    assert all(len(line) <= 120 for line in lines)
+    if sensor.spec.evs is not None:
+        assert sum(" lx " in line and line.endswith(("µs", "none")) for line in lines) >= len(TABLE_LUX)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"lux": [-1.0]}, "0 or more"),
+        ({"lux": [math.nan]}, "finite"),
+        ({"lux": [1.0], "step": 0.0}, "above 0"),
+        ({"lux": [1.0], "position": 4}, "event position"),
+    ],
+)
+def test_mistakes_are_named(arguments, text):
+    with pytest.raises(RangeError, match=text):
+        event_curves(hr.load_sensor("gen2"), **arguments)
+    with pytest.raises(RangeError, match="above -1"):
+        s_curve(hr.load_sensor("gen2"), 1.0, [-1.0])
