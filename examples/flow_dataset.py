@@ -21,16 +21,6 @@ BINS, SPAN_US, CLIPS = 5, 50_000, 4
 SCENES = ("camera-sweep", "facade-drive")
 
 
-def voxel_grid(events, shape, begin_us):
-    """Sum of polarities in bins of time, each event shared by the two bins nearest to it [bin, row, col]."""
-    place = (events["t_us"] - begin_us) / SPAN_US * (BINS - 1)
-    low = np.clip(place.astype(int), 0, BINS - 2)
-    grid = np.zeros((BINS, *shape))
-    for k, weight in ((low, low + 1 - place), (low + 1, place - low)):
-        np.add.at(grid, (k, events["y"], events["x"]), weight * events["polarity"])
-    return grid
-
-
 def clips(name):
     sensor = hr.load_sensor("gen2").crop(COLS, COLS * 3 // 4)
     rec = hr.simulate(hr.load_scene(name), sensor, duration_s=CLIPS * SPAN_US * 1e-6, seed=1, quality=2)
@@ -38,7 +28,8 @@ def clips(name):
         begin = k * SPAN_US
         inside = (rec.events["t_us"] >= begin) & (rec.events["t_us"] < begin + SPAN_US)
         flow = rec.truth.flow(begin, begin + SPAN_US, grid="events")
-        yield voxel_grid(rec.events[inside], rec.event_shape, begin), flow.flow_px, flow.visible
+        grid = hr.events.voxel_grid(rec.events[inside], rec.event_shape, BINS, begin, begin + SPAN_US)
+        yield grid, flow.flow_px, flow.visible
 
 
 def features(grid):
@@ -66,7 +57,7 @@ for name in SCENES:
     for k, (grid, flow_px, visible) in enumerate(clips(name)):
         part = "train" if k < CLIPS - 1 else "test"
         file = FOLDER / f"{part}-{name}-{k}.npz"
-        np.savez_compressed(file, voxels=grid.astype(np.float32), flow_px=flow_px, valid=visible)
+        np.savez_compressed(file, voxels=grid, flow_px=flow_px, valid=visible)
         active = uniform_filter(np.abs(grid).sum(axis=0), 9) > 0
         seen = visible & active & np.isfinite(flow_px).all(axis=-1)
         rows[part].append((features(grid)[seen], flow_px[seen]))
