@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from hesim_render import __version__
-from hesim_render.cli import calibrate, cube, doctor, exchange, look, measure, simulate, video
+from hesim_render.cli import benchmark, calibrate, cube, doctor, exchange, look, measure, simulate, video
 from hesim_render.cli.terminal import say
 
 app = typer.Typer(
@@ -36,3 +36,5 @@ for _command in (
     look.isp, look.view, exchange.export, exchange.import_, cube.cube, measure.measure,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
+
+app.add_typer(benchmark.app, name="benchmark")

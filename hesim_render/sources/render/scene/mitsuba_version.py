@@ -119,7 +119,8 @@ def load_scene(
     mi : the mitsuba module.
     source : path of an XML file, or a dictionary.
     review : called with the `ParserState` before the scene is built; it may change the state.
-    root : folder that must contain all files that the scene names; None allows all.
+    root : folder that must contain all files that the scene names, and in which the names in a dictionary are looked
+        up first; None allows all.
     """
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
@@ -128,6 +129,8 @@ def load_scene(
     inner = mi.FileResolver(resolver)
     if isinstance(source, Path):
         inner.prepend(str(source.resolve().parent))
+    elif root is not None:
+        inner.prepend(str(root.resolve()))
     inner.prepend(str(_home(mi)))
     mi.set_file_resolver(inner)
     try:
