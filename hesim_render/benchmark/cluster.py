@@ -54,7 +54,7 @@ def run_on_cluster(
             # the key is of this call: a result of an earlier build must not stand for this one
             future = client.submit(attempt, order, clip.as_dict(), pure=False, retries=0)
             futures[future.key] = (future, clip)
-        for future in as_completed([future for future, _ in futures.values()]):
+        for future in as_completed([future for future, _ in futures.values()], loop=client.loop):
             clip = futures[future.key][1]
             failure = future.exception()
             if failure is None:

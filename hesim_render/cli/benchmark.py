@@ -1,4 +1,4 @@
-"""Benchmarks: ``benchmark build`` and ``benchmark verify``."""
+"""Benchmarks: ``benchmark build``, ``verify`` and ``evaluate``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hesim_render.cli.options import LONG_MINUTES, Yes
+from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes, listed
 from hesim_render.cli.terminal import complain, say
-from hesim_render.core.errors import RangeError, TooLongError
+from hesim_render.core.errors import OutputError, RangeError, TooLongError
 from hesim_render.core.progress import progress_report
 
 if TYPE_CHECKING:
@@ -81,3 +81,28 @@ def verify(folder: _Folder) -> None:
         raise typer.Exit(_DIFFERENT)
     benchmark = Benchmark(folder)
     say(f"{len(benchmark.manifest['clips'])} clips are as they were built; digest {digest_of(benchmark)}")
+
+
+@app.command()
+def evaluate(
+    folder: _Folder,
+    split: Annotated[str, typer.Option(help="train, val, test or all")] = "test",
+    tasks: Annotated[
+        str | None, typer.Option(metavar="TASK,TASK…", help="deblur, interpolate, denoise, fidelity; default all")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="JSON file of all single values")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure the baselines of each task on the clips of a split."""
+    from hesim_render.benchmark.evaluate import evaluate_benchmark, table
+
+    if out is not None and out.exists() and not overwrite:
+        raise OutputError(f"{out} exists; use --overwrite to replace it")
+    with progress_report(f"evaluate {folder.name}") as progress:
+        result = evaluate_benchmark(
+            folder, split=None if split == "all" else split, tasks=listed(tasks), out=out, progress=progress
+        )
+    say(f"{result['clips']} clips of {result['benchmark']}, split {result['split']}")
+    say(table(result["summary"]) or "no clip has what these tasks need")
+    if out is not None:
+        say(f"in {out}")
