@@ -1,4 +1,4 @@
-"""Benchmarks: ``benchmark build``, ``verify`` and ``evaluate``."""
+"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate`` and ``export``."""
 
 from __future__ import annotations
 
@@ -106,3 +106,18 @@ def evaluate(
     say(table(result["summary"]) or "no clip has what these tasks need")
     if out is not None:
         say(f"in {out}")
+
+
+@app.command()
+def export(
+    folder: _Folder,
+    layout: Annotated[str, typer.Option(help="hs-ergb, bs-ergb, highrev, efnet or raw-npz")],
+    out: Annotated[Path, typer.Option(help="folder to write")],
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a benchmark in the layout that another program loads."""
+    from hesim_render.benchmark.layouts import export_benchmark
+
+    with progress_report(f"{folder.name} → {layout}") as progress:
+        count = export_benchmark(folder, layout, out, overwrite=overwrite, progress=progress)
+    say(f"{count} pictures in {out}")
