@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import time
@@ -20,7 +21,7 @@ from hesim_render.benchmark.plan import Plan, shared_parts
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.core.output import check_target, output_errors, replacing
-from hesim_render.core.progress import Progress
+from hesim_render.core.progress import Progress, in_words
 from hesim_render.specs.benchmark import BenchmarkSpec, read_benchmark
 from hesim_render.specs.files import content_hash
 
@@ -73,21 +74,22 @@ def build_benchmark(
     spec = spec if isinstance(spec, BenchmarkSpec) else read_benchmark(spec)
     plan = Plan(spec)
     plan.check()
-    root = _opened(plan, Path(out))
-    missing = [clip for clip in plan.clips if not is_complete(root, clip)]
-    expected = estimate_build(plan, missing) if estimate and missing else None
-    if expected is not None and on_estimate is not None:
-        on_estimate(expected)
-    begin, done = time.monotonic(), {"clips": len(plan.clips) - len(missing), "seconds": 0.0, "bytes": 0}
+    with _client(scheduler) as client:
+        root = _opened(plan, Path(out))
+        missing = [clip for clip in plan.clips if not is_complete(root, clip)]
+        expected = estimate_build(plan, missing) if estimate and missing else None
+        if expected is not None and on_estimate is not None:
+            on_estimate(expected)
+        begin, done = time.monotonic(), {"clips": len(plan.clips) - len(missing), "seconds": 0.0, "bytes": 0}
 
-    def told(answer: dict[str, Any]) -> None:
-        done["clips"] += 1
-        done["seconds"] += answer.get("seconds", 0.0)
-        done["bytes"] += answer.get("bytes", 0)
-        if progress is not None:
-            progress(done["clips"], len(plan.clips), "clips")
+        def told(answer: dict[str, Any]) -> None:
+            done["clips"] += 1
+            done["seconds"] += answer.get("seconds", 0.0)
+            done["bytes"] += answer.get("bytes", 0)
+            if progress is not None:
+                progress(done["clips"], len(plan.clips), "clips")
 
-    failed = _run(missing, order_of(spec, root), workers, scheduler, told) if missing else {}
+        failed = _run(missing, order_of(spec, root), workers, client, told) if missing else {}
     _report(root, expected, len(missing), time.monotonic() - begin, done, workers, scheduler)
     if failed:
         lines = [f"{name}: {reason}" for name, reason in sorted(failed.items())]
@@ -97,13 +99,35 @@ def build_benchmark(
     return Benchmark(root)
 
 
+def _client(scheduler: str | None) -> Any:
+    """A client of the scheduler, to be used in a with statement; None in it where there is no scheduler."""
+    if scheduler is None:
+        return contextlib.nullcontext()
+    from hesim_render.benchmark.cluster import connected
+
+    return connected(scheduler)
+
+
+def last_run(root: Path) -> str:
+    """What the last build in a folder took, in words."""
+    run = json.loads((root / REPORT_FILE).read_text(encoding="utf-8"))[-1]
+    if not run["clips"]:
+        return "all clips were there"
+    text = f"{run['clips']} clips in {in_words(run['seconds'])}, {3600 * run['clips'] / run['seconds']:.0f} clips/h"
+    text += f", {run['bytes'] / 1e9:.3g} GB"
+    if run["expected"] is not None:
+        seconds, size = run["expected"]["seconds"], run["expected"]["bytes"]
+        text += f" (estimate: {in_words(seconds)} of one worker, {size / 1e9:.2g} GB)"
+    return text
+
+
 def _run(
-    clips: list[Clip], order: str, workers: int, scheduler: str | None, told: Callable[[dict[str, Any]], None]
+    clips: list[Clip], order: str, workers: int, client: Any, told: Callable[[dict[str, Any]], None]
 ) -> dict[str, str]:
-    if scheduler is not None:
+    if client is not None:
         from hesim_render.benchmark.cluster import run_on_cluster
 
-        return run_on_cluster(scheduler, order, clips, told)
+        return run_on_cluster(client, order, clips, told)
     if workers:
         return LocalWorkers(order, workers).run(clips, told)
     failed: dict[str, str] = {}

@@ -23,9 +23,10 @@ from hesim_render.sources.scene import Scene, load_scene
 
 #: Clips that stand for all, at most; each takes some seconds.
 _MOST = 3
-#: Compiling, audit and writing of a clip, s (4.0 s for rotating-star at 32x24, 8 s for camera-sweep); bytes of a frame
-#: pixel in a frame with its truth, in a sharp image, in one image of each kind of truth, and of an event.
-_CLIP_S, _FRAME_BYTES, _SHARP_BYTES, _EVENT_BYTES = 5.0, 10, 8, 8
+#: Compiling, audit and writing of a clip, s of one processor: 3.7 to 22 s for generated scenes of one solid, 2 s for
+#: rotating-star. Bytes of a pixel in a frame with its electrons, in a sharp image, and of an event.
+_CLIP_S, _FRAME_BYTES, _SHARP_BYTES, _EVENT_BYTES = 15.0, 10, 8, 8
+#: Bytes of a pixel in one image of each kind of truth, packed.
 _TRUTH_BYTES = {"depth": 6, "normals": 6, "position": 9, "ids": 1, "flow": 12, "mixed": 0.3}
 #: Events per pixel and second that are assumed.
 _ACTIVITY_HZ = 10.0

@@ -36,7 +36,7 @@ def build(
     ] = None,
 ) -> None:
     """Build all clips of a benchmark, with manifest and card."""
-    from hesim_render.benchmark.build import build_benchmark
+    from hesim_render.benchmark.build import build_benchmark, last_run
     from hesim_render.specs.benchmark import read_benchmark
     from hesim_render.specs.files import parse_override
 
@@ -51,7 +51,8 @@ def build(
         )  # fmt: skip
     clips = built.manifest["clips"]
     splits = ", ".join(f"{sum(c['split'] == split for c in clips)} {split}" for split in ("train", "val", "test"))
-    say(f"{len(clips)} clips ({splits})\n  in {built.root}\n  card: {built.root / 'README.md'}")
+    say(f"{len(clips)} clips ({splits})\n  {last_run(built.root)}")
+    say(f"  in {built.root}\n  card: {built.root / 'README.md'}")
 
 
 def _estimated(expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool) -> None:

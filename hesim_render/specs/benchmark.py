@@ -16,7 +16,7 @@ from hesim_render.specs.files import Strict, load_yaml, locate, validate
 SPLITS = ("train", "val", "test")
 Split = Literal["train", "val", "test"]
 #: Largest number of clips of one benchmark.
-MOST_CLIPS = 10_000_000
+MOST_CLIPS = 1_000_000
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}"
 
 

@@ -26,11 +26,13 @@ from hesim_render.benchmark.verify import digest_of
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import BackendError, OutputError, RangeError, SpecError
 
+MATT = {"plastic": 0, "rough_plastic": 0, "metal": 0}
+
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The small benchmark, built in this process."""
-    return build_benchmark(small(), tmp_path_factory.mktemp("benchmark") / "small", estimate=False)
+    """The small benchmark, built by two processes."""
+    return build_benchmark(small(), tmp_path_factory.mktemp("benchmark") / "small", workers=2, estimate=False)
 
 
 def test_clips_hold_what_was_asked_for(built):
@@ -47,6 +49,7 @@ def test_clips_hold_what_was_asked_for(built):
     assert moving.content["render"]["audit"] and moving.content["versions"]["hesim_render"] == hr.__version__
 
 
+@pytest.mark.slow
 def test_the_blurred_frame_is_the_integral_of_the_sharp_flux(tmp_path):
     """20 windows of 500 µs tile the exposure of 10 ms; both sides have an error of half of the sensor's noise.
 
@@ -80,8 +83,10 @@ def test_the_blurred_frame_is_the_integral_of_the_sharp_flux(tmp_path):
     assert np.abs(raw - expected).max() <= 0.5 + 1e-3 * expected.max()
 
 
-def test_two_workers_leave_the_same_bytes(built, tmp_path):
-    again = build_benchmark(small(), tmp_path / "w2", workers=2, estimate=False)
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 1, 4])
+def test_any_number_of_workers_leaves_the_same_bytes(built, tmp_path, workers):
+    again = build_benchmark(small(), tmp_path / "w", workers=workers, estimate=False)
     assert (again.root / "benchmark.json").read_bytes() == (built.root / "benchmark.json").read_bytes()
     assert digest_of(again) == digest_of(built) and verify_benchmark(again.root) == []
 
@@ -119,6 +124,7 @@ def test_a_killed_worker_leaves_the_same_bytes(built, tmp_path):
 
 
 def test_a_build_goes_on_where_it_was(built, tmp_path):
+    """A clip that is built again in this process has the bytes that a worker process gave it."""
     root = tmp_path / "again"
     shutil.copytree(built.root, root)
     before = {path: path.stat().st_mtime_ns for path in root.rglob("clip.json")}
@@ -132,6 +138,33 @@ def test_a_build_goes_on_where_it_was(built, tmp_path):
     assert digest_of(Benchmark(root)) == digest_of(built)
     kept = [path for path in before if path.parent.name != lost]
     assert all(path.stat().st_mtime_ns == before[path] for path in kept)
+
+
+@pytest.mark.slow
+def test_a_generated_scene_is_rendered_from_its_folder(tmp_path):
+    """Its textures and meshes lie beside its scene file, and a render from there is the same as that of the clip."""
+    spec = generated(
+        1, seed=14, scenes={"objects": 1, "size": 0.4, "contrast": 0.9, "textured": 1, "materials": MATT},
+        motions={"speed": 2.0, "camera": 0}, lights={"illuminance_lux": 2000},
+    )  # fmt: skip
+    clip = next(build_benchmark(spec, tmp_path / "b", estimate=False).clips())
+    assert {path.suffix for path in (clip.folder / "scene").iterdir()} == {".yaml", ".png", ".obj"}
+    scene = hr.load_scene(clip.scene_file)
+    again = hr.simulate(scene, hr.load_sensor("reference-mono").crop(24, 16), duration_s=0.02, quality=4)
+    assert len(clip.recording.events) > 0 and np.array_equal(again.events, clip.recording.events)
+    for one, other in zip(again.frames, clip.recording.frames, strict=True):
+        assert np.array_equal(one.raw, other.raw)
+
+
+@pytest.mark.slow
+def test_a_hundred_clips_differ_by_decades(tmp_path):
+    spec = generated(
+        100, scenes={"objects": [1, 2]}, duration_s=0.02, quality=8, exposures_us=[2000],
+        sensors=[{"sensor": "reference-mono", "roi": "16x12"}],
+    )  # fmt: skip
+    built = build_benchmark(spec, tmp_path / "b", workers=2, estimate=False)
+    for name, values in spread([clip.content for clip in built.clips()]).items():
+        assert values["decades"] >= 1, (name, values)
 
 
 def test_verify_finds_every_change(built, tmp_path):

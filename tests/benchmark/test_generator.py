@@ -275,7 +275,7 @@ def test_what_cannot_be_built_is_refused_before_the_start(changes, message):
         ("scenes: {count: 1}\nsplits: {train: 0.9, val: 0.2, test: 0}", "add up to 1.1"),
         ("scenes: {count: 1}\nsharp: {every_us: 10, times_us: [5]}", "every_us or times_us"),
         ("scenes: {count: 1}\nsharp: {times_us: [5], window_us: 900}", "no window"),
-        ("scenes: {count: 1000000}\nseeds: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]", "at most"),
+        ("scenes: {count: 1000000}\nseeds: [1, 2]", "at most"),
         ("scenes: {count: 1}\nseeds: [3, 3]", "each name once"),
         ("scenes: {count: 1}\nnoise: [{name: a, clean: true, without: [aps.read]}]", "no noise at all"),
         ("scenes: {count: 1, materials: {matt: 0, plastic: 0, rough_plastic: 0, metal: 0}}", "at least one"),

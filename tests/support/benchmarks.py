@@ -25,8 +25,10 @@ def small(**changes: Any) -> BenchmarkSpec:
     return BenchmarkSpec.model_validate(SMALL | changes)
 
 
+_KEPT = ("schema_version", "name", "description", "sensors", "quality", "duration_s")
+
+
 def generated(count: int, **changes: Any) -> BenchmarkSpec:
-    """A benchmark of generated scenes alone."""
+    """A benchmark of generated scenes alone, in the default ranges."""
     scenes = {"count": count, **changes.pop("scenes", {})}
-    content = {key: value for key, value in SMALL.items() if key not in ("scenes", "sharp", "truth")}
-    return BenchmarkSpec.model_validate(content | {"scenes": scenes} | changes)
+    return BenchmarkSpec.model_validate({key: SMALL[key] for key in _KEPT} | {"scenes": scenes} | changes)
