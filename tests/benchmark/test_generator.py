@@ -127,7 +127,7 @@ def test_speeds_and_levels_span_their_ranges():
     spec = generated(1, motions={"speed": [0.05, 5.0], "camera": 0.0}, lights={"lamps": [1, 1]})
     speeds, levels = [], []
     for number in range(200):
-        for track in tracks(draws(1, 1, number), spec.motions, {"a": 0.2}, 100_000):
+        for track in tracks(draws(1, 1, number), spec.motions, {"a": 0.2}, 1_000_000):
             keys = track["keyframes"]
             steps = [
                 np.linalg.norm(np.subtract(b.get("translation_m", [0] * 3), a.get("translation_m", [0] * 3)))

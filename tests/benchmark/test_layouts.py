@@ -12,7 +12,8 @@ from hesim_render.benchmark.voxels import cumulative_grid, voxel_grid
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
-MIDDLES = [6000, 22667, 39333]
+#: Multiples of the tick, so that there are events at the very times.
+MIDDLES = [6250, 22500, 38750]
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +164,8 @@ def test_voxels_share_each_event_by_its_distance():
 
 def test_cumulative_bins_begin_in_the_middle():
     events = random_events()
+    events["t_us"][:50] = 100 + 200 * (np.arange(50) // 10)  # at the edges, too
+    events = np.sort(events, order="t_us")
     found, edges = cumulative_grid(events, (4, 5), 100, 900, 4), [100, 300, 500, 700, 900]
     for k, (first, last, sign) in enumerate([(100, 500, -1), (300, 500, -1), (500, 700, 1), (500, 900, 1)]):
         part = events[(events["t_us"] > first) & (events["t_us"] <= last)]

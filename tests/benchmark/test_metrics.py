@@ -125,6 +125,12 @@ def test_filters_are_their_definition(filtered, seed, count, until):
         assert kept[k] == bool((near & (age >= 0) & (age <= 700)).any())
 
 
+@pytest.mark.parametrize("filtered", [nearest_neighbour, background_activity])
+def test_support_ends_after_its_time(filtered):
+    events = np.array([(0, 3, 3, 1), (700, 3, 4, 1), (1401, 3, 3, 1)], EVENT_DTYPE)
+    assert filtered(events, (9, 11), 700).tolist() == [False, True, False]
+
+
 def test_scores_of_a_filter():
     kept, signal = np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 1, 0, 1], bool)
     found = denoising_scores(kept, signal)
@@ -140,10 +146,15 @@ def test_the_integral_of_a_single_pixel_is_exact():
     on, off = 0.3, 0.2
     events = np.array([(4, 1, 0, 1), (9, 1, 0, -1), (14, 1, 0, 1)], EVENT_DTYPE)
     first = 10 / (4 + 5 * np.exp(on) + np.exp(on - off))
-    ratio = sharp_over_blurred(events, (1, 3), 0, 10, [0, 2, 6, 10, 20], (on, off))
-    expected = first * np.exp([0, 0, on, on - off, 2 * on - off])
+    ratio = sharp_over_blurred(events, (1, 3), 0, 10, [0, 2, 4, 6, 10, 20], (on, off))
+    expected = first * np.exp([0, 0, on, on, on - off, 2 * on - off])  # a time stamp is an end: at 4 it has happened
     assert ratio[:, 0, 1] == pytest.approx(expected)
     assert (ratio[:, 0, [0, 2]] == 1).all()
+
+
+def test_an_event_at_the_begin_of_the_exposure_is_before_it():
+    ratio = sharp_over_blurred(np.array([(0, 0, 0, 1)], EVENT_DTYPE), (1, 1), 0, 10, [-5, 0, 5], (0.3, 0.2))
+    assert ratio[:, 0, 0] == pytest.approx([np.exp(-0.3), 1, 1])
 
 
 def test_times_before_the_exposure_and_rows_that_begin_later():
