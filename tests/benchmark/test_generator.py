@@ -149,6 +149,23 @@ def test_speeds_and_levels_span_their_ranges():
     assert 30 * 0.9 < min(levels) < 120 and 2500 < max(levels) < 10_000 * 1.1
 
 
+@pytest.mark.parametrize("duration_us", [20_000, 2_000_000])
+def test_motions_have_their_speed(duration_us):
+    """Every piece of every way, and the rim of what turns on the spot; 0.1 % for whole microseconds."""
+    from hesim_render.benchmark.motions import camera_track, solid_track
+
+    for number in range(80):
+        rng = draws(7, 1, number)
+        for track in (solid_track(rng, "a", 1.5, 0.2, duration_us), camera_track(rng, 1.5, duration_us)):
+            keys = track["keyframes"]
+            if "translation_m" not in keys[-1]:
+                assert np.pi * 0.2 * 1e6 / keys[-1]["t_us"] == pytest.approx(1.5, rel=1e-3)
+                continue
+            for a, b in zip(keys[:-1], keys[1:], strict=True):
+                way = np.linalg.norm(np.subtract(b["translation_m"], a["translation_m"]))
+                assert way / (b["t_us"] - a["t_us"]) * 1e6 == pytest.approx(1.5, rel=1e-3)
+
+
 def test_a_small_lamp_gives_its_illuminance():
     """A point, a sun, and a panel from the inverse-square law, written out again."""
     from hesim_render.benchmark.lamps import lamps
