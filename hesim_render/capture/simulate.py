@@ -139,12 +139,12 @@ def simulate(
         settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
         seen, level = in_absolute_light(scene)
-        flux, mode = _source(seen, sensor, seed, quality, samples, exact, told)
+        flux, mode = flux_source(seen, sensor, seed, quality, samples, exact, told)
         warn_if_unseen(scene.spec, flux.view, duration_us)
         settings |= mode
         if level is not None:
             settings["light_level"] = level.as_dict()
-        settings |= {"backend": backend.select().describe(), "camera": _camera_used(flux)}
+        settings |= {"backend": backend.select().label, "camera": _camera_used(flux)}
         rendering = _change_driven_parts(flux)
         wanted = rendering[0].quality if rendering else None
         labels = EVENTS in kinds
@@ -207,7 +207,7 @@ def _camera_used(flux: Any) -> dict[str, Any]:
     }
 
 
-def _source(
+def flux_source(
     scene: Scene,
     sensor: Sensor,
     seed: int,
@@ -216,7 +216,13 @@ def _source(
     exact: bool,
     progress: Progress | None,
 ) -> tuple[Any, dict[str, Any]]:
-    """The renderer that was asked for, or that the scene needs, and its settings for the manifest."""
+    """The renderer that was asked for, or that the scene needs, and its settings for the manifest.
+
+    Parameters
+    ----------
+    scene : with lights in absolute units (`in_absolute_light`).
+    sensor, seed, quality, samples, exact, progress : as for `simulate`.
+    """
     settings: dict[str, Any] = {}
     window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
     if not exact and samples is None:

@@ -152,7 +152,7 @@ def simulate_video(
         settings = {
             "clean": clean,
             "without": list(without),
-            "backend": backend.select().describe(),
+            "backend": backend.select().label,
         }
         capture = Capture(flux, sensor, aps, evs, duration_us, seed)
         with RecordingWriter(

@@ -8,6 +8,7 @@ import typer
 
 from hesim_render import __version__
 from hesim_render.cli import (
+    benchmark,
     calibrate,
     cube,
     doctor,
@@ -52,3 +53,4 @@ for _command in (
     app.command(_command.__name__.rstrip("_"))(_command)
 
 app.add_typer(sensor.app, name="sensor")
+app.add_typer(benchmark.app, name="benchmark")

@@ -94,9 +94,13 @@ class Candidate:
     works: bool = False
     reason: str = ""
 
+    @property
+    def label(self) -> str:
+        """Kind and version, which decide the bits; where the library lies does not."""
+        return "CUDA" if self.backend == "cuda" else f"LLVM {self.version or '?'}"
+
     def describe(self) -> str:
-        label = "CUDA" if self.backend == "cuda" else f"LLVM {self.version or '?'}"
-        return f"{label} ({self.source}: {self.path})" if self.path else f"{label} ({self.source})"
+        return f"{self.label} ({self.source}: {self.path})" if self.path else f"{self.label} ({self.source})"
 
 
 def _major(path: Path) -> int:

@@ -1,5 +1,6 @@
 """Scenes of Mitsuba's own: what is honoured, what needs the exact mode, and what is refused."""
 
+import json
 import os
 import re
 import subprocess
@@ -552,6 +553,7 @@ def test_an_environment_map_is_read_on_one_cpu(tmp_path):
     with OpenEXR.File({"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}, pixels) as file:
         file.write(str(tmp_path / "sky.exr"))
     code = f"""
+import json
 import os
 os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
 import hesim_render as hr
@@ -565,3 +567,31 @@ print(len(build(mitsuba(), Scene.from_mitsuba(shapes).spec).scene.emitters()))
 """
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=180)
     assert child.stdout.strip() == "1", child.stderr
+
+
+def test_files_of_an_inline_scene_lie_beside_the_scene_file(tmp_path, monkeypatch):
+    """Wherever the program was started; and no file outside is found by its name."""
+    from PIL import Image
+
+    folder, elsewhere = tmp_path / "scene", tmp_path / "elsewhere"
+    folder.mkdir()
+    elsewhere.mkdir()
+    Image.fromarray(np.full((4, 4, 3), 128, np.uint8)).save(folder / "mine.png")
+    Image.fromarray(np.full((4, 4, 3), 128, np.uint8)).save(elsewhere / "theirs.png")
+    monkeypatch.chdir(elsewhere)
+
+    def scene(name):
+        wall = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": name}}}
+        content = {
+            "schema_version": 1, "name": "inline", "description": "",
+            "mitsuba": {"inline": {"wall": wall, "sky": {"type": "constant"}}},
+            "camera": {"origin_m": [0, 0, 3]},
+        }  # fmt: skip
+        (folder / "scene.yaml").write_text(json.dumps(content))
+        return hr.load_scene(folder / "scene.yaml")
+
+    sensor = hr.load_sensor("reference-mono").crop(16, 12)
+    assert np.allclose(hr.SceneTruth(scene("mine.png"), sensor).depth(0), 3)
+    for name in ("theirs.png", "../elsewhere/theirs.png"):
+        with pytest.raises(SpecError):
+            hr.SceneTruth(scene(name), sensor).depth(0)

@@ -119,7 +119,8 @@ def load_scene(
     mi : the mitsuba module.
     source : path of an XML file, or a dictionary.
     review : called with the `ParserState` before the scene is built; it may change the state.
-    root : folder that must contain all files that the scene names; None allows all.
+    root : folder that must contain all files that the scene names, and in which the names in a dictionary are looked
+        up first; None allows all.
     """
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
@@ -128,6 +129,8 @@ def load_scene(
     inner = mi.FileResolver(resolver)
     if isinstance(source, Path):
         inner.prepend(str(source.resolve().parent))
+    elif root is not None:
+        inner.prepend(str(root.resolve()))
     inner.prepend(str(_home(mi)))
     mi.set_file_resolver(inner)
     try:
@@ -137,15 +140,22 @@ def load_scene(
             parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
         )
         if root is not None:
-            find = mi.file_resolver().resolve
             file = source if isinstance(source, Path) else None
-            require_state_inside(mi, state, root, lambda name: str(find(name)), file)
+            require_state_inside(mi, state, root, _opened, file)
         parser.transform_all(config, state)
         mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> element puts its own folder first
         review(state)
         return parser.instantiate(config, state)
     finally:
         mi.set_file_resolver(resolver)
+
+
+def _opened(name: str) -> str:
+    """The file that Mitsuba opens for a name: without one in its folders, that of the working folder."""
+    import mitsuba as mi
+
+    found = Path(str(mi.file_resolver().resolve(name)))  # type: ignore[operator]
+    return str(found.absolute() if found.exists() else found)
 
 
 def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:

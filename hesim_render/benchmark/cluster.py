@@ -1,0 +1,81 @@
+"""Clips on the workers of a dask.distributed scheduler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hesim_render.benchmark.plan import Clip
+from hesim_render.benchmark.worker import attempt
+from hesim_render.core.errors import OutputError, RangeError
+
+_PATIENCE_S = 10
+
+
+def connected(address: str) -> Any:
+    """A client of a scheduler.
+
+    Raises
+    ------
+    RangeError
+        If dask.distributed is not installed, or the scheduler does not answer.
+    """
+    try:
+        from distributed import Client
+        from distributed.comm.core import CommClosedError
+    except ImportError:
+        raise RangeError("--scheduler", address, "dask.distributed: pip install 'hesim_render[cluster]'") from None
+    try:
+        return Client(address, timeout=_PATIENCE_S, set_as_default=False)
+    except (OSError, ValueError, CommClosedError) as error:  # TimeoutError is an OSError
+        reason = str(error) or type(error).__name__
+        expected = f"the address of a running scheduler, such as tcp://10.0.0.1:8786 ({reason})"
+        raise RangeError("--scheduler", address, expected) from None
+
+
+def run_on_cluster(
+    client: Any, order: str, clips: Sequence[Clip], told: Callable[[dict[str, Any]], None]
+) -> dict[str, str]:
+    """Build clips on a cluster, whose workers see the folder of the benchmark under the same path.
+
+    Parameters
+    ----------
+    client : from `connected`.
+    order : from `order_of`.
+    clips : what is built.
+    told : called with each answer (`attempt`).
+
+    Returns
+    -------
+    Why a clip could not be built, by its name; empty if all are there.
+
+    Raises
+    ------
+    OutputError
+        If a clip cannot be written; the finished clips stay.
+    """
+    from distributed import as_completed
+    from distributed.scheduler import KilledWorker
+
+    failed: dict[str, str] = {}
+    futures = {}
+    for clip in clips:
+        # the key is of this call: a result of an earlier build must not stand for this one
+        future = client.submit(attempt, order, clip.as_dict(), pure=False, retries=0)
+        futures[future.key] = (future, clip)
+    for future in as_completed([future for future, _ in futures.values()], loop=client.loop):
+        clip = futures[future.key][1]
+        failure = future.exception()
+        if failure is None:
+            answer = future.result()
+        elif isinstance(failure, KilledWorker):
+            answer = {"name": clip.name, "error": "its workers died again and again (dask: KilledWorker)"}
+        else:
+            raise failure
+        told(answer)
+        if "error" in answer:
+            failed[clip.name] = answer["error"]
+            if answer.get("fatal"):
+                raise OutputError(answer["error"])
+        futures.pop(future.key)
+    return failed

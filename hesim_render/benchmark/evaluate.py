@@ -1,0 +1,131 @@
+"""Evaluation of a benchmark: every baseline of every task on every clip, and the means."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hesim_render.benchmark.clip import CLIP_FILE
+from hesim_render.benchmark.folder import Benchmark
+from hesim_render.benchmark.generator import file_hash
+from hesim_render.benchmark.tasks import TASKS, ClipTasks, Score
+from hesim_render.benchmark.verify import digest_of
+from hesim_render.core.errors import RangeError, SpecError, did_you_mean
+from hesim_render.core.output import check_place, replacing
+from hesim_render.core.progress import Progress
+from hesim_render.specs.benchmark import SPLITS
+
+Summary = dict[str, dict[str, dict[str, dict[str, float]]]]
+
+
+def evaluate_benchmark(
+    root: str | Path,
+    *,
+    split: str | None = "test",
+    tasks: Sequence[str] = (),
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Measure the baselines on the clips of a benchmark.
+
+    Parameters
+    ----------
+    root : folder of the benchmark.
+    split : whose clips; None takes all.
+    tasks : names (`TASKS`); default all. A clip without what a task needs is left out of it.
+    out : JSON file of the result; None writes none. It is replaced if it exists.
+    progress : called with (done, total, what).
+
+    Returns
+    -------
+    ``summary`` [task][method][measure]: mean, std and number of values; ``scores``, a list of every single one;
+    ``digest`` of the benchmark and ``split``.
+
+    Raises
+    ------
+    RangeError
+        If a task or the split is unknown, or the split has no clips.
+    SpecError
+        If the folder is no finished benchmark, or a clip was changed after it was built.
+    OutputError
+        If `out` cannot be written.
+    """
+    for name in tasks:
+        if name not in TASKS:
+            raise RangeError("task", name, f"one of {', '.join(TASKS)}{did_you_mean(name, TASKS)}")
+    if split is not None and split not in SPLITS:
+        raise RangeError("split", split, f"one of {', '.join(SPLITS)}, or all")
+    target = None if out is None else check_place(out)
+    benchmark = Benchmark(root)
+    clips = list(benchmark.clips(split))
+    if not clips:
+        raise RangeError("split", split, "a split that has clips")
+    hashes = {entry["name"]: entry["sha256"] for entry in benchmark.manifest["clips"]}
+    scores: list[Score] = []
+    for done, clip in enumerate(clips):
+        if not (clip.folder / CLIP_FILE).is_file() or file_hash(clip.folder / CLIP_FILE) != hashes[clip.folder.name]:
+            raise SpecError("was changed or removed after the build (benchmark verify)", file=clip.folder / CLIP_FILE)
+        for name in tasks or TASKS:
+            scores += TASKS[name](ClipTasks(clip))
+        if progress is not None:
+            progress(done + 1, len(clips), "clips")
+    result = {
+        "benchmark": benchmark.manifest["name"],
+        "digest": digest_of(benchmark),
+        "split": split or "all",
+        "clips": len(clips),
+        "summary": summary(scores),
+        "scores": [vars(score) for score in scores],
+    }
+    if target is not None:
+        with replacing(target) as unfinished:
+            unfinished.write_text(json.dumps(_plain(result), indent=1) + "\n", encoding="utf-8")
+    return result
+
+
+def _plain(node: Any) -> Any:
+    """JSON has no NaN or infinity: both are null."""
+    if isinstance(node, dict):
+        return {key: _plain(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_plain(value) for value in node]
+    if isinstance(node, float):
+        return node if np.isfinite(node) else None
+    return node
+
+
+def summary(scores: Sequence[Score]) -> Summary:
+    """Mean, standard deviation and number of the finite values of each measure, by task and method.
+
+    Parameters
+    ----------
+    scores : of clips and their items, each of which counts once.
+    """
+    values: dict[tuple[str, str, str], list[float]] = {}
+    for score in scores:
+        for name, value in score.values.items():
+            values.setdefault((score.task, score.method, name), []).append(value)
+    found: Summary = {}
+    for (task, method, name), given in values.items():
+        finite = np.array([value for value in given if np.isfinite(value)])
+        entry: dict[str, float] = {"count": len(finite)}
+        if len(finite):
+            entry |= {"mean": float(finite.mean()), "std": float(finite.std())}
+        found.setdefault(task, {}).setdefault(method, {})[name] = entry
+    return found
+
+
+def table(found: Summary) -> str:
+    """The means as a text table, one block for each task."""
+    lines = []
+    for task, methods in found.items():
+        names = list(dict.fromkeys(name for values in methods.values() for name in values))
+        lines.append(f"{task:<20}" + "".join(f"{name:>15}" for name in names))
+        for method, values in methods.items():
+            cells = [values[name].get("mean") if name in values else None for name in names]
+            lines.append(f"  {method:<18}" + "".join(f"{'–' if c is None else f'{c:.4g}':>15}" for c in cells))
+    return "\n".join(lines)

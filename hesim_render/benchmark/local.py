@@ -1,0 +1,166 @@
+"""Worker processes on this machine: they take clips one by one, and a dead one is replaced."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import IO, Any
+
+from hesim_render.benchmark.plan import Clip
+from hesim_render.core.errors import BackendError, OutputError
+
+#: A clip at which a worker dies so many times is given up.
+MOST_DEATHS = 3
+_GRACE_S = 2.0
+#: How a worker process is started.
+COMMAND = (sys.executable, "-c", "from hesim_render.benchmark.worker import main; main()")
+#: Called with the answer for each clip as it comes.
+Told = Callable[[dict[str, Any]], None]
+
+
+@dataclass
+class _Worker:
+    process: subprocess.Popen[str]
+    clip: Clip | None = None
+    is_ready: bool = False
+
+    @property
+    def answers(self) -> IO[str]:
+        assert self.process.stdout is not None
+        return self.process.stdout
+
+    def send(self, text: str) -> None:
+        assert self.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # its death is seen at its answers
+            self.process.stdin.write(text + "\n")
+            self.process.stdin.flush()
+
+
+class LocalWorkers:
+    """Processes that build clips.
+
+    Parameters
+    ----------
+    order : from `order_of`.
+    count : number of processes.
+    threads : threads of the renderer in each; 0 divides the processors among them.
+    """
+
+    def __init__(self, order: str, count: int, threads: int = 0) -> None:
+        self._order, self._count = order, count
+        self._threads = threads or max(1, len(os.sched_getaffinity(0)) // count)
+        self._waits = selectors.DefaultSelector()
+        self._workers: list[_Worker] = []
+
+    @property
+    def pids(self) -> list[int]:
+        """Numbers of the processes that run now."""
+        return [worker.process.pid for worker in self._workers]
+
+    def _start(self) -> _Worker:
+        process = subprocess.Popen(
+            COMMAND,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8", start_new_session=True,
+        )  # fmt: skip
+        worker = _Worker(process)
+        worker.send(f"{self._order}\n{self._threads}")
+        self._workers.append(worker)
+        self._waits.register(worker.answers, selectors.EVENT_READ, worker)
+        return worker
+
+    def run(self, clips: Sequence[Clip], told: Told) -> dict[str, str]:
+        """Build clips.
+
+        Parameters
+        ----------
+        clips : in the order in which they are begun.
+        told : called with each answer of a worker (`attempt`).
+
+        Returns
+        -------
+        Why a clip could not be built, by its name; empty if all are there.
+
+        Raises
+        ------
+        OutputError
+            If a clip cannot be written, as when the disk is full; the finished clips stay.
+        BackendError
+            If workers cannot start.
+        """
+        waiting, deaths, failed = deque(clips), dict.fromkeys((clip.name for clip in clips), 0), {}
+        try:
+            for _ in range(min(self._count, len(waiting))):
+                self._start()
+            while self._workers:
+                for key, _ in self._waits.select():
+                    worker: _Worker = key.data
+                    line = worker.answers.readline()
+                    if not line:
+                        clip, status = worker.clip, self._remove(worker)
+                        if not worker.is_ready:
+                            raise BackendError(f"a worker of the benchmark could not start (status {status})")
+                        if clip is not None:
+                            deaths[clip.name] += 1
+                            if deaths[clip.name] >= MOST_DEATHS:
+                                failed[clip.name] = f"its worker died {MOST_DEATHS} times (last: {_cause(status)})"
+                                told({"name": clip.name, "error": failed[clip.name]})
+                            else:
+                                waiting.append(clip)
+                        if waiting:
+                            self._start()
+                        continue
+                    answer = json.loads(line)
+                    if "ready" in answer:
+                        worker.is_ready = True
+                    else:
+                        worker.clip = None
+                        told(answer)
+                        if "error" in answer:
+                            failed[answer["name"]] = answer["error"]
+                            if answer.get("fatal"):
+                                raise OutputError(answer["error"])
+                    self._give(worker, waiting)
+        finally:
+            self._end()
+        return failed
+
+    def _give(self, worker: _Worker, waiting: deque[Clip]) -> None:
+        """The next clip for a worker; without one, the worker ends."""
+        if not waiting:
+            self._remove(worker)
+            return
+        worker.clip = waiting.popleft()
+        worker.send(json.dumps(worker.clip.as_dict()))
+
+    def _remove(self, worker: _Worker) -> int:
+        self._waits.unregister(worker.answers)
+        self._workers.remove(worker)
+        assert worker.process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            worker.process.stdin.close()
+        worker.answers.close()
+        return worker.process.wait()
+
+    def _end(self) -> None:
+        """End the workers that still run; their unfinished clips leave nothing."""
+        for worker in self._workers:
+            worker.process.terminate()
+        for worker in self._workers:
+            try:
+                worker.process.wait(_GRACE_S)
+            except subprocess.TimeoutExpired:
+                worker.process.kill()
+                worker.process.wait()
+        self._workers.clear()
+        self._waits.close()
+
+
+def _cause(status: int) -> str:
+    return f"signal {-status}" if status < 0 else f"exit status {status}"

@@ -1,0 +1,93 @@
+"""Pictures of clips as measures compare them: linear sRGB of RAW, exposed alike, and encoded."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.benchmark.folder import BenchmarkClip
+from hesim_render.benchmark.metrics import delta_e, learned, learned_measures, psnr, ssim
+from hesim_render.isp.pipeline import Pipeline, process
+from hesim_render.mosaic.layout import Layout
+from hesim_render.recording.manifest import sensor_spec
+from hesim_render.specs.sensor import SensorSpec
+from hesim_render.spectral.transfer import encode_exactly
+
+_LINEAR = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix")
+#: The brightest half percent of the truth becomes this white.
+_PERCENTILE, _WHITE = 99.5, 0.95
+
+
+class Development:
+    """RAW of one clip into comparable pictures.
+
+    Parameters
+    ----------
+    clip : whose mosaic, colours and levels are used.
+    """
+
+    def __init__(self, clip: BenchmarkClip) -> None:
+        self._clip = clip
+
+    @cached_property
+    def sensor(self) -> SensorSpec:
+        """The sensor of the clip."""
+        return sensor_spec(self._clip.recording.manifest, self._clip.recording.path)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Places of frame and event pixels in the region that was read out."""
+        roi = self._clip.recording.manifest["roi"]
+        return Layout(self.sensor, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
+
+    def linear(self, raw: NDArray) -> NDArray[np.float32]:
+        """Linear sRGB [row, col, 3] of RAW [row, col], DN; grey of a sensor without colours."""
+        return np.asarray(process(raw, self._clip.recording.mosaic, self._pipeline), dtype=np.float32)
+
+    @cached_property
+    def _pipeline(self) -> Pipeline:
+        tile = self._clip.recording.mosaic
+        is_mono = len({name for row in tile.tile_filter for name in row if name}) == 1
+        return Pipeline.of("black_level", "demosaic") if is_mono else _LINEAR
+
+    def on_mosaic(self, events_map: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values of the event grid [y, x] at all pixels of the mosaic [row, col].
+
+        They are linear along each row of event pixels, at their own columns, then linear between rows.
+        """
+        rows, cols = self.layout.shape
+        places = self.layout.evs_pixel.reshape(self.layout.evs_shape)
+        row_of, every = places[:, 0] // cols, np.arange(cols)
+        along = np.stack([np.interp(every, p % cols, v) for p, v in zip(places, events_map, strict=True)])
+        at = np.interp(np.arange(rows), row_of, np.arange(len(row_of)))
+        low = np.minimum(at.astype(np.int64), max(0, len(row_of) - 2))
+        weight = (at - low)[:, None]
+        return (1 - weight) * along[low] + weight * along[np.minimum(low + 1, len(row_of) - 1)]
+
+    def scores(self, raw: NDArray, truth: NDArray) -> dict[str, float]:
+        """Measures of a RAW frame against the noise-free one.
+
+        Both are developed to linear sRGB and multiplied by the factor that brings the truth's brightest half percent to
+        0.95. PSNR and SSIM are of the encoded pictures with a peak of 1; ΔE is of the linear ones. `raw_psnr_db` is of
+        the RAW values themselves, over frame pixels, of which 0 is black and 1 is full scale.
+
+        Parameters
+        ----------
+        raw, truth : [row, col], DN.
+        """
+        mosaic = self._clip.recording.mosaic
+        black = mosaic.black_level_dn
+        span = 2**mosaic.bit_depth - 1 - black
+        valid = self.layout.aps_mask
+        found = {"raw_psnr_db": psnr((raw - black) / span, (truth - black) / span, valid=valid)}
+        picture, wanted = self.linear(raw), self.linear(truth)
+        bright = float(np.percentile(wanted, _PERCENTILE))
+        gain = _WHITE / bright if bright > 0 else 1.0
+        picture, wanted = (np.clip(image * gain, 0, 1) for image in (picture, wanted))
+        a, b = encode_exactly(picture), encode_exactly(wanted)
+        found |= {"psnr_db": psnr(a, b), "delta_e": delta_e(picture, wanted)}
+        if min(a.shape[:2]) >= 11:
+            found["ssim"] = ssim(a, b)
+        return found | {name: learned(name, a, b) for name in learned_measures()}

@@ -1,0 +1,133 @@
+"""Sharp images of a clip: noise-free flux of the frame pixels in short windows, and the RAW of a still scene of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.simulate import flux_source
+from hesim_render.core.backend import jit
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import reading
+from hesim_render.core.hdf5 import COMPRESSION, Disk
+from hesim_render.core.units import S_PER_US
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.crosstalk import with_crosstalk
+from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.scene import Scene
+from hesim_render.specs.benchmark import SharpSpec
+
+SHARP_FILE = "sharp.h5"
+
+
+def write_sharp(
+    path: Path, scene: Scene, sensor: Sensor, spec: SharpSpec, duration_us: int, seed: int, quality: float
+) -> int:
+    """Write the sharp images of a clip.
+
+    Parameters
+    ----------
+    path : the HDF5 file: ``time_us`` [time] (middle of row 0's window), ``row_offset_us`` [row], ``flux_e_per_s`` and
+        ``stderr_e_per_s`` [time, row, col] (NaN where there is no frame value), and ``raw_dn`` [time, row, col], what
+        the sensor without noise would read of a still scene of that flux in its own exposure.
+    scene, sensor : of the clip.
+    spec : times and windows.
+    duration_us, seed, quality : of the clip. The error of a flux is that part of the noise of a whole exposure.
+
+    Returns
+    -------
+    The number of images.
+    """
+    aps = sensor.spec.aps
+    assert aps is not None
+    rolling = spec.shutter == "sensor" and aps.shutter == "rolling"
+    offset = np.arange(sensor.rows) * (aps.line_time_us if rolling else 0.0)
+    middles = spec.middles_us(duration_us, float(offset[-1]))
+    types = jit()
+    flux, _ = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, None, False, None)
+    clean, _ = noise_models(sensor, clean=True)
+    assert clean is not None
+    source = with_crosstalk(flux, sensor.layout.shape, sensor.aps.crosstalk)
+    pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
+    row = pixel // sensor.cols
+    shape, exposure_s = (len(middles), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US
+    disk = Disk(path)
+    file = h5py.File(disk, "w")
+    try:
+        with disk.told():
+            file.attrs.update({
+                "flux": "e-/s of each pixel through its own filter, mean over its window", "window_us": spec.window_us,
+                "exposure_us": aps.exposure_us, "shutter": spec.shutter, "quality": quality,
+            })  # fmt: skip
+            file["time_us"] = np.array(middles, dtype=np.float64)
+            file["row_offset_us"] = offset
+            for name, kind in (("flux_e_per_s", "f4"), ("stderr_e_per_s", "f4"), ("raw_dn", "u2")):
+                file.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), compression=COMPRESSION)
+            for number, middle in enumerate(middles):
+                first = middle - spec.window_us / 2 + offset[row]
+                half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
+                a, b = np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
+                image = np.full((2, sensor.rows * sensor.cols), np.nan, np.float32)
+                image[0, pixel], image[1, pixel] = 0.5 * (a + b), np.abs(a - b) * 0.5
+                electrons = np.nan_to_num(image[0], nan=0.0) * np.float32(exposure_s)
+                raw = clean.sample_dn(types.Float(electrons), aps.exposure_us, seed).numpy()
+                raw = np.where(sensor.layout.aps_mask, raw.reshape(shape[1:]), 0)
+                file["flux_e_per_s"][number] = image[0].reshape(shape[1:])
+                file["stderr_e_per_s"][number] = image[1].reshape(shape[1:])
+                file["raw_dn"][number] = raw.astype(np.uint16)
+            file.close()
+            disk.close()
+    except BaseException:
+        file.close()
+        disk.close()
+        raise
+    return len(middles)
+
+
+@dataclass(frozen=True)
+class SharpImages:
+    """Sharp images of a clip on disk; each is read when it is asked for.
+
+    Parameters
+    ----------
+    path : the file that `write_sharp` wrote.
+    """
+
+    path: Path
+
+    def _read(self, name: str, number: int | None = None) -> NDArray:
+        with reading(self.path, "as sharp images"), h5py.File(self.path, "r") as file:
+            if name not in file:
+                raise SpecError(f"has no {name}", file=self.path)
+            return file[name][()] if number is None else file[name][number]
+
+    @property
+    def time_us(self) -> NDArray[np.float64]:
+        """Middles of row 0's windows, [time], µs."""
+        return self._read("time_us")
+
+    @property
+    def row_offset_us(self) -> NDArray[np.float64]:
+        """Delay of each row, [row], µs."""
+        return self._read("row_offset_us")
+
+    def flux_e_per_s(self, number: int) -> NDArray[np.float32]:
+        """Flux of one time, [row, col], e⁻/s; NaN where there is no frame value."""
+        return self._read("flux_e_per_s", number)
+
+    def stderr_e_per_s(self, number: int) -> NDArray[np.float32]:
+        """Standard error of the flux of one time, [row, col], e⁻/s."""
+        return self._read("stderr_e_per_s", number)
+
+    def raw_dn(self, number: int) -> NDArray[np.uint16]:
+        """Noise-free RAW of one time, [row, col], DN."""
+        return self._read("raw_dn", number)
+
+    def nearest(self, t_us: float) -> int:
+        """Number of the image whose time of row 0 is nearest."""
+        return int(np.abs(self.time_us - t_us).argmin())

@@ -1,0 +1,108 @@
+"""A benchmark as a `torch.utils.data.Dataset` (extra ``torch``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.events import voxel_grid
+
+try:
+    import torch
+    from torch.utils.data import Dataset as _Dataset
+except ImportError:  # told when a data set is made
+    torch, _Dataset = None, object
+
+Task = Literal["deblur", "interpolate"]
+_NEIGHBOURS = {"deblur": (0, 0), "interpolate": (1, 1)}
+
+
+class BenchmarkDataset(_Dataset):
+    """Frames of a benchmark with their events and their sharp images, as tensors of RAW.
+
+    An item of ``deblur`` is one frame: ``frame`` float32 [1, row, col] in [0, 1] (black to full scale), ``sharp`` of
+    the same shape (the nearest sharp image to the middle of the exposure), ``valid`` bool [1, row, col] and ``voxels``
+    float32 [bin, y, x] of the events of the exposure. An item of ``interpolate`` is a frame k with a neighbour on each
+    side: ``before`` and ``after``, ``sharp`` of frame k, and the voxels from the middle of one neighbour to that of the
+    other. Both have ``clip`` (name), ``index`` (number of the frame) and ``t_us`` of the sharp image.
+
+    Parameters
+    ----------
+    root : folder of the benchmark.
+    split : ``train``, ``val``, ``test``, or None for all.
+    task : ``deblur`` or ``interpolate``.
+    bins : number of bins of the voxel grid.
+    transform : called with each item; what it returns is the item.
+
+    Raises
+    ------
+    RangeError
+        If the task is unknown.
+    SpecError
+        If PyTorch is missing, the folder is no finished benchmark, or no clip of the split has such items.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str | None = "train",
+        task: Task = "deblur",
+        bins: int = 5,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> None:
+        if torch is None:
+            raise SpecError("the loader needs PyTorch: pip install 'hesim_render[torch]'")
+        if task not in _NEIGHBOURS:
+            raise RangeError("task", task, "deblur or interpolate")
+        self._task, self._bins, self._transform = task, bins, transform
+        before, after = _NEIGHBOURS[task]
+        self._clips: list[BenchmarkClip] = []
+        self._items: list[tuple[int, int]] = []
+        for clip in Benchmark(root).clips(split):
+            counts = clip.content["counts"]
+            if counts["sharp"]:
+                self._items += [(len(self._clips), k) for k in range(before, counts["frames"] - after)]
+                self._clips.append(clip)
+        if not self._items:
+            raise SpecError(f"no clip of the split {split} has frames and sharp images for {task}", file=root)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __getitem__(self, item: int) -> Any:
+        number, k = self._items[item]
+        # opened anew for each item: an open HDF5 file must not be shared by the processes of a loader
+        clip = BenchmarkClip(self._clips[number].folder)
+        recording, sharp = clip.recording, clip.sharp
+        assert sharp is not None
+        mosaic = recording.mosaic
+        span = 2**mosaic.bit_depth - 1 - mosaic.black_level_dn
+
+        def signal(raw: np.ndarray) -> Any:
+            values = np.clip((raw.astype(np.float32) - mosaic.black_level_dn) / span, 0, 1).astype(np.float32)
+            return torch.from_numpy(values)[None]
+
+        def middle(frame: Any) -> float:
+            return frame.exposure_start_us + frame.exposure_us / 2
+
+        frame = recording.frames[k]
+        nearest = sharp.nearest(middle(frame))
+        found: dict[str, Any] = {"clip": clip.name, "index": k, "t_us": float(sharp.time_us[nearest])}
+        found["sharp"] = signal(sharp.raw_dn(nearest))
+        found["valid"] = torch.from_numpy(np.ascontiguousarray(frame.valid))[None]
+        if self._task == "deblur":
+            found["frame"] = signal(frame.raw)
+            begin, end = float(frame.exposure_start_us), float(frame.exposure_start_us + frame.exposure_us)
+        else:
+            first, last = recording.frames[k - 1], recording.frames[k + 1]
+            found |= {"before": signal(first.raw), "after": signal(last.raw)}
+            begin, end = middle(first), middle(last)
+        events = recording.event_slice(int(np.floor(begin)), int(np.ceil(end)) + 1)
+        if 0 not in recording.event_shape:
+            found["voxels"] = torch.from_numpy(voxel_grid(events, recording.event_shape, self._bins, begin, end))
+        return found if self._transform is None else self._transform(found)

@@ -1,0 +1,93 @@
+"""A worker process: takes clips from its standard input, one line each, and answers with one line each.
+
+A worker of dask calls `attempt`. Errors travel as text, because exceptions with several arguments cannot be pickled.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from hesim_render import __version__
+from hesim_render.benchmark.clip import build_clip
+from hesim_render.benchmark.plan import Clip, Plan
+from hesim_render.core.errors import HesimError, OutputError
+from hesim_render.core.output import discard_unfinished
+from hesim_render.specs.benchmark import BenchmarkSpec
+
+#: One clip at a time in a process, even if a scheduler gives it several threads.
+_one_at_a_time = threading.Lock()
+
+
+def order_of(spec: BenchmarkSpec, root: Path) -> str:
+    """Everything that a worker needs to build clips of a benchmark, as one line of text."""
+    content = {"spec": spec.model_dump(mode="json"), "folder": str(spec.folder.resolve()), "root": str(root)}
+    return json.dumps({**content, "version": __version__}, sort_keys=True)
+
+
+@functools.lru_cache(maxsize=4)
+def _opened(order: str) -> tuple[Plan, Path, str]:
+    content = json.loads(order)
+    spec = BenchmarkSpec.model_validate(content["spec"]).model_copy(update={"folder": Path(content["folder"])})
+    return Plan(spec), Path(content["root"]), content["version"]
+
+
+def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
+    """Build a clip and tell what became of it.
+
+    Parameters
+    ----------
+    order : from `order_of`.
+    clip : fields of a `Clip`.
+
+    Returns
+    -------
+    ``name``, and ``seconds`` and ``bytes``, or ``error`` and ``fatal`` (True where other clips would fail as well).
+    """
+    with _one_at_a_time:
+        name = str(clip["name"])
+        try:
+            plan, root, version = _opened(order)
+            if version != __version__:
+                text = f"this worker has hesim_render {__version__}, and the build was started by {version}"
+                return {"name": name, "error": text, "fatal": True}
+            built = build_clip(plan, Clip(**clip), root)
+        except HesimError as error:
+            return {"name": name, "error": str(error), "fatal": isinstance(error, OutputError)}
+        return {"name": name, "seconds": built.seconds, "bytes": built.bytes}
+
+
+def _stop(*_: object) -> None:
+    discard_unfinished()
+    os._exit(128 + signal.SIGTERM)
+
+
+def main() -> None:
+    """Serve clips until the standard input ends."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what libraries print is no answer
+    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one decides
+
+    def answer(content: dict[str, Any]) -> None:
+        answers.write(json.dumps(content) + "\n")
+        answers.flush()
+
+    order = sys.stdin.readline()
+    threads = int(sys.stdin.readline() or 0)
+    if threads:
+        import drjit as dr
+
+        from hesim_render.core import backend
+
+        backend.jit()
+        dr.set_thread_count(threads)
+    answer({"ready": True})
+    for line in sys.stdin:
+        answer(attempt(order.strip(), json.loads(line)))

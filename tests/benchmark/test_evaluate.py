@@ -1,0 +1,111 @@
+"""Evaluation of small benchmarks: which scores come, and that they mean what they say."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from benchmarks import small
+from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
+from hesim_render.benchmark.evaluate import summary, table
+from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.tasks import ClipTasks, Score
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.specs.files import data_folder
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A turning star seen by event pixels of a hybrid mosaic, which leak."""
+    keys = {"aps.frame_rate_hz": 60, "evs.leak_rate_hz": 200}
+    spec = small(
+        scenes={"given": [{"scene": "rotating-star", "split": "test"}]}, duration_s=0.048,
+        sensors=[{"sensor": "mipi-hybridevs", "roi": "24x16", "set": keys}],
+        exposures_us=[12_000], sharp={"times_us": [6000, 22667, 39333], "window_us": 500}, truth=["events"],
+    )  # fmt: skip
+    return build_benchmark(spec, tmp_path_factory.mktemp("evaluated") / "b", estimate=False)
+
+
+def test_every_task_has_scores(built, tmp_path):
+    result = evaluate_benchmark(built.root, out=tmp_path / "r.json")
+    found = result["summary"]
+    assert set(found["deblur"]) == {"blurred", "double-integral"}
+    assert set(found["interpolate"]) == {"hold", "average", "double-integral"}
+    assert set(found["denoise"]) == set(found["fidelity"]) == {"none", "nearest-neighbour", "background-activity"}
+    assert found["denoise"]["none"]["noise_kept"]["mean"] == 1
+    assert found["fidelity"]["none"]["count_error"]["count"] + found["denoise"]["none"]["noise_kept"]["count"] >= 1
+    blurred = found["deblur"]["blurred"]
+    assert 10 < blurred["psnr_db"]["mean"] < 60 and 0 < blurred["ssim"]["mean"] < 1 and blurred["delta_e"]["mean"] > 0
+    assert blurred["psnr_db"]["count"] == len(next(built.clips()).recording.frames)
+    stored = json.loads((tmp_path / "r.json").read_text())
+    assert stored["summary"]["deblur"]["blurred"] == blurred and stored["digest"] == result["digest"]
+    assert "double-integral" in table(found)
+
+
+def test_a_perfect_answer_scores_perfectly(built):
+    clip = next(built.clips())
+    truth = clip.sharp.raw_dn(1).astype(float)
+    found = Development(clip).scores(truth, truth)
+    assert found["psnr_db"] == found["raw_psnr_db"] == np.inf and found["ssim"] == 1 and found["delta_e"] == 0
+    # twice as far off: 6.02 dB
+    step = np.where(np.indices(truth.shape).sum(axis=0) % 2, 8.0, -8.0)
+    near, far = (Development(clip).scores(truth + k * step, truth)["raw_psnr_db"] for k in (1, 2))
+    assert near - far == pytest.approx(20 * np.log10(2), abs=0.05)
+
+
+def test_values_of_the_event_grid_reach_the_right_pixels(built):
+    """A map that is linear in the place of the event pixels is the same function at all pixels between."""
+    development = Development(next(built.clips()))
+    layout = development.layout
+    cols = layout.shape[1]
+    places = layout.evs_pixel.reshape(layout.evs_shape)
+    row, col = places // cols, places % cols
+    on_mosaic = development.on_mosaic(2.0 * row + 0.5 * col)
+    # in every row there are event pixels on both sides of these columns
+    r, c = np.mgrid[row.min() : row.max() + 1, col.min(axis=1).max() : col.max(axis=1).min() + 1]
+    assert r.size > 100 and on_mosaic[r, c] == pytest.approx(2.0 * r + 0.5 * c)
+    assert development.on_mosaic(np.ones(layout.evs_shape)) == pytest.approx(1)
+
+
+def test_means_are_over_finite_values():
+    scores = [Score("a", "t", "m", k, {"v": value}) for k, value in enumerate((1.0, 3.0, np.inf))]
+    assert summary(scores)["t"]["m"]["v"] == {"count": 2, "mean": 2.0, "std": 1.0}
+
+
+def test_what_cannot_be_evaluated_is_refused(built, tmp_path):
+    with pytest.raises(RangeError, match="did you mean 'deblur'"):
+        evaluate_benchmark(built.root, tasks=["debblur"])
+    with pytest.raises(RangeError, match="a split that has clips"):
+        evaluate_benchmark(built.root, split="val")
+    with pytest.raises(SpecError, match="no benchmark"):
+        evaluate_benchmark(tmp_path)
+    shutil.copytree(built.root, tmp_path / "changed")
+    clip = next(Benchmark(tmp_path / "changed").clips())
+    (clip.folder / "clip.json").write_text("{}")
+    with pytest.raises(SpecError, match="was changed or removed"):
+        evaluate_benchmark(tmp_path / "changed")
+
+
+@pytest.mark.slow
+def test_the_double_integral_gains_on_renders_and_noise_takes_it(tmp_path):
+    """An asynchronous sensor before a star that turns by a spoke within the exposure."""
+    text = (data_folder("scenes") / "rotating-star.yaml").read_text()
+    text = text.replace("illuminance_lux: 2000", "illuminance_lux: 60").replace("t_us: 2000000", "t_us: 600000")
+    (tmp_path / "star.yaml").write_text(text)
+    levels = [{"name": "clean", "clean": True}, {"name": "standard"}, {"name": "noisy", "set": NOISY}]
+    spec = small(
+        scenes={"given": [{"scene": "star.yaml", "split": "test"}]}, duration_s=0.026,
+        sensors=[{"sensor": "davis346", "roi": "64x48"}], exposures_us=[24_000], quality=1, noise=levels,
+        sharp={"times_us": [12_000], "window_us": 500}, truth=[],
+    ).model_copy(update={"folder": tmp_path})  # fmt: skip
+    built = build_benchmark(spec, tmp_path / "b", estimate=False)
+    gains = {}
+    for clip in built.clips():
+        scores = {score.method: score.values["raw_psnr_db"] for score in ClipTasks(clip).deblur()}
+        gains[clip.content["noise"]] = scores["double-integral"] - scores["blurred"]
+    print(gains)
+    assert gains["clean"] > 3 and gains["clean"] > gains["standard"] > gains["noisy"], gains
+
+
+NOISY = {"evs.leak_rate_hz": 50.0}
