@@ -8,6 +8,7 @@ from pathlib import Path
 
 import capture_sets
 import event_files
+import more_subjects as more
 import numpy as np
 import recordings
 import reset_captures
@@ -310,6 +311,11 @@ SUBJECTS = {
     "targets": (target_scene, build_targets, "s.yaml chart.yaml cube.npy a.glb b.stl way.csv way.tum patches.csv"),
     "exchange": (event_files_of_others, import_events, "*/events.*"),
     "labelled": (labelled, read_labelled, "r/truth/*.h5 r/recording.json"),
+    "surfaces": (more.surfaces, build_scene, "s.yaml t.png cube.npy sky.exr curve.csv"),
+    "lens": (more.lens, more.use_lens, "s.yaml psf.npy sheet.yaml"),
+    "studies": (more.studies, more.read_studies, "*.yaml"),
+    "cubes": (more.cubes, more.read_cubes, "a.hdr a.img b.mat c.mat"),
+    "benchmark": (more.benchmark, more.read_plan, "b.yaml"),
 }
 
 

@@ -1,0 +1,121 @@
+"""More of what is damaged: surfaces, lenses, data sheets, studies, hyperspectral cubes and benchmarks."""
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import scipy.io
+from PIL import Image
+
+import hesim_render as hr
+from benchmarks import SMALL
+
+_SHIPPED = Path(__file__).parents[2]
+_BANDS = np.arange(400.0, 701.0, 10.0)
+
+
+def surfaces(folder):
+    """Pictures and materials on objects, an environment map, and a track with a parent."""
+    from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+
+    rng = np.random.default_rng(6)
+    Image.fromarray(rng.integers(0, 255, (8, 8, 3), dtype=np.uint8)).save(folder / "t.png")
+    np.save(folder / "cube.npy", rng.random((4, 6, 5), dtype=np.float32))
+    mi = mitsuba()
+    mi.Bitmap(rng.random((4, 8, 3), dtype=np.float32)).write(str(folder / "sky.exr"))
+    (folder / "curve.csv").write_text("360,0.4\n830,0.5\n")
+    (folder / "s.yaml").write_text(
+        "schema_version: 1\nname: x\ndescription: d\nobjects:\n"
+        "  - {name: a, shape: sphere, size_m: [0.1, 0.1, 0.1], texture: {file: t.png, repeat: [2, 3]}}\n"
+        "  - {name: b, shape: box, texture: {file: cube.npy, wavelength_nm: [400, 475, 550, 625, 700], beyond: hold}}\n"
+        "  - {name: c, shape: rectangle, size_m: [1, 1, 0], position_m: [0, 0, -0.2],\n"
+        "     material: {type: roughplastic, alpha: 0.1, diffuse_reflectance: curve.csv}}\n"
+        "  - {name: d, shape: sphere, size_m: [0.1, 0.1, 0.1], position_m: [0, 0.3, 0],\n"
+        "     emission: {luminance_cd_m2: 10, waveform: {type: pwm, frequency_hz: 100, duty: 0.5}}}\n"
+        "motion:\n  - object: a\n    keyframes:\n      - {t_us: 0}\n      - {t_us: 900, rotation_deg: 90}\n"
+        "  - object: b\n    parent: a\n    repeat: true\n    keyframes:\n      - {t_us: 0}\n"
+        "      - {t_us: 500, rotation_axis: [1, 0, 0], rotation_deg: 360}\n"
+        "light: {type: environment, file: sky.exr, illuminance_lux: 100, rotation_deg: 20}\n"
+        "camera: {origin_m: [0, 0, 2]}\n"
+    )
+
+
+def lens(folder):
+    """A sensor with all effects of the lens and a measured PSF, and one from a data sheet."""
+    kernel = np.zeros((3, 5, 5))
+    kernel[:, 1:4, 1:4] = 1 / 9
+    np.save(folder / "psf.npy", kernel)
+    text = (_SHIPPED / "sensors" / "reference-mono.yaml").read_text()
+    begin, end = text.index("lens:"), text.index("\naps:")
+    own = (
+        "lens:\n  f_number: 4.0\n  focal_length_mm: 16.0\n  relative_illumination: cos4\n"
+        "  distortion: {model: opencv, k1: -0.2, k2: 0.05, p1: 0.001}\n  depth_of_field: true\n  diffraction: true\n"
+        "  psf: {type: measured, file: psf.npy, sample_um: 2.5, image_height_mm: [0, 1.5, 3]}\n"
+        "  lateral_chromatic: {wavelength_nm: [400, 550, 700], relative: [0.0005, 0, -0.0005]}\n  veiling_glare: 0.02\n"
+    )
+    (folder / "s.yaml").write_text(text[:begin] + own + text[end:])
+    shutil.copy(_SHIPPED / "sensors" / "imx636.yaml", folder / "sheet.yaml")
+
+
+def use_lens(folder):
+    from hesim_render.sources.render.projection import Projection
+
+    made = hr.load_sensor(folder / "s.yaml")
+    Projection.of(made).unproject([[0.0, 0.0], [10.0, 20.0]])
+    sheet = hr.load_sensor(folder / "sheet.yaml")
+    if sheet.spec.evs is not None and sheet.spec.geometry.rows > 8 and sheet.spec.geometry.cols > 8:
+        _ = sheet.crop(8, 8).evs.threshold_on_map
+
+
+def studies(folder):
+    for kind, name in (("study", "five-cfas"), ("design", "rggb-dyes"), ("sweep", "light-and-exposure")):
+        shutil.copy(_SHIPPED / f"{kind}_specs" / f"{name}.yaml", folder / f"{kind}.yaml")
+    shutil.copy(_SHIPPED / "filter_sets" / "rccb.yaml", folder / "set.yaml")
+    shutil.copy(_SHIPPED / "palettes" / "dyes.yaml", folder / "palette.yaml")
+
+
+def read_studies(folder):
+    from hesim_render.specs.design import read_design
+    from hesim_render.specs.filter_set import read_filter_set, read_palette
+    from hesim_render.specs.study import read_study
+    from hesim_render.specs.sweep import read_sweep
+
+    for read, name in (
+        (read_study, "study"), (read_design, "design"), (read_sweep, "sweep"), (read_filter_set, "set"),
+        (read_palette, "palette"),
+    ):  # fmt: skip
+        read(folder / f"{name}.yaml")
+
+
+def cubes(folder):
+    from spectral.io import envi
+
+    rng = np.random.default_rng(7)
+    cube = rng.random((7, 5, 31), dtype=np.float32)
+    header = {"wavelength": _BANDS.tolist(), "wavelength units": "nm"}
+    envi.save_image(str(folder / "a.hdr"), cube, metadata=header, dtype=np.float32)
+    scipy.io.savemat(folder / "b.mat", {"ref": cube.astype(float), "lbl": np.ones((7, 5))})
+    with h5py.File(folder / "c.mat", "w") as file:
+        file["cube"], file["bands"] = cube.transpose(2, 1, 0), _BANDS[None]
+
+
+def read_cubes(folder):
+    from hesim_render.targets.cube_file import open_cube
+
+    for name in ("a.hdr", "b.mat", "c.mat"):
+        found = open_cube(folder / name)
+        assert found.whole().shape == found.shape
+
+
+def benchmark(folder):
+    (folder / "b.yaml").write_text(json.dumps(SMALL, indent=1))
+
+
+def read_plan(folder):
+    from hesim_render.benchmark.plan import Plan
+    from hesim_render.specs.benchmark import read_benchmark
+
+    for clip in Plan(read_benchmark(folder / "b.yaml")).clips:
+        assert clip.name
