@@ -146,7 +146,7 @@ def falling_objects(rng):
         frames = [turned(1e6 * t, axis, rate * t, [0, -GRAVITY * t * t / 2, 0]) for t in times]
         motion.append({"object": name, "pivot_m": rounded(place), "keyframes": frames})
     camera = {"origin_m": [0, 0.9, 2.2], "target_m": [0, 0.75, -0.2], "horizontal_fov_deg": 40}
-    return "Fifty solids that fall and tumble.", objects, [LAMP, SKY], camera, motion
+    return "Fifty solids that fall and tumble before a wall of tiles.", objects, [LAMP, SKY], camera, motion
 
 
 def hand_held(rng):

@@ -475,7 +475,8 @@ def test_counts_that_no_law_describes_give_no_numbers(tmp_path):
     assert not (tmp_path / "calibration.yaml").exists()
 
 
-@pytest.mark.parametrize("name", ["gen2", pytest.param("mipi-hybridevs", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gen2", "mipi-hybridevs"])
 def test_white_event_pixels_take_their_signal_from_the_frames(name, tmp_path):
     """No frame pixel is white: the light stated in capture.yaml tells white from the colours around it."""
     sensor = hr.load_sensor(name, BUSY).crop(192, 192)

@@ -166,6 +166,7 @@ def kill_at_random(trial, times, seed):
         assert status in (0, 130, -signal.SIGINT, -number), status
 
 
+@pytest.mark.slow
 def test_view_killed_at_every_step(tmp_path):
     trial = Trial("view", tmp_path / "view")
     kill_at_every_step(trial, most=2)

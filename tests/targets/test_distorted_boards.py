@@ -80,7 +80,9 @@ def calibrated(target, model, count, seed, window=None):
     return np.abs(own / focal - 1).max(), centre, np.abs(off).max() / np.abs(displacement).max(), len(views)
 
 
-@pytest.mark.parametrize("model", [RADIAL, FISHEYE], ids=["opencv", "fisheye"])
+@pytest.mark.parametrize(
+    "model", [pytest.param(RADIAL, id="opencv"), pytest.param(FISHEYE, id="fisheye", marks=pytest.mark.slow)]
+)
 def test_opencv_finds_camera_and_distortion_from_a_few_checkerboards(model):
     focal, centre, distortion, count = calibrated(CHECKERBOARD, model, 9, 1)
     # bounds of 20 boards are 0.001, 0.001 and 0.02; errors of 9 are 1.5 times as large

@@ -69,7 +69,7 @@ def test_static_pixels_are_the_same_to_the_bit_in_every_tick_and_frame():
     assert np.any(first.raw != last.raw)
 
 
-@pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
+@pytest.mark.parametrize("name", [pytest.param("rotating-star", marks=pytest.mark.slow), "camera-sweep"])
 def test_flux_does_not_depend_on_what_was_asked_for_before(name):
     scene = hr.load_scene(name)
     source = ChangeDrivenFlux(scene, noisy(48, 36), seed=3)
@@ -150,7 +150,7 @@ def long_traces(scene, sensor, begin_us, end_us, rays=4096, seeds=(901, 902)):
     return np.mean(runs, axis=0), np.std(runs, axis=0, ddof=1) / len(seeds) ** 0.5
 
 
-@pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
+@pytest.mark.parametrize("name", ["rotating-star", pytest.param("camera-sweep", marks=pytest.mark.slow)])
 def test_quality_is_reached_and_the_error_that_is_told_is_the_error(name):
     """Against long traces; the mean square over 3072 pixels of a skewed distribution, three runs: false alarm 1e-3."""
     scene, sensor = hr.load_scene(name), noisy()
@@ -226,7 +226,7 @@ SURPRISES = {
 
 
 #: The others take a quarter of a minute each.
-QUICK = ("small fast object", "moving shadow")
+QUICK = ("small fast object",)
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SURPRISES])

@@ -49,6 +49,7 @@ def test_glare_spreads_a_part_of_the_light_of_the_whole_sensor():
         ChangeDrivenFlux(scene, rendering.mono(32, 24, lens__veiling_glare=0.1))
 
 
+@pytest.mark.slow
 def test_glare_has_the_light_of_each_pixels_own_time():
     """The card leaves the picture, with the camera, between the first window and the last."""
     track = {"object": "camera", "pivot_m": [0, 0, 1], "keyframes": [

@@ -63,11 +63,14 @@ def _composed(text: str) -> dict[str, Trajectory]:
 
 
 def _product(parent: Trajectory, own: TrackSpec) -> Trajectory:
-    """The track that moves as `own` on something that moves as `parent`.
+    """The track that moves as `own` on something that moves as `parent`; if one of them is at rest, the other.
 
     Keyframes are set where one of the two has them, and between them as densely as the tolerance asks for.
     """
     child = Trajectory(own)
+    for still, other in ((child, parent), (parent, child)):
+        if not still.moves and np.array_equal(still.matrix(0.0), np.eye(4)):
+            return other
     begin, end, repeat = _span(parent, child, own.object)
     inner = [track.ends_us(begin, end) for track in (parent, child)]
     times = np.unique(np.concatenate([[begin, end], *inner])).astype(np.int64)
