@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
@@ -30,7 +32,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if status == INTERRUPTED:  # newer typer turns the exception into this status itself
             discard_unfinished()
             complain("interrupted")
+            if arguments is None:
+                _leave_at_once()
     sys.exit(status)
+
+
+def _leave_at_once() -> None:
+    """End the process without Python's own clearing up: native threads may still run kernels whose memory it frees."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(INTERRUPTED)
 
 
 def _note(otherwise: Callable[..., None]) -> Callable[..., None]:

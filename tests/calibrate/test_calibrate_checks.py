@@ -253,7 +253,13 @@ GOOD_EVENTS = {"plain": {"mismatch": 0.0}, "mismatch": {}, "wide mismatch": {"mi
                "leak": {"leak": 2e-4}, "asymmetry": {"rho": 0.01}}  # fmt: skip
 
 
-@pytest.mark.parametrize("keys", GOOD_EVENTS.values(), ids=GOOD_EVENTS.keys())
+@pytest.mark.parametrize(
+    "keys",
+    [
+        pytest.param(keys, id=name, marks=pytest.mark.slow if name in ("leak", "asymmetry") else ())
+        for name, keys in GOOD_EVENTS.items()
+    ],
+)
 def test_good_events_are_not_blamed(tmp_path, keys):
     """4 checks of a chance of 1e-4 each: a false alarm of all in 0.2 % of changed seeds."""
     section, report = events_of(tmp_path, size=64, **keys)

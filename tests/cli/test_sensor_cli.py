@@ -19,6 +19,7 @@ def call(capsys, *arguments):
     return stop.value.code, out, err
 
 
+@pytest.mark.slow
 def test_describe_shows_figures_and_curves(capsys, tmp_path):
     file = tmp_path / "curves.png"
     status, out, _ = call(capsys, "sensor", "describe", "imx636", "--out", file)

@@ -144,6 +144,19 @@ def test_handlers_are_put_back():
     assert signal.set_wakeup_fd(wakeup) == wakeup
 
 
+def test_the_status_of_an_interrupt_does_not_depend_on_what_happens_at_the_end():
+    """Clearing up may crash where native threads still run; here it does in any case."""
+    code = (
+        "import atexit, os, signal, sys, hesim_render.cli as cli\n"
+        "cli._run = lambda *_: cli.INTERRUPTED\n"
+        "atexit.register(os.kill, os.getpid(), signal.SIGSEGV)\n"
+        "print('written')\n"
+        "cli.main()\n"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (child.returncode, child.stdout, child.stderr) == (INTERRUPTED, "written\n", "hesim-render: interrupted\n")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_a_command_ends_within_two_seconds_whenever_it_is_interrupted(seed, tmp_path):

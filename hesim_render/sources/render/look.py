@@ -24,6 +24,8 @@ _LONGER_SIDE, _BESIDE = 640, 0.125
 _COLOURS_NM = (610.0, 545.0, 465.0, 465.0)
 #: Brightness of a surface seen at a grazing angle, and of what is outside of the picture.
 _GRAZING, _OUTSIDE = 0.35, 0.45
+#: Reflectance that stands for glass and metal.
+_CLEAR = 0.3
 _SKY = (0.25, 0.30, 0.40)
 
 
@@ -96,7 +98,11 @@ def _colours(mi: MitsubaModule, scene: MitsubaObject, view: View, x: NDArray, y:
     ray = mi.RayDifferential3f(mi.Point3f(*origin), mi.Vector3f(*direction), mi.Float(0.0), bands)
     si = scene.ray_intersect(ray)
     hit = si.is_valid()
-    reflected = si.bsdf(ray).eval_diffuse_reflectance(si, hit)
+    bsdf = si.bsdf(ray)
+    reflected = bsdf.eval_diffuse_reflectance(si, hit)
+    # glass and metal have no diffuse part; without light they would be black
+    clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+    reflected = dr.select(clear & ~dr.any(reflected > 0), _CLEAR, reflected)
     shade = _GRAZING + (1 - _GRAZING) * dr.abs(dr.dot(si.n, ray.d))
     shines = dr.any(si.emitter(scene, hit).eval(si, hit) > 0) & hit
     found = []

@@ -81,6 +81,7 @@ def test_cover_and_stretch_frame_the_cube_and_average_texels(tmp_path):
     np.testing.assert_allclose(stretched, (thirds[::2] + thirds[1::2]) / 2, rtol=2e-3)
 
 
+@pytest.mark.filterwarnings("ignore::hesim_render.core.errors.HesimWarning")
 def test_an_image_that_pans_is_shifted_and_blurred(tmp_path):
     sensor = hr.load_sensor(RGGB).crop(48, 32)
     path = saved(tmp_path, texture(32, 48))

@@ -189,7 +189,7 @@ def test_the_mean_has_no_bias():
     assert abs(np.mean(means)) < 4.4 * error
 
 
-@pytest.mark.parametrize("quality", [0.3, 2.0])
+@pytest.mark.parametrize("quality", [pytest.param(0.3, marks=pytest.mark.slow), 2.0])
 def test_render_noise_on_a_static_scene_makes_no_event(quality):
     rec = hr.simulate(
         hr.load_scene("cornell-box"), hr.load_sensor("gen2").crop(64, 48), duration_s=0.02, clean=True, quality=quality

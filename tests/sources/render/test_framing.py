@@ -118,6 +118,17 @@ def test_the_picture_shows_the_surfaces_and_the_region():
     assert tuple(found.picture[int(top) - 1, cols // 2]) == (255, 255, 255)  # the region's outline
 
 
+@pytest.mark.parametrize("material", ["dielectric", "conductor", "diffuse"])
+def test_glass_and_metal_are_shown_in_grey(material):
+    """A ball that is seen, before a black card; a matt ball keeps its own reflectance."""
+    ball = {"name": "ball", "shape": "sphere", "size_m": [0.1] * 3, "position_m": [0, 0, 0.06], "material": material}
+    scene = scene_of({**CARD, "reflectance": 0.0}, {"fit": "target", "fit_margin": 0.5}, objects=[ball])
+    picture = look(scene, mono(60, 40)).picture
+    middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]
+    # sRGB of a reflectance of 0.3 (149), or of Mitsuba's own 0.5 (188), towards the camera
+    assert np.all(np.abs(middle - (188.0 if material == "diffuse" else 149.0)) < 6)
+
+
 def test_an_option_shows_darkness_and_moved_cameras_and_writes_one_picture(tmp_path, capsys):
     def run(*options):
         with pytest.raises(SystemExit) as caught:

@@ -97,7 +97,9 @@ MOST_MISSED, MOST_EXTRA = 0.02, 0.01
 RAYS = dict.fromkeys(hidden_scenes.SCENES, 1024) | {"400 sparks": 4096}
 
 
-@pytest.mark.parametrize("name", [FAST[1], FAST[2], pytest.param(FAST[0], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [FAST[1], *(pytest.param(name, marks=pytest.mark.slow) for name in (FAST[0], FAST[2]))]
+)
 def test_nothing_goes_by_unseen(name):
     total, told, missed, extra = judge(name, 1, RAYS[name])
     assert total["true"] > 50

@@ -31,13 +31,8 @@ def test_a_motion_scene_has_texture(name):
     assert len(textured) >= 50
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=() if n in ("falling-objects", "glass-and-metal") else pytest.mark.slow)
-        for n in script.SCENES
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", script.SCENES)
 def test_a_motion_scene_moves(name):
     scene = hr.load_scene(name)
     sensor = hr.load_sensor("reference-mono").crop(32, 24)

@@ -81,7 +81,10 @@ def lamps(count):
     }
 
 
-@pytest.mark.parametrize(("depth", "roulette"), [(2, 16), (4, 16), (12, 16), (12, 3)])
+@pytest.mark.parametrize(
+    ("depth", "roulette"),
+    [(2, 16), pytest.param(4, 16, marks=pytest.mark.slow), pytest.param(12, 16, marks=pytest.mark.slow), (12, 3)],
+)
 @pytest.mark.parametrize("light", [{"sky": SKY}, {"lamp": LAMP, "sky": SKY}, lamps(3), lamps(12)])
 def test_paths_are_those_of_mitsuba(light, depth, roulette, draws_of_mitsuba):
     """However long they are, and whatever their last segment may run into: the same rays to the same value.

@@ -39,7 +39,16 @@ def bayer(cols=32, rows=24):
 
 
 #: Targets that are built as others are: polygons of a few reflectances.
-ALIKE = ("circle-grid", "dot-grid", "edge-field", "grey-ramp", "resolution-wedges", "siemens-star", "step-wedge")
+ALIKE = (
+    "checkerboard",
+    "circle-grid",
+    "dot-grid",
+    "edge-field",
+    "grey-ramp",
+    "resolution-wedges",
+    "siemens-star",
+    "step-wedge",
+)
 #: Darkness, and streets at night and by day.
 OTHER_LIGHT = ("dark", "traffic-light", "facade-drive")
 
