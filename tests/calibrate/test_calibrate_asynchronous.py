@@ -419,6 +419,7 @@ def session(tmp_path_factory):
 DAVIS = Pixels(theta_on=0.2, theta_off=0.2, mismatch=0.15, r=0.2, shot=0.03, dark=0.04, cutoff_hz=300.0, leak_hz=0.01)
 
 
+@pytest.mark.slow
 def test_a_session_of_davis346_gives_its_own_parameters_back(session):
     sensor, folder = session
     section = read_calibration(folder / "calibration.yaml")["evs"]
@@ -464,6 +465,7 @@ def test_a_calibrated_sensor_behaves_like_the_captured_one(session, tmp_path):
                 assert np.all(np.abs(p1 - there) < 6 * error + 0.06 * p1 * (1 - p1) + 0.02 * (name == "evs_s_curve"))
 
 
+@pytest.mark.slow
 def test_calibrations_of_the_two_kinds_of_sensor_are_not_mixed_up(session):
     _, folder = session
     with pytest.raises(SpecError, match="the sensor needs reference 'last_event'"):

@@ -67,6 +67,7 @@ def test_the_sizes_of_drifts_are_told(tmp_path):
     assert deviation[20000] - deviation[1000] == pytest.approx(0.016, abs=0.003)
 
 
+@pytest.mark.slow
 def test_row_noise_is_measured_and_taken_out_of_the_variance(tmp_path):
     """Four seeds of 1.5 DN and 64 rows: z of row noise, of β0 and β1 of four positions; 4.5 sigma (36 values, 2e-4)."""
     z = []

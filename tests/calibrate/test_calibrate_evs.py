@@ -307,6 +307,7 @@ def test_two_hundred_starts_end_at_one_point(plain, mismatched, tmp_path):
         assert max(study["largest_difference_in_standard_errors"]) < 0.01
 
 
+@pytest.mark.slow
 def test_bootstrap_agrees_with_the_information(tmp_path):
     folder = capture_sets.generated(1)
     calibrate_evs(folder, tmp_path / "c.yaml", bootstrap=40)

@@ -454,6 +454,7 @@ def test_without_a_measured_threshold_the_files_own_is_kept(tmp_path):
     assert 0.2 / 0.00075 * one.beta2 / one.beta4 == pytest.approx(data["positions"][0]["B"]["value"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_sensor_with_poisson_events_gives_its_own_parameters(tmp_path):
     """reference-mono: A = θβ1/β4 = 5, B = 5, C = √2/0.02; rates from 0.46 to 1e-4. False alarm 6e-5 each."""
     folder = write_captures(hr.load_sensor("reference-mono").crop(64, 64), tmp_path / "c", frames=8, ticks=4000)
@@ -465,6 +466,7 @@ def test_a_sensor_with_poisson_events_gives_its_own_parameters(tmp_path):
         assert section[name]["standard_error"] < 0.1 * true
 
 
+@pytest.mark.slow
 def test_counts_that_no_law_describes_give_no_numbers(tmp_path):
     folder = write_captures(hr.load_sensor("reference-mono").crop(64, 64), tmp_path / "c", frames=8, ticks=2000)
     static = arrays(folder / "evs_static.npz")

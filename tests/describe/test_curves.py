@@ -54,6 +54,7 @@ def after_step(sensor, lux, contrast, wait_us, without=()):
     return first["t_us"] - begin_us, first["polarity"]
 
 
+@pytest.mark.slow
 def test_the_background_of_a_data_sheet_is_what_the_sensor_gives():
     sensor = hr.load_sensor("imx636", SLOW).crop(64, 64)
     on, off = simulated_rates(sensor, 5, 4.0, 2.0)  # after 80 periods of the noise the level has settled

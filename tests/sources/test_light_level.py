@@ -113,6 +113,7 @@ def test_coloured_light_is_weighed_by_v():
     agree(measured({"lamp": lamp(radiance=spectrum)}, {"irradiance_w_m2": 3.0}), form() * watts)
 
 
+@pytest.mark.slow
 def test_the_stated_error_is_the_true_one():
     rng = np.random.default_rng(4)
     z = []

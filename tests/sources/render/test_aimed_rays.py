@@ -55,7 +55,9 @@ CURVED = {"lens__distortion": {"model": "opencv", "k1": -3.0, "k2": 20.0},
           "lens__psf": {"type": "gaussian", "image_height_mm": [0, 0.05], "fwhm_um": [1, 8]}}  # fmt: skip
 
 
-@pytest.mark.parametrize("changes", [{}, {"camera_moves": True, "lens__psf_fwhm_um": 4.0}, CURVED])
+@pytest.mark.parametrize(
+    "changes", [pytest.param({}, marks=pytest.mark.slow), {"camera_moves": True, "lens__psf_fwhm_um": 4.0}, CURVED]
+)
 def test_the_flux_is_that_of_uniform_rays(changes):
     """Sums over the picture: Student's t over ten runs of each kind, false alarm 1e-4; and pair by pair."""
     sensor = mono(COLS, ROWS, **{key: value for key, value in changes.items() if "__" in key})

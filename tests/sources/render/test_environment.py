@@ -31,7 +31,7 @@ def flux(folder, light, tilt_deg=0.0, samples=1 << 14):
     return float((a + b).mean() / 2)
 
 
-@pytest.mark.parametrize("rotation_deg", [0, 70])
+@pytest.mark.parametrize("rotation_deg", [pytest.param(0, marks=pytest.mark.slow), 70])
 def test_the_level_is_the_one_asked_for(tmp_path, rotation_deg):
     """A grey map with a gradient, a bright window and a bright spot, against the uniform light of the same level."""
     values = 1 + 0.8 * np.cos(THETA) + 0.5 * np.sin(THETA) * np.cos(AROUND)

@@ -141,6 +141,7 @@ def test_the_stated_error_of_event_samples_is_the_true_one(seed):
     assert told["share_above_wanted"] == pytest.approx(np.mean(off > QUALITY), rel=0.4)
 
 
+@pytest.mark.slow
 def test_the_stated_error_of_frames_is_that_of_all_lights_together():
     """Scatter between runs of other seeds. Three lights, each with a render of its own, before moving objects."""
     lights = [

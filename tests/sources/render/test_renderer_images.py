@@ -63,6 +63,7 @@ def irradiance(points, lamp):
     return np.array(total)
 
 
+@pytest.mark.slow
 def test_light_by_way_of_a_mirror_is_that_of_the_image():
     """A lamp and its image, both integrated numerically: the light of three segments over that of two.
 

@@ -105,7 +105,7 @@ def test_paths_are_those_of_mitsuba(light, depth, roulette, draws_of_mitsuba):
     assert np.sum(got) == pytest.approx(np.sum(wanted), rel=1e-3)
 
 
-@pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
+@pytest.mark.parametrize("name", ["rotating-star", pytest.param("camera-sweep", marks=pytest.mark.slow)])
 def test_matt_surfaces_have_the_flux_of_the_exact_mode(name):
     """Both estimates against Mitsuba's own paths, in a window so short that nothing moves.
 

@@ -67,7 +67,7 @@ def test_every_shipped_scene_renders(name):
         assert 300 < np.quantile(a, 0.9) * 0.01 < 20_000
 
 
-@pytest.mark.parametrize("name", ["camera-sweep", "rotating-star"])
+@pytest.mark.parametrize("name", [pytest.param("camera-sweep", marks=pytest.mark.slow), "rotating-star"])
 def test_moving_scenes_move_within_a_tenth_of_a_second(name):
     scene, sensor = hr.load_scene(name), bayer(64, 48)
     source = RenderedFlux(scene, sensor, 16)

@@ -38,7 +38,13 @@ def picture(folder, values, name="picture.png"):
     return {"file": name}
 
 
-@pytest.mark.parametrize("name", ["roughplastic", "roughconductor", "dielectric", "principled"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("roughplastic", "principled")),
+        *("roughconductor", "dielectric"),
+    ],
+)
 def test_a_material_is_that_of_mitsuba(name):
     """A ball before a wall under the sky: the same material in a dictionary of Mitsuba's own, other random numbers."""
     spectra = {
