@@ -134,19 +134,19 @@ def pendulum(rng):
 
 
 def falling_objects(rng):
-    """Fifty solids let go from different heights that tumble for 0.6 s."""
+    """Thirty solids let go from different heights that tumble for 0.6 s."""
     objects, motion = [floor(rng), *tiles(rng, 8, 6, 0.25, -0.9, 0.1)], []
-    for k in range(50):
+    for k in range(30):
         shape = ["box", "sphere"][k % 2]
         size = [rng.uniform(0.03, 0.09)] * 3 if shape == "sphere" else rng.uniform(0.03, 0.1, 3)
         place = rng.uniform([-0.7, 0.6, -0.6], [0.7, 2.2, 0.3])
         name, axis, rate = f"body-{k}", rng.normal(size=3), rng.uniform(-900, 900)
         objects.append(part(name, shape, size, place, rng))
-        times = np.arange(0, 601, 20) * 1e-3
+        times = np.arange(0, 601, 25) * 1e-3
         frames = [turned(1e6 * t, axis, rate * t, [0, -GRAVITY * t * t / 2, 0]) for t in times]
         motion.append({"object": name, "pivot_m": rounded(place), "keyframes": frames})
     camera = {"origin_m": [0, 0.9, 2.2], "target_m": [0, 0.75, -0.2], "horizontal_fov_deg": 40}
-    return "Fifty solids that fall and tumble before a wall of tiles.", objects, [LAMP, SKY], camera, motion
+    return "Thirty solids that fall and tumble before a wall of tiles.", objects, [LAMP, SKY], camera, motion
 
 
 def hand_held(rng):
