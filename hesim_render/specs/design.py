@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
-from hesim_render.specs.study import InFolder, NamedLight, SetUseSpec, SurfacesSpec
+from hesim_render.specs.study import NamedLight, NamesFiles, SetUseSpec, SurfacesSpec
 
 _Lux = Annotated[float, Field(gt=0, le=1e9)]
 
@@ -27,7 +27,7 @@ class CostSpec(Strict):
         return self
 
 
-class LightsSpec(InFolder):
+class LightsSpec(NamesFiles):
     """Reflectances under lights."""
 
     reflectances: str
@@ -38,7 +38,7 @@ class LightsSpec(InFolder):
         return SurfacesSpec.model_validate({"reflectances": self.reflectances}, context={"folder": self.folder})
 
 
-class DesignSpec(InFolder):
+class DesignSpec(NamesFiles):
     """A filter design."""
 
     schema_version: Literal[1]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
+from hesim_render.specs.reflectance import InFolder
 from hesim_render.specs.spectrum import SpectrumSpec
 
 #: Groups of figures.
@@ -19,19 +20,8 @@ _Lux = Annotated[float, Field(gt=0, le=1e9)]
 _Exposure = Annotated[int, Field(ge=1, le=10**9)]
 
 
-class InFolder(Strict):
-    """A part of a file that names others, relative to it."""
-
-    folder: Path = Field(Path(), exclude=True)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _beside_the_file(cls, data: Any, info: ValidationInfo) -> Any:
-        if isinstance(data, dict) and info.context:
-            if "folder" in data:
-                raise ValueError("unknown key 'folder'")
-            return {**data, "folder": info.context["folder"]}
-        return data
+class NamesFiles(InFolder):
+    """A part of a file that names shipped things, or files relative to it."""
 
     def beside(self, name: str, shipped: bool = True) -> str:
         """A shipped name as it is, and a path relative to the file."""
@@ -39,7 +29,7 @@ class InFolder(Strict):
         return str(self.folder / name) if is_path or not shipped else name
 
 
-class SurfacesSpec(InFolder):
+class SurfacesSpec(NamesFiles):
     """What is looked at: a set of reflectances, a hyperspectral cube, or a scene that is rendered into one."""
 
     reflectances: str | None = Field(None, description="name of a set, or a CSV file of patches")
@@ -99,7 +89,7 @@ class NamedLight(Strict):
         return self
 
 
-class SetUseSpec(InFolder):
+class SetUseSpec(NamesFiles):
     """A filter set with its palette."""
 
     set: str = Field(description="name of a shipped filter set, or a file")
@@ -120,7 +110,7 @@ class NoiseStudySpec(Strict):
     seed: int = Field(1, ge=0, lt=2**63)
 
 
-class StudySpec(InFolder):
+class StudySpec(NamesFiles):
     """A study of filter sets."""
 
     schema_version: Literal[1]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
-from hesim_render.specs.study import InFolder
+from hesim_render.specs.study import NamesFiles
 
 #: Most runs of a sweep.
 MOST_RUNS = 100_000
@@ -38,7 +38,7 @@ class RangeSpec(Strict):
         return [float(f"{value:.12g}") for value in space(self.first, self.last, self.count)]
 
 
-class SweepSpec(InFolder):
+class SweepSpec(NamesFiles):
     """A sweep over keys of scene and sensor files."""
 
     schema_version: Literal[1]
