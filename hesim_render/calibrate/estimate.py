@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
 
 #: Half width of a 95 % interval of a normal law, in standard errors.
 Z_95 = 1.959963984540054
 
 
-def estimated(value: float, standard_error: float, unit: str = "") -> dict[str, Any]:
+def estimated(value: float, standard_error: float, unit: str = "", groups: int | None = None) -> dict[str, Any]:
     """A parameter with its 95 % interval; it is not identifiable where either number is not finite.
 
     Parameters
@@ -19,6 +20,8 @@ def estimated(value: float, standard_error: float, unit: str = "") -> dict[str, 
     value : the estimate, in `unit`.
     standard_error : its standard error, in `unit`.
     unit : name of the unit, empty for a pure number.
+    groups : number of groups of the jackknife that gave the standard error; its own scatter widens the interval, by
+        Student's law with groups − 1 degrees of freedom (Tukey 1958). Without it the error counts as known.
 
     Returns
     -------
@@ -27,10 +30,11 @@ def estimated(value: float, standard_error: float, unit: str = "") -> dict[str, 
     if not (np.isfinite(value) and np.isfinite(standard_error)):
         return not_identifiable("the estimate is not finite")
     value, standard_error = float(value), float(standard_error)
+    half = standard_error * (Z_95 if groups is None else float(student.ppf(0.975, groups - 1)))
     return {
         "value": value,
         "standard_error": standard_error,
-        "interval_95": [value - Z_95 * standard_error, value + Z_95 * standard_error],
+        "interval_95": [value - half, value + half],
         "unit": unit,
     }
 
@@ -49,11 +53,13 @@ class Spread:
     value : relative standard deviation, 0 where it is not significant.
     error : standard error, NaN where the value is not significant.
     limit : upper limit of 95 % where the value is not significant.
+    groups : of the jackknife that gave the error, or None.
     """
 
     value: float
     error: float
     limit: float
+    groups: int | None = None
 
     @property
     def relative_error(self) -> float:
@@ -63,6 +69,6 @@ class Spread:
     def described(self) -> dict[str, Any]:
         """As `estimated`, or 0 with its limit."""
         if self.value > 0:
-            return estimated(self.value, self.error, "relative std")
+            return estimated(self.value, self.error, "relative std", self.groups)
         note = "the pixels scatter no more than counting makes them"
         return {"value": 0.0, "upper_limit": self.limit, "note": note}

@@ -13,7 +13,7 @@ from scipy.special import betainc, gammaincc, ndtr
 
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
-from hesim_render.calibrate.estimate import Spread
+from hesim_render.calibrate.estimate import Spread, estimated
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.counts import StaticCapture
@@ -348,3 +348,12 @@ def test_asymmetry_is_kept_from_a_likelihood_ratio_of_1e_3_on(gain, kept):
     assert fit.free[4] == kept and not fit.free[5]
     if kept:
         assert fit.values[4] == pytest.approx(rho, rel=0.02)
+
+
+def test_intervals_of_a_jackknife_are_as_wide_as_students_law_asks():
+    """Tables of t at 97.5 %: 2.2622 with 9 degrees of freedom, 1.9842 with 99; 1.9600 of a normal law."""
+    for groups, half in ((10, 2.2622), (100, 1.9842), (None, 1.9600)):
+        low, high = estimated(5.0, 0.5, "", groups)["interval_95"]
+        assert (low, high) == pytest.approx((5 - half / 2, 5 + half / 2), abs=5e-5)
+        spread = Spread(0.15, 0.002, 0.2, groups).described()
+        assert spread["interval_95"][1] == pytest.approx(0.15 + 0.002 * half, abs=1e-6)

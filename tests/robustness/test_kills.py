@@ -41,7 +41,20 @@ COMMANDS = {
     "cube": (["cube", "flat-field", "--sensor", "reference-mono", "--roi", "8x8", "--samples", "16", "--out", "out.exr",
               "--overwrite"], ["--seed", "8"], "out.exr", None),
     "simulate": (["simulate", "flat-field", *PIXELS], ["--seed", "8"], "out", "recording.json"),
+    "rerun": (["rerun", "rec", "--out", "out", "--overwrite"], None, "out", "recording.json"),
+    "expose": (["expose", "cube.npy", "--bands", "400:700:10", "--hold", "--lux", "500", *PIXELS], ["--seed", "8"],
+               "out", "recording.json"),
+    "study": (["study", "cfa", "small.yaml", "--out", "out", "--overwrite"], None, "out", "results.json"),
+    "measure": (["measure", "mtf", "rec", "--out", "out.csv", "--overwrite"], None, "out.csv", None),
+    "describe": (["sensor", "describe", "reference-mono", "--out", "out.png", "--overwrite"], None, "out.png", None),
+    "new": (["sensor", "new", "out.yaml", "--overwrite"], None, "out.yaml", None),
 }  # fmt: skip
+
+
+STUDY = (
+    "schema_version: 1\nname: x\ndescription: d\nsensors: [reference-bayer]\npalette: dyes\nfilter_sets: [rggb, rccb]\n"
+    "surfaces: [colorchecker]\nilluminants: [D65]\nilluminance_lux: [20]\nfigures: [colour, noise]\n"
+)
 
 
 def prepare(name, folder):
@@ -56,6 +69,32 @@ def prepare(name, folder):
         capture_sets.write_frames(folder / "set", size=32, frames=8)
     elif name == "evs":
         capture_sets.write_events(folder / "set", size=32, trials=20000)
+    elif name == "rerun":
+        finish(folder, ["simulate", "flat-field", *PIXELS[:-2], "rec"])
+    elif name == "measure":
+        finish(
+            folder,
+            [
+                "simulate",
+                "slanted-edge",
+                "--sensor",
+                "reference-mono",
+                "--roi",
+                "64x64",
+                "--samples",
+                "16",
+                "--duration",
+                "0.02",
+                "--set",
+                "light.illuminance_lux=300",
+                "--out",
+                "rec",
+            ],
+        )
+    elif name == "expose":
+        np.save(folder / "cube.npy", np.full((16, 16, 31), 0.3, np.float32))
+    elif name == "study":
+        (folder / "small.yaml").write_text(STUDY)
     elif name == "video":
         np.save(folder / "v.npy", np.full((4, 16, 16), 128, np.uint8))
 
@@ -187,3 +226,31 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
     is_file = trial.marker is None and trial.target is not None
     assert at_steps >= (2 if is_file else 4) and trial.kills >= (10 if is_file else 16)
     trial.end()
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_goes_on(tmp_path):
+    """Started again after each of ten kills, it ends with the bytes of one that ran through."""
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "s.yaml").write_text(
+            "schema_version: 1\nname: x\ndescription: d\nscenes: [flat-field]\nsensors: [reference-mono]\nroi: 16x16\n"
+            "duration_s: 0.02\nvary:\n  light.illuminance_lux: [1, 10, 100]\nseeds: [1, 2]\nmetrics: [electrons]\n"
+        )
+    arguments = ["sweep", "s.yaml", "--out", "out"]
+    began = time.monotonic()
+    finish(tmp_path / "whole", arguments)
+    seconds, rng, killed = time.monotonic() - began, random.Random(5), 0
+    for _ in range(10):
+        child = start(tmp_path / "killed", arguments)
+        time.sleep(rng.uniform(0.2, 0.9) * seconds)
+        child.send_signal(signal.SIGKILL)
+        _, err = child.communicate(timeout=60)
+        assert "Traceback" not in err
+        killed += child.returncode == -signal.SIGKILL
+    finish(tmp_path / "killed", arguments)
+    whole, again = (tmp_path / name / "out" for name in ("whole", "killed"))
+    assert killed >= 3
+    assert files_in(again) == files_in(whole)
+    for path in files_in(whole):
+        assert (again / path).read_bytes() == (whole / path).read_bytes(), path

@@ -14,6 +14,7 @@ from hesim_render.calibrate.evs.checks import check_events
 from hesim_render.calibrate.evs.counts import StaticCapture
 from hesim_render.calibrate.evs.fitted import EventFit
 from hesim_render.calibrate.evs.model import both_probabilities
+from hesim_render.calibrate.evs.steps import GROUPS
 from hesim_render.calibrate.evs.thresholds import curve
 from hesim_render.recording.capture_set import CaptureSet
 from hesim_render.specs.calibration_spec import Defect
@@ -57,13 +58,13 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     else:
         error = np.sqrt(np.diag(thresholds.covariance))
         section |= {
-            "theta": estimated(thresholds.theta, thresholds.theta_error, "ln"),
-            "theta_on": estimated(thresholds.theta_on, error[0], "ln"),
-            "theta_off": estimated(thresholds.theta_off, error[1], "ln"),
+            "theta": estimated(thresholds.theta, thresholds.theta_error, "ln", GROUPS),
+            "theta_on": estimated(thresholds.theta_on, error[0], "ln", GROUPS),
+            "theta_off": estimated(thresholds.theta_off, error[1], "ln", GROUPS),
         }
     if levels is not None:
         section["s_curve"] = {
-            name: estimated(value, error, "events per trial") for name, (value, error) in vars(levels).items()
+            name: estimated(value, error, "events per trial", GROUPS) for name, (value, error) in vars(levels).items()
         }
     section["threshold_mismatch"] = result.mismatch.described() | {
         "from": "static counts" if thresholds is None else "steps"

@@ -133,6 +133,7 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
             mismatch,
             both_error / (2 * mismatch) if mismatch else float("nan"),
             float(np.sqrt(max(both, 0.0) + 2 * both_error)),
+            GROUPS,
         ),
         mismatch_on=each[0],
         mismatch_off=each[1],
