@@ -193,8 +193,11 @@ def kill_at_every_step(trial, exchange=True, most=12):
 
 
 def kill_at_random(trial, times, seed):
-    rng = random.Random(seed)
-    for k in range(times):
+    """Until so many runs did not end by themselves; a run that is faster than expected is no kill."""
+    rng, wanted = random.Random(seed), trial.kills + times
+    for k in range(3 * times):
+        if trial.kills == wanted:
+            return
         child = start(trial.folder, trial.before if k % 2 else trial.arguments)
         time.sleep(rng.uniform(0.1, 1.0) * trial.seconds)
         number = rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
@@ -224,7 +227,7 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
     # of all commands more than 100 kills; a single file appears in one step
     print(f"{name}: {at_steps} kills at steps, {trial.kills} in all")
     is_file = trial.marker is None and trial.target is not None
-    assert at_steps >= (2 if is_file else 4) and trial.kills >= (10 if is_file else 16)
+    assert at_steps >= (2 if is_file else 4) and trial.kills >= (14 if is_file else 16)
     trial.end()
 
 

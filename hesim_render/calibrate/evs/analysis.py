@@ -143,7 +143,7 @@ def analyse(
         best, *fits = (_with_sampling_error(fit, thresholds, good) for fit in (best, *fits))
     tell("200 starts", 0.8)
     averaged = pool_events(static, good, PixelThresholds.unknown(good.shape, spread.value))
-    ends = multi_start(averaged, best, theta_v, seed)
+    ends = multi_start(averaged if thresholds is None else pixels, best, theta_v, seed)
     return EvsCalibration(
         static=static,
         defects=classify(static, bad, steps),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from hesim_render.calibrate.evs.counts import StaticCapture
 _BINS, _LOG_BINS, _LEAST_SIGNAL = 192, 480, 1e-4
 #: Width of a bin of relative thresholds. Their variation within a bin counts as spread.
 _THRESHOLD_STEP = 0.01
+#: Largest deviation of a typical pixel's relative threshold from 1.
+_TYPICAL = 0.1
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,18 @@ class Cells:
         spread = np.sqrt(np.maximum(mean(self.spread**2 + self.relative**2) - relative**2, 0.0))
         events = np.bincount(group, self.events[order]).astype(np.float64)
         return Cells(mean(self.signal_dn), mean(self.polarity), relative, spread, total, events, self.trials)
+
+    def typical(self) -> Cells:
+        """The cells whose known thresholds are near the mean, or all if none is.
+
+        A pixel whose threshold nearly vanishes has a thousand times the events of others. Pooled with them it would
+        outweigh them, and no normal law describes such a cell.
+        """
+        near = np.abs(self.relative - 1) <= _TYPICAL
+        if not near.any():
+            return self
+        parts = {f.name: getattr(self, f.name)[near] for f in fields(self) if f.name != "trials"}
+        return replace(self, **parts)
 
     def with_spread(self, factor: float) -> Cells:
         """The same cells with the spread of thresholds scaled."""

@@ -47,7 +47,7 @@ def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, s
 
     Parameters
     ----------
-    pixels : counts.
+    pixels : counts. Of pixels with known thresholds those near the mean are used.
     fit : the fit whose parameters the starts surround.
     theta_v : Θ, threshold in V.
     seed : seed of the starts.
@@ -65,7 +65,7 @@ def multi_start(pixels: PixelCounts, fit: EventFit, theta_v: float, seed: int, s
     if free[3]:
         begin[:, 3] = rng.uniform(-0.9, 0.9, starts)
     begin[:, 4:] = np.where(free[4:], 0.0, begin[:, 4:])
-    cells = pixels.cells.coarser()
+    cells = pixels.cells.typical().coarser()
     eta, fisher, _ = search(cells, from_natural(begin), theta_v, fit.law, fit.free)
     values, covariance = natural(eta, np.linalg.pinv(fisher))
     errors = np.sqrt(np.maximum(np.einsum("fii->fi", covariance)[:, :4], 0))
