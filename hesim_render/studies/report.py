@@ -15,8 +15,9 @@ from hesim_render.core.drawing import report_style
 from hesim_render.core.html import PAGE_STYLE, number, row_of, table
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
-from hesim_render.studies.cfa import Seen, StudyResult
+from hesim_render.studies.cfa import StudyResult
 from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
+from hesim_render.studies.seen import Seen
 from hesim_render.studies.table import Table
 
 #: Columns of the report's tables: name in the results, heading.

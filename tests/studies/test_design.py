@@ -13,9 +13,9 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.design import DesignSpec, read_design
 from hesim_render.specs.files import list_names
 from hesim_render.spectral import spectrum as spectra
+from hesim_render.spectral.colour_difference import delta_e_2000, lab
 from hesim_render.spectral.physical import dye_transmittance, thin_film_transmittance
 from hesim_render.studies import ChannelNoise, reflectance_set
-from hesim_render.studies.colour_error import delta_e_2000, lab
 from hesim_render.studies.colour_samples import colour_samples
 from hesim_render.studies.design import Problem, optimise
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
