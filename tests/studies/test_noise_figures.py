@@ -34,8 +34,8 @@ def test_amplification_and_snr_by_hand():
     np.testing.assert_allclose(found.rgb, 0.18, rtol=1e-12)
 
 
-#: Tables 1.1 and 1.2 of [adams2010]: balance gains, sensitivity gain, colour matrix (rows sum to 1, which tells the signs
-#: that the reprint lost), then S_C = M·S_B·Mᵀ in the lower triangle and the luminance noise before and after M.
+#: Tables 1.1 and 1.2 of [adams2010]: balance gains, sensitivity gain, colour matrix (rows sum to 1, which tells the
+#: signs that the reprint lost), then S_C = M·S_B·Mᵀ in the lower triangle and the luminance noise before and after M.
 PUBLISHED = {
     "RGB": ([1.518, 1.000, 1.257], 2.616,
             [[1.558, -0.531, -0.027], [-0.078, 1.477, -0.399], [0.039, -0.508, 1.469]],

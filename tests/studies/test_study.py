@@ -56,8 +56,8 @@ def test_closed_forms_are_those_of_the_full_simulation(filters, crosstalk):
 def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_says():
     """Luminance SNR of mono, RCCC, RGBW and RGB mosaics of the MT9V024's pixel at 3 lux, from electrons and read noise.
 
-    Closed forms are exact but for the integration; noisy frames are within 3 % of them. The mean and the standard deviation
-    of 36,864 output pixels with an SNR of 1 are known to 0.5 % and 0.4 %: 3 % are 4.6 standard errors at least.
+    Closed forms are exact but for the integration; noisy frames are within 3 % of them. The mean and the standard
+    deviation of 36,864 output pixels with an SNR of 1 are known to 0.5 % and 0.4 %: 3 % are 4.6 standard errors.
     """
     names = ["mono", "rccc", "rgbw-half", "rgbw", "rggb"]
     table = study({
