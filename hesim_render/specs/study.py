@@ -117,6 +117,7 @@ class StudySpec(NamesFiles):
     name: str = Field(min_length=1)
     description: str = ""
     sensors: list[str] = Field(min_length=1, description="names or files; their pixels, lens and noise")
+    sensor_keys: dict[str, Any] = Field({}, description="keys of the sensor files to change, as aps.read_noise_e: 1.5")
     palette: str = "dyes"
     filter_sets: list[SetUseSpec] = Field([], description="none: the sensors' own filters")
     surfaces: list[SurfacesSpec] = [SurfacesSpec(reflectances="colorchecker")]
