@@ -1,11 +1,10 @@
 """How long a study of filter sets, large cubes and a design take, and how much memory each kind of cube needs.
 
-Run: python benchmarks/studies.py [sets | demosaic | cubes | design]
+Run: python benchmarks/studies.py [sets | demosaic | cubes | ENVI | HDF5 | NPY | EXR | design]
 
-cubes reads 3264x2448x31 values from ENVI, HDF5, NPY and EXR files, each in a process of its own, and needs 4 GB of disk.
+cubes reads 3264x2448x31 values from ENVI, HDF5, NPY and EXR files, each in a process of its own; it needs 1 GB of disk.
 """
 
-import resource
 import subprocess
 import sys
 import tempfile
@@ -58,7 +57,9 @@ def palettes(folder, count):
 def timed(text, call):
     begin, cpu = time.perf_counter(), time.process_time()
     call()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    # the high-water mark of this process; that of getrusage begins with its parent's
+    status = Path("/proc/self/status").read_text().splitlines()
+    peak = int(next(line for line in status if line.startswith("VmHWM")).split()[1]) / 1e6
     wall, own = time.perf_counter() - begin, time.process_time() - cpu
     print(f"{text}: {wall:.1f} s, {own:.1f} s of processor time, {peak:.2f} GB peak so far", flush=True)
 
@@ -136,8 +137,8 @@ def main(parts):
         if "demosaic" in parts:
             more = {**base, "filter_sets": sets, "figures": ["colour", "noise", "demosaic"], "noise": {"repeats": 8}}
             timed("50 filter sets with demosaic figures and 8 noisy frames", lambda: hr.study(more))
-        if "cubes" in parts:
-            for kind in LARGE:
+        for kind in LARGE:
+            if "cubes" in parts or kind in parts:
                 file = large_cube(folder, kind)
                 # another process: its peak is of this file alone
                 subprocess.run([sys.executable, __file__, "read", str(file), *(use["palette"] for use in sets[:5])],

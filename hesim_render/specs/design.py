@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -61,7 +62,7 @@ class DesignSpec(NamesFiles):
     bands: int = Field(2, ge=1, le=6, description="absorption bands of a dye")
     layers: int = Field(9, ge=1, le=40, description="layers of a stack of thin films")
     transmittance_max: float = Field(0.95, gt=0, le=1)
-    transmittance_min: float = Field(0.0, ge=0, lt=1, description="of free curves")
+    transmittance_min: float = Field(0.0, ge=0, lt=1, description="what passes a filter where it is darkest")
     slope_max_per_nm: float = Field(0.03, gt=0, le=1, description="steepest change of the transmittance")
     fit: LightsSpec
     illuminance_lux: list[_Lux] = Field([20.0, 1000.0], min_length=1)
@@ -87,8 +88,8 @@ class DesignSpec(NamesFiles):
         return self
 
 
-def read_design(name_or_path: str | Path) -> DesignSpec:
-    """A design's file, by shipped name or path.
+def read_design(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> DesignSpec:
+    """A design's file, by shipped name or path, perhaps with other values of dotted keys.
 
     Raises
     ------
@@ -96,4 +97,4 @@ def read_design(name_or_path: str | Path) -> DesignSpec:
         With file, line and key of all that is wrong.
     """
     file = locate(name_or_path, "design_specs")
-    return validate(DesignSpec, load_yaml(file), file, {})
+    return validate(DesignSpec, load_yaml(file), file, overrides or {})

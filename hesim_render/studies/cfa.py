@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.progress import Progress
-from hesim_render.specs.study import NamedLight, StudySpec, SurfacesSpec
+from hesim_render.specs.study import Equal, NamedLight, StudySpec, SurfacesSpec
 from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.studies.candidate import candidates
 from hesim_render.studies.colour_matrix import to_srgb
@@ -20,6 +21,7 @@ from hesim_render.studies.noise_figures import noise_figures
 from hesim_render.studies.seen import Seen, seen_by
 from hesim_render.studies.surfaces import reflectances_of
 from hesim_render.studies.table import Cell, Table
+from hesim_render.targets.opened_cube import CubeFile
 
 #: Most pictures of demosaiced patterns that a study keeps.
 MOST_PICTURES = 48
@@ -65,19 +67,23 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
     rows: list[dict[str, Cell]] = []
     every: list[Seen] = []
     pictures: list[tuple[str, NDArray[np.float32]]] = []
-    for number, (item, light) in enumerate((item, light) for item in spec.surfaces for light in spec.illuminants):
-        chart = _chart(item)
-        spectrum = light.spectrum.load()
-        group = []
-        for k, candidate in enumerate(tried):
-            if progress is not None:
-                progress(number * len(tried) + k / 2, total, f"{candidate.set_name} on {candidate.sensor_name}")
-            group.append(seen_by(spec, candidate, item.label, light.name, spectrum, chart))
-        for k, (seen, more) in enumerate(zip(group, _of_cube(item, group, light, spec), strict=True)):
-            if progress is not None:
-                progress(number * len(tried) + (len(tried) + k) / 2, total, f"{seen.candidate.set_name}: rows")
-            rows += _rows(spec, seen, spectrum, chart, more, reference, pictures)
-        every += group
+    number = 0
+    for item in spec.surfaces:
+        chart, cube = _chart(item), _cube(item, spec)
+        for light in spec.illuminants:
+            spectrum = light.spectrum.load()
+            group = []
+            for k, candidate in enumerate(tried):
+                if progress is not None:
+                    progress(number + k / 2, total, f"{candidate.set_name} on {candidate.sensor_name}")
+                group.append(seen_by(spec, candidate, item.label, light.name, spectrum, chart))
+            figures = [{}] * len(group) if cube is None else _of_cube(item, cube, group, light)
+            for k, (seen, more) in enumerate(zip(group, figures, strict=True)):
+                if progress is not None:
+                    progress(number + (len(tried) + k) / 2, total, f"{seen.candidate.set_name}: noise and details")
+                rows += _rows(spec, seen, spectrum, chart, more, reference, pictures)
+            every += group
+            number += len(tried)
     return StudyResult(Table(rows), every, pictures)
 
 
@@ -87,14 +93,21 @@ def _chart(item: SurfacesSpec) -> list[Spectrum]:
     return list(found.values())
 
 
-def _of_cube(item: SurfacesSpec, group: Sequence[Seen], light: NamedLight, spec: StudySpec) -> list[dict[str, Cell]]:
-    """Figures of a cube for each candidate."""
+def _cube(item: SurfacesSpec, spec: StudySpec) -> CubeFile | None:
+    """The cube of surfaces, where its colours are wanted."""
     if item.reflectances is not None or "colour" not in spec.figures:
-        return [{} for _ in group]
+        return None
+    from hesim_render.studies.cube_colour import open_surfaces
+
+    return open_surfaces(item)
+
+
+def _of_cube(item: SurfacesSpec, cube: CubeFile, group: Sequence[Seen], light: NamedLight) -> list[dict[str, Cell]]:
+    """Figures of a cube for each candidate."""
     from hesim_render.studies.cube_colour import cube_figures
 
     matrices = [each.colour.matrix for each in group if each.colour is not None]
-    return list(cube_figures(item, [each.candidate.responses for each in group], matrices, light))
+    return list(cube_figures(item, cube, [each.candidate.responses for each in group], matrices, light))
 
 
 def _rows(
@@ -111,26 +124,29 @@ def _rows(
                 candidate.sensor, candidate.event_filters, event_rate, seen.events.camera, seen.samples
             )
         aps = candidate.sensor.spec.aps
-        for nominal_us in spec.exposures_us or [aps.exposure_us if aps is not None else 1]:
-            for equal in spec.equal:
-                row: dict[str, Cell] = {
-                    "surfaces": seen.surfaces, "illuminant": seen.light_name, "illuminance_lux": lux,
-                    "sensor": candidate.sensor_name, "filter_set": candidate.set_name,
-                    "crosstalk": candidate.crosstalk, "equal": equal,
-                }  # fmt: skip
-                if aps is not None:
-                    exposure_us = exposure_for(equal, candidate.sensor, nominal_us, rate, reference, spec.white_fill)
-                    row |= {"nominal_exposure_us": nominal_us, "exposure_us": exposure_us}
-                row |= seen.row | more
-                if aps is not None and "noise" in spec.figures:
-                    row |= noise_figures(spec, seen, spectrum, chart, rate, lux, exposure_us)
-                if aps is not None and "demosaic" in spec.figures:
-                    found, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
-                    row |= found
-                    if len(pictures) < MOST_PICTURES:
-                        text = f"{candidate.set_name}, {seen.light_name}, {lux:g} lx, equal {equal}"
-                        pictures.append((text, picture))
-                yield row | events
+        if aps is None:  # event pixels have no exposure
+            combinations: list[tuple[float, Equal]] = [(0.0, "exposure")]
+        else:
+            combinations = list(product(spec.exposures_us or [aps.exposure_us], spec.equal))
+        for nominal_us, equal in combinations:
+            row: dict[str, Cell] = {
+                "surfaces": seen.surfaces, "illuminant": seen.light_name, "illuminance_lux": lux,
+                "sensor": candidate.sensor_name, "filter_set": candidate.set_name,
+                "crosstalk": candidate.crosstalk, "equal": equal,
+            }  # fmt: skip
+            if aps is not None:
+                exposure_us = exposure_for(equal, candidate.sensor, nominal_us, rate, reference, spec.white_fill)
+                row |= {"nominal_exposure_us": nominal_us, "exposure_us": exposure_us}
+            row |= seen.row | more
+            if aps is not None and "noise" in spec.figures:
+                row |= noise_figures(spec, seen, spectrum, chart, rate, lux, exposure_us)
+            if aps is not None and "demosaic" in spec.figures:
+                found, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
+                row |= found
+                if len(pictures) < MOST_PICTURES:
+                    text = f"{candidate.set_name}, {seen.light_name}, {lux:g} lx, equal {equal}"
+                    pictures.append((text, picture))
+            yield row | events
 
 
 def _detail(

@@ -50,6 +50,7 @@ def open_surfaces(item: SurfacesSpec) -> CubeFile:
 
 def cube_figures(
     item: SurfacesSpec,
+    cube: CubeFile,
     sets: Sequence[Sequence[Spectrum]],
     matrices: Sequence[NDArray[np.float64]],
     light: NamedLight,
@@ -61,7 +62,8 @@ def cube_figures(
 
     Parameters
     ----------
-    item : the cube.
+    item : how the cube is read.
+    cube : from `open_surfaces`.
     sets : responses of each filter set.
     matrices : [3, channel] of each set, from channels with white at 1 to XYZ.
     light : illuminant of reflectances, white of radiances.
@@ -75,7 +77,6 @@ def cube_figures(
     SpecError
         If the cube cannot be read, does not cover a response, or holds reflectances outside 0 to 1.
     """
-    cube = open_surfaces(item)
     spectrum = light.spectrum.load()
     is_reflectance = item.is_reflectance
     if is_reflectance:

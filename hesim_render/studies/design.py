@@ -305,7 +305,7 @@ def silicon_depth(efficiency: SpectrumSpec) -> float:
 
 def _family(spec: DesignSpec) -> Family:
     if spec.family == "dye":
-        return Dyes(BANDS_NM, spec.bands, spec.transmittance_max)
+        return Dyes(BANDS_NM, spec.bands, spec.transmittance_max, spec.transmittance_min)
     if spec.family == "thin_film":
-        return ThinFilms(BANDS_NM, spec.layers, spec.transmittance_max)
+        return ThinFilms(BANDS_NM, spec.layers, spec.transmittance_max, spec.transmittance_min)
     return FreeCurves(BANDS_NM, spec.transmittance_min, spec.transmittance_max)

@@ -22,15 +22,13 @@ from hesim_render.studies.design import DesignResult, Problem, optimise
 from hesim_render.studies.design_result import designed_palette, designed_set
 from hesim_render.studies.filter_sets import with_filter_set
 from hesim_render.studies.patterns import CHART_PX
-from hesim_render.studies.report import report_page
+from hesim_render.studies.report import report_page, verdict_table
 from hesim_render.studies.table import Table
 
 #: File that marks the folder of a design.
 MARKER = "design.json"
 #: Name of the designed set in the results.
 DESIGNED = "designed"
-#: Half a 95 % interval over standard errors.
-_Z95 = 1.96
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +102,8 @@ def design(
                 "silicon_depth_um": result.silicon_depth_um, "verdicts": verdicts,
             }  # fmt: skip
             (folder.path / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-            (folder.path / "report.html").write_text(report_page(judged, found), encoding="utf-8")
+            summary = verdict_table(verdicts, result.costs, None if result.shares is None else filters.tile)
+            (folder.path / "report.html").write_text(report_page(judged, found, summary), encoding="utf-8")
         folder.commit()
     except BaseException:
         folder.discard()
@@ -155,10 +154,16 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
             continue
         other = table.where(filter_set=name)
         parts = []
+        # a set without event pixels cannot be judged by them
+        has_events = (
+            weights.events > 0
+            and "event_contrast_on" in table.columns
+            and all(np.isfinite(each["event_contrast_on"]).all() for each in (own, other))
+        )
         for each in (own, other):
             cost = weights.colour * each["delta_e_mean"] + weights.noise * each["delta_e_noisy_noise_aware_simulated"]
-            if weights.events and "event_contrast_on" in each.columns:
-                cost = cost + weights.events * np.nan_to_num(each["event_contrast_on"])
+            if has_events:
+                cost = cost + weights.events * each["event_contrast_on"]
             half = each["delta_e_noisy_noise_aware_high"] - each["delta_e_noisy_noise_aware_simulated"]
             parts.append((float(cost.mean()), weights.noise * float(np.sqrt(np.sum(half**2))) / len(each)))
         difference = parts[0][0] - parts[1][0]

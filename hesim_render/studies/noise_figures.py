@@ -56,17 +56,20 @@ def noise_figures(
 
     Returns
     -------
-    Figures by column; those of simulation where the study has repeats.
+    Figures by column; those of simulation where the study has repeats. If the grey card itself saturates, levels alone.
     """
     candidate = seen.candidate
     sensor = candidate.sensor
     white_e = electrons(rate, exposure_us)
     noise = channel_noise(sensor, candidate.channels, exposure_us, spec.area_px)
+    saturation = saturation_e(sensor, exposure_us)
     row: dict[str, Cell] = {
         "white_e": float(white_e.max()),
-        "white_saturation": float(white_e.max() / saturation_e(sensor, exposure_us)),
+        "white_saturation": float(white_e.max() / saturation),
         "dynamic_range_db": dynamic_range_db(sensor, exposure_us),
     }
+    if GREY * white_e.max() >= saturation:
+        return row
     aware = noise_aware_matrix(seen.samples, white_e, noise)
     if seen.colour is None:
         row |= _of_luminance(aware[1], white_e, noise, lux)

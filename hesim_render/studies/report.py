@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.drawing import report_style
-from hesim_render.core.html import PAGE_STYLE, number, row_of, table
+from hesim_render.core.html import PAGE_STYLE, inline_picture, number, row_of, table
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
 from hesim_render.studies.cfa import StudyResult
 from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
 from hesim_render.studies.seen import Seen
-from hesim_render.studies.table import Table
+from hesim_render.studies.table import Cell, Table
 
 #: Columns of the report's tables: name in the results, heading.
 _COLUMNS = {
@@ -45,18 +44,20 @@ _INTERVALS = {
 _MOST_GROUPS = 24
 
 
-def report_page(spec: StudySpec, result: StudyResult) -> str:
+def report_page(spec: StudySpec, result: StudyResult, summary: str = "") -> str:
     """The page of a study.
 
     Parameters
     ----------
     spec, result : the study and its results.
+    summary : HTML that comes first, after the description.
 
     Returns
     -------
     HTML.
     """
     parts = [f"<h1>{escape(spec.name)}</h1>", f"<p>{escape(spec.description)}</p>" if spec.description else ""]
+    parts.append(summary)
     with report_style():
         parts += ["<h2>Filter sets</h2>", row_of(*map(response_plot, _first_of_each_set(result.seen)))]
         parts += _groups(result.table)
@@ -64,7 +65,8 @@ def report_page(spec: StudySpec, result: StudyResult) -> str:
     if result.pictures:
         parts.append("<h2>Patterns after demosaicing</h2>")
         figures = (
-            f"{_png(encode_srgb(image))}<figcaption>{escape(text)}</figcaption>" for text, image in result.pictures
+            f"{inline_picture(encode_srgb(image), text)}<figcaption>{escape(text)}</figcaption>"
+            for text, image in result.pictures
         )
         parts.append(row_of(*figures))
     parts.append(_method(spec))
@@ -73,6 +75,39 @@ def report_page(spec: StudySpec, result: StudyResult) -> str:
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f"<title>{escape(spec.name)}</title><style>{PAGE_STYLE}</style></head><body>{body}</body></html>\n"
     )
+
+
+def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float64], tile: str | None) -> str:
+    """HTML of how a designed set compares with others.
+
+    Parameters
+    ----------
+    verdicts : of each set it is compared with.
+    costs : of each start before and after, [start, 2].
+    tile : the designed tile, where shares were varied.
+    """
+    parts = ["<h2>Verdict</h2>"]
+    named = {"delta_e_mean": "mean ΔE2000", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
+             "zone_plate_colour": "zone plate, C*ab", "picture_error_simulated": "rms error with noise"}  # fmt: skip
+    for verdict in verdicts:
+        low, high = (number(verdict[f"cost_difference_{end}"]) for end in ("low", "high"))
+        rows = [
+            ["judged cost", number(verdict["cost"]), number(verdict["cost_against"]), f"difference {low} to {high}"]
+        ]
+        rows += [
+            [title, number(verdict[key]), number(verdict[f"{key}_against"]), ""]
+            for key, title in named.items()
+            if key in verdict
+        ]
+        for key, value in verdict.items():
+            if key.startswith("ysnr_ratio_"):
+                rows.append([f"YSNR at {key.split('_')[2]} lx", "", "", f"{number(value)} times"])
+        parts.append(table(["", "designed", str(verdict["against"]), "95 % interval or ratio"], rows))
+    if tile is not None:
+        parts.append(f"<p>Designed tile:</p><pre>{escape(tile)}</pre>")
+    told = ", ".join(f"{number(before)} to {number(after)}" for before, after in costs)
+    parts.append(f"<p>Cost of the optimiser, before and after, for each start: {told}.</p>")
+    return "\n".join(parts)
 
 
 def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
@@ -89,9 +124,11 @@ def _groups(rows: Table) -> list[str]:
         for name in ("surfaces", "illuminant", "illuminance_lux", "nominal_exposure_us", "equal")
         if name in rows.columns
     ]
-    order = sorted(rows, key=lambda row: [str(row[name]) for name in keys])
+    groups: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in keys), []).append(row)
     parts = []
-    for number_, (values, group) in enumerate(groupby(order, key=lambda row: [row[name] for name in keys])):
+    for number_, (values, group) in enumerate(groups.items()):
         if number_ == _MOST_GROUPS:
             parts.append("<p>More groups of rows are in results.csv.</p>")
             break
@@ -99,7 +136,7 @@ def _groups(rows: Table) -> list[str]:
         named = dict(zip(keys, values, strict=True))
         title = f"{named['surfaces']}, {named['illuminant']}, {named['illuminance_lux']:g} lx, equal {named['equal']}"
         parts.append(f"<h2>{escape(title)}</h2>")
-        if {"delta_e_mean", "ysnr"} <= set(some.columns):
+        if any(row.get("delta_e_mean") is not None and row.get("ysnr") is not None for row in some):
             parts.append(row_of(pareto_plot(some, "Colour against noise")))
         parts.append(_table(some))
     return parts
@@ -141,22 +178,16 @@ def _patches(seen: Sequence[Seen]) -> list[str]:
         some = list(group)
         parts.append(row_of(patch_plot(some)))
         named = zip(some, seen_labels(some), strict=True)
-        charts = (f"{_png(chart_picture(each))}<figcaption>{escape(text)}</figcaption>" for each, text in named)
+        charts = (
+            f"{inline_picture(chart_picture(each), text)}<figcaption>{escape(text)}</figcaption>"
+            for each, text in named
+        )
         parts.append(row_of(*charts))
     parts.append(
         "<p>Upper left half of a patch: its true colour. Lower right half: after the matrix of the filter set, without "
         "noise.</p>"
     )
     return parts
-
-
-def _png(image: NDArray[np.uint8]) -> str:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, format="PNG")
-    text = base64.b64encode(stream.getvalue()).decode("ascii")
-    return f'<img alt="" src="data:image/png;base64,{text}">'
 
 
 def _method(spec: StudySpec) -> str:

@@ -175,7 +175,7 @@ def test_every_shipped_filter_set_stands_before_a_sensor():
     assert float(palette.quantum_efficiency.load().at(720)) < 1e-3
 
 
-def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, capsys):
+def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, capsys, monkeypatch):
     file = tmp_path / "mine.yaml"
     (tmp_path / "curve.csv").write_text("nm,t\n380,0\n430,0.8\n480,0\n")
     (tmp_path / "own.yaml").write_text(
@@ -211,6 +211,29 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
     assert stop.value.code == 2 and "exists" in capsys.readouterr().err
     before = (tmp_path / "out" / "results.csv").read_text()
     assert study(file, out=tmp_path / "out", overwrite=True).to_csv() == before
+    # other surfaces and keys from the command line; paths are those of the working folder
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / "cube.npy", np.full((2, 2, 95), 0.3, np.float32))
+    commands = (
+        [
+            "--surfaces",
+            "patches.csv",
+            "--surfaces",
+            "cie-tcs",
+            "--set",
+            "filter_sets=[rggb]",
+            "--set",
+            "noise.repeats=0",
+        ],
+        ["--surfaces", "cube.npy", "--set", "filter_sets=[rggb]", "--set", "noise.repeats=0"],
+    )
+    for number, more in enumerate(commands):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["study", "cfa", str(file), "--out", str(tmp_path / f"more{number}"), *more])
+        told = capsys.readouterr()
+        assert stop.value.code == 0 if number == 0 else "cube.npy: wavelength_nm: says no wavelengths" in told.err
+    rows = json.loads((tmp_path / "more0" / "results.json").read_text())["rows"]
+    assert [(row["surfaces"], row["filter_set"]) for row in rows] == [("patches", "rggb"), ("cie-tcs", "rggb")]
 
 
 BAD = [
@@ -269,6 +292,30 @@ def test_bad_filter_sets_are_one_clear_line(tmp_path, old, new, message):
     file.write_text(SET.replace(old, new))
     with pytest.raises(SpecError, match=message):
         run(filter_sets=[str(file)])
+
+
+@pytest.mark.parametrize(("curve", "message"), [
+    ("nm,t\n400,0.1\n500,1.2\n700,0.1\n", r"transmittance must lie in \[0, 1\]"),
+    ("nm,t\n400,0.1\n500,-0.2\n700,0.1\n", r"transmittance must lie in \[0, 1\]"),
+    ("nm,t\n400,0.1\n500,\n700,0.1\n", r"curve\.csv:3: expected numbers"),
+    ("nm,t\n400,0.1\n500,nan\n700,0.1\n", "finite"),
+    ("nm,t\n400,0.1\n700,0.5\n500,0.1\n", "increas"),
+    ("nm,t\n400,0.1\n400,0.5\n500,0.1\n", "increas"),
+])  # fmt: skip
+def test_a_curve_out_of_range_or_with_gaps_is_one_clear_line(tmp_path, curve, message):
+    (tmp_path / "curve.csv").write_text(curve)
+    (tmp_path / "own.yaml").write_text(SET.replace("pixels:", "filters: {red: curve.csv}\npixels:"))
+    with pytest.raises(SpecError, match=message) as caught:
+        run(filter_sets=[str(tmp_path / "own.yaml")])
+    assert "\n" not in str(caught.value)
+    # the same in a palette
+    (tmp_path / "own.yaml").unlink()
+    (tmp_path / "mine.yaml").write_text(
+        "schema_version: 1\nname: mine\ndescription: mine\nfilters: {red: curve.csv, green: 0.5, blue: 0.5}\n"
+    )
+    with pytest.raises(SpecError, match=message.replace("transmittance ", "")) as caught:
+        run(filter_sets=["rggb"], palette=str(tmp_path / "mine.yaml"))
+    assert "\n" not in str(caught.value)
 
 
 def test_a_set_does_not_inherit_noise_of_other_positions(tmp_path):

@@ -41,6 +41,10 @@ def test_envi(tmp_path, interleave):
     with pytest.raises(SpecError, match="says no wavelengths"):
         open_cube(tmp_path / "c.hdr")
     check(tmp_path / "c.hdr", wavelength_nm=BANDS.tolist())
+    # fewer values than the header says
+    (tmp_path / "a.img").write_bytes((tmp_path / "a.img").read_bytes()[:-400])
+    with pytest.raises(SpecError, match=r"a\.hdr: cannot be read"):
+        open_cube(tmp_path / "a.hdr").whole()
     (tmp_path / "a.img").unlink()
     with pytest.raises(SpecError, match=r"a\.hdr: cannot be read"):
         open_cube(tmp_path / "a.hdr")
@@ -133,6 +137,9 @@ def test_cave_folders(tmp_path):
             tmp_path / "water" / f"water_ms_{band + 1:02}.png"
         )
     check(tmp_path / "water", (codes >> 8) / np.float32(255))
+    Image.fromarray(codes[:6, :, 6]).save(tmp_path / "toy_ms_07.png")
+    with pytest.raises(SpecError, match="its pictures differ in size"):
+        open_cube(tmp_path)
     (tmp_path / "toy_ms_07.png").unlink()
     with pytest.raises(SpecError, match=r"NAME_ms_01.png, 02"):
         open_cube(tmp_path)
