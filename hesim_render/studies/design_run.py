@@ -175,8 +175,9 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
             "delta_e_mean_against": float(other["delta_e_mean"].mean()),
         }  # fmt: skip
         for lux in spec.illuminance_lux:
-            pair = [each.where(illuminance_lux=lux)["ysnr_simulated"].mean() for each in (own, other)]
-            verdict[f"ysnr_ratio_{lux:g}_lux"] = float(pair[0] / pair[1])
+            for name, column in (("ysnr_ratio", "ysnr"), ("ysnr_noise_aware_ratio", "ysnr_noise_aware")):
+                pair = [each.where(illuminance_lux=lux)[f"{column}_simulated"].mean() for each in (own, other)]
+                verdict[f"{name}_{lux:g}_lux"] = float(pair[0] / pair[1])
         for figure in ("mtf50_cy_per_px", "false_colour", "zone_plate_colour", "picture_error_simulated"):
             if figure in table.columns:
                 verdict[figure], verdict[f"{figure}_against"] = (

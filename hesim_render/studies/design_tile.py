@@ -24,7 +24,13 @@ def counts_of(shares: NDArray[np.float64], pixels: int) -> NDArray[np.int64]:
     -------
     [filter], sum `pixels`.
     """
-    wanted = 1 + shares * (pixels - len(shares)) if np.any(shares * pixels < 1) else shares * pixels
+    is_free = np.ones(len(shares), dtype=bool)
+    while True:  # who would get less than a pixel gets one, and the others share the rest
+        wanted = np.where(is_free, shares / shares[is_free].sum() * (pixels - np.sum(~is_free)), 1.0)
+        few = is_free & (wanted < 1)
+        if not few.any():
+            break
+        is_free &= ~few
     found = np.floor(wanted + 1e-9).astype(np.int64)
     rest = np.argsort(found - wanted, kind="stable")
     found[rest[: pixels - int(found.sum())]] += 1

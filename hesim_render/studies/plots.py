@@ -35,13 +35,13 @@ def pareto_front(cost: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArra
 
 def pareto_plot(rows: Table, title: str) -> str:
     """SVG of colour error against luminance SNR, one point a filter set; the front is a line."""
-    figure, axes = panel(title, "mean ΔE2000", "YSNR of an 18 % grey card", (430, 320))
+    figure, axes = panel(title, "mean ΔE2000", "YSNR of an 18 % grey card", (400, 300))
     rows = Table(row for row in rows if row["delta_e_mean"] is not None and row["ysnr"] is not None)
     error, snr, names = rows["delta_e_mean"], rows["ysnr"], _labels(rows)
     for k, name in enumerate(dict.fromkeys(names)):
         own = np.array([other == name for other in names])
         axes.plot(
-            error[own], snr[own], linestyle="none", marker=_MARKERS[k % len(_MARKERS)], markersize=5,
+            error[own], snr[own], linestyle="none", marker=_MARKERS[k % len(_MARKERS)], markersize=7,
             color=COLOURS[k % len(COLOURS)], label=name,
         )  # fmt: skip
     front = np.flatnonzero(pareto_front(error, snr))

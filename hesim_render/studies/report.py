@@ -19,23 +19,31 @@ from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, r
 from hesim_render.studies.seen import Seen
 from hesim_render.studies.table import Cell, Table
 
-#: Columns of the report's tables: name in the results, heading.
-_COLUMNS = {
-    "filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, µs",
+#: Columns that say which row it is; all but the first are left out if they say the same in every row.
+_NAMES = {"filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, ms"}
+#: Columns of the tables of figures: name in the results, heading. Those of colour do not depend on the level.
+_COLOUR = {
     "delta_e_mean": "ΔE2000 mean", "delta_e_p95": "95 %", "delta_e_max": "max",
-    "delta_e_mean_root_polynomial": "root polynomial", "smi": "SMI", "vora": "Vora",
-    "luther_residual": "Luther residual",
-    "noise_amplification": "noise ampl.", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
+    "delta_e_mean_root_polynomial": "root polynomial", "delta_e_cube_mean": "ΔE2000 of the cube",
+    "delta_e_cube_p95": "95 %", "delta_e_cube_max": "max", "smi": "SMI", "vora": "Vora",
+    "vora_light": "Vora, this light", "luther_residual": "Luther residual",
+    "filter_quality_min": "least filter quality",
+}  # fmt: skip
+_NOISE = {
+    "noise_amplification": "amplification", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
     "delta_e_noisy_simulated": "ΔE2000 with noise", "ysnr_noise_aware": "YSNR, noise-aware",
     "delta_e_mean_noise_aware": "ΔE2000, noise-aware", "snr10_lux": "SNR10, lx", "dynamic_range_db": "DR, dB",
-    "white_saturation": "white / saturation", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
-    "zipper": "zipper, %", "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
-    "picture_error_simulated": "rms error with noise",
-    "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz",
-    "event_seen": "steps seen", "event_seen_isoluminant": "isoluminant steps seen",
+    "white_saturation": "white / saturation",
 }  # fmt: skip
-#: Columns that a table leaves out if they say the same in every row.
-_BORING = ("sensor", "crosstalk", "exposure_us")
+_DETAIL = {
+    "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab", "zipper": "zipper, %",
+    "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
+    "picture_error_simulated": "rms error with noise",
+}  # fmt: skip
+_EVENTS = {
+    "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz", "event_seen": "steps seen",
+    "event_seen_isoluminant": "isoluminant steps seen",
+}  # fmt: skip
 #: Figures with an interval: ends of the columns of its limits.
 _INTERVALS = {
     "ysnr_simulated": "ysnr", "delta_e_noisy_simulated": "delta_e_noisy", "picture_error_simulated": "picture_error",
@@ -100,8 +108,10 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
             if key in verdict
         ]
         for key, value in verdict.items():
-            if key.startswith("ysnr_ratio_"):
-                rows.append([f"YSNR at {key.split('_')[2]} lx", "", "", f"{number(value)} times"])
+            for start, title in (("ysnr_ratio_", "YSNR"), ("ysnr_noise_aware_ratio_", "YSNR, noise-aware matrix,")):
+                if key.startswith(start):
+                    lux = key.removeprefix(start).removesuffix("_lux")
+                    rows.append([f"{title} at {lux} lx", "", "", f"{number(value)} times"])
         parts.append(table(["", "designed", str(verdict["against"]), "95 % interval or ratio"], rows))
     if tile is not None:
         parts.append(f"<p>Designed tile:</p><pre>{escape(tile)}</pre>")
@@ -118,40 +128,64 @@ def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
 
 
 def _groups(rows: Table) -> list[str]:
-    """Drawing and table of each group of rows in which only sensors, filter sets and crosstalk differ."""
-    keys = [
-        name
-        for name in ("surfaces", "illuminant", "illuminance_lux", "nominal_exposure_us", "equal")
-        if name in rows.columns
-    ]
-    groups: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    """Drawings and tables of each group of rows in which only sensors, filter sets and crosstalk differ."""
+    lights, levels = ("surfaces", "illuminant"), ["illuminance_lux", "equal"]
+    of_sensor: dict[Cell, set[Cell]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[name] for name in keys), []).append(row)
+        of_sensor.setdefault(row["sensor"], set()).add(row.get("nominal_exposure_us"))
+    if max(map(len, of_sensor.values())) > 1:  # else each sensor has its own exposure
+        levels.append("nominal_exposure_us")
     parts = []
-    for number_, (values, group) in enumerate(groups.items()):
+    for number_, ((surfaces, light), group) in enumerate(_grouped(rows, lights)):
         if number_ == _MOST_GROUPS:
             parts.append("<p>More groups of rows are in results.csv.</p>")
             break
-        some = Table(group)
-        named = dict(zip(keys, values, strict=True))
-        title = f"{named['surfaces']}, {named['illuminant']}, {named['illuminance_lux']:g} lx, equal {named['equal']}"
-        parts.append(f"<h2>{escape(title)}</h2>")
-        if any(row.get("delta_e_mean") is not None and row.get("ysnr") is not None for row in some):
-            parts.append(row_of(pareto_plot(some, "Colour against noise")))
-        parts.append(_table(some))
+        parts.append(f"<h2>{escape(f'{surfaces}, {light}')}</h2>")
+        inner = _grouped(group, levels)
+        plots = [
+            pareto_plot(some, _level(levels, values))
+            for values, some in inner
+            if any(row.get("delta_e_mean") is not None and row.get("ysnr") is not None for row in some)
+        ]
+        parts.append(row_of(*plots) if plots else "")
+        named = [name for name in _NAMES if name != "exposure_us" and name in group.columns]
+        first = {tuple(row[name] for name in named): row for row in reversed(list(group))}
+        parts.append(_table(Table(reversed(first.values())), _COLOUR))
+        for values, some in inner:
+            tables = [_table(some, columns) for columns in (_NOISE, _DETAIL, _EVENTS)]
+            if any(tables):
+                parts += [f"<h3>{escape(_level(levels, values))}</h3>", *tables]
     return parts
 
 
-def _table(rows: Table) -> str:
-    shown = [
-        name for name in _COLUMNS
-        if name in rows.columns and not (name in _BORING and len({row[name] for row in rows}) == 1)
-        and any(row[name] is not None for row in rows)
+def _grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
+    """The rows by the values of some columns, in the order in which these first occur."""
+    found: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in keys), []).append(row)
+    return [(values, Table(group)) for values, group in found.items()]
+
+
+def _level(keys: Sequence[str], values: Sequence[Cell]) -> str:
+    named = dict(zip(keys, values, strict=True))
+    text = f"{named['illuminance_lux']:g} lx, equal {named['equal']}"
+    return text + (f", {named['nominal_exposure_us']:g} µs" if named.get("nominal_exposure_us") else "")
+
+
+def _table(rows: Table, columns: Mapping[str, str]) -> str:
+    """A table of some figures; empty if no row has any of them."""
+    known = [name for name in columns if name in rows.columns and any(row[name] is not None for row in rows)]
+    if not known:
+        return ""
+    names = [
+        name for name in _NAMES
+        if name in rows.columns and (name == "filter_set" or len({row[name] for row in rows}) > 1)
+        and not (name == "exposure_us" and columns is _COLOUR)
     ]  # fmt: skip
     lines = []
     for row in rows:
-        cells = []
-        for name in shown:
+        cells = [_cell(_in_ms(row[name]) if name == "exposure_us" else row[name]) for name in names]
+        for name in known:
             text = _cell(row[name])
             if name in _INTERVALS and row[name] is not None:
                 low, high = (row.get(f"{_INTERVALS[name]}_{end}") for end in ("low", "high"))
@@ -159,7 +193,11 @@ def _table(rows: Table) -> str:
                     text += f" ({number(low)} to {number(high)})"
             cells.append(text)
         lines.append(cells)
-    return table([_COLUMNS[name] for name in shown], lines)
+    return table([*(_NAMES[name] for name in names), *(columns[name] for name in known)], lines)
+
+
+def _in_ms(value: Cell) -> Cell:
+    return float(value) / 1000 if isinstance(value, int | float) else value
 
 
 def _cell(value: object) -> str:

@@ -237,7 +237,8 @@ def test_gradients_of_shares_and_depth_are_central_differences():
 def test_shares_become_whole_pixels_that_lie_apart():
     assert counts_of(np.array([0.5, 0.25, 0.25]), 16).tolist() == [8, 4, 4]
     assert counts_of(np.array([0.97, 0.01, 0.02]), 16).sum() == 16
-    assert counts_of(np.array([0.97, 0.01, 0.02]), 16).min() == 1
+    assert counts_of(np.array([0.97, 0.01, 0.02]), 16).tolist() == [14, 1, 1]
+    assert counts_of(np.array([0.334, 0.284, 0.331, 0.051]), 16).tolist() == [5, 5, 5, 1]
     assert counts_of(np.array([0.41, 0.30, 0.29]), 4).tolist() == [2, 1, 1]
     every = np.ones((4, 4), bool)
     tile = spread_tile(np.full((4, 4), "x"), every, {"G": 8, "R": 4, "B": 4})
