@@ -67,10 +67,10 @@ def study(
         table = hr.study(chosen, out=out, overwrite=overwrite, progress=progress)
     shown = {name: title for name, title in _SHOWN.items() if name in table.columns}
     every = ("surfaces", "illuminant", "illuminance_lux", "sensor", "crosstalk", "equal")
-    keys = [name for name in every if len({row[name] for row in table}) > 1]
-    lines = [[*keys, *shown.values()]]
+    varied = [name for name in every if len({row[name] for row in table}) > 1]
+    lines = [[*varied, *shown.values()]]
     for row in list(table)[:_MOST]:
-        lines.append([_text(row[name]) for name in (*keys, *shown)])
+        lines.append([_text(row[name]) for name in (*varied, *shown)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     say(
         "\n".join(

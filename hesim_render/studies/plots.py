@@ -111,8 +111,9 @@ def chart_picture(seen: Seen, across: int = 6, size_px: int = 26) -> NDArray[np.
     assert seen.colour is not None
     samples = seen.samples
     count = min(len(samples.xyz), 4 * across)
-    true = encode_srgb(xyz_to_linear_srgb(samples.xyz[:count], samples.white_xyz))
-    camera = encode_srgb(xyz_to_linear_srgb(samples.camera[:count] @ seen.colour.matrix.T, samples.white_xyz))
+    chosen = np.linspace(0, len(samples.xyz) - 1, count).round().astype(int)  # of many, evenly spaced ones
+    true = encode_srgb(xyz_to_linear_srgb(samples.xyz[chosen], samples.white_xyz))
+    camera = encode_srgb(xyz_to_linear_srgb(samples.camera[chosen] @ seen.colour.matrix.T, samples.white_xyz))
     lower = np.add.outer(np.arange(size_px), np.arange(size_px)) >= size_px
     down = -(-count // across)
     out = np.full((down * size_px, across * size_px, 3), 40, np.uint8)
