@@ -1,9 +1,11 @@
-"""How long a study of filter sets, a large cube and a design take, and how much memory the cube needs.
+"""How long a study of filter sets, large cubes and a design take, and how much memory each kind of cube needs.
 
-Run: python benchmarks/studies.py [sets | demosaic | cube | design]
+Run: python benchmarks/studies.py [sets | demosaic | cubes | ENVI | HDF5 | NPY | EXR | design]
+
+cubes reads 3264x2448x31 values from ENVI, HDF5, NPY and EXR files, each in a process of its own; it needs 1 GB of disk.
 """
 
-import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -55,12 +57,74 @@ def palettes(folder, count):
 def timed(text, call):
     begin, cpu = time.perf_counter(), time.process_time()
     call()
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    # the high-water mark of this process; that of getrusage begins with its parent's
+    status = Path("/proc/self/status").read_text().splitlines()
+    peak = int(next(line for line in status if line.startswith("VmHWM")).split()[1]) / 1e6
     wall, own = time.perf_counter() - begin, time.process_time() - cpu
     print(f"{text}: {wall:.1f} s, {own:.1f} s of processor time, {peak:.2f} GB peak so far", flush=True)
 
 
+LARGE = ("ENVI", "HDF5", "NPY", "EXR")
+ROWS, COLS = 2448, 3264
+
+
+def large_cube(folder, kind):
+    """A file of 3264x2448x31 values: the ColorChecker's reflectances mixed, bands of 64 rows over and over."""
+    table = np.array([each.at(BANDS) for each in reflectance_set("colorchecker").values()], np.float32)
+    rng = np.random.default_rng(1)
+    part = rng.dirichlet(np.full(len(table), 0.2), (64, COLS)).astype(np.float32) @ table
+    starts = range(0, ROWS, 64)
+    if kind == "NPY":
+        file = folder / "large.npy"
+        stored = np.lib.format.open_memmap(file, mode="w+", dtype=np.float32, shape=(ROWS, COLS, BANDS.size))
+        for first in starts:
+            stored[first : first + 64] = part[: ROWS - first]
+    elif kind == "HDF5":
+        import h5py
+
+        file = folder / "large.h5"
+        with h5py.File(file, "w") as opened:  # ARAD-1K's layout: axes in MATLAB's order
+            stored = opened.create_dataset("cube", (BANDS.size, COLS, ROWS), np.float32, chunks=(BANDS.size, 64, 64))
+            for first in starts:
+                stored[:, :, first : first + 64] = part[: ROWS - first].transpose(2, 1, 0)
+            opened["bands"] = BANDS
+    elif kind == "ENVI":
+        file = folder / "large.hdr"
+        file.write_text(
+            f"ENVI\nsamples = {COLS}\nlines = {ROWS}\nbands = {BANDS.size}\nheader offset = 0\ndata type = 4\n"
+            f"interleave = bil\nbyte order = 0\nwavelength units = nm\nwavelength = {{{', '.join(map(str, BANDS))}}}\n"
+        )
+        with (folder / "large.img").open("wb") as opened:
+            for first in starts:
+                opened.write(np.ascontiguousarray(part[: ROWS - first].transpose(0, 2, 1)).tobytes())
+    else:
+        import OpenEXR
+
+        file = folder / "large.exr"
+        planes = np.tile(part.astype(np.float16), (-(-ROWS // 64), 1, 1))[:ROWS]
+        names = [f"T.{band:g},0nm" for band in BANDS]
+        header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {n: np.ascontiguousarray(planes[..., k]) for k, n in enumerate(names)}).write(str(file))
+    return file
+
+
+def read(file, palettes):
+    """A study of a large cube."""
+    item = {"cube": file, "beyond": "hold"}
+    if file.endswith(".npy"):
+        item["wavelength_nm"] = BANDS.tolist()
+    spec = {
+        "schema_version": 1, "name": "large", "sensors": ["reference-bayer"], "figures": ["colour"],
+        "filter_sets": [{"set": "rggb", "palette": palette} for palette in palettes], "surfaces": [item],
+    }  # fmt: skip
+    timed(f"{len(palettes)} filter sets over one {COLS}x{ROWS}x{BANDS.size} cube, {Path(file).suffix}",
+          lambda: hr.study(spec))  # fmt: skip
+
+
 def main(parts):
+    if parts[0] == "read":
+        read(parts[1], parts[2:])
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         base = {"schema_version": 1, "name": "benchmark", "sensors": ["reference-bayer"]}
@@ -73,15 +137,18 @@ def main(parts):
         if "demosaic" in parts:
             more = {**base, "filter_sets": sets, "figures": ["colour", "noise", "demosaic"], "noise": {"repeats": 8}}
             timed("50 filter sets with demosaic figures and 8 noisy frames", lambda: hr.study(more))
-        if "cube" in parts:
-            cube(folder / "large.npy", 2448, 3264)
-            surfaces = [{"cube": str(folder / "large.npy"), "wavelength_nm": BANDS.tolist(), "beyond": "hold"}]
-            spec = {**base, "filter_sets": sets[:5], "surfaces": surfaces, "figures": ["colour"]}
-            timed("5 filter sets over one 3264x2448x31 cube (NPY, streamed)", lambda: hr.study(spec))
+        for kind in LARGE:
+            if "cubes" in parts or kind in parts:
+                file = large_cube(folder, kind)
+                # another process: its peak is of this file alone
+                subprocess.run([sys.executable, __file__, "read", str(file), *(use["palette"] for use in sets[:5])],
+                               check=True)  # fmt: skip
+                for each in folder.glob("large*"):
+                    each.unlink()
         if "design" in parts:
             problem = Problem(read_design("rggb-dyes"))
             timed("design rggb-dyes, 4 starts of 125 steps", lambda: optimise(problem))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["sets", "demosaic", "cube", "design"])
+    main(sys.argv[1:] or ["sets", "demosaic", "cubes", "design"])

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.folder import BenchmarkClip
-from hesim_render.benchmark.metrics import delta_e, learned, learned_measures, psnr, ssim
+from hesim_render.benchmark.metrics import learned, learned_measures
 from hesim_render.isp.pipeline import Pipeline, process
+from hesim_render.measure.pictures import delta_e, psnr, ssim
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording.manifest import sensor_spec
 from hesim_render.specs.sensor import SensorSpec

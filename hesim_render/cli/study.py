@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from hesim_render.cli.options import Overwrite
 from hesim_render.cli.terminal import say
+from hesim_render.core.errors import RangeError
 from hesim_render.core.output import check_target
 from hesim_render.core.progress import progress_report
 
@@ -33,25 +34,43 @@ def study(
     kind: Annotated[StudyKind, typer.Argument(help="cfa (compare colour filter arrays) or design (of filters)")],
     spec: Annotated[str, typer.Argument(metavar="SPEC", help="name of a shipped study or design, or a file")],
     out: Annotated[Path, typer.Option(help="folder to write tables and report to")],
+    surfaces: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME or FILE", help="what cfa looks at, in place of the study's own: a scene, a cube, patches"
+        ),
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the file; repeatable")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare filter sets, or design filters: colour, noise and event figures, as tables and a report."""
+    from hesim_render.specs.files import parse_override
+    from hesim_render.specs.study import read_study, surfaces_of
+
+    keys = dict(map(parse_override, set_ or []))
     if kind is StudyKind.design:
-        _design(spec, out, overwrite)
+        if surfaces:
+            raise RangeError("--surfaces", ", ".join(surfaces), "none in a design, which has fit and judge in its file")
+        _design(spec, out, keys, overwrite)
         return
+    if surfaces:
+        keys["surfaces"] = [surfaces_of(text) for text in surfaces]
+    chosen = read_study(spec, keys)
     from hesim_render.studies.run import MARKER
 
     check_target(out, MARKER, overwrite)
     import hesim_render as hr
 
     with progress_report(f"study {kind.value}") as progress:
-        table = hr.study(spec, out=out, overwrite=overwrite, progress=progress)
+        table = hr.study(chosen, out=out, overwrite=overwrite, progress=progress)
     shown = {name: title for name, title in _SHOWN.items() if name in table.columns}
     every = ("surfaces", "illuminant", "illuminance_lux", "sensor", "crosstalk", "equal")
-    keys = [name for name in every if len({row[name] for row in table}) > 1]
-    lines = [[*keys, *shown.values()]]
+    varied = [name for name in every if len({row[name] for row in table}) > 1]
+    lines = [[*varied, *shown.values()]]
     for row in list(table)[:_MOST]:
-        lines.append([_text(row[name]) for name in (*keys, *shown)])
+        lines.append([_text(row[name]) for name in (*varied, *shown)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     say(
         "\n".join(
@@ -69,12 +88,14 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else str(value)
 
 
-def _design(spec: str, out: Path, overwrite: bool) -> None:
+def _design(spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
+    from hesim_render.specs.design import read_design
     from hesim_render.studies.design_run import MARKER, design
 
+    chosen = read_design(spec, keys)
     check_target(out, MARKER, overwrite)
     with progress_report("study design") as progress:
-        found = design(spec, out=out, overwrite=overwrite, progress=progress)
+        found = design(chosen, out=out, overwrite=overwrite, progress=progress)
     costs = found.result.costs
     say(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
     for verdict in found.verdicts:

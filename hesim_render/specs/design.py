@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -11,6 +12,8 @@ from hesim_render.specs.files import Strict, load_yaml, locate, validate
 from hesim_render.specs.study import NamedLight, NamesFiles, SetUseSpec, SurfacesSpec
 
 _Lux = Annotated[float, Field(gt=0, le=1e9)]
+_Side = Annotated[int, Field(ge=1, le=12)]
+_Depth = Annotated[float, Field(gt=0, le=1000)]
 
 
 class CostSpec(Strict):
@@ -48,11 +51,18 @@ class DesignSpec(NamesFiles):
     filter_set: SetUseSpec
     palette: str = Field("dyes", description="filters to start from, filters that are not varied, quantum efficiency")
     vary: list[str] = Field([], description="names of the filters that are varied; none: all of the set")
+    tile_px: tuple[_Side, _Side] | None = Field(
+        None, description="rows and columns of a tile in which the shares of the frame filters are varied"
+    )
+    share_min: float = Field(0.05, gt=0, le=0.5, description="least share of a frame filter in that tile")
+    silicon_depth_um: tuple[_Depth, _Depth] | None = Field(
+        None, description="range in which the depth of the silicon is varied; default that of the palette"
+    )
     family: Literal["dye", "thin_film", "free"] = "dye"
     bands: int = Field(2, ge=1, le=6, description="absorption bands of a dye")
     layers: int = Field(9, ge=1, le=40, description="layers of a stack of thin films")
     transmittance_max: float = Field(0.95, gt=0, le=1)
-    transmittance_min: float = Field(0.0, ge=0, lt=1, description="of free curves")
+    transmittance_min: float = Field(0.0, ge=0, lt=1, description="what passes a filter where it is darkest")
     slope_max_per_nm: float = Field(0.03, gt=0, le=1, description="steepest change of the transmittance")
     fit: LightsSpec
     illuminance_lux: list[_Lux] = Field([20.0, 1000.0], min_length=1)
@@ -63,7 +73,8 @@ class DesignSpec(NamesFiles):
     steps: int = Field(125, ge=1, le=100_000, description="of the optimiser, for each start")
     seed: int = Field(1, ge=0, lt=2**63)
     judge: LightsSpec = Field(description="what the result is judged on; should not be what it was fitted to")
-    compare: list[SetUseSpec] = Field([], description="sets that the result is compared with")
+    compare: list[SetUseSpec] = Field([], description="sets that the result is compared with; none: that of the start")
+    demosaic: bool = Field(True, description="judge it after demosaicing, too")
     repeats: int = Field(8, ge=2, le=1000, description="noisy frames of the judgement")
 
     @model_validator(mode="after")
@@ -72,11 +83,13 @@ class DesignSpec(NamesFiles):
             raise ValueError("transmittance_min must be below transmittance_max")
         if len(set(self.vary)) != len(self.vary):
             raise ValueError("vary: a filter is there twice")
+        if self.silicon_depth_um is not None and self.silicon_depth_um[0] >= self.silicon_depth_um[1]:
+            raise ValueError("silicon_depth_um: expected the least and the largest depth")
         return self
 
 
-def read_design(name_or_path: str | Path) -> DesignSpec:
-    """A design's file, by shipped name or path.
+def read_design(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> DesignSpec:
+    """A design's file, by shipped name or path, perhaps with other values of dotted keys.
 
     Raises
     ------
@@ -84,4 +97,4 @@ def read_design(name_or_path: str | Path) -> DesignSpec:
         With file, line and key of all that is wrong.
     """
     file = locate(name_or_path, "design_specs")
-    return validate(DesignSpec, load_yaml(file), file, {})
+    return validate(DesignSpec, load_yaml(file), file, overrides or {})

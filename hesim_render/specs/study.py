@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -68,7 +69,7 @@ class SurfacesSpec(NamesFiles):
     @property
     def label(self) -> str:
         """Name in the results."""
-        return self.name or self.reflectances or self.scene or Path(self.cube or "").stem
+        return self.name or Path(self.reflectances or self.scene or self.cube or "").stem
 
 
 class NamedLight(Strict):
@@ -117,6 +118,7 @@ class StudySpec(NamesFiles):
     name: str = Field(min_length=1)
     description: str = ""
     sensors: list[str] = Field(min_length=1, description="names or files; their pixels, lens and noise")
+    sensor_keys: dict[str, Any] = Field({}, description="keys of the sensor files to change, as aps.read_noise_e: 1.5")
     palette: str = "dyes"
     filter_sets: list[SetUseSpec] = Field([], description="none: the sensors' own filters")
     surfaces: list[SurfacesSpec] = [SurfacesSpec(reflectances="colorchecker")]
@@ -157,8 +159,28 @@ def set_label(use: SetUseSpec, palette: str) -> str:
     return use.name or Path(use.set).stem + own
 
 
-def read_study(name_or_path: str | Path) -> StudySpec:
-    """A study's file, by shipped name or path.
+def surfaces_of(text: str) -> dict[str, str]:
+    """The surfaces that a text names: a scene, a CSV file of patches, a cube, or a set of reflectances.
+
+    Parameters
+    ----------
+    text : name of a shipped scene or of a set, or a path; paths are relative to the working folder.
+
+    Returns
+    -------
+    The entry of a study's file.
+    """
+    from hesim_render.specs.files import list_names
+
+    path = Path(text)
+    if path.suffix == "" and len(path.parts) == 1 and not path.exists():
+        return {"scene" if text in list_names("scenes") and text != "colorchecker" else "reflectances": text}
+    kind = {".yaml": "scene", ".yml": "scene", ".csv": "reflectances"}.get(path.suffix.lower(), "cube")
+    return {kind: str(path.resolve())}
+
+
+def read_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> StudySpec:
+    """A study's file, by shipped name or path, perhaps with other values of dotted keys.
 
     Raises
     ------
@@ -166,4 +188,4 @@ def read_study(name_or_path: str | Path) -> StudySpec:
         With file, line and key of all that is wrong.
     """
     file = locate(name_or_path, "study_specs")
-    return validate(StudySpec, load_yaml(file), file, {})
+    return validate(StudySpec, load_yaml(file), file, overrides or {})

@@ -7,13 +7,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from hesim_render.core.errors import did_you_mean
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
 from hesim_render.specs.study import NamesFiles
 
 #: Most runs of a sweep.
 MOST_RUNS = 100_000
 _Scalar = str | float | int | bool
-Metric = Literal["frames", "electrons", "raw_mean", "raw_variance", "snr", "events", "event_rate", "mtf50"]
+#: Figures of a recording; those that begin with picture are of its first frame after the ISP.
+METRICS = (
+    "frames", "electrons", "raw_mean", "raw_variance", "snr", "events", "event_rate", "on_share", "mtf50", "mtf10",
+    "mtf_nyquist", "picture_mean", "picture_psnr", "picture_ssim", "picture_delta_e", "picture_mtf50", "isp_report",
+)  # fmt: skip
 
 
 class RangeSpec(Strict):
@@ -39,21 +44,23 @@ class RangeSpec(Strict):
 
 
 class SweepSpec(NamesFiles):
-    """A sweep over keys of scene and sensor files."""
+    """A sweep over keys of scenes, sensors and ISP steps, or over keys of a study of filter sets."""
 
     schema_version: Literal[1]
     name: str = Field(min_length=1)
     description: str = ""
-    scenes: list[str] = Field(min_length=1)
-    sensors: list[str] = Field(min_length=1)
+    study: str | None = Field(None, description="name or file of a study, in place of scenes and sensors")
+    scenes: list[str] = []
+    sensors: list[str] = []
     roi: str | None = Field(None, description="part of the sensor: WIDTHxHEIGHT, px")
     duration_s: float = Field(0.1, gt=0, le=1e6)
     vary: dict[str, list[Any] | RangeSpec] = Field(
-        {}, description="keys as in --set (light.illuminance_lux, sensor.aps.exposure_us): values or a range"
+        {}, description="keys as in --set (light.illuminance_lux, sensor.aps.exposure_us, isp.demosaic.method)"
     )
     seeds: list[Annotated[int, Field(ge=0, lt=2**64)]] = Field([7], min_length=1)
+    isp: str | None = Field(None, description="file of a pipeline; default: the ISP's own without noise reduction")
     options: dict[str, _Scalar] = Field({}, description="quality, samples, exact or clean, as for simulate")
-    metrics: list[Metric] = Field(["electrons", "snr", "event_rate"], min_length=1)
+    metrics: list[str] = Field([], description="of recordings, or columns of a study; default: three, or all")
     keep: bool = Field(False, description="keep the recordings, not only their figures")
 
     @field_validator("vary", mode="before")
@@ -84,8 +91,27 @@ class SweepSpec(NamesFiles):
         return value
 
     @model_validator(mode="after")
+    def _kind(self) -> SweepSpec:
+        if self.study is None:
+            if not self.scenes or not self.sensors:
+                raise ValueError("a sweep needs 'scenes' and 'sensors', or a 'study'")
+            for name in self.metrics:
+                if name not in METRICS:
+                    raise ValueError(f"metrics: unknown {name!r}{did_you_mean(name, METRICS)}; {', '.join(METRICS)}")
+            return self
+        given = {"scenes", "sensors", "roi", "duration_s", "isp", "options", "keep"} & self.model_fields_set
+        if given:
+            raise ValueError(f"{', '.join(sorted(given))}: not in a sweep of a study, whose file says these things")
+        return self
+
+    @property
+    def wanted(self) -> list[str]:
+        """The metrics of a sweep of recordings."""
+        return self.metrics or ["electrons", "snr", "event_rate"]
+
+    @model_validator(mode="after")
     def _countable(self) -> SweepSpec:
-        total = len(self.scenes) * len(self.sensors) * len(self.seeds)
+        total = max(1, len(self.scenes)) * max(1, len(self.sensors)) * len(self.seeds)
         for values in self.vary.values():
             total *= values.count if isinstance(values, RangeSpec) else len(values)
         if total > MOST_RUNS:

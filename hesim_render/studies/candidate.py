@@ -95,7 +95,7 @@ def candidates(spec: StudySpec) -> list[Candidate]:
 
     found, problems = [], []
     for name in spec.sensors:
-        base = load_sensor(spec.beside(name))
+        base = load_sensor(spec.beside(name), spec.sensor_keys)
         sets: Sequence[Any] = spec.filter_sets or [None]
         for number, use in enumerate(sets):
             try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import RangeError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import mixed
-from hesim_render.studies.colour_error import delta_e_2000, lab
+from hesim_render.spectral.colour_difference import delta_e_2000, lab
 from hesim_render.studies.colour_noise import YSNR_WEIGHTS
 from hesim_render.studies.colour_samples import ColourSamples
 
@@ -162,17 +162,35 @@ def measured_figures(
     -------
     ``ysnr`` and ``noise_amplification`` on the grey card, ``delta_e_noisy``: mean ΔE2000 of noisy output pixels.
     """  # fmt: skip
-    repeats, channels = len(balanced), balanced.shape[-1]
-    grey = balanced[:, -GREYS:].reshape(repeats, -1, channels)
+    grey = _grey_card(balanced)
     rgb = grey @ rgb_matrix.T
-    luminance = rgb @ np.array(YSNR_WEIGHTS)
-    ysnr = luminance.mean(axis=1) / luminance.std(axis=1, ddof=1)
     amplification = np.sqrt(rgb.var(axis=1, ddof=1).mean(axis=-1) / grey.var(axis=1, ddof=1).mean(axis=-1))
     seen = lab(balanced[:, :-GREYS] @ xyz_matrix.T, samples.white_xyz)
     wanted = lab(samples.xyz, samples.white_xyz)[None, :, None]
     difference = delta_e_2000(seen, np.broadcast_to(wanted, seen.shape))
     return {
-        "ysnr": Measured.of(ysnr),
+        "ysnr": measured_luminance(balanced, np.array(YSNR_WEIGHTS) @ rgb_matrix),
         "noise_amplification": Measured.of(amplification),
         "delta_e_noisy": Measured.of(difference.mean(axis=(1, 2))),
     }
+
+
+def measured_luminance(balanced: NDArray[np.float64], weights: NDArray[np.float64]) -> Measured:
+    """Luminance over its standard deviation on the grey card of noisy frames.
+
+    Parameters
+    ----------
+    balanced : as for `measured_figures`.
+    weights : [channel], of the channels in the luminance.
+
+    Returns
+    -------
+    The mean over frames, with its interval.
+    """
+    luminance = _grey_card(balanced) @ weights
+    return Measured.of(luminance.mean(axis=1) / luminance.std(axis=1, ddof=1))
+
+
+def _grey_card(balanced: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The output pixels of the grey card, [repeat, pixel, channel]."""
+    return balanced[:, -GREYS:].reshape(len(balanced), -1, balanced.shape[-1])

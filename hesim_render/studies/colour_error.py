@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.spectral.spectrum import colour_science
+from hesim_render.spectral.colour_difference import delta_e_2000, delta_e_ab, lab
 from hesim_render.studies.colour_samples import ColourSamples
 from hesim_render.studies.subspace import rank
 
@@ -59,22 +59,6 @@ class ColourError:
     def max(self) -> float:
         """Largest of the surfaces."""
         return float(self.delta_e.max())
-
-
-def lab(xyz: ArrayLike, white_xyz: ArrayLike) -> NDArray[np.float64]:
-    """CIELAB (CIE 15) of XYZ values [..., 3] under a white."""
-    white = np.asarray(white_xyz, dtype=np.float64)
-    return colour_science().XYZ_to_Lab(np.asarray(xyz) / white[1], white[:2] / white.sum())
-
-
-def delta_e_ab(lab_a: ArrayLike, lab_b: ArrayLike) -> NDArray[np.float64]:
-    """ΔE*ab (CIE 1976) between CIELAB values [..., 3]."""
-    return np.linalg.norm(np.asarray(lab_a) - np.asarray(lab_b), axis=-1)
-
-
-def delta_e_2000(lab_a: ArrayLike, lab_b: ArrayLike) -> NDArray[np.float64]:
-    """ΔE2000 (CIE 142-2001) between CIELAB values [..., 3]."""
-    return colour_science().difference.delta_E_CIE2000(np.asarray(lab_a), np.asarray(lab_b))
 
 
 def expanded(camera: ArrayLike, expansion: Expansion = "linear") -> NDArray[np.float64]:

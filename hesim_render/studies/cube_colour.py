@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
+from hesim_render.core.namespace import device_namespace
+from hesim_render.core.tables import table
 from hesim_render.sources.cube.planes import blocks, integration_weights
 from hesim_render.sources.render.cube import render_cube
 from hesim_render.sources.scene import load_scene
-from hesim_render.specs.study import Method, NamedLight, SurfacesSpec
+from hesim_render.specs.study import NamedLight, SurfacesSpec
+from hesim_render.spectral.colour_difference import Triple, delta_e_2000_of, lab_of
 from hesim_render.spectral.spectrum import Spectrum, colour_matching_functions, product
-from hesim_render.studies.colour_error import delta_e_2000, fit_matrix, lab
-from hesim_render.studies.colour_samples import colour_samples
 from hesim_render.studies.table import Cell
 from hesim_render.targets.cube_file import CubeFile, open_cube
 
@@ -46,21 +49,24 @@ def open_surfaces(item: SurfacesSpec) -> CubeFile:
 
 
 def cube_figures(
-    item: SurfacesSpec, sets: Sequence[Sequence[Spectrum]], light: NamedLight, chart: Sequence[Spectrum], method: Method
+    item: SurfacesSpec,
+    cube: CubeFile,
+    sets: Sequence[Sequence[Spectrum]],
+    matrices: Sequence[NDArray[np.float64]],
+    light: NamedLight,
 ) -> Iterator[dict[str, Cell]]:
     """Mean, 95 % quantile and maximum of ΔE2000 over the pixels of a cube, for each filter set.
 
-    The matrix of a set is fitted to a chart under the light. All sets are integrated together, in one pass over the
-    file. A cube of radiance is seen in its own light; the light of the study is its white, and the luminance that
-    99.5 % of the pixels stay below is that of white.
+    All sets are integrated together, in one pass over the file. A cube of radiance is seen in its own light; the light
+    of the study is its white, and the luminance that 99.5 % of the pixels stay below is that of white.
 
     Parameters
     ----------
-    item : the cube.
+    item : how the cube is read.
+    cube : from `open_surfaces`.
     sets : responses of each filter set.
+    matrices : [3, channel] of each set, from channels with white at 1 to XYZ.
     light : illuminant of reflectances, white of radiances.
-    chart : reflectances that the matrices are fitted to.
-    method : how they are fitted.
 
     Yields
     ------
@@ -71,7 +77,6 @@ def cube_figures(
     SpecError
         If the cube cannot be read, does not cover a response, or holds reflectances outside 0 to 1.
     """
-    cube = open_surfaces(item)
     spectrum = light.spectrum.load()
     is_reflectance = item.is_reflectance
     if is_reflectance:
@@ -83,30 +88,50 @@ def cube_figures(
     weights = integration_weights(seen, cube, item.beyond == "hold") * item.scale
     white = np.array([product(each, spectrum).integral() for each in [*every, *colour_matching_functions()]])
     scale = 1.0 if is_reflectance else white[-2] / _white_luminance(cube, weights[:, -2])
-    matrices = [fit_matrix(colour_samples(responses, spectrum, chart, light.name), method).matrix for responses in sets]
     starts = np.cumsum([0, *(len(responses) for responses in sets)])
+    parts = [np.s_[first:end] for first, end in pairwise(starts)]
+    # from the bands of a texel straight to X/X_n, Y/Y_n, Z/Z_n: the true ones first, then those of each set
     white_xyz = white[-3:] / white[-2]
-    histograms = np.zeros((len(sets), round(_MOST / _BIN)), dtype=np.int64)
+    tables = [weights[:, -3:] / white[-2]]
+    tables += [(weights[:, own] / white[own]) @ matrix.T for own, matrix in zip(parts, matrices, strict=True)]
+    to_ratios = [(scale * each / white_xyz).astype(np.float32) for each in tables]
+    counts = np.zeros((len(sets), round(_MOST / _BIN)), dtype=np.int64)
     total, largest = np.zeros(len(sets)), np.zeros(len(sets))
     for values in blocks(cube):
         if is_reflectance:
             _check_reflectance(values, item, cube)
-        signals = values.reshape(-1, values.shape[2]) @ (weights * scale).astype(np.float32)
-        wanted = lab(signals[:, -3:] / white[-2], white_xyz)
-        for k, matrix in enumerate(matrices):
-            part = slice(starts[k], starts[k + 1])
-            corrected = (signals[:, part] / white[part].astype(np.float32)) @ matrix.T
-            difference = delta_e_2000(lab(corrected, white_xyz), wanted)
-            histograms[k] += np.histogram(difference, histograms.shape[1], (0, _MOST))[0]
-            total[k] += difference.sum()
-            largest[k] = max(largest[k], float(difference.max()))
+        texels = values.reshape(-1, values.shape[2]).T
+        true = _lab_on_device(to_ratios[0].T @ texels)
+        for k, own in enumerate(to_ratios[1:]):
+            found = _differences(true, own.T @ texels)
+            number = np.minimum((found * (1 / _BIN)).astype(np.int32), counts.shape[1] - 1)
+            counts[k] += np.bincount(number, minlength=counts.shape[1])
+            total[k] += found.sum(dtype=np.float64)
+            largest[k] = max(largest[k], float(found.max()))
     pixels = cube.shape[0] * cube.shape[1]
     for k in range(len(sets)):
-        place = int(np.searchsorted(np.cumsum(histograms[k]), 0.95 * histograms[k].sum()))
+        place = int(np.searchsorted(np.cumsum(counts[k]), 0.95 * pixels))
         yield {
             "delta_e_cube_mean": float(total[k] / pixels), "delta_e_cube_p95": (place + 1) * _BIN,
             "delta_e_cube_max": float(largest[k]), "cube_pixels": pixels,
         }  # fmt: skip
+
+
+def _lab_on_device(ratios: NDArray[np.float32]) -> Triple:
+    """CIELAB of X, Y and Z over white, [3, texel], as device arrays."""
+    import drjit as dr
+
+    x, y, z = (table(jit().Float, row) for row in ratios)
+    found = lab_of((x, y, z), device_namespace())
+    dr.eval(*found)
+    return found
+
+
+def _differences(true: Triple, ratios: NDArray[np.float32]) -> NDArray[np.float32]:
+    """ΔE2000 of texels, [texel]."""
+    xp = device_namespace()
+    x, y, z = (table(jit().Float, row) for row in ratios)
+    return np.asarray(delta_e_2000_of(lab_of((x, y, z), xp), true, xp).numpy())
 
 
 def _check_reflectance(values: NDArray[np.float32], item: SurfacesSpec, cube: CubeFile) -> None:

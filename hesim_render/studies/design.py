@@ -1,4 +1,4 @@
-"""Design of filters by gradients: from a file to a sensor file, judged by full simulation."""
+"""Design by gradients: filters, depth of the silicon and tile shares, from a file to palette and filter set."""
 
 from __future__ import annotations
 
@@ -14,18 +14,22 @@ from hesim_render.core.device_types import Float64
 from hesim_render.core.errors import SpecError, did_you_mean
 from hesim_render.core.tables import table
 from hesim_render.sensor import lens as optics
-from hesim_render.sensor.sensor import Sensor, load_sensor
+from hesim_render.sensor.sensor import load_sensor
 from hesim_render.specs.design import DesignSpec
 from hesim_render.specs.filter_set import FilterSetSpec, PaletteSpec, read_filter_set, read_palette
 from hesim_render.specs.spectrum import SpectrumSpec
+from hesim_render.spectral.physical import silicon_quantum_efficiency
 from hesim_render.studies.colour_noise import channel_noise
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights
 from hesim_render.studies.design_filters import Dyes, Family, FreeCurves, ThinFilms
+from hesim_render.studies.design_tile import repeated
 from hesim_render.studies.filter_sets import filters_of, with_filter_set
 from hesim_render.studies.surfaces import reflectances_of
 
 #: Bands of all spectra of a design, nm.
 BANDS_NM = np.arange(360.0, 831.0, 5.0)
+#: Added to the weight of each share, so that all can be 0.
+_LEAST_WEIGHT = 1e-3
 #: Weight of the mean squared excess of a slope, in units of the largest slope.
 _SLOPE_WEIGHT = 1000.0
 
@@ -37,12 +41,16 @@ class DesignResult:
     Parameters
     ----------
     filters : transmittance at `BANDS_NM` of each varied filter.
+    shares : share of each frame filter in the frame pixels, where shares are varied.
+    silicon_depth_um : depth of the silicon, where it is varied.
     cost : of the best start.
     costs : of each start, before and after, [start, 2].
     evaluations : of the cost and its gradient, in all.
     """
 
     filters: dict[str, NDArray[np.float64]]
+    shares: dict[str, float] | None
+    silicon_depth_um: float | None
     cost: float
     costs: NDArray[np.float64]
     evaluations: int
@@ -75,6 +83,28 @@ class Problem:
         if self.sensor.spec.aps is None:
             raise SpecError("a design needs frame pixels", key="filter_set")
         self.family = _family(spec)
+        self.frames = filters_of(self.sensor, "aps")
+        self.filter_size = len(self.vary) * len(self.family.bounds())
+        self._start_depth_um = 0.0
+        if spec.silicon_depth_um is not None:
+            self._start_depth_um = silicon_depth(self.sensor.spec.quantum_efficiency)
+        if spec.tile_px is not None:
+            self._require_shares(*spec.tile_px)
+
+    def _require_shares(self, rows: int, cols: int) -> None:
+        tile, free = self.tile(rows, cols)
+        if len(self.frames) < 2 or len(self.frames) * self.spec.share_min >= 1:
+            raise SpecError(f"no shares of {len(self.frames)} filters of frames can be varied", key="share_min")
+        if free.sum() < len(self.frames):
+            raise SpecError(f"{len(self.frames)} filters do not fit on {free.sum()} pixels", key="tile_px")
+        if any(set(self.filter_set.pixels[letter].roles) == {"aps", "evs"} for letter in tile.ravel()):
+            raise SpecError("shares of pixels that give frames and events cannot be varied", key="tile_px")
+
+    def tile(self, rows: int, cols: int) -> tuple[NDArray[np.str_], NDArray[np.bool_]]:
+        """The set's tile repeated over a larger one, and which pixels give frames, [row, col]."""
+        tile = repeated(self.filter_set, rows, cols)
+        roles = np.vectorize(lambda letter: "aps" in self.filter_set.pixels[str(letter)].roles)
+        return tile, roles(tile)
 
     @cached_property
     def open_response(self) -> NDArray[np.float64]:
@@ -92,7 +122,7 @@ class Problem:
     def cost(self) -> DesignCost:
         """The cost as a function of the responses."""
         spec, sensor = self.spec, self.sensor
-        frames, events = filters_of(sensor, "aps"), filters_of(sensor, "evs")
+        events = filters_of(sensor, "evs")
         reflectances = list(reflectances_of(spec.fit.surfaces()).values())
         conditions = [Condition.of(reflectances, each.spectrum.load(), BANDS_NM) for each in spec.fit.illuminants]
         aps, evs = sensor.spec.aps, sensor.spec.evs
@@ -105,7 +135,8 @@ class Problem:
             window_us = float(evs.window_us)
         return DesignCost(
             sensor, BANDS_NM, conditions, spec.illuminance_lux, exposure_us,
-            channel_noise(sensor, frames, exposure_us, spec.area_px), [self.names.index(name) for name in frames],
+            channel_noise(sensor, self.frames, exposure_us, spec.area_px),
+            [self.names.index(name) for name in self.frames],
             [self.names.index(name) for name in events], scale, window_us,
             Weights(spec.cost.colour, spec.cost.noise, spec.cost.events),
         )  # fmt: skip
@@ -125,20 +156,59 @@ class Problem:
             found[name] = self.family.transmittance(own)
         return found
 
+    def shares(self, parameters: Float64) -> list[Float64]:
+        """Share of each frame filter in the frame pixels, at least `share_min`, sum 1."""
+        import drjit as dr
+
+        first = parameters.shape[0] - len(self.frames)
+        types = jit()
+        weights = [
+            dr.gather(types.Float64, parameters, types.UInt32(first + k)) + _LEAST_WEIGHT
+            for k in range(len(self.frames))
+        ]
+        least = self.spec.share_min
+        return [least + (1 - len(weights) * least) * each / sum(weights) for each in weights]
+
+    def depth_um(self, parameters: Float64) -> Float64:
+        """Depth of the silicon, µm."""
+        import drjit as dr
+
+        assert self.spec.silicon_depth_um is not None
+        low, high = self.spec.silicon_depth_um
+        return low + (high - low) * dr.gather(jit().Float64, parameters, jit().UInt32(self.filter_size))
+
+    def _light(self, parameters: Float64) -> Float64:
+        """Response at the bands of a pixel without a filter, with the depth of the silicon."""
+        import drjit as dr
+
+        light = table(jit().Float64, self.open_response)
+        if self.spec.silicon_depth_um is None:
+            return light
+        thin_um = 0.01
+        per_um = -np.log1p(-silicon_quantum_efficiency(thin_um).at(BANDS_NM)) / thin_um
+        before = -np.expm1(-per_um * self._start_depth_um)
+        absorbed = 1 - dr.exp(-table(jit().Float64, per_um) * self.depth_um(parameters))
+        return light * absorbed / table(jit().Float64, before)
+
     def __call__(self, parameters: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Cost and gradient with respect to parameters between 0 and 1."""
+        """Cost and gradient with respect to parameters between 0 and 1: filters, depth of the silicon, tile shares."""
         import drjit as dr
 
         types = jit()
         given = table(types.Float64, parameters)
         dr.enable_grad(given)
         filters = self.transmittances(given)
-        light = table(types.Float64, self.open_response)
+        light = self._light(given)
         responses = [
             filters[name] * light if name in filters else table(types.Float64, self.start_transmittance[name]) * light
             for name in self.names
         ]
-        total = self.cost(responses)
+        counts = None
+        if self.spec.tile_px is not None:
+            _, free = self.tile(*self.spec.tile_px)
+            own = float(self.spec.area_px * free.mean())
+            counts = [own * share for share in self.shares(given)]
+        total = self.cost(responses, counts)
         for each in filters.values():
             total += self._steepness(each) / len(filters)
         dr.backward(total)
@@ -161,7 +231,20 @@ class Problem:
         found = []
         for _ in range(self.spec.starts):
             own = [(self.family.start(self.start_transmittance[name], rng) - low) / (high - low) for name in self.vary]
-            found.append(np.clip(np.concatenate(own), 0, 1))
+            found.append(np.clip(np.concatenate([*own, *self._other_starts()]), 0, 1))
+        return found
+
+    def _other_starts(self) -> list[NDArray[np.float64]]:
+        """Depth and shares as they are, as parameters."""
+        found = []
+        if self.spec.silicon_depth_um is not None:
+            least, most = self.spec.silicon_depth_um
+            found.append(np.array([(self._start_depth_um - least) / (most - least)]))
+        if self.spec.tile_px is not None:
+            tile, free = self.tile(*self.spec.tile_px)
+            filters = [self.filter_set.pixels[str(letter)].filter for letter in tile[free]]
+            above = np.array([filters.count(name) / len(filters) for name in self.frames]) - self.spec.share_min
+            found.append(np.maximum(above, 0.02) / above.max())
         return found
 
 
@@ -193,33 +276,36 @@ def optimise(problem: Problem, told: Callable[[float, float, str], None] | None 
         if best is None or found.fun < best.fun:
             best = found
     assert best is not None
-    curves = problem.transmittances(jit().Float64(np.ascontiguousarray(best.x)))
+    given = jit().Float64(np.ascontiguousarray(best.x))
+    curves = problem.transmittances(given)
     filters = {name: np.clip(np.array(each, dtype=np.float64), 0.0, 1.0) for name, each in curves.items()}
-    return DesignResult(filters, float(best.fun), np.array(costs), evaluations)
+    shares = depth_um = None
+    if spec.tile_px is not None:
+        shares = {name: float(each[0]) for name, each in zip(problem.frames, problem.shares(given), strict=True)}
+    if spec.silicon_depth_um is not None:
+        depth_um = float(problem.depth_um(given)[0])
+    return DesignResult(filters, shares, depth_um, float(best.fun), np.array(costs), evaluations)
 
 
-def designed_palette(problem: Problem, result: DesignResult) -> dict[str, object]:
-    """The content of a palette file with the filters of a result, in place of those of the palette."""
-    palette = problem.palette.model_dump(mode="json", exclude_none=True)
-    filters = {}
-    for name in problem.names:
-        values = result.filters.get(name, problem.start_transmittance[name])
-        filters[name] = {"wavelength_nm": BANDS_NM.tolist(), "value": np.round(values, 6).tolist()}
-    return {
-        **palette, "name": problem.spec.name, "filters": filters, "sources": {},
-        "description": f"{', '.join(problem.vary)} designed as {problem.spec.family}; start {problem.palette.name}",
-        "assumptions": {"filters": "designed by gradients; no filter of these curves has been made"},
-    }  # fmt: skip
+def silicon_depth(efficiency: SpectrumSpec) -> float:
+    """Depth of the silicon in a quantum efficiency, µm.
 
-
-def designed_sensor(problem: Problem, palette: PaletteSpec) -> Sensor:
-    """The sensor with the filters of a result."""
-    return with_filter_set(problem.base, problem.filter_set, palette)
+    Raises
+    ------
+    SpecError
+        If it is not computed from one.
+    """
+    for part in (efficiency, *(efficiency.product or [])):
+        if part.silicon_depth_um is not None:
+            return part.silicon_depth_um
+    raise SpecError(
+        "the quantum efficiency does not come from a silicon_depth_um, alone or in a product", key="silicon_depth_um"
+    )
 
 
 def _family(spec: DesignSpec) -> Family:
     if spec.family == "dye":
-        return Dyes(BANDS_NM, spec.bands, spec.transmittance_max)
+        return Dyes(BANDS_NM, spec.bands, spec.transmittance_max, spec.transmittance_min)
     if spec.family == "thin_film":
-        return ThinFilms(BANDS_NM, spec.layers, spec.transmittance_max)
+        return ThinFilms(BANDS_NM, spec.layers, spec.transmittance_max, spec.transmittance_min)
     return FreeCurves(BANDS_NM, spec.transmittance_min, spec.transmittance_max)

@@ -14,7 +14,7 @@ constant M. All numbers have 64 bits, because a matrix of similar filters amplif
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,8 @@ from hesim_render.core.device_types import Float64
 from hesim_render.core.tables import table
 from hesim_render.sensor.photocurrent import photocurrent
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.spectral.colour_difference import lab
 from hesim_render.spectral.spectrum import Spectrum, scale_to_lux
-from hesim_render.studies.colour_error import lab
 from hesim_render.studies.colour_noise import GREY, ChannelNoise
 from hesim_render.studies.colour_samples import colour_samples
 
@@ -104,7 +104,7 @@ class DesignCost:
     conditions : lights.
     illuminance_lux : levels.
     exposure_us : µs.
-    noise : of the channels of frames; the signal's own noise is in it.
+    noise : of the channels of frames, the signal's own noise included; its counts hold unless a call gives others.
     frames, events : numbers of the filters of frame and of event pixels.
     event_scale : relative rise of light per event without baseline, and baseline over slope in electrons of a window.
     event_window_us : window of the event pixels, µs.
@@ -123,13 +123,18 @@ class DesignCost:
     event_window_us: float
     weights: Weights
 
-    def __call__(self, responses: Sequence[Float64]) -> Float64:
+    def __call__(self, responses: Sequence[Float64], counts: Sequence[Float64] | None = None) -> Float64:
         """The cost, a Dr.Jit number with derivatives.
 
         Parameters
         ----------
         responses : response of each filter at the bands, Dr.Jit Float64 [band].
+        counts : pixels of each channel of the frames in an output pixel, Dr.Jit numbers; None: those of `noise`.
         """
+        import drjit as dr
+
+        if counts is None:
+            counts = [dr.opaque(jit().Float64, float(count)) for count in self.noise.count]
         name = self.sensor.layout.filters[0]
         types = jit()
         total: Float64 = types.Float64(0.0)
@@ -142,10 +147,10 @@ class DesignCost:
                     radiance, self.wavelength_nm, self.sensor, self.exposure_us, filter=name, responses=own
                 )
                 per_lux.append(electrons.array)
-            total += self._of_condition(condition, per_lux) / len(self.conditions)
+            total += self._of_condition(condition, per_lux, counts) / len(self.conditions)
         return total
 
-    def _of_condition(self, condition: Condition, per_lux: list[Float64]) -> Float64:
+    def _of_condition(self, condition: Condition, per_lux: list[Float64], counts: Sequence[Float64]) -> Float64:
         import drjit as dr
 
         count = len(condition.xyz)
@@ -155,10 +160,10 @@ class DesignCost:
         if self.weights.colour:
             scale = 1e4 / max(float(np.mean(each.numpy())) for each in chosen)
             electrons = [each * dr.opaque(jit().Float64, scale) for each in chosen]
-            total += self.weights.colour * self._difference(condition, electrons, False)
+            total += self.weights.colour * self._difference(condition, electrons, None)
         for lux in self.illuminance_lux:
             if self.weights.noise:
-                part = self._difference(condition, [each * lux for each in chosen], True)
+                part = self._difference(condition, [each * lux for each in chosen], counts)
                 total += self.weights.noise / len(self.illuminance_lux) * part
             if self.weights.events and self.events:
                 total += self.weights.events / len(self.illuminance_lux) * self._contrast(per_lux, count, lux)
@@ -177,13 +182,15 @@ class DesignCost:
             total += rise * (1 + baseline_e / dr.maximum(electrons, 1e-3)) / len(self.events)
         return total
 
-    def _difference(self, condition: Condition, electrons: list[Float64], noisy: bool) -> Float64:
-        """√J with its best matrix."""
+    def _difference(self, condition: Condition, electrons: list[Float64], counts: Sequence[Float64] | None) -> Float64:
+        """√J with its best matrix; without noise where there are no counts."""
         import drjit as dr
 
         types, noise = jit(), self.noise
+        if counts is not None:
+            noise = replace(noise, count=np.array([float(each[0]) for each in counts]))
         host = np.stack([np.array(each, dtype=np.float64) for each in electrons], axis=1)
-        spread = noise.variance_e2(host) if noisy else np.full_like(host, _LEAST_VARIANCE)
+        spread = np.full_like(host, _LEAST_VARIANCE) if counts is None else noise.variance_e2(host)
         matrix = best_matrix(host, spread, condition.xyz, condition.weights)
         rows = [table(types.Float64, condition.weights[:, i, j]) for i in range(3) for j in range(3)]
         true = [table(types.Float64, column) for column in condition.xyz.T]
@@ -200,11 +207,11 @@ class DesignCost:
         weighted = np.einsum("sij,jc->sic", condition.weights, matrix)
         for c, each in enumerate(electrons):
             gain = table(types.Float64, np.sum(weighted[:, :, c] ** 2, axis=1))
-            if noisy:
+            if counts is not None:
                 # plain numbers: NumPy's would turn the array into one of NumPy's, without derivatives
                 constant, linear, square = (float(part[c]) for part in (noise.constant, noise.linear, noise.quadratic))
                 variance = constant + linear * each + square * dr.square(each)
-                total += gain * variance / float(noise.count[c])
+                total += gain * variance / counts[c]
             else:
                 total += gain * _LEAST_VARIANCE
         return dr.sqrt(dr.mean(total))

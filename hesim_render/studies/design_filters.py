@@ -42,18 +42,19 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Dyes:
-    """10^(−A) with A a sum of Gaussian bands, below a largest transmittance.
+    """10^(−A) with A a sum of Gaussian bands, between a least and a largest transmittance.
 
     Parameters
     ----------
     wavelength_nm : of the result.
     bands : number of bands.
-    most : largest transmittance.
+    most, least : largest and least transmittance.
     """
 
     wavelength_nm: NDArray[np.float64]
     bands: int
     most: float
+    least: float = 0.0
 
     def bounds(self) -> list[tuple[float, float]]:
         """See `Family.bounds`: centre, width and density of each band."""
@@ -68,7 +69,7 @@ class Dyes:
         for k in range(self.bands):
             centre, width, density = parameters[3 * k : 3 * k + 3]
             absorbance += density * dr.exp(-4 * log(2) * dr.square((grid - centre) / width))
-        return self.most * dr.exp(-log(10) * absorbance)
+        return self.least + (self.most - self.least) * dr.exp(-log(10) * absorbance)
 
     def start(self, wanted: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """See `Family.start`: bands where the wanted filter is dark."""
@@ -92,13 +93,14 @@ class ThinFilms:
     ----------
     wavelength_nm : of the result.
     layers : number of layers, the first one of the high index.
-    most : factor below 1 for what is lost elsewhere.
+    most, least : transmittance where all light passes the stack, and where none does.
     high, low, incidence, substrate : refractive indices.
     """
 
     wavelength_nm: NDArray[np.float64]
     layers: int
     most: float
+    least: float = 0.0
     high: float = 2.35
     low: float = 1.46
     incidence: float = 1.52
@@ -131,7 +133,8 @@ class ThinFilms:
                 cosine * c_im + sine * index * b_re,
             )
         real, imaginary = self.incidence * b_re + c_re, self.incidence * b_im + c_im
-        return self.most * 4 * self.incidence * self.substrate / (dr.square(real) + dr.square(imaginary))
+        passed = 4 * self.incidence * self.substrate / (dr.square(real) + dr.square(imaginary))
+        return self.least + (self.most - self.least) * passed
 
     def start(self, wanted: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
         """See `Family.start`: quarter waves at which the wanted filter is dark, varied by a fifth."""

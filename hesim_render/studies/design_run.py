@@ -18,16 +18,17 @@ from hesim_render.specs.files import validate
 from hesim_render.specs.filter_set import read_palette
 from hesim_render.specs.study import StudySpec
 from hesim_render.studies.cfa import run_study
-from hesim_render.studies.design import DesignResult, Problem, designed_palette, designed_sensor, optimise
-from hesim_render.studies.report import report_page
+from hesim_render.studies.design import DesignResult, Problem, optimise
+from hesim_render.studies.design_result import designed_palette, designed_set
+from hesim_render.studies.filter_sets import with_filter_set
+from hesim_render.studies.patterns import CHART_PX
+from hesim_render.studies.report import report_page, verdict_table
 from hesim_render.studies.table import Table
 
 #: File that marks the folder of a design.
 MARKER = "design.json"
 #: Name of the designed set in the results.
 DESIGNED = "designed"
-#: Half a 95 % interval over standard errors.
-_Z95 = 1.96
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,8 @@ def design(
     Parameters
     ----------
     spec : name of a shipped design, path of a file, or its content as a dictionary (``docs/studies.md``).
-    out : folder for ``sensor.yaml``, ``palette.yaml``, ``design.json``, ``results.csv`` and ``report.html``.
+    out : folder for ``sensor.yaml``, ``palette.yaml``, ``filter_set.yaml``, ``design.json``, ``results.csv`` and
+        ``report.html``.
     overwrite : replace the results of another design in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
 
@@ -84,20 +86,24 @@ def design(
             result = optimise(problem, told)
             _write_yaml(folder.path / "palette.yaml", designed_palette(problem, result))
             palette = read_palette(folder.path / "palette.yaml")
-            sensor = designed_sensor(problem, palette).spec.model_dump(mode="json", exclude_none=True)
+            filters = designed_set(problem, result)
+            _write_yaml(folder.path / "filter_set.yaml", filters.model_dump(mode="json", exclude_none=True))
+            sensor = with_filter_set(problem.base, filters, palette).spec.model_dump(mode="json", exclude_none=True)
             sensor |= {"description": palette.description, "sources": {}, "assumptions": palette.assumptions}
             _write_yaml(folder.path / "sensor.yaml", sensor)
-            judged = _judgement(read, folder.path / "palette.yaml")
+            judged = _judgement(read, problem, folder.path)
             found = run_study(judged, told)
         verdicts = _verdicts(read, found.table)
         with output_errors(folder.target):
             found.table.write(folder.path / "results.csv")
             content = {
                 "design": json.loads(read.model_dump_json()), "cost": result.cost, "costs": result.costs.tolist(),
-                "evaluations": result.evaluations, "verdicts": verdicts,
+                "evaluations": result.evaluations, "shares": result.shares,
+                "silicon_depth_um": result.silicon_depth_um, "verdicts": verdicts,
             }  # fmt: skip
             (folder.path / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-            (folder.path / "report.html").write_text(report_page(judged, found), encoding="utf-8")
+            summary = verdict_table(verdicts, result.costs, None if result.shares is None else filters.tile)
+            (folder.path / "report.html").write_text(report_page(judged, found, summary), encoding="utf-8")
         folder.commit()
     except BaseException:
         folder.discard()
@@ -105,22 +111,30 @@ def design(
     return Design(result, found.table, verdicts)
 
 
-def _judgement(spec: DesignSpec, palette: Path) -> StudySpec:
-    """The study that judges the result."""
-    own = {"set": spec.filter_set.beside(spec.filter_set.set), "palette": str(palette.resolve()), "name": DESIGNED}
+def _judgement(spec: DesignSpec, problem: Problem, folder: Path) -> StudySpec:
+    """The study that judges the result, against the sets of `compare` or that of the start."""
+    own = {
+        "set": str((folder / "filter_set.yaml").resolve()), "palette": str((folder / "palette.yaml").resolve()),
+        "name": DESIGNED,
+    }  # fmt: skip
+    start = spec.filter_set.model_copy(update={"name": spec.filter_set.name or "start"})
     others = [
         {
             "set": use.beside(use.set), "palette": use.beside(use.palette or spec.palette),
             "name": use.name or f"{Path(use.set).stem} ({Path(use.palette or spec.palette).stem})",
         }
-        for use in spec.compare
+        for use in spec.compare or [start]
     ]  # fmt: skip
+    figures = ["colour", "noise", "events"]
+    geometry = problem.sensor.spec.geometry
+    if spec.demosaic and geometry.rows >= CHART_PX[0] and geometry.cols >= CHART_PX[1]:
+        figures.append("demosaic")
     exposure = [] if spec.exposure_us is None else [spec.exposure_us]
     data = {
         "schema_version": 1, "name": spec.name, "description": spec.description, "sensors": [spec.beside(spec.sensor)],
         "palette": spec.beside(spec.palette), "filter_sets": [own, *others],
         "surfaces": [spec.judge.surfaces()], "illuminants": spec.judge.illuminants,
-        "illuminance_lux": spec.illuminance_lux, "exposures_us": exposure, "area_px": spec.area_px,
+        "figures": figures, "illuminance_lux": spec.illuminance_lux, "exposures_us": exposure, "area_px": spec.area_px,
         "noise": {"repeats": spec.repeats, "patch_px": 24, "seed": 1},
     }  # fmt: skip
     return StudySpec.model_validate(data, context={"folder": spec.folder})
@@ -140,10 +154,16 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
             continue
         other = table.where(filter_set=name)
         parts = []
+        # a set without event pixels cannot be judged by them
+        has_events = (
+            weights.events > 0
+            and "event_contrast_on" in table.columns
+            and all(np.isfinite(each["event_contrast_on"]).all() for each in (own, other))
+        )
         for each in (own, other):
             cost = weights.colour * each["delta_e_mean"] + weights.noise * each["delta_e_noisy_noise_aware_simulated"]
-            if weights.events and "event_contrast_on" in each.columns:
-                cost = cost + weights.events * np.nan_to_num(each["event_contrast_on"])
+            if has_events:
+                cost = cost + weights.events * each["event_contrast_on"]
             half = each["delta_e_noisy_noise_aware_high"] - each["delta_e_noisy_noise_aware_simulated"]
             parts.append((float(cost.mean()), weights.noise * float(np.sqrt(np.sum(half**2))) / len(each)))
         difference = parts[0][0] - parts[1][0]
@@ -155,8 +175,14 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
             "delta_e_mean_against": float(other["delta_e_mean"].mean()),
         }  # fmt: skip
         for lux in spec.illuminance_lux:
-            pair = [each.where(illuminance_lux=lux)["ysnr_simulated"].mean() for each in (own, other)]
-            verdict[f"ysnr_ratio_{lux:g}_lux"] = float(pair[0] / pair[1])
+            for name, column in (("ysnr_ratio", "ysnr"), ("ysnr_noise_aware_ratio", "ysnr_noise_aware")):
+                pair = [each.where(illuminance_lux=lux)[f"{column}_simulated"].mean() for each in (own, other)]
+                verdict[f"{name}_{lux:g}_lux"] = float(pair[0] / pair[1])
+        for figure in ("mtf50_cy_per_px", "false_colour", "zone_plate_colour", "picture_error_simulated"):
+            if figure in table.columns:
+                verdict[figure], verdict[f"{figure}_against"] = (
+                    float(np.nanmean(each[figure])) for each in (own, other)
+                )
         found.append(verdict)
     return found
 

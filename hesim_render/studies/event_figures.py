@@ -11,7 +11,7 @@ from hesim_render.core.namespace import NUMPY
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs import formulas
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.studies.colour_error import delta_e_ab, lab
+from hesim_render.spectral.colour_difference import delta_e_ab, lab
 from hesim_render.studies.colour_noise import GREY
 from hesim_render.studies.colour_samples import ColourSamples
 

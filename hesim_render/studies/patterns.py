@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 #: Side of a pattern, px; a multiple of the tiles of 2, 3, 4 and 6 pixels.
 SIDE_PX = 192
+#: Rows and columns of all patterns side by side.
+CHART_PX = SIDE_PX, 3 * SIDE_PX
 #: Angle of the edge from the vertical, degrees; spokes of the star; highest frequency of the zone plate, cycles per px.
 EDGE_DEG, SPOKES, ZONE_TOP = 5.0, 36, 0.5
 #: Points across a pixel.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, svg
 from hesim_render.spectral.colorimetry import encode_srgb, xyz_to_linear_srgb
-from hesim_render.studies.cfa import Seen
+from hesim_render.studies.seen import Seen
 from hesim_render.studies.table import Table
 
 _MARKERS = "osD^vP*X<>hp"
@@ -35,12 +35,13 @@ def pareto_front(cost: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArra
 
 def pareto_plot(rows: Table, title: str) -> str:
     """SVG of colour error against luminance SNR, one point a filter set; the front is a line."""
-    figure, axes = panel(title, "mean ΔE2000", "YSNR of an 18 % grey card", (430, 320))
+    figure, axes = panel(title, "mean ΔE2000", "YSNR of an 18 % grey card", (400, 300))
+    rows = Table(row for row in rows if row["delta_e_mean"] is not None and row["ysnr"] is not None)
     error, snr, names = rows["delta_e_mean"], rows["ysnr"], _labels(rows)
     for k, name in enumerate(dict.fromkeys(names)):
         own = np.array([other == name for other in names])
         axes.plot(
-            error[own], snr[own], linestyle="none", marker=_MARKERS[k % len(_MARKERS)], markersize=5,
+            error[own], snr[own], linestyle="none", marker=_MARKERS[k % len(_MARKERS)], markersize=7,
             color=COLOURS[k % len(COLOURS)], label=name,
         )  # fmt: skip
     front = np.flatnonzero(pareto_front(error, snr))
@@ -110,8 +111,9 @@ def chart_picture(seen: Seen, across: int = 6, size_px: int = 26) -> NDArray[np.
     assert seen.colour is not None
     samples = seen.samples
     count = min(len(samples.xyz), 4 * across)
-    true = encode_srgb(xyz_to_linear_srgb(samples.xyz[:count], samples.white_xyz))
-    camera = encode_srgb(xyz_to_linear_srgb(samples.camera[:count] @ seen.colour.matrix.T, samples.white_xyz))
+    chosen = np.linspace(0, len(samples.xyz) - 1, count).round().astype(int)  # of many, evenly spaced ones
+    true = encode_srgb(xyz_to_linear_srgb(samples.xyz[chosen], samples.white_xyz))
+    camera = encode_srgb(xyz_to_linear_srgb(samples.camera[chosen] @ seen.colour.matrix.T, samples.white_xyz))
     lower = np.add.outer(np.arange(size_px), np.arange(size_px)) >= size_px
     down = -(-count // across)
     out = np.full((down * size_px, across * size_px, 3), 40, np.uint8)

@@ -2,40 +2,48 @@
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import groupby
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.drawing import report_style
-from hesim_render.core.html import PAGE_STYLE, number, row_of, table
+from hesim_render.core.html import PAGE_STYLE, inline_picture, number, row_of, table
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
-from hesim_render.studies.cfa import Seen, StudyResult
+from hesim_render.studies.cfa import StudyResult
 from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
-from hesim_render.studies.table import Table
+from hesim_render.studies.seen import Seen
+from hesim_render.studies.table import Cell, Table
 
-#: Columns of the report's tables: name in the results, heading.
-_COLUMNS = {
-    "filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, µs",
+#: Columns that say which row it is; all but the first are left out if they say the same in every row.
+_NAMES = {"filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, ms"}
+#: Columns of the tables of figures: name in the results, heading. Those of colour do not depend on the level.
+_COLOUR = {
     "delta_e_mean": "ΔE2000 mean", "delta_e_p95": "95 %", "delta_e_max": "max",
-    "delta_e_mean_root_polynomial": "root polynomial", "smi": "SMI", "vora": "Vora",
-    "luther_residual": "Luther residual",
-    "noise_amplification": "noise ampl.", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
+    "delta_e_mean_root_polynomial": "root polynomial", "delta_e_cube_mean": "ΔE2000 of the cube",
+    "delta_e_cube_p95": "95 %", "delta_e_cube_max": "max", "smi": "SMI", "vora": "Vora",
+    "vora_light": "Vora, this light", "luther_residual": "Luther residual",
+    "filter_quality_min": "least filter quality",
+}  # fmt: skip
+_NOISE = {
+    "noise_amplification": "amplification", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
     "delta_e_noisy_simulated": "ΔE2000 with noise", "ysnr_noise_aware": "YSNR, noise-aware",
     "delta_e_mean_noise_aware": "ΔE2000, noise-aware", "snr10_lux": "SNR10, lx", "dynamic_range_db": "DR, dB",
-    "white_saturation": "white / saturation", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
-    "zipper": "zipper, %", "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
-    "picture_error_simulated": "rms error with noise",
-    "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz",
-    "event_seen": "steps seen", "event_seen_isoluminant": "isoluminant steps seen",
+    "white_saturation": "white / saturation",
 }  # fmt: skip
-#: Columns that a table leaves out if they say the same in every row.
-_BORING = ("sensor", "crosstalk", "exposure_us")
+_DETAIL = {
+    "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab", "zipper": "zipper, %",
+    "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
+    "picture_error_simulated": "rms error with noise",
+}  # fmt: skip
+_EVENTS = {
+    "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz", "event_seen": "steps seen",
+    "event_seen_isoluminant": "isoluminant steps seen",
+}  # fmt: skip
 #: Figures with an interval: ends of the columns of its limits.
 _INTERVALS = {
     "ysnr_simulated": "ysnr", "delta_e_noisy_simulated": "delta_e_noisy", "picture_error_simulated": "picture_error",
@@ -44,18 +52,20 @@ _INTERVALS = {
 _MOST_GROUPS = 24
 
 
-def report_page(spec: StudySpec, result: StudyResult) -> str:
+def report_page(spec: StudySpec, result: StudyResult, summary: str = "") -> str:
     """The page of a study.
 
     Parameters
     ----------
     spec, result : the study and its results.
+    summary : HTML that comes first, after the description.
 
     Returns
     -------
     HTML.
     """
     parts = [f"<h1>{escape(spec.name)}</h1>", f"<p>{escape(spec.description)}</p>" if spec.description else ""]
+    parts.append(summary)
     with report_style():
         parts += ["<h2>Filter sets</h2>", row_of(*map(response_plot, _first_of_each_set(result.seen)))]
         parts += _groups(result.table)
@@ -63,7 +73,8 @@ def report_page(spec: StudySpec, result: StudyResult) -> str:
     if result.pictures:
         parts.append("<h2>Patterns after demosaicing</h2>")
         figures = (
-            f"{_png(encode_srgb(image))}<figcaption>{escape(text)}</figcaption>" for text, image in result.pictures
+            f"{inline_picture(encode_srgb(image), text)}<figcaption>{escape(text)}</figcaption>"
+            for text, image in result.pictures
         )
         parts.append(row_of(*figures))
     parts.append(_method(spec))
@@ -74,6 +85,41 @@ def report_page(spec: StudySpec, result: StudyResult) -> str:
     )
 
 
+def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float64], tile: str | None) -> str:
+    """HTML of how a designed set compares with others.
+
+    Parameters
+    ----------
+    verdicts : of each set it is compared with.
+    costs : of each start before and after, [start, 2].
+    tile : the designed tile, where shares were varied.
+    """
+    parts = ["<h2>Verdict</h2>"]
+    named = {"delta_e_mean": "mean ΔE2000", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
+             "zone_plate_colour": "zone plate, C*ab", "picture_error_simulated": "rms error with noise"}  # fmt: skip
+    for verdict in verdicts:
+        low, high = (number(verdict[f"cost_difference_{end}"]) for end in ("low", "high"))
+        rows = [
+            ["judged cost", number(verdict["cost"]), number(verdict["cost_against"]), f"difference {low} to {high}"]
+        ]
+        rows += [
+            [title, number(verdict[key]), number(verdict[f"{key}_against"]), ""]
+            for key, title in named.items()
+            if key in verdict
+        ]
+        for key, value in verdict.items():
+            for start, title in (("ysnr_ratio_", "YSNR"), ("ysnr_noise_aware_ratio_", "YSNR, noise-aware matrix,")):
+                if key.startswith(start):
+                    lux = key.removeprefix(start).removesuffix("_lux")
+                    rows.append([f"{title} at {lux} lx", "", "", f"{number(value)} times"])
+        parts.append(table(["", "designed", str(verdict["against"]), "95 % interval or ratio"], rows))
+    if tile is not None:
+        parts.append(f"<p>Designed tile:</p><pre>{escape(tile)}</pre>")
+    told = ", ".join(f"{number(before)} to {number(after)}" for before, after in costs)
+    parts.append(f"<p>Cost of the optimiser, before and after, for each start: {told}.</p>")
+    return "\n".join(parts)
+
+
 def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
     found: dict[tuple[str, str], Seen] = {}
     for each in seen:
@@ -82,38 +128,64 @@ def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
 
 
 def _groups(rows: Table) -> list[str]:
-    """Drawing and table of each group of rows in which only sensors, filter sets and crosstalk differ."""
-    keys = [
-        name
-        for name in ("surfaces", "illuminant", "illuminance_lux", "nominal_exposure_us", "equal")
-        if name in rows.columns
-    ]
-    order = sorted(rows, key=lambda row: [str(row[name]) for name in keys])
+    """Drawings and tables of each group of rows in which only sensors, filter sets and crosstalk differ."""
+    lights, levels = ("surfaces", "illuminant"), ["illuminance_lux", "equal"]
+    of_sensor: dict[Cell, set[Cell]] = {}
+    for row in rows:
+        of_sensor.setdefault(row["sensor"], set()).add(row.get("nominal_exposure_us"))
+    if max(map(len, of_sensor.values())) > 1:  # else each sensor has its own exposure
+        levels.append("nominal_exposure_us")
     parts = []
-    for number_, (values, group) in enumerate(groupby(order, key=lambda row: [row[name] for name in keys])):
+    for number_, ((surfaces, light), group) in enumerate(_grouped(rows, lights)):
         if number_ == _MOST_GROUPS:
             parts.append("<p>More groups of rows are in results.csv.</p>")
             break
-        some = Table(group)
-        named = dict(zip(keys, values, strict=True))
-        title = f"{named['surfaces']}, {named['illuminant']}, {named['illuminance_lux']:g} lx, equal {named['equal']}"
-        parts.append(f"<h2>{escape(title)}</h2>")
-        if {"delta_e_mean", "ysnr"} <= set(some.columns):
-            parts.append(row_of(pareto_plot(some, "Colour against noise")))
-        parts.append(_table(some))
+        parts.append(f"<h2>{escape(f'{surfaces}, {light}')}</h2>")
+        inner = _grouped(group, levels)
+        plots = [
+            pareto_plot(some, _level(levels, values))
+            for values, some in inner
+            if any(row.get("delta_e_mean") is not None and row.get("ysnr") is not None for row in some)
+        ]
+        parts.append(row_of(*plots) if plots else "")
+        named = [name for name in _NAMES if name != "exposure_us" and name in group.columns]
+        first = {tuple(row[name] for name in named): row for row in reversed(list(group))}
+        parts.append(_table(Table(reversed(first.values())), _COLOUR))
+        for values, some in inner:
+            tables = [_table(some, columns) for columns in (_NOISE, _DETAIL, _EVENTS)]
+            if any(tables):
+                parts += [f"<h3>{escape(_level(levels, values))}</h3>", *tables]
     return parts
 
 
-def _table(rows: Table) -> str:
-    shown = [
-        name for name in _COLUMNS
-        if name in rows.columns and not (name in _BORING and len({row[name] for row in rows}) == 1)
-        and any(row[name] is not None for row in rows)
+def _grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
+    """The rows by the values of some columns, in the order in which these first occur."""
+    found: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in keys), []).append(row)
+    return [(values, Table(group)) for values, group in found.items()]
+
+
+def _level(keys: Sequence[str], values: Sequence[Cell]) -> str:
+    named = dict(zip(keys, values, strict=True))
+    text = f"{named['illuminance_lux']:g} lx, equal {named['equal']}"
+    return text + (f", {named['nominal_exposure_us']:g} µs" if named.get("nominal_exposure_us") else "")
+
+
+def _table(rows: Table, columns: Mapping[str, str]) -> str:
+    """A table of some figures; empty if no row has any of them."""
+    known = [name for name in columns if name in rows.columns and any(row[name] is not None for row in rows)]
+    if not known:
+        return ""
+    names = [
+        name for name in _NAMES
+        if name in rows.columns and (name == "filter_set" or len({row[name] for row in rows}) > 1)
+        and not (name == "exposure_us" and columns is _COLOUR)
     ]  # fmt: skip
     lines = []
     for row in rows:
-        cells = []
-        for name in shown:
+        cells = [_cell(_in_ms(row[name]) if name == "exposure_us" else row[name]) for name in names]
+        for name in known:
             text = _cell(row[name])
             if name in _INTERVALS and row[name] is not None:
                 low, high = (row.get(f"{_INTERVALS[name]}_{end}") for end in ("low", "high"))
@@ -121,7 +193,11 @@ def _table(rows: Table) -> str:
                     text += f" ({number(low)} to {number(high)})"
             cells.append(text)
         lines.append(cells)
-    return table([_COLUMNS[name] for name in shown], lines)
+    return table([*(_NAMES[name] for name in names), *(columns[name] for name in known)], lines)
+
+
+def _in_ms(value: Cell) -> Cell:
+    return float(value) / 1000 if isinstance(value, int | float) else value
 
 
 def _cell(value: object) -> str:
@@ -140,22 +216,16 @@ def _patches(seen: Sequence[Seen]) -> list[str]:
         some = list(group)
         parts.append(row_of(patch_plot(some)))
         named = zip(some, seen_labels(some), strict=True)
-        charts = (f"{_png(chart_picture(each))}<figcaption>{escape(text)}</figcaption>" for each, text in named)
+        charts = (
+            f"{inline_picture(chart_picture(each), text)}<figcaption>{escape(text)}</figcaption>"
+            for each, text in named
+        )
         parts.append(row_of(*charts))
     parts.append(
         "<p>Upper left half of a patch: its true colour. Lower right half: after the matrix of the filter set, without "
         "noise.</p>"
     )
     return parts
-
-
-def _png(image: NDArray[np.uint8]) -> str:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, format="PNG")
-    text = base64.b64encode(stream.getvalue()).decode("ascii")
-    return f'<img alt="" src="data:image/png;base64,{text}">'
 
 
 def _method(spec: StudySpec) -> str:

@@ -1,40 +1,43 @@
-"""Sweeps: one simulation for each combination of keys and seeds, with figures of each; they can be resumed."""
+"""Sweeps: one simulation or study for each combination of keys and seeds, with figures of each; they can be resumed."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from hesim_render.capture.simulate import simulate
-from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
+from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError, did_you_mean
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, shown
-from hesim_render.measure import measure_mtf
+from hesim_render.isp.pipeline import DEFAULT, Pipeline, load_pipeline
 from hesim_render.recording.recording import Recording
 from hesim_render.sensor.sensor import load_sensor
 from hesim_render.sources.scene import load_scene
-from hesim_render.specs.files import content_hash, validate
+from hesim_render.specs.files import content_hash, load_yaml, locate, validate
+from hesim_render.specs.filter_set import read_filter_set, read_palette
+from hesim_render.specs.study import StudySpec
 from hesim_render.specs.sweep import RangeSpec, SweepSpec, read_sweep
+from hesim_render.studies.run import study
+from hesim_render.studies.sweep_metrics import Figures, changed_pipeline
 from hesim_render.studies.table import Cell, Table
 
 #: File that marks the folder of a sweep.
 MARKER = "sweep.json"
+_SENSOR, _ISP = "sensor.", "isp."
 
 
 @dataclass(frozen=True)
 class Run:
-    """One simulation of a sweep.
+    """One simulation or study of a sweep.
 
     Parameters
     ----------
-    scene, sensor : names or paths as in the file.
+    scene, sensor : names or paths as in the file; empty in a sweep of a study.
     changes : values of the varied keys.
     seed : seed of the run.
     """
@@ -46,30 +49,34 @@ class Run:
 
     @property
     def cells(self) -> dict[str, Cell]:
-        """The run's own columns."""
-        return {"scene": self.scene, "sensor": self.sensor, **dict(self.changes), "seed": self.seed}
+        """The run's own columns; values that are no numbers or texts as JSON."""
+        named = {key: value for key, value in (("scene", self.scene), ("sensor", self.sensor)) if value}
+        told = {
+            key: value if isinstance(value, str | float | int | bool | None) else json.dumps(value)
+            for key, value in self.changes
+        }
+        return {**named, **told, "seed": self.seed}
 
-    def number(self, spec: SweepSpec, contents: Mapping[str, str]) -> str:
-        """A name that depends on all that decides the run's figures: the content of its files, too."""
-        own: list[Any] = [
-            contents[self.scene],
-            contents[self.sensor],
-            self.scene,
-            self.sensor,
-            list(map(list, self.changes)),
-            self.seed,
-            spec.duration_s,
-            spec.roi,
-        ]
-        own += [dict(sorted(spec.options.items())), sorted(spec.metrics)]
-        return hashlib.sha256(json.dumps(own, sort_keys=True).encode()).hexdigest()[:20]
+    def keys(self, prefix: str) -> dict[str, Any]:
+        """Values of the keys with a prefix, without it; with an empty one, of those that have neither."""
+        if prefix:
+            return {key.removeprefix(prefix): value for key, value in self.changes if key.startswith(prefix)}
+        return {key: value for key, value in self.changes if not key.startswith((_SENSOR, _ISP))}
+
+    @property
+    def simulation(self) -> str:
+        """What decides the recording: all but the keys of the ISP."""
+        changes = [[key, value] for key, value in self.changes if not key.startswith(_ISP)]
+        return json.dumps([self.scene, self.sensor, changes, self.seed])
 
 
 def runs_of(spec: SweepSpec) -> Iterator[Run]:
     """All combinations of a sweep, seeds fastest."""
     keys = list(spec.vary)
     lists = [each.values() if isinstance(each, RangeSpec) else list(each) for each in spec.vary.values()]
-    for scene, sensor, *values, seed in itertools.product(spec.scenes, spec.sensors, *lists, spec.seeds):
+    for scene, sensor, *values, seed in itertools.product(
+        spec.scenes or [""], spec.sensors or [""], *lists, spec.seeds
+    ):
         yield Run(scene, sensor, tuple(zip(keys, values, strict=True)), seed)
 
 
@@ -79,7 +86,7 @@ def sweep(
     out: str | Path,
     progress: Progress | Literal[False] | None = None,
 ) -> Table:
-    """Simulate every combination of a sweep and tabulate its figures; runs that are there already are not repeated.
+    """Simulate or study every combination of a sweep, and tabulate its figures; runs that are there are not repeated.
 
     Parameters
     ----------
@@ -90,7 +97,8 @@ def sweep(
 
     Returns
     -------
-    A row for each run: scene, sensor, varied keys, seed, and the metrics.
+    A row for each run: scene, sensor, varied keys, seed, and the metrics. Runs of a study have a row for each of its
+    combinations.
 
     Raises
     ------
@@ -112,54 +120,153 @@ def sweep(
         content = json.dumps(json.loads(read.model_dump_json()), indent=1)
         with replacing(folder / MARKER) as unfinished:
             unfinished.write_text(content + "\n", encoding="utf-8")
-    contents = {name: content_hash(load_scene(read.beside(name)).spec) for name in read.scenes}
-    contents |= {name: content_hash(load_sensor(read.beside(name)).spec) for name in read.sensors}
-    rows: list[dict[str, Cell]] = []
+    made: _Studies | _Recordings = _Recordings(read, folder) if read.study is None else _Studies(read)
+    # runs that differ in the ISP alone come one after the other, so that they share a recording
+    first = _first_of_each(runs)
+    order = sorted(range(len(runs)), key=lambda k: (first[runs[k].simulation], k))
+    found: dict[int, list[dict[str, Cell]]] = {}
     with shown(progress, read.name) as told:
-        for done, run in enumerate(runs):
+        for done, k in enumerate(order):
             if told is not None:
                 told(done, len(runs), f"run {done + 1} of {len(runs)}")
-            rows.append(run.cells | _figures(read, run, run.number(read, contents), folder))
-    table = Table(rows)
+            found[k] = _rows(made, runs[k], folder)
+    table = Table(run.cells | row for k, run in enumerate(runs) for row in found[k])
     table.write(folder / "results.csv", overwrite=True)
     table.write(folder / "results.json", overwrite=True)
     return table
 
 
-def _figures(spec: SweepSpec, run: Run, number: str, folder: Path) -> dict[str, Cell]:
-    """Figures of a run, from its file if there is one."""
-    file = folder / "runs" / f"{number}.json"
-    if file.is_file():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-            if stored["run"] == json.loads(json.dumps(run.cells)):
-                return dict(stored["figures"])
-        except (ValueError, KeyError, TypeError):
-            raise OutputError(f"{file}: is damaged; remove it to repeat the run") from None
-    recording = _simulated(spec, run, folder / "recordings" / number)
-    found = {name: each for metric in spec.metrics for name, each in _metric(recording, metric).items()}
-    with replacing(file) as unfinished:
-        unfinished.write_text(json.dumps({"run": run.cells, "figures": found}) + "\n", encoding="utf-8")
+def _first_of_each(runs: Sequence[Run]) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for k, run in enumerate(runs):
+        found.setdefault(run.simulation, k)
     return found
 
 
-def _simulated(spec: SweepSpec, run: Run, place: Path) -> Recording:
-    changes = dict(run.changes)
-    sensor_changes = {key.removeprefix("sensor."): value for key, value in changes.items() if key.startswith("sensor.")}
-    scene_changes = {key: value for key, value in changes.items() if not key.startswith("sensor.")}
+def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str, Cell]]:
+    """Rows of a run, from its file if there is one."""
     told = ", ".join(f"{key}={value}" for key, value in run.cells.items())
     try:
-        sensor = load_sensor(spec.beside(run.sensor), sensor_changes)
-        if spec.roi is not None:
-            sensor = sensor.crop(*_size(spec.roi))
-        scene = load_scene(spec.beside(run.scene), scene_changes)
-        out = place if spec.keep else None
-        return simulate(
-            scene, sensor, duration_s=spec.duration_s, seed=run.seed, out=out, overwrite=True, progress=False,
-            **spec.options,  # type: ignore[arg-type]
-        )  # fmt: skip
+        file = folder / "runs" / f"{_digest(made.identity(run))}.json"
+        if file.is_file():
+            try:
+                stored = json.loads(file.read_text(encoding="utf-8"))
+                if stored["run"] == json.loads(json.dumps(run.cells)):
+                    return [dict(row) for row in stored["rows"]]
+            except (ValueError, KeyError, TypeError):
+                raise OutputError(f"{file}: is damaged; remove it to repeat the run") from None
+        rows = made.rows(run)
+    except OutputError:
+        raise
     except HesimError as error:
         raise SpecError(f"run with {told}: {str(error).splitlines()[0]}") from None
+    with replacing(file) as unfinished:
+        unfinished.write_text(json.dumps({"run": run.cells, "rows": rows}) + "\n", encoding="utf-8")
+    return rows
+
+
+def _digest(identity: Any) -> str:
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:20]
+
+
+class _Recordings:
+    """Runs that simulate recordings."""
+
+    def __init__(self, spec: SweepSpec, folder: Path) -> None:
+        self._spec, self._folder = spec, folder
+        contents = {name: content_hash(load_scene(spec.beside(name)).spec) for name in spec.scenes}
+        self._contents = contents | {name: content_hash(load_sensor(spec.beside(name)).spec) for name in spec.sensors}
+        self._pipeline = DEFAULT if spec.isp is None else load_pipeline(spec.beside(spec.isp, shipped=False))
+        self._last: tuple[str, Recording] | None = None
+
+    def identity(self, run: Run) -> Any:
+        """All that decides the figures of a run: the content of its files, too."""
+        spec = self._spec
+        return [
+            self._contents[run.scene], self._contents[run.sensor], run.scene, run.sensor, run.changes, run.seed,
+            spec.duration_s, spec.roi, sorted(spec.options.items()), sorted(spec.wanted),
+            self._pipeline.model_dump(mode="json"),
+        ]  # fmt: skip
+
+    def rows(self, run: Run) -> list[dict[str, Cell]]:
+        """The one row of a run."""
+        figures = Figures(self._recording(run), self._developed(run))
+        return [{name: cell for metric in self._spec.wanted for name, cell in figures(metric).items()}]
+
+    def _developed(self, run: Run) -> Pipeline:
+        return changed_pipeline(self._pipeline, run.keys(_ISP))
+
+    def _recording(self, run: Run) -> Recording:
+        if self._last is not None and self._last[0] == run.simulation:
+            return self._last[1]
+        self._developed(run)  # a mistake there is told before a long simulation
+        spec = self._spec
+        sensor = load_sensor(spec.beside(run.sensor), run.keys(_SENSOR))
+        if spec.roi is not None:
+            sensor = sensor.crop(*_size(spec.roi))
+        scene = load_scene(spec.beside(run.scene), run.keys(""))
+        place = self._folder / "recordings" / _digest(run.simulation)
+        recording = simulate(
+            scene, sensor, duration_s=spec.duration_s, seed=run.seed, out=place if spec.keep else None,
+            overwrite=True, progress=False, **spec.options,  # type: ignore[arg-type]
+        )  # fmt: skip
+        self._last = run.simulation, recording
+        return recording
+
+
+class _Studies:
+    """Runs of a study of filter sets."""
+
+    def __init__(self, spec: SweepSpec) -> None:
+        assert spec.study is not None
+        self._spec = spec
+        self._file = locate(spec.beside(spec.study), "study_specs")
+
+    def _study(self, run: Run) -> StudySpec:
+        """The study with the keys of a run; those that begin with sensor. change its sensors."""
+        keys = run.keys("")
+        if run.keys(_ISP):
+            raise SpecError("keys of the ISP are for sweeps of recordings")
+        data = load_yaml(self._file)
+        if run.keys(_SENSOR):
+            data["sensor_keys"] = {**data.get("sensor_keys", {}), **run.keys(_SENSOR)}
+        if len(self._spec.seeds) > 1:
+            keys = {**keys, "noise.seed": run.seed}
+        return validate(StudySpec, data, self._file, keys)
+
+    def identity(self, run: Run) -> Any:
+        """All that decides the figures of a run: the content of its files, too."""
+        read = self._study(run)
+        sets = [read_filter_set(use.beside(use.set)) for use in read.filter_sets]
+        palettes = {use.palette or read.palette: use for use in read.filter_sets}
+        files = [read_palette(use.beside(name)) for name, use in palettes.items()]
+        sensors = [load_sensor(read.beside(name), read.sensor_keys).spec for name in read.sensors]
+        named = [
+            item.beside(name) for item in read.surfaces for name in (item.reflectances, item.cube, item.scene) if name
+        ]
+        stamps = [
+            [name, path.stat().st_size, path.stat().st_mtime_ns] for name in named if (path := Path(name)).exists()
+        ]
+        return [
+            json.loads(read.model_dump_json()), [content_hash(each) for each in (*sets, *files, *sensors)], stamps,
+            sorted(self._spec.metrics), run.seed,
+        ]  # fmt: skip
+
+    def rows(self, run: Run) -> list[dict[str, Cell]]:
+        """A row for each combination of the study."""
+        table = study(self._study(run), progress=False)
+        wanted = self._spec.metrics
+        for name in wanted:
+            if name not in table.columns:
+                raise SpecError(f"metrics: the study has no column {name!r}{did_you_mean(name, table.columns)}")
+        names = [name for name in _NAMES if name in table.columns] + wanted if wanted else table.columns
+        return [{name: row[name] for name in names} for row in table]
+
+
+#: Columns of a study that say which combination a row is.
+_NAMES = (
+    "surfaces", "illuminant", "illuminance_lux", "sensor", "filter_set", "crosstalk", "equal", "exposure_us",
+)  # fmt: skip
 
 
 def _size(roi: str) -> tuple[int, int]:
@@ -167,43 +274,3 @@ def _size(roi: str) -> tuple[int, int]:
     if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise RangeError("roi", roi, "WIDTHxHEIGHT in px, such as 512x384")
     return int(parts[0]), int(parts[1])
-
-
-def _metric(recording: Recording, metric: str) -> dict[str, Cell]:
-    """One figure of a recording, None where it has no meaning."""
-    frames, duration_s = recording.frames, recording.duration_us * 1e-6
-    if metric == "frames":
-        return {"frames": len(frames)}
-    if metric in ("events", "event_rate"):
-        height, width = recording.manifest["event_grid"]["height"], recording.manifest["event_grid"]["width"]
-        if not width:
-            return {metric: None}
-        count = int(recording.manifest["counts"]["events"])
-        return (
-            {"events": count} if metric == "events" else {"event_rate_hz_per_px": count / (width * height * duration_s)}
-        )
-    names = {"electrons": "electrons_mean", "raw_mean": "raw_mean_dn", "raw_variance": "raw_variance_dn2", "snr": "snr",
-             "mtf50": "mtf50_cy_per_px"}  # fmt: skip
-    if not len(frames):
-        return {names[metric]: None}
-    first = frames[0]
-    if metric == "electrons":
-        return {"electrons_mean": float(first.electrons_mean[first.valid].mean(dtype=np.float64))}
-    if metric == "raw_mean":
-        return {"raw_mean_dn": float(first.raw[first.valid].mean(dtype=np.float64))}
-    if metric == "mtf50":
-        try:
-            return {"mtf50_cy_per_px": measure_mtf(recording, signal="electrons").frequency_at(0.5)}
-        except RangeError:
-            return {"mtf50_cy_per_px": None}  # no edge, or a mosaic
-    # temporal variance from the difference of two frames, EMVA 1288; a still scene is needed
-    if len(frames) < 2:
-        return {names[metric]: None}
-    second = frames[1]
-    both = first.valid & second.valid
-    a, b = first.raw[both].astype(np.float64), second.raw[both].astype(np.float64)
-    variance = float(((a - b).var()) / 2)
-    if metric == "raw_variance":
-        return {"raw_variance_dn2": variance}
-    signal = float((a.mean() + b.mean()) / 2 - recording.mosaic.black_level_dn)
-    return {"snr": signal / variance**0.5 if variance > 0 else None}

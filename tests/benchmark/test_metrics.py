@@ -9,17 +9,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from hesim_render.benchmark.double_integral import sharp_over_blurred
 from hesim_render.benchmark.event_filters import background_activity, nearest_neighbour
-from hesim_render.benchmark.metrics import (
-    chamfer,
-    count_error,
-    delta_e,
-    denoising_scores,
-    psnr,
-    rate_error,
-    rate_maps,
-    ssim,
-)
+from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error, rate_maps
 from hesim_render.core.errors import RangeError
+from hesim_render.measure.pictures import delta_e, psnr, ssim
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.spectral.transfer import encode_exactly
 

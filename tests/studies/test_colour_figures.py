@@ -21,6 +21,7 @@ from hesim_render.studies import (
     vora_value,
 )
 from hesim_render.studies.colour_error import expanded
+from hesim_render.studies.colour_matrix import to_srgb
 from hesim_render.studies.subspace import GRID_NM, rank
 
 NIKON, SIGMA = "Nikon 5100 (NPL)", "Sigma SDMerill (NPL)"
@@ -177,6 +178,25 @@ def test_root_polynomials_are_those_of_colour_science_and_follow_the_exposure():
     np.testing.assert_allclose(expanded(3 * rgb, "root_polynomial"), 3 * ours, rtol=1e-12)
     samples = colour_samples(responses(SIGMA), D65, PATCHES)
     assert fit_matrix(samples, expansion="root_polynomial").mean < fit_matrix(samples).mean
+
+
+def test_matrices_and_chromatic_adaptation_are_those_of_colour_science():
+    samples = colour_samples(responses(SIGMA), spectra.illuminant("A"), PATCHES)
+    fit = fit_matrix(samples, "least_squares_xyz").matrix
+    theirs = colour.characterisation.matrix_colour_correction_Cheung2004(samples.camera, samples.xyz, terms=3)
+    np.testing.assert_allclose(fit, theirs, rtol=1e-9)
+    root = fit_matrix(samples, "least_squares_xyz", "root_polynomial").matrix
+    theirs = colour.characterisation.matrix_colour_correction_Finlayson2015(samples.camera, samples.xyz, 2, True)
+    np.testing.assert_allclose(
+        expanded(samples.camera, "root_polynomial") @ root.T,
+        colour.characterisation.polynomial_expansion_Finlayson2015(samples.camera, 2, True) @ theirs.T, rtol=1e-7,
+    )  # fmt: skip
+    # from the white of incandescent light to that of sRGB, Bradford
+    expected = colour.XYZ_to_RGB(
+        samples.camera @ fit.T, "sRGB", colour.XYZ_to_xy(samples.white_xyz), chromatic_adaptation_transform="Bradford"
+    )
+    np.testing.assert_allclose(samples.camera @ to_srgb(fit, samples.white_xyz).T, expected, atol=5e-4)
+    np.testing.assert_allclose(to_srgb(np.eye(3), samples.white_xyz) @ samples.white_xyz, 1, atol=1e-6)
 
 
 def test_sets_of_reflectances():

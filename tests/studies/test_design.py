@@ -1,10 +1,12 @@
 """Design of filters: families against other programs, cost and gradients against central differences on float64."""
 
 import json
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 import hesim_render as hr
 from hesim_render import cli
@@ -12,15 +14,18 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.design import DesignSpec, read_design
 from hesim_render.specs.files import list_names
+from hesim_render.specs.filter_set import read_filter_set
 from hesim_render.spectral import spectrum as spectra
-from hesim_render.spectral.physical import dye_transmittance, thin_film_transmittance
+from hesim_render.spectral.colour_difference import delta_e_2000, lab
+from hesim_render.spectral.physical import dye_transmittance, silicon_index, thin_film_transmittance
 from hesim_render.studies import ChannelNoise, reflectance_set
-from hesim_render.studies.colour_error import delta_e_2000, lab
 from hesim_render.studies.colour_samples import colour_samples
-from hesim_render.studies.design import Problem, optimise
+from hesim_render.studies.design import BANDS_NM as DESIGN_NM
+from hesim_render.studies.design import Problem, optimise, silicon_depth
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
 from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
 from hesim_render.studies.design_run import design
+from hesim_render.studies.design_tile import counts_of, spread_tile
 
 BANDS = np.arange(360.0, 831.0, 10.0)
 FAMILIES = {"dye": Dyes(BANDS, 2, 0.95), "film": ThinFilms(BANDS, 5, 0.97), "free": FreeCurves(BANDS, 0.01, 0.95)}
@@ -81,8 +86,6 @@ def test_weights_are_the_derivative_of_colour_differences():
 
 
 def test_the_best_matrix_is_that_of_a_general_minimiser():
-    from scipy.optimize import minimize
-
     rng = np.random.default_rng(3)
     electrons, xyz = rng.uniform(10, 100, (12, 4)), rng.uniform(0.1, 1, (12, 3))
     weights, variance = rng.normal(size=(12, 3, 3)), rng.uniform(5, 30, (12, 4))
@@ -118,12 +121,12 @@ def test_the_cost_is_that_of_its_formula():
         assert found == pytest.approx(reference(cost, curves), rel=2e-4)
 
 
-def reference(cost, curves):
+def reference(cost, curves, bands=BANDS):
     """The cost on float64."""
-    total = 0.0
+    total, lights, levels = 0.0, len(cost.conditions), len(cost.illuminance_lux)
     for condition in cost.conditions:
         electrons = np.stack([
-            hr.photocurrent(condition.radiance, BANDS, cost.sensor, cost.exposure_us,
+            hr.photocurrent(condition.radiance, bands, cost.sensor, cost.exposure_us,
                             filter=cost.sensor.layout.filters[0], responses=curve)
             for curve in curves
         ], axis=1)  # fmt: skip
@@ -146,12 +149,12 @@ def reference(cost, curves):
             return np.sqrt(np.sum((a @ solution - b) ** 2) / len(c))
 
         if cost.weights.colour:
-            total += cost.weights.colour * root(patches * 1e4 / patches.mean(axis=0).max(), False) / 2
+            total += cost.weights.colour * root(patches * 1e4 / patches.mean(axis=0).max(), False) / lights
         for lux in cost.illuminance_lux:
-            total += cost.weights.noise * root(patches * lux, True) / 4
+            total += cost.weights.noise * root(patches * lux, True) / lights / levels
             if cost.events:
                 window = grey[list(cost.events)] * lux * cost.event_window_us / cost.exposure_us
-                total += cost.weights.events * np.mean(0.22 * (1 + 12.0 / window)) / 4
+                total += cost.weights.events * np.mean(0.22 * (1 + 12.0 / window)) / lights / levels
     return total
 
 
@@ -195,11 +198,110 @@ def test_gradients_of_the_cost_are_central_differences(family):
     assert np.linalg.norm((found - expected) * (high - low)) < 1e-3 * np.linalg.norm(expected * (high - low))
 
 
+def test_gradients_of_shares_and_depth_are_central_differences():
+    """Every parameter of a problem: filters, depth of the silicon and tile shares, against a float64 copy of it all."""
+    problem = Problem(DesignSpec.model_validate({
+        **SMALL, "family": "free", "tile_px": [4, 4], "silicon_depth_um": [1.0, 6.0], "slope_max_per_nm": 1.0,
+    }))  # fmt: skip
+    count = problem.filter_size
+    parameters = np.random.default_rng(8).uniform(0.2, 0.8, count + 4)
+    _, found = problem(parameters)
+    n, k = silicon_index()
+    alpha = 4 * np.pi * np.exp(np.interp(DESIGN_NM, k.wavelength_nm, np.log(k.values))) / DESIGN_NM * 1e3
+    assert n.at(500) > 4
+    open_response = problem.open_response / -np.expm1(-alpha * 3.0)
+    noise, cost = problem.cost.noise, problem.cost
+
+    def on_host(values):
+        own = values[:count].reshape(3, -1)
+        filters = [np.interp(DESIGN_NM, problem.family.knots_nm, 0.95 * row) for row in own]
+        light = open_response * -np.expm1(-alpha * (1 + 5 * values[count]))
+        weights = values[count + 1 :] + 1e-3
+        shares = 0.05 + 0.85 * weights / weights.sum()
+        assert shares.sum() == pytest.approx(1)
+        counted = replace(cost, noise=replace(noise, count=4 * shares))
+        return reference(counted, [each * light for each in filters], DESIGN_NM)
+
+    expected = np.empty_like(found)
+    for number in range(parameters.size):
+        step = np.zeros(parameters.size)
+        step[number] = 1e-4
+        expected[number] = (on_host(parameters + step) - on_host(parameters - step)) / 2e-4
+    assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+    # each group on its own: the filters do not hide the others
+    for part in (np.s_[:count], np.s_[count : count + 1], np.s_[count + 1 :]):
+        assert np.linalg.norm((found - expected)[part]) < 3e-3 * np.linalg.norm(expected[part])
+        assert np.abs(expected[part]).max() > 1e-3 * np.abs(expected).max()
+
+
+def test_shares_become_whole_pixels_that_lie_apart():
+    assert counts_of(np.array([0.5, 0.25, 0.25]), 16).tolist() == [8, 4, 4]
+    assert counts_of(np.array([0.97, 0.01, 0.02]), 16).sum() == 16
+    assert counts_of(np.array([0.97, 0.01, 0.02]), 16).tolist() == [14, 1, 1]
+    assert counts_of(np.array([0.334, 0.284, 0.331, 0.051]), 16).tolist() == [5, 5, 5, 1]
+    assert counts_of(np.array([0.41, 0.30, 0.29]), 4).tolist() == [2, 1, 1]
+    every = np.ones((4, 4), bool)
+    tile = spread_tile(np.full((4, 4), "x"), every, {"G": 8, "R": 4, "B": 4})
+    assert {name: int((tile == name).sum()) for name in "RGB"} == {"R": 4, "G": 8, "B": 4}
+    # half of the pixels on a chessboard, as Bayer has them
+    row, col = np.nonzero(tile == "G")
+    assert len(set((row + col) % 2)) == 1
+    # other pixels stay where they are
+    letters = np.full((4, 4), "x")
+    letters[1, 2] = "w"
+    held = spread_tile(letters, letters != "w", {"R": 5, "G": 5, "B": 5})
+    assert held[1, 2] == "w" and "x" not in held
+
+
+def test_a_design_of_shares_ends_in_a_tile_of_its_own(tmp_path):
+    """Noise alone: the share of a filter follows from its electrons and its part in the matrix."""
+    spec = {**SMALL, "tile_px": [4, 4], "silicon_depth_um": [2.0, 4.0], "steps": 8, "demosaic": False,
+            "illuminance_lux": [20], "cost": {"colour": 0.2, "noise": 1.0}, "repeats": 2, "compare": []}  # fmt: skip
+    found = design(spec, out=tmp_path / "out")
+    result = found.result
+    assert sum(result.shares.values()) == pytest.approx(1) and min(result.shares.values()) >= 0.05
+    assert 2 <= result.silicon_depth_um <= 4 and result.silicon_depth_um != 3
+    sensor = hr.load_sensor(tmp_path / "out" / "sensor.yaml")
+    assert sensor.layout.tile_shape == (4, 4)
+    shares = counts_of(np.array(list(result.shares.values())), 16)
+    tile = [sensor.spec.pixels[letter].filter for letter in "".join(sensor.spec.tile_rows)]
+    assert [tile.count(name) for name in result.shares] == shares.tolist()
+    assert silicon_depth(sensor.spec.quantum_efficiency) == pytest.approx(result.silicon_depth_um, abs=1e-4)
+    assert [verdict["against"] for verdict in found.verdicts] == ["start"]
+    stored = json.loads((tmp_path / "out" / "design.json").read_text())
+    assert stored["shares"] == result.shares
+    # the set can be studied again
+    assert read_filter_set(tmp_path / "out" / "filter_set.yaml").tile == sensor.spec.tile
+
+
+def test_the_best_shares_are_those_of_a_closed_form():
+    """Fixed filters: J = Σ_c a_c/s_c is least at s_c ∝ √a_c if the matrix does not change, as at many electrons."""
+    free = {**SMALL, "family": "free", "tile_px": [4, 4], "illuminance_lux": [3000], "share_min": 0.01,
+            "cost": {"colour": 0, "noise": 1}, "vary": ["blue"]}  # fmt: skip
+    problem = Problem(DesignSpec.model_validate(free))
+    start = problem.starts()[0]
+    size = problem.filter_size
+
+    def cost(shares):
+        weights = (np.array(shares) - 0.01) / 0.97
+        return problem(np.concatenate([start[:size], weights]))[0] ** 2
+
+    even = np.full(3, 1 / 3)
+    # the part of each channel in J, from changes of its share alone would need shares that do not sum to 1: three pairs
+    points = [even, [0.5, 0.25, 0.25], [0.25, 0.5, 0.25], [0.25, 0.25, 0.5]]
+    table = np.array([[1.0, *(1 / np.array(point))] for point in points])
+    _, *parts = np.linalg.solve(table, [cost(point) for point in points])
+    expected = np.sqrt(parts) / np.sqrt(parts).sum()
+    found = minimize(lambda values: cost([*values, 1 - values.sum()]), even[:2], method="Nelder-Mead",
+                     options={"xatol": 1e-4, "maxfev": 80})  # fmt: skip
+    np.testing.assert_allclose([*found.x, 1 - found.x.sum()], expected, atol=0.02)
+
+
 SMALL = {
     "schema_version": 1, "name": "small", "sensor": "reference-bayer", "filter_set": "rggb",
     "palette": "nikon-5100-silicon", "family": "dye", "bands": 3, "starts": 1, "steps": 40,
     "fit": {"reflectances": "colorchecker", "illuminants": ["D65"]},
-    "judge": {"reflectances": "cie-tcs", "illuminants": ["A"]}, "repeats": 4,
+    "judge": {"reflectances": "cie-tcs", "illuminants": ["A"]}, "repeats": 4, "demosaic": False,
     "compare": [{"set": "rggb", "palette": "nikon-5100-silicon", "name": "Nikon"}],
 }  # fmt: skip
 
@@ -214,7 +316,7 @@ def test_every_family_lowers_the_cost_within_its_constraints(family):
     before, after = result.costs[0]
     assert after < 0.8 * before
     for curve in result.filters.values():
-        assert curve.min() >= (0.02 if family == "free" else 0) - 1e-9 and curve.max() <= 0.95 + 1e-6
+        assert curve.min() >= 0.02 - 1e-9 and curve.max() <= 0.95 + 1e-6
         # the penalty is soft: a tenth above at most
         assert np.abs(np.diff(curve)).max() / 5 < 0.022 if family != "thin_film" else True
 
@@ -236,7 +338,7 @@ def test_fresh_parameters_compile_nothing():
 def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
     """Three dyes against a camera, on colours and a light that they were not fitted to; few steps do not win yet."""
     file = tmp_path / "small.yaml"
-    file.write_text(json.dumps({**SMALL, "starts": 2 if steps > 5 else 1, "steps": steps}))
+    file.write_text(json.dumps({**SMALL, "starts": 2 if steps > 5 else 1, "steps": steps, "demosaic": steps > 5}))
     with pytest.raises(SystemExit) as stop:
         cli.main(["study", "design", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0, capsys.readouterr().err
@@ -246,6 +348,9 @@ def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
     assert verdict["cost_difference_low"] < verdict["cost_difference"] < verdict["cost_difference_high"]
     if steps > 5:
         assert verdict["cost_difference_high"] < 0 and verdict["delta_e_mean"] < verdict["delta_e_mean_against"]
+        assert "mtf50_cy_per_px" in verdict and verdict["zone_plate_colour"] > 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<h2>Verdict</h2>" in page and "difference" in page
     sensor = hr.load_sensor(tmp_path / "out" / "sensor.yaml")
     assert sensor.spec.tile == "RG\nGB" and list(sensor.spec.filters) == ["red", "green", "blue"]
     # the figures of the file are those of the judgement
@@ -253,6 +358,22 @@ def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
     own = (tmp_path / "out" / "results.csv").read_text().splitlines()
     column = own[0].split(",").index("delta_e_mean")
     assert table["delta_e_mean"][0] == pytest.approx(float(own[1].split(",")[column]), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_shipped_design_beats_the_camera_on_colours_and_lights_that_it_has_not_seen(tmp_path):
+    """Weights, levels and both sets of colours are those of the shipped file; 95 reflectances under three lights."""
+    spec = read_design("rggb-dyes")
+    assert spec.fit.reflectances != spec.judge.reflectances
+    assert not {light.name for light in spec.fit.illuminants} & {light.name for light in spec.judge.illuminants}
+    (verdict,) = design(spec, out=tmp_path / "out").verdicts
+    assert verdict["against"] == "Nikon 5100"
+    ratios = [verdict["ysnr_ratio_20_lux"], verdict["ysnr_ratio_1000_lux"]]
+    better_colour = verdict["delta_e_mean"] < verdict["delta_e_mean_against"]
+    assert (better_colour and min(ratios) > 0.95) or (
+        min(ratios) > 1 and verdict["delta_e_mean"] < 1.05 * verdict["delta_e_mean_against"]
+    )
+    assert verdict["cost_difference_low"] < verdict["cost_difference"] < verdict["cost_difference_high"] < 0
 
 
 STUDY = {"schema_version": 1, "name": "again", "surfaces": ["cie-tcs"], "illuminants": ["A"], "figures": ["colour"]}
@@ -263,6 +384,11 @@ STUDY = {"schema_version": 1, "name": "again", "surfaces": ["cie-tcs"], "illumin
     ({"cost": {"colour": 0, "noise": 0}}, "at least one weight"),
     ({"transmittance_min": 0.97}, "must be below transmittance_max"),
     ({"family": "glass"}, "family"),
+    ({"tile_px": [3, 4]}, r"a tile of 3x4 px is no multiple of the 2x2 px of 'rggb'"),
+    ({"tile_px": [4, 4], "share_min": 0.4}, "no shares of 3 filters"),
+    ({"silicon_depth_um": [4, 2]}, "least and the largest depth"),
+    ({"palette": "dyes", "sensor": "eiger", "filter_set": "quad-bayer-white-event", "tile_px": [8, 8]},
+     "numbers its event pixels by its tile of 4x4 px"),
     ({"filter_set": "cygm"}, "the palette 'nikon-5100-silicon' has no filter 'cyan'"),
     ({"fit": {"reflectances": "none", "illuminants": ["D65"]}}, "no set of reflectances named 'none'"),
 ])  # fmt: skip

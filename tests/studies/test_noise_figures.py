@@ -34,6 +34,44 @@ def test_amplification_and_snr_by_hand():
     np.testing.assert_allclose(found.rgb, 0.18, rtol=1e-12)
 
 
+#: Tables 1.1 and 1.2 of [adams2010]: balance gains, sensitivity gain, colour matrix (rows sum to 1, which tells the
+#: signs that the reprint lost), then S_C = M·S_B·Mᵀ in the lower triangle and the luminance noise before and after M.
+PUBLISHED = {
+    "RGB": ([1.518, 1.000, 1.257], 2.616,
+            [[1.558, -0.531, -0.027], [-0.078, 1.477, -0.399], [0.039, -0.508, 1.469]],
+            [10.38, -2.50, 6.25, 0.82, -3.90, 7.78], 1.24, 1.60),
+    "red, panchromatic, blue": ([3.972, 1.000, 3.289], 1.000,
+            [[2.000, -1.373, 0.373], [-1.062, 3.384, -1.322], [0.412, -1.248, 1.836]],
+            [18.22, -14.70, 21.68, 7.24, -13.94, 13.32], 0.84, 2.51),
+    "CMY": ([1.155, 1.081, 1.000], 1.752,
+            [[-2.554, 2.021, 1.533], [0.941, -1.512, 1.571], [1.201, 1.783, -1.984]],
+            [25.05, -6.43, 10.45, -4.71, -8.28, 15.84], 1.03, 1.90),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_comparison_with_clear_pixels_is_reproduced(name):
+    """Noise of white-balanced and colour-corrected signals of RGB, RWB and CMY pixels, to the digits printed.
+
+    The clear pixel has less noise than green before the matrix (0.84 against 1.24) and more after it (2.51 against
+    1.60). S is in units of the photo-electrons of the exposure index; shot noise alone, one pixel of each channel.
+    """
+    gains, sensitivity, matrix, triangle, before, after = PUBLISHED[name]
+    unit = 1e4  # electrons of a channel with gain 1
+    white = unit / (np.array(gains) * sensitivity)
+    luminance = (0.2126, 0.7152, 0.0722)
+    noise = ChannelNoise.of_photons(3)
+    plain, corrected = (output_noise(each, white, noise, 1.0, luminance) for each in (np.eye(3), matrix))
+    np.testing.assert_allclose(corrected.rgb, 1, atol=2e-3)
+    published = np.zeros((3, 3))
+    published[np.tril_indices(3)] = triangle
+    published += np.tril(published, -1).T
+    # rounding of S_C, and of matrices with three digits after the point
+    np.testing.assert_allclose(corrected.covariance * unit, published, atol=0.02)
+    for found, expected in ((plain, before), (corrected, after)):
+        assert math.sqrt(unit) * found.rgb @ luminance / found.ysnr == pytest.approx(expected, abs=0.006)
+
+
 def test_snr10_of_a_textbook_sensor():
     """One channel, 3200 e⁻ per lux of white, 18 %: N² = 100 (N + σ²) solved by the schoolbook."""
     for read in (0.0, 2.0, 50.0):

@@ -5,10 +5,12 @@ import math
 
 import numpy as np
 import pytest
+from skimage.metrics import peak_signal_noise_ratio
 
 import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.isp import Pipeline, process
 from hesim_render.specs.files import data_folder, list_names
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
@@ -90,6 +92,79 @@ def test_resolution_is_a_metric_where_there_is_an_edge(tmp_path):
     found = sweep(spec, out=tmp_path / "out")
     assert found.row(0)["mtf50_cy_per_px"] == pytest.approx(0.6, abs=0.05)  # sinc f = 1/2 at 0.603
     assert found.row(1)["mtf50_cy_per_px"] is None
+    spec |= {"metrics": ["mtf10", "mtf_nyquist", "picture_mtf50"], "scenes": ["slanted-edge"]}
+    row = sweep(spec, out=tmp_path / "more").row(0)
+    assert row["mtf_nyquist"] == pytest.approx(np.sinc(0.5), abs=0.03)
+    assert row["mtf10_cy_per_px"] == pytest.approx(0.908, abs=0.05)  # sinc f = 0.1
+    assert row["picture_mtf50_cy_per_px"] == pytest.approx(0.6, abs=0.05)
+
+
+def test_keys_of_the_isp_are_varied_on_one_recording(tmp_path, monkeypatch):
+    """Pictures of the same frame: as `develop` makes them, against those of its noise-free electrons."""
+    plain, done = sweeps.simulate, []
+    monkeypatch.setattr(sweeps, "simulate", lambda *args, **options: done.append(1) or plain(*args, **options))
+    file = tmp_path / "pipeline.yaml"
+    file.write_text(
+        "schema_version: 1\nsteps:\n- {step: black_level}\n- {step: white_balance}\n- {step: demosaic}\n"
+        "- {step: colour_matrix}\n- {step: exposure, gain: 1.0}\n- {step: encode}\n"
+    )
+    spec = {**BASE, "scenes": ["colorchecker"], "sensors": ["reference-bayer"], "roi": "48x32", "duration_s": 0.03,
+            "isp": str(file), "seeds": [3],
+            "vary": {"isp.demosaic.method": ["guided", "linear"], "isp.exposure.gain": [1, 2],
+                     "light.illuminance_lux": [50, 400], "isp.encode": [True, False]},
+            "metrics": ["picture_mean", "picture_psnr", "picture_ssim", "picture_delta_e", "isp_report"]}  # fmt: skip
+    table = sweep(spec, out=tmp_path / "out")
+    assert len(table) == 16 and len(done) == 2
+    row = table.where(**{"isp.demosaic.method": "linear", "isp.exposure.gain": 2, "isp.encode": False,
+                         "light.illuminance_lux": 400}).row(0)  # fmt: skip
+    scene = hr.load_scene("colorchecker", {"light.illuminance_lux": 400})
+    rec = plain(scene, hr.load_sensor("reference-bayer").crop(48, 32), duration_s=0.03, seed=3, samples=4)
+    steps = ["black_level", "white_balance", {"step": "demosaic", "method": "linear"}, "colour_matrix",
+             {"step": "exposure", "gain": 2}]  # fmt: skip
+    picture = process(rec.frames[0], rec.mosaic, Pipeline.of(*steps))
+    clean = process((64 + 0.25 * rec.frames[0].electrons_mean).astype(np.float32), rec.mosaic, Pipeline.of(*steps))
+    assert row["picture_mean"] == pytest.approx(float(picture.mean()), rel=1e-6)
+    expected = peak_signal_noise_ratio(np.clip(clean, 0, 1), np.clip(picture, 0, 1), data_range=1)
+    assert row["picture_psnr_db"] == pytest.approx(expected, rel=1e-6)
+    assert 0 < row["picture_ssim"] < 1 and row["picture_delta_e"] > 0
+    # twice the gain doubles what is linear and not clipped, noise included: 6.02 dB
+    once, twice = (
+        table.where(**{"isp.exposure.gain": gain, "isp.encode": False, "light.illuminance_lux": 50}) for gain in (1, 2)
+    )
+    np.testing.assert_allclose(twice["picture_mean"], 2 * once["picture_mean"], rtol=1e-3)
+    np.testing.assert_allclose(once["picture_psnr_db"] - twice["picture_psnr_db"], 6.02, atol=0.2)
+
+
+def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monkeypatch):
+    file = tmp_path / "study.yaml"
+    file.write_text(
+        "schema_version: 1\nname: two\nsensors: [reference-bayer]\nfilter_sets: [rggb, ryyb]\nfigures: [noise]\n"
+    )
+    spec = {"schema_version": 1, "name": "sweep", "study": str(file), "metrics": ["ysnr"],
+            "vary": {"sensor.aps.read_noise_e": [1.0, 20.0], "illuminance_lux": [[5], [50]]}}  # fmt: skip
+    table = sweep(spec, out=tmp_path / "out")
+    assert len(table) == 8 and table["illuminance_lux"].tolist() == [5, 5, 50, 50] * 2
+    alone = hr.study({"schema_version": 1, "name": "one", "sensors": ["reference-bayer"], "filter_sets": ["ryyb"],
+                      "figures": ["noise"], "illuminance_lux": [5],
+                      "sensor_keys": {"aps.read_noise_e": 20.0}})  # fmt: skip
+    found = table.where(**{"sensor.aps.read_noise_e": 20.0, "illuminance_lux": 5, "filter_set": "ryyb"}).row(0)
+    assert found["ysnr"] == pytest.approx(alone["ysnr"][0], rel=1e-12) and "snr10_lux" not in found
+    # again: nothing is computed; a changed palette is a changed run
+    monkeypatch.setattr(sweeps, "study", None)
+    assert sweep(spec, out=tmp_path / "out").to_csv() == table.to_csv()
+    monkeypatch.undo()
+    spec["vary"] = {"noise.repeats": [0]}
+    assert len(sweep({**spec, "metrics": []}, out=tmp_path / "out")) == 2
+    for changes, message in (
+        ({"metrics": ["ysrn"]}, "no column 'ysrn'.*did you mean 'ysnr'"),
+        ({"vary": {"isp.demosaic.method": ["linear"]}}, "for sweeps of recordings"),
+        ({"vary": {"filter_set": ["rggb"]}}, "run with filter_set=rggb.*unknown key"),
+        ({"scenes": ["flat-field"]}, "scenes: not in a sweep of a study"),
+        ({"study": "five-cfa"}, "no study_spec named 'five-cfa'.*did you mean"),
+    ):
+        with pytest.raises(SpecError, match=message) as caught:
+            sweep({**spec, **changes}, out=tmp_path / "bad")
+        assert "\n" not in str(caught.value)
 
 
 def test_ranges_and_files(tmp_path, capsys):
@@ -110,7 +185,10 @@ def test_ranges_and_files(tmp_path, capsys):
     ({"vary": {"light.illuminance": [3]}}, r"run with scene=flat-field.*light.illuminance=3.*unknown key"),
     ({"vary": {"sensor.aps.exposure_us": []}}, "a list of values is empty"),
     ({"vary": {"a": {"first": 0, "last": 1, "count": 3, "scale": "log"}}}, "ends above 0"),
-    ({"roi": "32"}, "WIDTHxHEIGHT"), ({"metrics": ["psnr"]}, "metrics"),
+    ({"roi": "32"}, "WIDTHxHEIGHT"), ({"metrics": ["snrs"]}, "metrics: unknown 'snrs'.*did you mean 'snr'"),
+    ({"vary": {"isp.demosaick.method": ["linear"]}}, "no step 'demosaick'.*did you mean 'demosaic'"),
+    ({"vary": {"isp.demosaic.method": ["cubic"]}}, "method"), ({"vary": {"isp.demosaic": [False]}}, "exactly one"),
+    ({"vary": {"isp.encode": [3]}}, "expected true or false"), ({"scenes": []}, "needs 'scenes' and 'sensors'"),
     ({"options": {"speed": 1}}, "expected quality"),
     ({"scenes": ["none"]}, "no scene named 'none'"), ({"seeds": list(range(100_001))}, "more than 100000"),
 ])  # fmt: skip

@@ -9,7 +9,7 @@ from PIL import Image
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
-from hesim_render.targets import cube_file
+from hesim_render.targets import matlab_cube
 from hesim_render.targets.cube_file import open_cube
 
 BANDS = np.arange(400.0, 701.0, 10.0)
@@ -41,6 +41,10 @@ def test_envi(tmp_path, interleave):
     with pytest.raises(SpecError, match="says no wavelengths"):
         open_cube(tmp_path / "c.hdr")
     check(tmp_path / "c.hdr", wavelength_nm=BANDS.tolist())
+    # fewer values than the header says
+    (tmp_path / "a.img").write_bytes((tmp_path / "a.img").read_bytes()[:-400])
+    with pytest.raises(SpecError, match=r"a\.hdr: cannot be read"):
+        open_cube(tmp_path / "a.hdr").whole()
     (tmp_path / "a.img").unlink()
     with pytest.raises(SpecError, match=r"a\.hdr: cannot be read"):
         open_cube(tmp_path / "a.hdr")
@@ -63,7 +67,7 @@ def test_matlab_v5_of_harvard_and_foster(tmp_path):
 
 def test_matlab_v5_is_refused_where_it_is_too_large(tmp_path, monkeypatch):
     scipy.io.savemat(tmp_path / "large.mat", {"ref": np.zeros((40, 50, 31)), "lbl": np.ones((40, 50))})
-    monkeypatch.setattr(cube_file, "MOST_MATLAB_BYTES", 500_000)
+    monkeypatch.setattr(matlab_cube, "MOST_MATLAB_BYTES", 500_000)
     with pytest.raises(SpecError, match=r"MATLAB v5 file is read whole; this one would take 0\.000512 GB"):
         open_cube(tmp_path / "large.mat")
 
@@ -84,6 +88,18 @@ def test_isetcam_scenes(tmp_path):
     scipy.io.savemat(tmp_path / "bad.mat", {"mcCOEF": coefficients, "basis": {"wave": BANDS[:-1], "basis": basis}})
     with pytest.raises(SpecError, match="does not fit 30 wavelengths"):
         open_cube(tmp_path / "bad.mat")
+    # the same saved as v7.3: axes in the opposite order, the structure as a group
+    with h5py.File(tmp_path / "iset73.mat", "w") as file:
+        file["mcCOEF"], file["imgMean"] = coefficients.transpose(2, 1, 0), mean[:, None]
+        file["basis/wave"], file["basis/basis"] = BANDS[None], basis.T
+    check(tmp_path / "iset73.mat", (photons / BANDS).astype(np.float32), rtol=1e-5)
+    with h5py.File(tmp_path / "photons73.mat", "w") as file:
+        file["photons"], file["wave"] = photons.transpose(2, 1, 0), BANDS
+    check(tmp_path / "photons73.mat", (photons / BANDS).astype(np.float32), rtol=1e-6)
+    with h5py.File(tmp_path / "alone.mat", "w") as file:
+        file["mcCOEF"] = coefficients
+    with pytest.raises(SpecError, match="needs a structure basis"):
+        open_cube(tmp_path / "alone.mat")
 
 
 def test_matlab_v73_of_arad_and_icvl(tmp_path):
@@ -113,15 +129,32 @@ def test_cave_folders(tmp_path):
         Image.fromarray(codes[..., band]).save(tmp_path / f"toy_ms_{band + 1:02}.png")
     Image.new("RGB", (5, 7)).save(tmp_path / "toy_RGB.bmp")
     check(tmp_path, codes / np.float32(65535))
+    # watercolors_ms: 8 bits, with alpha
+    (tmp_path / "water").mkdir()
+    for band in range(31):
+        grey = Image.fromarray((codes[..., band] >> 8).astype(np.uint8))
+        Image.merge("RGBA", [grey, grey, grey, Image.new("L", (5, 7), 255)]).save(
+            tmp_path / "water" / f"water_ms_{band + 1:02}.png"
+        )
+    check(tmp_path / "water", (codes >> 8) / np.float32(255))
+    Image.fromarray(codes[:6, :, 6]).save(tmp_path / "toy_ms_07.png")
+    with pytest.raises(SpecError, match="its pictures differ in size"):
+        open_cube(tmp_path)
     (tmp_path / "toy_ms_07.png").unlink()
     with pytest.raises(SpecError, match=r"NAME_ms_01.png, 02"):
         open_cube(tmp_path)
 
 
 def test_exr_of_kaist_and_of_the_renderer(tmp_path):
-    channels = {f"w{band:.0f}nm": np.ascontiguousarray(CUBE[..., k]) for k, band in enumerate(BANDS)}
+    bands = 420 + 10.0 * np.arange(31)
+    channels = {f"w{band:.0f}nm": np.ascontiguousarray(CUBE[..., k]) for k, band in enumerate(bands)}
+    half = {name: plane.astype(np.float16) for name, plane in channels.items()}
     OpenEXR.File({}, channels).write(str(tmp_path / "kaist.exr"))
-    check(tmp_path / "kaist.exr")
+    check(tmp_path / "kaist.exr", bands=bands)
+    # halves, in a window that does not begin at 0
+    window = np.array([3, 10], np.int32), np.array([7, 16], np.int32)
+    OpenEXR.File({"dataWindow": window}, half).write(str(tmp_path / "part.exr"))
+    check(tmp_path / "part.exr", CUBE.astype(np.float16).astype(np.float32), bands)
     hr.write_spectral_exr(tmp_path / "ours.exr", CUBE, BANDS)
     check(tmp_path / "ours.exr")
 

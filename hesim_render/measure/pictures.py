@@ -1,0 +1,88 @@
+"""Measures of pictures against a truth. Range, window and border of each are stated."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import RangeError
+from hesim_render.isp.colour import delta_e_2000
+
+#: Window and constants of SSIM [wang2004].
+_SIGMA, _TRUNCATE, _K1, _K2 = 1.5, 3.5, 0.01, 0.03
+
+
+def psnr(picture: NDArray, truth: NDArray, peak: float = 1.0, valid: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio, dB: 10 log₁₀(peak² / MSE), one MSE over all pixels and channels, no border cut.
+
+    Parameters
+    ----------
+    picture, truth : of the same shape; both are clipped to [0, peak] first.
+    peak : largest value.
+    valid : pixels that count; default all.
+
+    Returns
+    -------
+    dB; infinite for equal pictures.
+    """
+    a, b = in_range(picture, truth, peak)
+    square = (a - b) ** 2
+    mse = float(square.mean() if valid is None else square[valid].mean())
+    return float("inf") if mse == 0 else 10 * float(np.log10(peak**2 / mse))
+
+
+def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
+    """Structural similarity [wang2004]: Gaussian window of σ 1.5 px (11×11), K₁ 0.01, K₂ 0.03, mean over channels.
+
+    The border of 5 px, where the window leaves the picture, does not count. This is skimage's `structural_similarity`
+    with ``gaussian_weights=True, use_sample_covariance=False``; EFNet's own measure uses a three-dimensional window.
+
+    Parameters
+    ----------
+    picture, truth : [row, col] or [row, col, channel], at least 11 px on each side; clipped to [0, peak] first.
+    peak : largest value.
+
+    Returns
+    -------
+    The mean over pixels and channels, at most 1.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    a, b = in_range(picture, truth, peak)
+    if min(a.shape[:2]) < 11:
+        raise RangeError("shape of the picture", a.shape, "11 px or more on each side, the window of SSIM")
+    if a.ndim == 2:
+        a, b = a[..., None], b[..., None]
+
+    def smooth(values: NDArray) -> NDArray:
+        return gaussian_filter(values, _SIGMA, truncate=_TRUNCATE, axes=(0, 1))
+
+    mean_a, mean_b = smooth(a), smooth(b)
+    var_a, var_b = smooth(a * a) - mean_a**2, smooth(b * b) - mean_b**2
+    both = smooth(a * b) - mean_a * mean_b
+    c1, c2 = (_K1 * peak) ** 2, (_K2 * peak) ** 2
+    index = (2 * mean_a * mean_b + c1) * (2 * both + c2) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+    return float(index[5:-5, 5:-5].mean(dtype=np.float64))
+
+
+def delta_e(picture: NDArray, truth: NDArray) -> float:
+    """Mean CIEDE2000 colour difference [sharma2005].
+
+    Parameters
+    ----------
+    picture, truth : [row, col, 3], linear sRGB in [0, 1].
+
+    Returns
+    -------
+    ΔE₀₀, mean over pixels.
+    """
+    a, b = in_range(picture, truth, 1.0)
+    return float(np.mean(delta_e_2000(a.reshape(-1, 3), b.reshape(-1, 3))))
+
+
+def in_range(picture: NDArray, truth: NDArray, peak: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two pictures of one shape, clipped to [0, peak]."""
+    if np.shape(picture) != np.shape(truth):
+        raise RangeError("shape of the picture", np.shape(picture), f"that of the truth, {np.shape(truth)}")
+    a, b = (np.clip(np.asarray(image, dtype=np.float64), 0, peak) for image in (picture, truth))
+    return a, b
