@@ -89,7 +89,7 @@ def test_kalibr_writes_x_y_z_w_of_the_inverse_rotation_under_that_header(tmp_pat
 
 @pytest.mark.parametrize("ending", ["yaml", "json"])
 def test_poses_of_opencv_put_points_where_opencv_projects_them(ending, tmp_path):
-    """Written by OpenCV itself; `cv2.projectPoints` against the camera and against the board that such a track moves."""
+    """Written by OpenCV itself; `cv2.projectPoints` against a camera and against a board on such a track."""
     cv2 = pytest.importorskip("cv2")
     rng = np.random.default_rng(3)
     rvecs, tvecs = rng.normal(0, 0.3, (2, 3)), rng.normal(0, 0.1, (2, 3))

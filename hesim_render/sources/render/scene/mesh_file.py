@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
+from hesim_render.sources.render.scene.deformation import Deformation, read_deformation
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.surfaces import area_emitter, radiance_of
@@ -30,8 +31,9 @@ def mesh_shapes(
     bsdf: Any,
     folder: Path,
     allow_outside: bool,
-) -> dict[str, Any]:
-    """Shapes of a mesh file, scaled to a bounding box of `size_m` and centred on the object's place.
+) -> tuple[dict[str, Any], Deformation | None]:
+    """Shapes of a mesh file, scaled to a bounding box of `size_m` and centred on the object's place, and its
+    deformation, if it has one.
 
     Faces of GLB, glTF and STL files are flat. A material of a GLB or glTF file becomes Mitsuba's ``principled``: base
     colour (factor times texture) by its sRGB, metallic and roughness by their factors; its other keys (normal maps,
@@ -50,7 +52,7 @@ def mesh_shapes(
     Raises
     ------
     SpecError
-        If the file is missing, cannot be read, or has no surface.
+        If the file is missing, cannot be read, or has no surface; or if the deformation does not fit it.
     """
     path, key = folder / str(item.mesh), f"objects.{item.name}.mesh"
     emitter = area_emitter(radiance_of(item))
@@ -63,8 +65,11 @@ def mesh_shapes(
         box = shape.bbox()
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         fit = placement @ _fit(item, low, high, int(shape.face_count()), path, key)
+        deformation = None
+        if item.deformation is not None:
+            deformation = read_deformation(mi, item.deformation, shape, fit, f"objects.{item.name}.deformation")
         shape = {"type": kind, "filename": str(path), "to_world": transform(mi, fit), "bsdf": bsdf}
-        return {name: shape if emitter is None else {**shape, "emitter": emitter}}
+        return {name: shape if emitter is None else {**shape, "emitter": emitter}}, deformation
     if kind not in _OF_TRIMESH:
         known = ", ".join(end.upper() for end in (*_OF_MITSUBA, *_OF_TRIMESH))
         raise SpecError(f"a mesh must be one of {known}, not {path.name}", key=key)
@@ -79,7 +84,7 @@ def mesh_shapes(
         uv = getattr(part.visual, "uv", None)
         surface = bsdf if item.materials == "own" else _principled(mi, part.visual, uv is not None)
         found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv, emitter)
-    return found
+    return found, None
 
 
 def _fit(
