@@ -237,7 +237,7 @@ def flux_source(
             if quality is not None:
                 raise
             settings["exact_because"] = str(error)
-    default = MOVING_SAMPLES if scene.spec.motion else STATIC_SAMPLES
+    default = MOVING_SAMPLES if scene.spec.moves else STATIC_SAMPLES
     rays = default if samples is None else samples
     told = _ray_progress(scene, sensor, rays, progress)
     flux = flickering(
@@ -276,7 +276,7 @@ def _ray_progress(
     scene: Scene, sensor: Sensor, samples: int, progress: Progress | None
 ) -> Callable[[int], None] | None:
     """Progress of a static scene, which is one long render: rays done out of all rays."""
-    if progress is None or scene.spec.motion:
+    if progress is None or scene.spec.moves:
         return None
     wanted = sensor.layout.aps_mask.copy()
     wanted.ravel()[sensor.layout.evs_pixel.ravel()] = True

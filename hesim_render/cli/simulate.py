@@ -25,6 +25,7 @@ from hesim_render.cli.options import (
 )
 from hesim_render.cli.terminal import is_short_of_wish, say, split_overrides, summary
 from hesim_render.core.errors import OutputError
+from hesim_render.core.guard import printable
 from hesim_render.core.output import check_place, replacing
 from hesim_render.core.progress import progress_report
 
@@ -119,6 +120,10 @@ def _look(
     found = look(loaded, cropped(hr.load_sensor(sensor, sensor_changes), roi))
     with replacing(target) as unfinished:
         Image.fromarray(found.picture).save(unfinished, format="PNG")
+    for name, materials in found.materials.items():
+        say(f"materials of {name}:")
+        for material in materials:
+            say(f"  {printable(str(material))}")
     say(f"{found.target or 'the scene has no target'}\nframing in {target}")
 
 

@@ -111,6 +111,7 @@ def _file_hashes(scene: BaseModel) -> dict[str, str]:
     names += [getattr(light, "file", None) for light in getattr(scene, "lights", ())]
     for item in objects:
         names += [item.texture.file if item.texture is not None else None]
+        names += item.deformation.files if item.deformation is not None else []
         names += [texture.file for _, texture in leaves_of(item.material or {}, TextureSpec)]
         names += [name for key, name in leaves_of(item.material or {}, str) if key.split(".")[-1] == "filename"]
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names if name is not None}

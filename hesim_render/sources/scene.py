@@ -45,6 +45,7 @@ class Scene:
             parts += [f"object {item.name}" for item in spec.objects]
             parts += [f"light {light.type}" for light in spec.lights]
         moving = [track.object for track in spec.motion]
+        moving += [item.name for item in spec.objects if item.deformation is not None and item.name not in moving]
         if moving:
             parts.append(f"moving: {', '.join(moving)}")
         if len(parts) > _MOST_PARTS:

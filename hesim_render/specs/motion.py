@@ -13,7 +13,10 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vector
-from hesim_render.specs.poses import read_poses
+from hesim_render.specs.poses import PoseFile, read_poses
+
+#: Keys of a track that say how its `file` is read, and the texts that they may be; without any, whole numbers.
+_OF_FILE = {"axes": ("scene", "opencv"), "quaternion": ("hamilton", "kalibr"), "begin_us": (), "every_us": ()}
 
 
 class KeyframeSpec(Strict):
@@ -89,21 +92,27 @@ class TrackSpec(Strict):
         """Read the keyframes of ``file``; a dump then holds the numbers. What only rides on its parent needs none."""
         if isinstance(data, dict) and data.get("parent") is not None and not ({"file", "keyframes"} & set(data)):
             return {**data, "keyframes": [{"t_us": 0}, {"t_us": 1}]}
-        if not isinstance(data, dict) or not ({"file", "axes"} & set(data)):
+        if not isinstance(data, dict) or not ({"file", *_OF_FILE} & set(data)):
             return data
-        name, axes = data.get("file"), data.get("axes", "scene")
+        name, given = data.get("file"), {key: data[key] for key in _OF_FILE if key in data}
         if "keyframes" in data or not isinstance(name, str):
-            raise ValueError("give keyframes or file, exactly one of them; axes goes with file")
-        if axes not in ("scene", "opencv"):
-            raise ValueError("axes: expected scene or opencv")
+            raise ValueError(f"give keyframes or file, exactly one of them; {', '.join(_OF_FILE)} go with file")
+        for key, known in _OF_FILE.items():
+            value = given.get(key)
+            if known and value is not None and value not in known:
+                raise ValueError(f"{key}: expected {' or '.join(known)}")
+            if not known and value is not None and (isinstance(value, bool) or not isinstance(value, int)):
+                raise ValueError(f"{key}: expected a whole number of microseconds")
+        if given.get("every_us") is not None and given["every_us"] < 1:
+            raise ValueError("every_us: expected 1 µs or more")
         file = (info.context or {}).get("folder", Path()) / name
         if not os.path.isfile(file):
             raise ValueError(f"file: no such file: {file}")
         try:
-            frames = read_poses(file, axes)
+            frames = read_poses(file, PoseFile(**given), data.get("object") == "camera")
         except SpecError as error:
             raise ValueError(str(error)) from None
-        return {key: value for key, value in data.items() if key not in ("file", "axes")} | {"keyframes": frames}
+        return {key: value for key, value in data.items() if key not in ("file", *_OF_FILE)} | {"keyframes": frames}
 
     @field_validator("keyframes")
     @classmethod

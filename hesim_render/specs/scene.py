@@ -22,6 +22,7 @@ from pydantic import (
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out
+from hesim_render.specs.deformation import DeformationSpec
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.light import LampSpec, LightSpec
@@ -57,12 +58,16 @@ class ObjectSpec(Strict):
         "own", description="of a mesh: the reflectance above, or the materials of a GLB or glTF file"
     )
 
+    deformation: DeformationSpec | None = Field(None, description="of a PLY or OBJ mesh: its shape at other times")
+
     @model_validator(mode="after")
     def _check(self) -> ObjectSpec:
         if (self.shape == "mesh") != (self.mesh is not None):
             raise ValueError("shape 'mesh' and the key 'mesh' go together")
         if self.materials == "file" and not str(self.mesh).lower().endswith((".glb", ".gltf")):
             raise ValueError("materials: only GLB and glTF files have materials that are read")
+        if self.deformation is not None and not str(self.mesh).lower().endswith((".ply", ".obj")):
+            raise ValueError("deformation: it is for meshes of PLY and OBJ files")
         surfaces = self.model_fields_set & {"reflectance", "texture", "material"}
         surfaces -= {key for key in surfaces if getattr(self, key) is None}
         if len(surfaces) + (self.materials == "file") > 1:
@@ -272,6 +277,11 @@ class SceneSpec(Strict):
     def lamps(self) -> tuple[LampSpec, ...]:
         """The values of `named_lamps`."""
         return tuple(lamp for _, lamp in self.named_lamps)
+
+    @property
+    def moves(self) -> bool:
+        """True if something has a track, or changes its shape."""
+        return bool(self.motion) or any(item.deformation is not None for item in self.objects)
 
     @property
     def depth(self) -> int:

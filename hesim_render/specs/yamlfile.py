@@ -30,7 +30,11 @@ def read_yaml(file: Path, with_lines: bool = True) -> Any:
     SpecError
         If it is not a YAML mapping, or its aliases expand to too much.
     """
-    text = read_text(file)
+    return parse_yaml(read_text(file), file, with_lines)
+
+
+def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:
+    """The mapping in a text; see `read_yaml`. `file` is for errors."""
     with reading(file, "as YAML"):
         try:
             if "*" in text:

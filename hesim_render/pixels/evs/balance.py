@@ -51,6 +51,10 @@ class Balance:
         self._waiting = np.zeros((2, pixels, _ROOM), np.int64)
         self._ready_us = np.full(pixels, -np.inf)
 
+    def is_idle(self, pixel: NDArray[np.int64], t_us: int) -> NDArray[np.bool_]:
+        """True for pixels of which no step waits, and that are not in their dead time."""
+        return ~self._count[:, pixel].any(axis=0) & (self._ready_us[pixel] <= t_us)
+
     def take(self, causes: Steps, effects: Steps) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Take the next steps of both sequences.
 

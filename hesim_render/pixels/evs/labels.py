@@ -6,9 +6,9 @@ thresholds give the noise-free stream.
 
 With fixed ticks, an event is `signal` if the nominal pixel gives the same event at the same tick, and `mismatch` if
 only the one with its own threshold does. Asynchronous pixels give their events a little earlier or later than without
-noise. There, the noise-free pixels begin with the reference level that the real pixel has, and an event is paired with
-the step that the noise-free pixel makes sooner or later, unless the real one goes back before (`balance`). What has no
-partner is `leak` or `hot` if that process gave it, else `noise`.
+noise. There, the noise-free pixels compare with the reference level that the real pixel has, and an event is paired
+with the step that the noise-free pixel makes sooner or later, unless the real one goes back before (`balance`). What
+has no partner is `leak` or `hot` if that process gave it, else `noise`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.pixels.evs.balance import Balance, Steps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost, Origin, no_events
@@ -58,6 +59,8 @@ class Labeller:
         self._label: list[NDArray[np.uint8]] = [np.empty(0, np.uint8)]
         self._events = self._steps = 0
         #: Pairs of an event and a step of the pixel's own, and of that and a nominal step; and steps in dead time.
+        #: Pixels that had steps since they took over the reference level of the real ones.
+        self._stepped = np.ones(pixels, np.bool_)
         self._pairs: list[tuple[NDArray, NDArray]] = []
         self._nominal_too: list[NDArray] = []
         self._asleep: list[NDArray[np.void]] = [no_events()]
@@ -86,10 +89,6 @@ class Labeller:
         clean = self._clean_pixels.step(electrons, stage.t_us)
         own = clean if self._own is None else self._own.step(electrons, stage.t_us)
         nominal = own if self._nominal is None else self._nominal.step(electrons, stage.t_us)
-        if is_first and not self._by_tick:
-            for pixels in (self._own, self._nominal):
-                if pixels is not None:
-                    _share_reference(stage, pixels)
         self._clean.append(self._in_run(clean))
         through = np.ones(events.size, np.bool_) if kept is None else kept
         self._unread.append(self._in_run(events[~through]))
@@ -103,6 +102,7 @@ class Labeller:
             found[np.isin(place, self._key(clean))] = Label.SIGNAL
         else:
             self._pair(nominal, own, events, origin, number)
+            self._share_reference(stage, stage.t_us, is_first)
         self._label.append(found[counted])
 
     def _pair(
@@ -121,6 +121,8 @@ class Labeller:
             self._as_steps(own, step), self._as_steps(events[compared], number[compared])
         )
         self._pairs.append((cause, effect))
+        for steps in (own, events[compared]):
+            self._stepped[self._place(steps)] = True
         first = self._steps - own.size
         self._asleep.append(self._in_run(own[np.sort(asleep) - first]))
         if self._nominal is not None:
@@ -153,16 +155,34 @@ class Labeller:
 
     def _key(self, events: NDArray[np.void]) -> NDArray[np.int64]:
         """A number for each pixel and polarity."""
-        place = events["y"].astype(np.int64) * self._cols + events["x"]
-        return 2 * place + (events["polarity"] > 0)
+        return 2 * self._place(events) + (events["polarity"] > 0)
+
+    def _place(self, events: NDArray[np.void]) -> NDArray[np.int64]:
+        return events["y"].astype(np.int64) * self._cols + events["x"]
+
+    def _share_reference(self, stage: EvsStage, t_us: int, is_first: bool) -> None:
+        """Let noise-free pixels compare with the level of the real one where no step of either waits for its partner.
+
+        Noise moves the level of a real pixel whose two thresholds differ: an event up and one down leave it beside
+        where it was, and so does a dead time. The nominal pixel follows the other noise-free one.
+        """
+        import drjit as dr
+
+        assert self._own is not None
+        place = np.flatnonzero(self._stepped)
+        idle = place if is_first else place[self._of_events.is_idle(place, t_us)]
+        if idle.size == 0:
+            return
+        self._stepped[idle] = False
+        types = jit()
+        index = types.UInt32(idle.astype(np.uint32))
+        before, now = (dr.gather(types.Float, level.reference, index) for level in (self._own, stage))
+        dr.eval(before, now)
+        for pixels in filter(None, (self._own, self._nominal)):
+            reference = dr.copy(pixels.reference)
+            dr.scatter(reference, now if is_first else dr.gather(types.Float, reference, index) + (now - before), index)
+            dr.eval(reference)
+            pixels.compare_with(reference)
 
     def _as_steps(self, events: NDArray[np.void], number: NDArray[np.int64]) -> Steps:
-        place = events["y"].astype(np.int64) * self._cols + events["x"]
-        return Steps(events["t_us"], place, events["polarity"].astype(np.int64), number)
-
-
-def _share_reference(stage: EvsStage, other: EvsStage) -> None:
-    """Let the asynchronous pixels of another stage compare with the levels of the first."""
-    state = other.state()
-    state["_mode"]["_reference"] = stage.state()["_mode"]["_reference"]
-    other.resume(state)
+        return Steps(events["t_us"], self._place(events), events["polarity"].astype(np.int64), number)

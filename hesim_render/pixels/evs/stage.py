@@ -112,6 +112,17 @@ class EvsStage:
         restore(self, state)
 
     @property
+    def reference(self) -> Float:
+        """Level with which each asynchronous pixel compares, ln x; None before the first sample."""
+        assert isinstance(self._mode, _LastEvent)
+        return self._mode._reference
+
+    def compare_with(self, reference: Float) -> None:
+        """Let the asynchronous pixels compare with other levels, ln x, from now on."""
+        assert isinstance(self._mode, _LastEvent)
+        self._mode._reference = reference
+
+    @property
     def t_us(self) -> int | None:
         """Time of the last sample; None before the first."""
         return self._t_us

@@ -64,7 +64,10 @@ def timeline_of(tracer: PixelTracer, max_motion_px: float = MAX_MOTION_PX) -> Ti
     """Slices of the scene of a tracer, in each of which objects stand still."""
     built = tracer.built
     corners = {name: np.concatenate([s.corners for s in built.groups[name]]) for name in built.trajectories}
-    return Timeline(tracer.view, tracer.camera, built.trajectories, corners, built.corners, max_motion_px)
+    return Timeline(
+        tracer.view, tracer.camera, built.trajectories, corners, built.corners, max_motion_px,
+        deformations=built.deformations,
+    )  # fmt: skip
 
 
 class RenderedFlux(WindowByWindow):
@@ -120,7 +123,7 @@ class RenderedFlux(WindowByWindow):
         self.view = self._tracer.view
         self.sensor = self.view.sensor
         self._timeline = timeline_of(self._tracer, max_motion_px)
-        self.is_static = not self._tracer.built.trajectories and self._tracer.camera is None
+        self.is_static = not self._tracer.built.moves and self._tracer.camera is None
         types = jit()
         self._wavelengths = WavelengthSampler(self.sensor.responses)
         self._filter = types.UInt32(self.sensor.layout.filter_index.ravel().astype(np.uint32))

@@ -13,8 +13,10 @@ from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import MITSUBA_AXES, place_camera
 from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.scene.builder import build
-from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict
+from hesim_render.sources.render.scene.deformation import Deformation
+from hesim_render.sources.render.scene.mitsuba_version import box_corners, spectrum_dict
 from hesim_render.sources.render.scene.parents import camera_trajectory, trajectories
+from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.specfilm import camera_at, perspective_dict
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
@@ -64,7 +66,7 @@ class FrozenPixels:
         self.view = place_camera(scene.spec, sensor, self._built.mitsuba_sensor())
         sensor = self.view.sensor
         self.is_dark = self._built.is_dark
-        self.is_static = not self._built.trajectories and camera_trajectory(scene.spec) is None
+        self.is_static = not self._built.moves and camera_trajectory(scene.spec) is None
         self._filter = sensor.layout.filter_index.ravel()
         self._full_index = sensor.layout.full_index.ravel()
         scale = scene.spec.mitsuba.radiance_scale if scene.spec.mitsuba is not None else 1.0
@@ -157,15 +159,22 @@ class FrozenPixels:
         pixels.
         """
         times, farthest = np.linspace(begin_us, end_us, _STEPS), 0.0
-        knots = [t_us for track in trajectories(self._scene.spec).values() for t_us in track.knots_us]
+        moving: list[Trajectory | Deformation] = [*trajectories(self._scene.spec).values()]
+        moving += self._built.deformations.values()
+        knots = [t_us for each in moving for t_us in each.knots_us]
         inside = [float(t) for t in knots if begin_us < t < end_us]
         times = np.unique(np.concatenate([times, inside]))
         cameras = np.stack([camera_at(self._scene, self.view, float(t)) for t in times])
         still = [self._built.corners] if np.ptp(cameras, axis=0).any() else []
         places = [np.broadcast_to(corners, (times.size, *corners.shape)) for corners in still]
-        for name, trajectory in self._built.trajectories.items():
-            poses = trajectory.matrix(times)
-            corners = np.concatenate([shape.corners for shape in self._built.groups[name]])
+        for name in dict.fromkeys((*self._built.trajectories, *self._built.deformations)):
+            track, deformation = self._built.trajectories.get(name), self._built.deformations.get(name)
+            poses = np.broadcast_to(np.eye(4), (times.size, 4, 4)) if track is None else track.matrix(times)
+            if deformation is None:
+                corners = np.concatenate([shape.corners for shape in self._built.groups[name]])
+            else:
+                vertices = (deformation.at(t_us) for t_us in times)
+                corners = np.stack([box_corners(shape.min(axis=0), shape.max(axis=0)) for shape in vertices])
             places.append(corners @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3])
         for points in places:
             size = np.array([self.view.sensor.cols, self.view.sensor.rows])

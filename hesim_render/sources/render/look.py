@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from hesim_render.sources.render.camera import View, place_camera
 from hesim_render.sources.render.framing import Framing, framing, outline, posed_view
 from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.scene.builder import build
+from hesim_render.sources.render.scene.mesh_file import FileMaterial, file_materials
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.transfer import encode
@@ -38,11 +39,13 @@ class Look:
     picture : uint8 [row, col, 3], sRGB; the region that is read out, and darkened the surroundings.
     region : left, top, right, bottom of the read-out region in the picture.
     target : the target in the picture; None without a target.
+    materials : materials of GLB and glTF files as they are rendered, by the name of the object.
     """
 
     picture: NDArray[np.uint8]
     region: tuple[float, float, float, float]
     target: Framing | None
+    materials: dict[str, list[FileMaterial]] = field(default_factory=dict)
 
 
 def look(scene: Scene, sensor: Sensor) -> Look:
@@ -81,7 +84,7 @@ def look(scene: Scene, sensor: Sensor) -> Look:
     rim = outline(scene.spec, view)
     picture = encode(np.clip(shown, 0, 1).astype(np.float32), "srgb", depth=8)
     drawn = _with_lines(picture, region, None if rim is None else (rim + beside) / scale)
-    return Look(drawn, region, framing(scene.spec, view))
+    return Look(drawn, region, framing(scene.spec, view), file_materials(scene.spec))
 
 
 def _colours(mi: MitsubaModule, scene: MitsubaObject, view: View, x: NDArray, y: NDArray) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from itertools import pairwise
 
@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.sources.render.camera import View
+from hesim_render.sources.render.scene.deformation import Deformation
 from hesim_render.sources.render.scene.trajectory import Trajectory
 
 #: Least number of steps in which the path of an object's corners is measured between two keyframes.
 _LEAST_STEPS = 16
+#: Vertices of a mesh whose paths are measured at once.
+_CHUNK = 1 << 15
 #: Largest turn of one such step.
 _STEP_RAD = np.radians(5.0)
 #: Longest step in which the camera's motion is measured, µs.
@@ -24,7 +27,8 @@ class Timeline:
     """Slices of an animated scene; a pure function of time, independent of the interval that is asked for.
 
     Between two keyframes of any object, time is cut evenly into slices. Within a slice, no corner of
-    a moving object's bounding box moves more than `max_motion_px` in the image.
+    a moving object's bounding box moves more than `max_motion_px` in the image, and no vertex of a mesh that changes
+    its shape.
 
     Parameters
     ----------
@@ -35,6 +39,7 @@ class Timeline:
     scene_corners : corners of the whole scene's box at rest, [8, 3], m; they bound what a moving camera sees.
     max_motion_px : largest motion within a slice, pixels.
     min_slice_us : shortest slice, µs.
+    deformations : shapes of the objects that change them, with or without a track.
     """
 
     def __init__(
@@ -46,9 +51,12 @@ class Timeline:
         scene_corners: NDArray[np.float64],
         max_motion_px: float = 0.5,
         min_slice_us: float = 10.0,
+        deformations: Mapping[str, Deformation] | None = None,
     ) -> None:
         self._view, self._camera = view, camera
         self._trajectories, self._corners = dict(trajectories), dict(corners)
+        self._deformations = dict(deformations or {})
+        self._moving: list[Trajectory | Deformation] = [*self._trajectories.values(), *self._deformations.values()]
         self._scene_corners = scene_corners
         self._max_motion_px, self._min_slice_us = max_motion_px, min_slice_us
         self._edges_between = lru_cache(maxsize=4096)(self._measure)
@@ -56,10 +64,10 @@ class Timeline:
     def _knots(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """All keyframe times from the last at or before `begin_us` to the first at or after `end_us`."""
         knots: list[NDArray[np.float64]] = []
-        for trajectory in self._trajectories.values():
-            own = trajectory.knots_us
-            if trajectory.repeat:
-                period = trajectory.period_us
+        for moving in self._moving:
+            own = moving.knots_us
+            if moving.repeat:
+                period = moving.period_us
                 first = np.floor((begin_us - own[0]) / period) - 1
                 last = np.floor((end_us - own[0]) / period) + 1
                 own = (own[None, :-1] + period * np.arange(first, last + 1)[:, None]).ravel()
@@ -73,25 +81,38 @@ class Timeline:
     def _measure(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Slice edges strictly between two neighbouring keyframes."""
         path_px = 0.0
-        for name, trajectory in self._trajectories.items():
-            turn = float(np.max(np.abs(trajectory.arc_rad)))
+        for name in dict.fromkeys((*self._trajectories, *self._deformations)):
+            trajectory = self._trajectories.get(name)
+            turn = 0.0 if trajectory is None else float(np.max(np.abs(trajectory.arc_rad)))
             steps = _LEAST_STEPS + int(np.ceil(turn / _STEP_RAD))
             times = np.linspace(begin_us, end_us, steps + 1)
             # a repeating track jumps at the knot itself: use the pose before the jump
             times[-1] -= 1e-6 * (end_us - begin_us)
-            poses = trajectory.matrix(times)
-            points = self._corners[name] @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+            poses = np.broadcast_to(np.eye(4), (times.size, 4, 4)) if trajectory is None else trajectory.matrix(times)
             camera = np.broadcast_to(self._view.camera_to_world, poses.shape)
             if self._camera is not None:
                 camera = self._camera.matrix(times) @ camera
-            # project both positions through the same camera, because each ray follows the camera's motion itself
-            first = self._view.project(points[:-1], camera[:-1])
-            second = self._view.project(points[1:], camera[:-1])
-            step_px = np.linalg.norm(second - first, axis=-1).max(axis=-1)
-            path_px = max(path_px, float(step_px.max()) * steps)
+            for rest in self._points(name, times):
+                points = rest @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3]
+                # project both positions through the same camera, because each ray follows the camera's motion itself
+                first = self._view.project(points[:-1], camera[:-1])
+                second = self._view.project(points[1:], camera[:-1])
+                step_px = np.linalg.norm(second - first, axis=-1).max(axis=-1)
+                path_px = max(path_px, float(step_px.max()) * steps)
         pieces = int(np.ceil(path_px / self._max_motion_px - 1e-9))
         pieces = max(1, min(pieces, int((end_us - begin_us) / self._min_slice_us)))
         return np.linspace(begin_us, end_us, pieces + 1)[1:-1]
+
+    def _points(self, name: str, times_us: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+        """Points of an object whose paths bound its motion, before its track: corners of its box [n, 3], or the
+        vertices of a mesh that changes its shape, [time, n, 3], some at a time.
+        """
+        deformation = self._deformations.get(name)
+        if deformation is None:
+            yield self._corners[name]
+            return
+        for first in range(0, deformation.vertices_m.shape[1], _CHUNK):
+            yield deformation.part(slice(first, first + _CHUNK)).at(times_us)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside an interval between which the image moves by `max_motion_px` or less, µs.
@@ -131,7 +152,7 @@ class Timeline:
 
     def edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """All slice edges strictly inside an interval, increasing."""
-        if not self._trajectories:
+        if not self._moving:
             return np.empty(0)
         knots = self._knots(begin_us, end_us)
         between = [self._edges_between(float(a), float(b)) for a, b in zip(knots[:-1], knots[1:], strict=True)]
@@ -141,7 +162,7 @@ class Timeline:
     def pose_time_us(self, begin_us: float, end_us: float) -> float:
         """Middle of the slice that contains an interval, µs: objects are drawn at their pose of this time."""
         middle = (begin_us + end_us) / 2
-        if not self._trajectories:
+        if not self._moving:
             return middle
         knots = self._knots(middle, middle)
         if knots[0] > middle or knots[-1] < middle:  # the pose is held before the first and after the last keyframe

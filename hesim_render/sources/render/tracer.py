@@ -137,7 +137,7 @@ class PixelTracer(Tracer):
 
     def pose(self, t_us: float) -> None:
         """Put moving objects at their poses of `t_us`."""
-        if self.built.trajectories and t_us != self._posed_us:
+        if self.built.moves and t_us != self._posed_us:
             self.built.pose(t_us)
             self._posed_us = t_us
 

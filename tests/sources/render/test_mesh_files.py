@@ -13,6 +13,8 @@ from trimesh.visual.material import PBRMaterial
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.cube import render_cube
+from hesim_render.sources.render.look import look
+from hesim_render.sources.render.scene.mesh_file import file_materials
 
 CAMERA = {"origin_m": [0, 0, 5], "horizontal_fov_deg": 30}
 
@@ -66,6 +68,30 @@ def test_materials_of_the_file_are_mapped(kind, tmp_path):
     light, dark = radiance[14, 45], radiance[26, 45]
     # grey of 0.5, with some sheen of the rough surface beside it
     assert 0.35 < light[0] < 0.6 and dark[0] < 0.12 and abs(light[0] / light[1] - 1) < 0.05
+
+
+def test_materials_are_listed_as_they_are_rendered(tmp_path, capsys):
+    """Three parts of three materials; factors come back in steps of 1/255, as trimesh has them."""
+    scene = two_parts()
+    normals = Image.fromarray(np.full((4, 4, 3), 128, np.uint8))
+    steel = PBRMaterial(name="steel", baseColorFactor=[51, 102, 153, 255], metallicFactor=1.0, roughnessFactor=0.25,
+                        normalTexture=normals, emissiveFactor=[0.5, 0.0, 0.0], alphaMode="BLEND")  # fmt: skip
+    ball = trimesh.creation.box((0.2, 0.2, 0.2))
+    ball.visual = TextureVisuals(uv=np.zeros((len(ball.vertices), 2)), material=steel)
+    scene.add_geometry(ball, geom_name="ball")
+    (tmp_path / "three.glb").write_bytes(scene.export(file_type="glb"))
+    spec = hr.load_scene(scene_file(tmp_path, "three.glb", ", materials: file")).spec
+    own = {material.part: material for material in file_materials(spec)["thing"]}
+    box, plate, metal = (own[name] for name in ("box", "plate", "ball"))
+    np.testing.assert_allclose(box.base_color, [128 / 255, 0, 0], atol=0.5 / 255)
+    assert (box.metallic, box.roughness, box.has_texture, box.unused) == (0.0, 1.0, False, ())
+    assert plate.has_texture and plate.base_color == (1.0, 1.0, 1.0)
+    np.testing.assert_allclose(metal.base_color, [0.2, 0.4, 0.6], atol=0.5 / 255)
+    assert (metal.metallic, metal.roughness) == (1.0, 0.25)
+    assert set(metal.unused) == {"normal texture", "emission", "transparency"}
+    found = look(hr.load_scene(tmp_path / "scene.yaml"), hr.load_sensor("reference-mono").crop(64, 48))
+    listed = "\n".join(map(str, found.materials["thing"]))
+    assert "ball: steel, base colour (0.2, 0.4, 0.6), metallic 1, roughness 0.25; not used: normal texture, " in listed
 
 
 def test_an_stl_file_is_a_mesh_with_one_reflectance(tmp_path):

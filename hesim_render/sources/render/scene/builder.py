@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene import lights
+from hesim_render.sources.render.scene.deformation import Deformation
 from hesim_render.sources.render.scene.mesh_file import mesh_shapes
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
 from hesim_render.sources.render.scene.mitsuba_scene import load_mitsuba, path_tracer
@@ -57,6 +58,7 @@ class BuiltScene:
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
     object_of_shape : name of the object of each shape, by the shape's id; a shape of a Mitsuba scene is an object
         of its own, under its id, and is not listed.
+    deformations : objects that change their shape, by name.
     """
 
     mi: MitsubaModule
@@ -71,18 +73,26 @@ class BuiltScene:
     camera: MitsubaCamera | None = None
     integrator_plugin: dict[str, Any] | None = None
     object_of_shape: dict[str, str] = field(default_factory=dict)
+    deformations: dict[str, Deformation] = field(default_factory=dict)
+
+    @property
+    def moves(self) -> bool:
+        """True if an object moves or changes its shape."""
+        return bool(self.trajectories or self.deformations)
 
     def pose(self, t_us: float) -> None:
-        """Move every moving object to its pose at `t_us`."""
-        for name, trajectory in self.trajectories.items():
-            matrix = trajectory.matrix(t_us)
+        """Move every moving object to its pose at `t_us`, and give it its shape of that time."""
+        for name in dict.fromkeys((*self.trajectories, *self.deformations)):
+            matrix = self.trajectories[name].matrix(t_us) if name in self.trajectories else np.eye(4)
             for shape in self.groups[name]:
+                if name in self.deformations:
+                    shape.deform(self.deformations[name].at(t_us))
                 shape.set_pose(matrix)
-        if self.trajectories:
+        if self.moves:
             self.parameters.update()
 
     def rest(self) -> None:
-        """Move every moving object back to its place in the file."""
+        """Move every moving object back to its place in the file; it keeps its shape."""
         for name in self.trajectories:
             for shape in self.groups[name]:
                 shape.set_pose(np.eye(4))
@@ -129,9 +139,12 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         scene, integrator, because, camera = loaded.scene, loaded.integrator, loaded.exact_because, loaded.camera
         plugin = loaded.integrator_plugin
         groups: dict[str, list[str]] = {}
+        deformations: dict[str, Deformation] = {}
         paints = None
     else:
-        content, groups, paints = _describe(mi, spec)
+        content, groups, paints, deformations = _describe(mi, spec)
+        if deformations:
+            because = f"object {next(iter(deformations))!r} changes its shape"
         with as_spec_error(spec.file):
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
         integrator = path_tracer(mi, spec.depth)
@@ -139,7 +152,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
     tracks = {name: track for name, track in trajectories(spec).items() if name != "camera"}
     movable: dict[str, list[Movable]] = {}
     shapes = {shape.id(): shape for shape in scene.shapes()}
-    for name in tracks:
+    for name in (*tracks, *(own for own in deformations if own not in tracks)):
         prefixes = groups.get(name, [name])
         for prefix in prefixes:
             if prefix not in shapes:
@@ -163,14 +176,18 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
         exact_because=because,
         camera=camera,
         integrator_plugin=plugin,
+        deformations=deformations,
         object_of_shape={prefix: name for name, prefixes in groups.items() for prefix in prefixes},
     )
 
 
-def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint] | None]:
-    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, and the paint of the shapes (None if
-    a shape shines or has a picture).
+def _describe(
+    mi: MitsubaModule, spec: SceneSpec
+) -> tuple[dict[str, Any], dict[str, list[str]], list[Paint] | None, dict[str, Deformation]]:
+    """Mitsuba's dictionary of a scene file, the shape ids of each movable name, the paint of the shapes (None if
+    a shape shines or has a picture), and the objects that change their shape.
     """
+    deformations: dict[str, Deformation] = {}
     all_matt = True
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
@@ -189,7 +206,10 @@ def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[
         name = f"object_{number}"
         placement, bsdf = _placement(item), surface_of(mi, item, spec)
         if item.shape == "mesh":
-            parts = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, spec.allow_outside or spec.file is None)
+            anywhere = spec.allow_outside or spec.file is None
+            parts, deformation = mesh_shapes(mi, item, name, placement, bsdf, spec.folder, anywhere)
+            if deformation is not None:
+                deformations[item.name] = deformation
         else:
             parts = {name: _object(mi, item, name, placement, bsdf)}
         content.update(parts)
@@ -203,7 +223,7 @@ def _describe(mi: MitsubaModule, spec: SceneSpec) -> tuple[dict[str, Any], dict[
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
-    return content, groups, paints if all_matt and not has_map else None
+    return content, groups, paints if all_matt and not has_map else None, deformations
 
 
 def _target_pieces(spec: SceneSpec) -> list[Piece]:

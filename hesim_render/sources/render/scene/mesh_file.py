@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,22 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
+from hesim_render.sources.render.scene.deformation import Deformation, read_deformation
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.surfaces import area_emitter, radiance_of
-from hesim_render.specs.scene import OUTSIDE, ObjectSpec
+from hesim_render.specs.scene import OUTSIDE, ObjectSpec, SceneSpec
 from hesim_render.spectral.transfer import decode
 from hesim_render.targets.piece import Picture
 
 _OF_MITSUBA, _OF_TRIMESH = ("obj", "ply"), ("stl", "glb", "gltf")
+#: Textures of glTF materials that are not rendered, by trimesh's name.
+_UNUSED = {
+    "metallicRoughnessTexture": "metallic and roughness texture",
+    "normalTexture": "normal texture",
+    "occlusionTexture": "occlusion texture",
+    "emissiveTexture": "emission texture",
+}
 
 
 def mesh_shapes(
@@ -30,8 +39,9 @@ def mesh_shapes(
     bsdf: Any,
     folder: Path,
     allow_outside: bool,
-) -> dict[str, Any]:
-    """Shapes of a mesh file, scaled to a bounding box of `size_m` and centred on the object's place.
+) -> tuple[dict[str, Any], Deformation | None]:
+    """Shapes of a mesh file, scaled to a bounding box of `size_m` and centred on the object's place, and its
+    deformation, if it has one.
 
     Faces of GLB, glTF and STL files are flat. A material of a GLB or glTF file becomes Mitsuba's ``principled``: base
     colour (factor times texture) by its sRGB, metallic and roughness by their factors; its other keys (normal maps,
@@ -50,7 +60,7 @@ def mesh_shapes(
     Raises
     ------
     SpecError
-        If the file is missing, cannot be read, or has no surface.
+        If the file is missing, cannot be read, or has no surface; or if the deformation does not fit it.
     """
     path, key = folder / str(item.mesh), f"objects.{item.name}.mesh"
     emitter = area_emitter(radiance_of(item))
@@ -63,8 +73,11 @@ def mesh_shapes(
         box = shape.bbox()
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         fit = placement @ _fit(item, low, high, int(shape.face_count()), path, key)
+        deformation = None
+        if item.deformation is not None:
+            deformation = read_deformation(mi, item.deformation, shape, fit, f"objects.{item.name}.deformation")
         shape = {"type": kind, "filename": str(path), "to_world": transform(mi, fit), "bsdf": bsdf}
-        return {name: shape if emitter is None else {**shape, "emitter": emitter}}
+        return {name: shape if emitter is None else {**shape, "emitter": emitter}}, deformation
     if kind not in _OF_TRIMESH:
         known = ", ".join(end.upper() for end in (*_OF_MITSUBA, *_OF_TRIMESH))
         raise SpecError(f"a mesh must be one of {known}, not {path.name}", key=key)
@@ -77,9 +90,9 @@ def mesh_shapes(
         own = f"{name}_{number}"
         vertices = np.asarray(part.vertices, dtype=np.float64) @ fit[:3, :3].T + fit[:3, 3]
         uv = getattr(part.visual, "uv", None)
-        surface = bsdf if item.materials == "own" else _principled(mi, part.visual, uv is not None)
+        surface = bsdf if item.materials == "own" else _principled(mi, part)
         found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv, emitter)
-    return found
+    return found, None
 
 
 def _fit(
@@ -123,25 +136,99 @@ def _load(path: Path, kind: str, root: Path | None, key: str) -> list[Any]:
         return [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh)]
 
 
-def _principled(mi: MitsubaModule, visual: Any, has_uv: bool) -> dict[str, Any]:
-    """The material of a part as Mitsuba's."""
-    material = visual.material.to_pbr() if hasattr(visual, "material") and hasattr(visual.material, "to_pbr") else None
-    material = getattr(visual, "material", None) if material is None else material
+@dataclass(frozen=True)
+class FileMaterial:
+    """A material of a GLB or glTF file as it is rendered.
+
+    Parameters
+    ----------
+    part, name : names of the part and of its material in the file.
+    base_color : linear sRGB, [3]; multiplies the texture, where there is one.
+    has_texture : True if a texture of the base colour is used.
+    metallic, roughness : of Mitsuba's ``principled``.
+    unused : what else the material has, which is not rendered.
+    """
+
+    part: str
+    name: str
+    base_color: tuple[float, float, float]
+    has_texture: bool
+    metallic: float
+    roughness: float
+    unused: tuple[str, ...]
+
+    def __str__(self) -> str:
+        colour = ", ".join(f"{value:.3g}" for value in self.base_color)
+        picture = " times a texture" if self.has_texture else ""
+        left = f"; not used: {', '.join(self.unused)}" if self.unused else ""
+        return (
+            f"{self.part}: {self.name}, base colour ({colour}){picture}, metallic {self.metallic:.3g}, "
+            f"roughness {self.roughness:.3g}{left}"
+        )
+
+
+def file_materials(spec: SceneSpec) -> dict[str, list[FileMaterial]]:
+    """Materials of all objects that take them from their files, by the object's name, part by part.
+
+    Raises
+    ------
+    SpecError
+        If a file is missing or cannot be read.
+    """
+    found = {}
+    for item in spec.objects:
+        if item.materials == "file":
+            path = spec.folder / str(item.mesh)
+            if not path.is_file():
+                raise SpecError(f"no such mesh file: {path}", key=f"objects.{item.name}.mesh")
+            root = None if spec.allow_outside or spec.file is None else spec.folder
+            parts = _load(path, path.suffix.lower().lstrip("."), root, f"objects.{item.name}.mesh")
+            found[item.name] = [_material_of(part) for part in parts]
+    return found
+
+
+def _pbr(part: Any) -> Any:
+    """The material of a part in the terms of glTF; None if it has none."""
+    material = getattr(part.visual, "material", None)
+    return material.to_pbr() if hasattr(material, "to_pbr") else material
+
+
+def _material_of(part: Any) -> FileMaterial:
+    material = _pbr(part)
     factor = getattr(material, "baseColorFactor", None)
     # trimesh has the linear factors of the file in steps of 1/255
     colour = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3]
     if factor is not None and np.asarray(factor).dtype.kind in "ui":
         colour = colour / 255
-    texture = getattr(material, "baseColorTexture", None)
-    base: Any = {"type": "rgb", "value": colour.tolist()}
-    if texture is not None and has_uv:
-        codes = np.asarray(texture.convert("RGB"), dtype=np.float64) / 255
-        base = picture_texture(mi, Picture((decode(codes, "srgb") * colour).astype(np.float32), "srgb"))
+    red, green, blue = colour.tolist()
     metallic, rough = getattr(material, "metallicFactor", None), getattr(material, "roughnessFactor", None)
-    surface = {
-        "type": "principled",
-        "base_color": base,
-        "metallic": 0.0 if metallic is None else float(metallic),
-        "roughness": 0.5 if rough is None else max(float(rough), 0.02),
-    }
+    textured = getattr(material, "baseColorTexture", None) is not None
+    has_uv = getattr(part.visual, "uv", None) is not None
+    unused = [told for key, told in _UNUSED.items() if getattr(material, key, None) is not None]
+    glow = getattr(material, "emissiveFactor", None)
+    if glow is not None and np.any(np.asarray(glow) > 0):
+        unused.append("emission")
+    if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
+        unused.append("transparency")
+    if textured and not has_uv:
+        unused.append("base colour texture (the part has no u, v)")
+    return FileMaterial(
+        str(part.metadata.get("name") or part.metadata.get("node") or "part"),
+        str(getattr(material, "name", None) or "without a name"),
+        (red, green, blue),
+        textured and has_uv,
+        0.0 if metallic is None else float(metallic),
+        0.5 if rough is None else max(float(rough), 0.02),
+        tuple(unused),
+    )
+
+
+def _principled(mi: MitsubaModule, part: Any) -> dict[str, Any]:
+    """The material of a part as Mitsuba's."""
+    told = _material_of(part)
+    base: Any = {"type": "rgb", "value": list(told.base_color)}
+    if told.has_texture:
+        codes = np.asarray(_pbr(part).baseColorTexture.convert("RGB"), dtype=np.float64) / 255
+        base = picture_texture(mi, Picture((decode(codes, "srgb") * told.base_color).astype(np.float32), "srgb"))
+    surface = {"type": "principled", "base_color": base, "metallic": told.metallic, "roughness": told.roughness}
     return {"type": "twosided", "material": surface}

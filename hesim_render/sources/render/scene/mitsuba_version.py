@@ -276,6 +276,11 @@ class Movable:
                 unit = box_corners(-np.ones(3), np.ones(3))  # Mitsuba's analytic shapes fit into [-1, 1]³
                 self.corners = unit @ self._to_world[:3, :3].T + self._to_world[:3, 3]
 
+    def deform(self, vertices_m: NDArray[np.float64]) -> None:
+        """Give a mesh another shape, [vertex, 3] as at its initial placement; takes effect at the next `set_pose`."""
+        self._vertices = vertices_m
+        self._normals = None  # Mitsuba computes those of the new shape
+
     def set_pose(self, pose: NDArray[np.float64]) -> None:
         """Set the shape to `pose` (4×4, rigid) times its initial placement; takes effect at ``parameters.update()``."""
         rotation, shift = pose[:3, :3], pose[:3, 3]

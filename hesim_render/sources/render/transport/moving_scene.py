@@ -121,6 +121,10 @@ class MovingScene:
     """
 
     def __init__(self, built: BuiltScene, geometry_only: bool = False) -> None:
+        if geometry_only and built.deformations:
+            raise SpecError(
+                f"geometric truth follows rigid motion, and {next(iter(built.deformations))!r} changes its shape"
+            )
         mi = built.mi
         if not geometry_only:
             _require_paths(built)
