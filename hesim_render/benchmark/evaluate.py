@@ -16,6 +16,7 @@ from hesim_render.benchmark.tasks import TASKS, ClipTasks, Score
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.output import check_place, replacing
+from hesim_render.core.plain import finite
 from hesim_render.core.progress import Progress
 from hesim_render.specs.benchmark import SPLITS
 
@@ -83,19 +84,8 @@ def evaluate_benchmark(
     }
     if target is not None:
         with replacing(target) as unfinished:
-            unfinished.write_text(json.dumps(_plain(result), indent=1) + "\n", encoding="utf-8")
+            unfinished.write_text(json.dumps(finite(result), indent=1) + "\n", encoding="utf-8")
     return result
-
-
-def _plain(node: Any) -> Any:
-    """JSON has no NaN or infinity: both are null."""
-    if isinstance(node, dict):
-        return {key: _plain(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_plain(value) for value in node]
-    if isinstance(node, float):
-        return node if np.isfinite(node) else None
-    return node
 
 
 def summary(scores: Sequence[Score]) -> Summary:

@@ -1,4 +1,4 @@
-"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate`` and ``export``."""
+"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate``, ``export`` and ``peers``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Build, verify and evaluate benchmarks of many clips.", no_args_is_help=True)
 _Folder = Annotated[Path, typer.Argument(help="folder of a benchmark")]
-_DIFFERENT = 1  # exit status of verify
+_DIFFERENT = 1  # exit status of verify where a file differs, of peers where one of them fails
 
 
 @app.command()
@@ -122,3 +122,29 @@ def export(
     with progress_report(f"{folder.name} → {layout}") as progress:
         count = export_benchmark(folder, layout, out, overwrite=overwrite, progress=progress)
     say(f"{count} pictures in {out}")
+
+
+@app.command()
+def peers(
+    spec: Annotated[Path, typer.Argument(help="YAML file of the comparison")],
+    out: Annotated[Path | None, typer.Option(help="JSON file of the result")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the YAML file")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare our sensor and other event simulators in the same light. Ends with status 1 where one of them fails."""
+    from hesim_render.benchmark.peers import compare_peers, peers_table
+    from hesim_render.specs.files import parse_override
+    from hesim_render.specs.peers import read_peers
+
+    if out is not None and out.exists() and not overwrite:
+        raise OutputError(f"{out} exists; use --overwrite to replace it")
+    content = read_peers(spec, dict(map(parse_override, set_ or [])))
+    with progress_report(content.name) as progress:
+        result = compare_peers(content, out, progress)
+    say(peers_table(result))
+    if out is not None:
+        say(f"in {out}")
+    if any("failed" in told for told in result["peers"].values()) or any("error" in row for row in result["rows"]):
+        raise typer.Exit(_DIFFERENT)
