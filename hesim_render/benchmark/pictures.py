@@ -66,6 +66,19 @@ class Development:
         weight = (at - low)[:, None]
         return (1 - weight) * along[low] + weight * along[np.minimum(low + 1, len(row_of) - 1)]
 
+    def grey_pair(self, first: NDArray, second: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Two RAW frames as 8-bit grey pictures (BT.709 luma, encoded as sRGB), both with the exposure of the first.
+
+        Parameters
+        ----------
+        first, second : [row, col], DN.
+        """
+        a, b = (self.linear(raw) @ np.array([0.2126, 0.7152, 0.0722], np.float32) for raw in (first, second))
+        bright = float(np.percentile(a, _PERCENTILE))
+        gain = _WHITE / bright if bright > 0 else 1.0
+        a, b = (np.rint(255 * encode_exactly(np.clip(grey * gain, 0, 1))).astype(np.uint8) for grey in (a, b))
+        return a, b
+
     def scores(self, raw: NDArray, truth: NDArray) -> dict[str, float]:
         """Measures of a RAW frame against the noise-free one.
 

@@ -89,22 +89,31 @@ def evaluate(
     folder: _Folder,
     split: Annotated[str, typer.Option(help="train, val, test or all")] = "test",
     tasks: Annotated[
-        str | None, typer.Option(metavar="TASK,TASK…", help="deblur, interpolate, denoise, fidelity; default all")
+        str | None,
+        typer.Option(
+            metavar="TASK,TASK…", help="deblur, interpolate, denoise, fidelity, flow, intensity, hdr; default all"
+        ),
+    ] = None,
+    predictions: Annotated[
+        Path | None, typer.Option(help="folder of your own results, TASK/CLIP/000000.npy, scored beside the baselines")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="JSON file of all single values")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure the baselines of each task on the clips of a split."""
+    """Measure the baselines of each task, and your own results, on the clips of a split."""
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
     if out is not None and out.exists() and not overwrite:
         raise OutputError(f"{out} exists; use --overwrite to replace it")
     with progress_report(f"evaluate {folder.name}") as progress:
         result = evaluate_benchmark(
-            folder, split=None if split == "all" else split, tasks=listed(tasks), out=out, progress=progress
-        )
+            folder, split=None if split == "all" else split, tasks=listed(tasks), predictions=predictions, out=out,
+            progress=progress,
+        )  # fmt: skip
     say(f"{result['clips']} clips of {result['benchmark']}, split {result['split']}")
     say(table(result["summary"]) or "no clip has what these tasks need")
+    for name in result["unused"]:
+        complain(f"{name}: belongs to no item that was scored")
     if out is not None:
         say(f"in {out}")
 
