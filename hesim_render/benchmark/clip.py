@@ -97,7 +97,8 @@ def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
     sensor, level = plan.sensor(clip), spec.noise[clip.noise]
     recording = simulate(
         scene, sensor, duration_s=spec.duration_s, seed=spec.seeds[clip.seed], clean=level.clean,
-        without=level.without, quality=spec.quality, truth=spec.truth, out=folder / RECORDING, progress=False,
+        without=level.without, quality=spec.quality, truth=spec.truth, audit=plan.is_audited(clip),
+        out=folder / RECORDING, progress=False,
     )  # fmt: skip
     sharp = 0
     if spec.sharp is not None:

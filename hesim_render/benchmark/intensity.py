@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hesim_render.benchmark.double_integral import log_steps
 from hesim_render.benchmark.metrics import ssim
 
-#: Time in which the sum falls to 1/e, µs. Scheerlinck et al. take 5 to 10 rad/s for indoor scenes [scheerlinck2018].
+#: Time in which the sum falls to 1/e, µs; a choice of ours, not fitted to any data.
 LEAK_US = 200_000.0
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +56,7 @@ def of_pictures(method: str, first: NDArray[np.uint8], second: NDArray[np.uint8]
     method : ``farneback`` [farneback2003] (three levels, window of 15 px) or ``dis`` [kroeger2016] (preset medium).
     first, second : [row, col], 8 bit.
     """
-    import cv2
-
+    cv2: Any = importlib.import_module("cv2")
     if method == "farneback":
         start = np.zeros((*first.shape, 2), np.float32)
         return cv2.calcOpticalFlowFarneback(first, second, start, 0.5, 3, 15, 3, 7, 1.5, 0)
@@ -96,10 +97,10 @@ def _planes(time: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     there = np.isfinite(time)
     if not there.any():
         return np.full((*time.shape, 2), np.nan), np.zeros(time.shape)
-    y, x = np.indices(time.shape).astype(np.float64)
+    y, x = (np.asarray(index, dtype=np.float64) for index in np.indices(time.shape))
     t = np.where(there, time - time[there].mean(), 0.0)
 
-    def total(values: NDArray) -> NDArray[np.float64]:
+    def total(values: Any) -> NDArray[np.float64]:
         return uniform_filter(np.where(there, values, 0.0), _SIDE, mode="constant") * _SIDE**2
 
     n, sx, sy, st = total(np.ones_like(t)), total(x), total(y), total(t)

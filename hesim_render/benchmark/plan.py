@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from hesim_render.benchmark.draws import CLIPS, EXPOSURES, draws, log_uniform
+from hesim_render.benchmark.draws import AUDITS, CLIPS, EXPOSURES, draws, log_uniform
 from hesim_render.benchmark.generator import Generator, SceneFiles
 from hesim_render.core.errors import SpecError
 from hesim_render.sensor.sensor import Sensor, load_sensor
@@ -126,6 +126,11 @@ class Plan:
         if clip.exposure_us is not None:
             changes["aps.exposure_us"] = clip.exposure_us
         return chosen_sensor(choice, self.spec.folder, f"sensors.{clip.sensor}.sensor", changes)
+
+    def is_audited(self, clip: Clip) -> bool:
+        """True if the render of a clip is audited; a pure function of the specification and the clip's numbers."""
+        numbers = (clip.scene, clip.motion, clip.light, clip.sensor, clip.exposure, clip.noise, clip.seed)
+        return bool(draws(self.spec.seed, AUDITS, *numbers).random() < self.spec.audit)
 
     def check(self) -> None:
         """Load every sensor and given scene once, and see that splits share no part of a given scene.

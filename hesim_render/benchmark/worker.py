@@ -16,6 +16,7 @@ from typing import Any
 
 from hesim_render import __version__
 from hesim_render.benchmark.clip import build_clip
+from hesim_render.benchmark.devices import claim_device
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.core.errors import HesimError, OutputError
 from hesim_render.core.output import discard_unfinished
@@ -38,6 +39,12 @@ def _opened(order: str) -> tuple[Plan, Path, str]:
     return Plan(spec), Path(content["root"]), content["version"]
 
 
+@functools.cache
+def _claimed() -> str | None:
+    """The GPU of this process, chosen before the first clip."""
+    return claim_device()
+
+
 def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
     """Build a clip and tell what became of it.
 
@@ -51,6 +58,7 @@ def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
     ``name``, and ``seconds`` and ``bytes``, or ``error`` and ``fatal`` (True where other clips would fail as well).
     """
     with _one_at_a_time:
+        _claimed()
         name = str(clip["name"])
         try:
             plan, root, version = _opened(order)
@@ -79,6 +87,7 @@ def main() -> None:
         answers.write(json.dumps(content) + "\n")
         answers.flush()
 
+    _claimed()
     order = sys.stdin.readline()
     threads = int(sys.stdin.readline() or 0)
     if threads:

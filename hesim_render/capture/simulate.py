@@ -52,6 +52,7 @@ def simulate(
     max_minutes: float | None = None,
     truth: str | Sequence[str] = (),
     truth_every_us: int | None = None,
+    audit: bool = True,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
@@ -79,6 +80,8 @@ def simulate(
         Without `out`, `Recording.truth` computes them when they are asked for.
     truth_every_us : interval between the times at which event pixels are described, µs; default: the middle of each
         frame, or every 10 ms where there are none.
+    audit : measure the error of the render with random numbers of its own. Without it the run is shorter, all else is
+        the same to the bit, and ``settings.render`` has no audit.
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
@@ -166,10 +169,11 @@ def simulate(
                 told.expect(expected.seconds)
             if flux.is_static:
                 rendering[0].progress = _share_progress(expected.rays, told)
-        noted = _noted(flux, plain, round(sample.windows), seed) if rendering else None
+        noted = _noted(flux, plain, round(sample.windows), seed) if rendering and audit else None
         capture = plain
-        if noted is not None:
-            capture = Capture(noted, flux.sensor, *noise, duration_us, seed, labels=labels)
+        if rendering:
+            seen_by = flux if noted is None else noted
+            capture = Capture(seen_by, flux.sensor, *noise, duration_us, seed, labels=labels)
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
             overwrite=overwrite,
@@ -178,10 +182,11 @@ def simulate(
             render: dict[str, Any] = {
                 "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
             }
+            if rendering:
+                render |= _work_done(rendering)
             if noted is not None:
                 if told is not None:
                     told(0, 1, "audit")
-                render |= _work_done(rendering)
                 model = flux.sensor.evs if flux.sensor.spec.evs is not None else None
                 render["audit"] = Audit(noted, flux, rendering[0].quality, model, capture.event_pixels, seed).run()
             writer.add_settings({"render": render})

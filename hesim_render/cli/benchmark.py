@@ -1,4 +1,4 @@
-"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate``, ``export`` and ``peers``."""
+"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate``, ``export``, ``pack`` and ``peers``."""
 
 from __future__ import annotations
 
@@ -131,6 +131,28 @@ def export(
     with progress_report(f"{folder.name} → {layout}") as progress:
         count = export_benchmark(folder, layout, out, overwrite=overwrite, progress=progress)
     say(f"{count} pictures in {out}")
+
+
+@app.command()
+def pack(
+    folder: _Folder,
+    out: Annotated[str, typer.Option(help="folder, or an address that fsspec knows, such as s3://bucket/set")],
+    format_: Annotated[str, typer.Option("--format", help="webdataset (tar) or hdf5")] = "webdataset",
+    shard_mb: Annotated[float, typer.Option(help="size at which a shard is closed, MB")] = 256.0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the samples of a benchmark into a few large files for training, each checked after it is there."""
+    from hesim_render.benchmark.shards import pack_benchmark, verify_shards
+
+    with progress_report(f"{folder.name} → {out}") as progress:
+        count = pack_benchmark(
+            folder, out, format=format_, shard_mb=shard_mb, overwrite=overwrite, progress=progress
+        )  # fmt: skip
+        problems = verify_shards(out, progress)
+    if problems:
+        complain(*problems)
+        raise typer.Exit(_DIFFERENT)
+    say(f"{count} samples in {out}")
 
 
 @app.command()

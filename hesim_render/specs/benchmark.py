@@ -207,6 +207,7 @@ class BenchmarkSpec(Strict):
     sharp: SharpSpec | None = None
     truth: tuple[str, ...] = Field(("flow", "depth"), description="kinds as of simulate; events labels events")
     quality: float = Field(0.5, gt=0, le=100)
+    audit: float = Field(1.0, ge=0, le=1, description="share of the clips whose render is audited, drawn at random")
     folder: Path = Field(Path(), exclude=True)
 
     @model_validator(mode="after")

@@ -291,6 +291,46 @@ def test_a_scheduler_that_is_not_there_is_refused(tmp_path):
         build_benchmark(small(), tmp_path / "b", scheduler="tcp://127.0.0.1:9", estimate=False)
 
 
+def test_a_scheduler_that_dies_and_a_clip_that_kills_its_workers_are_told(monkeypatch):
+    """Answers as dask gives them: of a finished clip, of dead workers, and of a scheduler that is gone."""
+    distributed = pytest.importorskip("distributed")
+    from concurrent.futures import CancelledError
+
+    from distributed.scheduler import KilledWorker
+
+    from hesim_render.benchmark.cluster import run_on_cluster
+
+    clips = Plan(generated(3)).clips
+
+    class Answer:
+        def __init__(self, key, failure):
+            self.key, self.failure = key, failure
+
+        def exception(self):
+            if isinstance(self.failure, CancelledError):
+                raise self.failure
+            return self.failure
+
+        def result(self):
+            return {"name": clips[self.key].name, "seconds": 1.0, "bytes": 2}
+
+    class Client:
+        loop = None
+
+        def __init__(self, *failures):
+            self.waiting = [Answer(k, failure) for k, failure in enumerate(failures)][::-1]
+
+        def submit(self, *arguments, **options):
+            return self.waiting.pop()
+
+    monkeypatch.setattr(distributed, "as_completed", lambda futures, loop: futures)
+    dead, told = KilledWorker.__new__(KilledWorker), []
+    failed = run_on_cluster(Client(None, dead, None), "{}", clips, told.append)
+    assert len(told) == 3 and list(failed) == [clips[1].name] and "died again and again" in failed[clips[1].name]
+    with pytest.raises(BackendError, match="the finished ones stay"):
+        run_on_cluster(Client(None, CancelledError()), "{}", clips[:2], told.append)
+
+
 @pytest.mark.slow
 def test_two_workers_of_dask_and_a_kill_leave_the_same_bytes(built, tmp_path):
     distributed = pytest.importorskip("distributed")
