@@ -153,7 +153,8 @@ def simulate(
         labels = EVENTS in kinds
         plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=labels and not rendering)
         sample = plain.sample_of_event_blocks() if rendering and not flux.is_static else BlockSample([], 1.0)
-        if rendering:
+        is_asked = told is not None or on_estimate is not None or max_minutes is not None
+        if rendering and is_asked:  # it takes as long as a short run, and changes nothing
             expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
             if on_estimate is not None:
                 on_estimate(expected)

@@ -381,6 +381,29 @@ def test_the_card_says_how_clips_differ(built):
     assert (built.root / "histograms.png").stat().st_size > 1000
 
 
+def test_a_share_of_the_clips_is_audited():
+    """A quarter of 400 clips: 100 with a standard deviation of 8.7; 4.5 of these are 39 (false alarm 7e-6)."""
+    plans = [Plan(generated(400, audit=share)) for share in (0.25, 0.25, 0, 1)]
+    counts = [sum(plan.is_audited(clip) for clip in plan.clips) for plan in plans]
+    assert 61 <= counts[0] <= 139 and counts[1:] == [counts[0], 0, 400]
+    assert [plans[0].is_audited(c) for c in plans[0].clips] == [plans[1].is_audited(c) for c in plans[1].clips]
+
+
+def test_without_an_audit_a_clip_has_the_same_bits_and_says_so(tmp_path):
+    found = {}
+    for audit in (0, 1):
+        sensors = [{"sensor": "reference-mono", "roi": "8x6"}]
+        given = {"given": [{"scene": "flat-field", "split": "test"}]}
+        plan = Plan(small(scenes=given, sensors=sensors, truth=[], sharp=None, audit=audit))
+        build_clip(plan, plan.clips[0], tmp_path / str(audit))
+        folder = clip_folder(tmp_path / str(audit), plan.clips[0])
+        content = json.loads((folder / CLIP_FILE).read_text())
+        assert ("audit" in content["render"]) is bool(audit) and content["render"]["rays"] > 0
+        found[audit] = hr.Recording.load(folder / "recording")
+    assert np.array_equal(found[0].frames[0].raw, found[1].frames[0].raw)
+    assert np.array_equal(found[0].events, found[1].events)
+
+
 def test_the_estimate_counts_the_missing_clips():
     plan = Plan(small(truth=[], sharp=None))
     one, two = estimate_build(plan, plan.clips[1:]), estimate_build(plan, plan.clips[1:] * 2)
