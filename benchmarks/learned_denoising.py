@@ -78,8 +78,8 @@ def clip(seed, changes, duration_s, lux):
 def run(clips, duration_s, lux, seeds=3):
     """Figures of each filter on the events of all clips of the test.
 
-    Of a network, for each seed of its training: area under the curve, and the share of noise that it keeps together with
-    90 % of the signal. Of the other filters: shares of signal and of noise that they keep.
+    Of a network, for each seed of its training: area under the curve, and the share of noise that it keeps together
+    with 90 % of the signal. Of the other filters: shares of signal and of noise that they keep.
     """
     backend.jit()
     known = [clip(100 + k, KNOWN, duration_s, lux) for k in range(clips)]
@@ -121,11 +121,9 @@ def main():
     networks, filters = run(given.clips, given.duration, given.lux, given.seeds)
     for name, values in networks.items():
         areas, kept = np.array(values).T
-        print(
-            f"trained on {name}: area under the curve {areas.mean():.3f} ({areas.min():.3f} to {areas.max():.3f}), ",
-            end="",
-        )
-        print(f"with 90 % of the signal {100 * kept.mean():.0f} % of the noise")
+        limits = f"{areas.min():.3f} to {areas.max():.3f}"
+        print(f"trained on {name}: area under the curve {areas.mean():.3f} ({limits}),")
+        print(f"  with 90 % of the signal {100 * kept.mean():.0f} % of the noise")
     for name, (signal, noise) in filters.items():
         print(f"{name}: keeps {100 * signal:.0f} % of the signal, {100 * noise:.0f} % of the noise")
     print(f"{time.process_time() - begin:.0f} s of processor time")
