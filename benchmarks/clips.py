@@ -7,8 +7,8 @@ Three parts, each with generated scenes of the default ranges::
     python benchmarks/clips.py workers [the same options]
 
 `parts` prints processor seconds of each step of a clip, with the materials of its scene. `overhead` builds the clips
-with one worker of one thread, and prints what that took beyond the time inside the clips, which is mostly the start of
-the worker; then a whole build. `workers` builds the same clips with one and with two workers of one thread each.
+with one worker of one thread, and prints what that took beyond the time inside the clips. `workers` builds the same
+clips with one and with two workers of one thread each. Both need an idle machine and clips of more than some seconds.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from hesim_render.benchmark import clip as clip_module
-from hesim_render.benchmark.build import build_benchmark
+from hesim_render.benchmark.build import build_benchmark, opened
 from hesim_render.benchmark.clip import build_clip
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan
@@ -97,31 +97,39 @@ def parts(spec, folder):
 
 
 def run(spec, folder, count):
-    """Clips by `count` workers of one thread each: wall-clock seconds, and those inside each clip."""
+    """Clips by `count` workers of one thread: when they began, the time of each answer, and that inside its clip."""
     plan = Plan(spec)
-    folder.mkdir(parents=True, exist_ok=True)
-    inside, begin = [], time.monotonic()
+    opened(plan, folder)
+    answers, begin = [], time.monotonic()
     failed = LocalWorkers(order_of(spec, folder), count, threads=1).run(
-        plan.clips, lambda answer: inside.append(answer.get("seconds", 0.0))
+        plan.clips, lambda answer: answers.append((time.monotonic(), answer.get("seconds", 0.0)))
     )
     assert not failed, failed
-    return time.monotonic() - begin, inside
+    return begin, answers
 
 
 def overhead(spec, folder):
+    begin, answers = run(spec, folder, 1)
+    ends, inside = zip(*answers, strict=True)
+    start = ends[0] - begin - inside[0]
+    between = ends[-1] - ends[0] - sum(inside[1:])
+    print(f"{len(inside)} clips, {sum(inside):.1f} s inside them; start of the worker {start:.1f} s, once")
+    if len(inside) > 1:
+        share = 100 * between / sum(inside[1:])
+        print(f"hand-over between clips {1000 * between / (len(inside) - 1):.0f} ms each: {share:.2f} % of their time")
     begin = time.monotonic()
-    build_benchmark(spec, folder / "whole", workers=1, estimate=False)
-    whole = time.monotonic() - begin
-    wall, inside = run(spec, folder / "clips", 1)
-    start = wall - sum(inside)
-    print(f"{len(inside)} clips: {sum(inside):.1f} s inside clips, {wall:.1f} s with one worker of one thread")
-    print(f"start of the worker and hand-over {start:.1f} s, once for each worker: {100 * start / wall:.1f} %")
-    print(f"a whole build with plan, manifest and card took {whole:.1f} s (threads: all)")
+    build_benchmark(spec, folder, workers=0, estimate=False)  # the clips are there: plan, manifest and card alone
+    rest = time.monotonic() - begin
+    print(f"plan, manifest and card {rest:.1f} s, {100 * rest / sum(inside):.2f} %")
 
 
 def workers(spec, folder):
-    times = {count: run(spec, folder / str(count), count)[0] for count in (1, 2)}
-    print(f"one worker {times[1]:.1f} s, two workers {times[2]:.1f} s: {times[1] / times[2]:.2f} times as fast")
+    times = {}
+    for count in (1, 2):
+        begin, answers = run(spec, folder / str(count), count)
+        times[count] = max(end for end, _ in answers) - begin
+        print(f"{count} workers of one thread: {times[count]:.1f} s with their start", flush=True)
+    print(f"two are {times[1] / times[2]:.2f} times as fast as one")
 
 
 def main():

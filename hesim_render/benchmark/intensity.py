@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +32,8 @@ def leaky_sum(
     part = events[events["t_us"] <= t_us]
     steps = log_steps(part, *thresholds) * np.exp((part["t_us"] - t_us) / leak_us)
     place = part["y"].astype(np.int64) * shape[1] + part["x"]
-    return np.bincount(place, steps, shape[0] * shape[1]).reshape(shape)
+    total: NDArray[np.float64] = np.bincount(place, steps, shape[0] * shape[1]).astype(np.float64)
+    return total.reshape(shape)
 
 
 def intensity_scores(log_picture: NDArray, log_truth: NDArray) -> dict[str, float]:
@@ -66,10 +65,7 @@ def intensity_scores(log_picture: NDArray, log_truth: NDArray) -> dict[str, floa
     }
     low, high = np.quantile(b, [0.005, 0.995])
     if min(log_truth.shape) >= 11 and high > low:
-        pair: list[NDArray[Any]] = []
-        for values in (fitted, b):
-            picture = np.zeros(log_truth.shape)
-            picture[valid] = (values - low) / (high - low)
-            pair.append(picture)
-        found["ssim"] = ssim(*pair)
+        pictures = np.zeros((2, *log_truth.shape))
+        pictures[:, valid] = (np.stack([fitted, b]) - low) / (high - low)
+        found["ssim"] = ssim(pictures[0], pictures[1])
     return found

@@ -41,7 +41,7 @@ class _Ours:
 
     events: NDArray[np.void]
     truth: NDArray[np.void]
-    error: dict[str, Any]
+    error: dict[str, float] | None
     seconds: float
 
     def between(self, first_us: float, last_us: float) -> tuple[NDArray[np.void], NDArray[np.void]]:

@@ -76,8 +76,8 @@ class Development:
         a, b = (self.linear(raw) @ np.array([0.2126, 0.7152, 0.0722], np.float32) for raw in (first, second))
         bright = float(np.percentile(a, _PERCENTILE))
         gain = _WHITE / bright if bright > 0 else 1.0
-        a, b = (np.rint(255 * encode_exactly(np.clip(grey * gain, 0, 1))).astype(np.uint8) for grey in (a, b))
-        return a, b
+        codes = [np.rint(255 * encode_exactly(np.clip(grey * gain, 0, 1))).astype(np.uint8) for grey in (a, b)]
+        return codes[0], codes[1]
 
     def scores(self, raw: NDArray, truth: NDArray) -> dict[str, float]:
         """Measures of a RAW frame against the noise-free one.

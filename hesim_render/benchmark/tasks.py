@@ -193,7 +193,8 @@ class ClipTasks:
         step_px = [max(1.0, float(np.median(np.diff(places)))) for places in (place[0] % layout.cols,)]
         row = place[:, 0] // layout.cols
         step_px.append(max(1.0, float(np.median(np.diff(row)))) if len(row) > 1 else 1.0)
-        on_mosaic = [self._development.on_mosaic(np.nan_to_num(velocity[..., k]) * step_px[k]) for k in range(2)]
+        known = np.where(given[..., None], velocity, 0.0) * np.array(step_px)
+        on_mosaic = [self._development.on_mosaic(known[..., k]) for k in range(2)]
         near = self._development.on_mosaic(given.astype(np.float64)) >= 0.5
         return np.where(near[..., None], np.stack(on_mosaic, axis=-1), np.nan)
 

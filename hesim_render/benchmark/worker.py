@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,9 @@ def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
             built = build_clip(plan, Clip(**clip), root)
         except HesimError as error:
             return {"name": name, "error": str(error), "fatal": isinstance(error, OutputError)}
+        except Exception as error:  # a fault of ours in one clip must not end the build of the others
+            traceback.print_exc()
+            return {"name": name, "error": f"{type(error).__name__}: {error}", "fatal": False}
         return {"name": name, "seconds": built.seconds, "bytes": built.bytes}
 
 

@@ -70,15 +70,21 @@ def _estimated(expected: BuildEstimate, progress: ProgressReport, workers: int, 
 
 
 @app.command()
-def verify(folder: _Folder) -> None:
+def verify(
+    folder: _Folder,
+    discard: Annotated[bool, typer.Option("--discard", help="remove damaged clips; build makes them again")] = False,
+) -> None:
     """Compare every file of a benchmark with its SHA-256. Ends with status 1 where anything differs."""
     from hesim_render.benchmark.folder import Benchmark
-    from hesim_render.benchmark.verify import digest_of, verify_benchmark
+    from hesim_render.benchmark.verify import digest_of, discard_damaged, verify_benchmark
 
     with progress_report(f"verify {folder.name}") as progress:
         problems = verify_benchmark(folder, progress)
     if problems:
         complain(*problems)
+        if discard:
+            removed = discard_damaged(folder, problems)
+            say(f"removed {len(removed)} clips; 'benchmark build' makes them again")
         raise typer.Exit(_DIFFERENT)
     benchmark = Benchmark(folder)
     say(f"{len(benchmark.manifest['clips'])} clips are as they were built; digest {digest_of(benchmark)}")

@@ -22,7 +22,7 @@ from hesim_render.benchmark.clip import CLIP_FILE, build_clip, clip_folder
 from hesim_render.benchmark.forecast import estimate_build
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan
-from hesim_render.benchmark.verify import digest_of
+from hesim_render.benchmark.verify import digest_of, discard_damaged
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import BackendError, OutputError, RangeError, SpecError
 
@@ -366,6 +366,37 @@ def test_twenty_random_kills_leave_the_same_bytes(built, tmp_path):
         run.wait()
     subprocess.run([*command, "1"], check=True)
     assert verify_benchmark(root) == [] and digest_of(Benchmark(root)) == digest_of(built)
+
+
+def test_damaged_clips_are_discarded_and_made_again(tmp_path):
+    spec = small(
+        scenes={"given": [{"scene": "flat-field", "split": "train"}, {"scene": "dark", "split": "test"}]}, truth=[],
+        sensors=[{"sensor": "reference-mono", "roi": "8x6"}], sharp=None, audit=0,
+    )  # fmt: skip
+    built = build_benchmark(spec, tmp_path / "b", estimate=False)
+    digest, first = digest_of(built), next(built.clips())
+    (first.folder / "recording" / "preview.png").write_bytes(b"")
+    problems = verify_benchmark(built.root)
+    assert problems == [f"{first.name}/recording/preview.png: was changed"]
+    assert discard_damaged(built.root, problems) == [first.name] and not first.folder.exists()
+    again = build_benchmark(spec, built.root, estimate=False)
+    assert digest_of(again) == digest and verify_benchmark(built.root) == []
+    plan = built.root / "plan.json"
+    plan.write_text(plan.read_text() + " ")
+    assert verify_benchmark(built.root) == ["plan.json: was changed, or is missing"]
+    assert discard_damaged(built.root, verify_benchmark(built.root)) == []  # nothing of the clips is wrong
+    shutil.rmtree(built.root / "clips")
+    assert len(verify_benchmark(built.root)) == 3  # two clips and the plan, without a traceback
+
+
+def test_a_fault_of_ours_in_one_clip_does_not_stop_the_others(monkeypatch):
+    def broken(plan, clip, root):
+        raise KeyError("x")
+
+    monkeypatch.setattr("hesim_render.benchmark.worker.build_clip", broken)
+    plan = Plan(small())
+    answer = attempt(order_of(plan.spec, __import__("pathlib").Path("/nowhere")), plan.clips[0].as_dict())
+    assert answer == {"name": plan.clips[0].name, "error": "KeyError: 'x'", "fatal": False}
 
 
 # ---- card and estimate --------------------------------------------------------------------------------
