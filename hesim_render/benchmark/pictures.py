@@ -66,6 +66,21 @@ class Development:
         weight = (at - low)[:, None]
         return (1 - weight) * along[low] + weight * along[np.minimum(low + 1, len(row_of) - 1)]
 
+    def flow_on_mosaic(self, flow: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Flow of the event grid [y, x, 2], in its pixels, at all pixels of the mosaic [row, col, 2], in pixels of that.
+
+        Pixels whose event pixels around have no flow (NaN) have none.
+        """
+        tile = self.sensor.tile_rows
+        grid = self.sensor.evs_grid
+        assert grid is not None
+        pitch = np.array([len(tile[0]) / grid.cols_per_tile, len(tile) / grid.rows_per_tile])
+        given: NDArray[np.bool_] = np.asarray(np.isfinite(flow).all(axis=-1))
+        known: NDArray[np.float64] = np.where(given[..., None], flow, 0.0) * pitch
+        found = np.stack([self.on_mosaic(known[..., k]) for k in range(2)], axis=-1)
+        near = self.on_mosaic(given.astype(np.float64)) >= 0.5
+        return np.where(near[..., None], found, np.nan)
+
     def grey_pair(self, first: NDArray, second: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Two RAW frames as 8-bit grey pictures (BT.709 luma, encoded as sRGB), both with the exposure of the first.
 

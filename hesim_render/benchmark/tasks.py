@@ -185,18 +185,10 @@ class ClipTasks:
 
     def _event_flow(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Flow of the mosaic between two times, px, from planes through the events between them."""
-        recording, layout = self._clip.recording, self._development.layout
+        recording = self._clip.recording
         events = recording.event_slice(int(begin_us), int(np.ceil(end_us)) + 1)
         velocity = plane_fit(events, recording.event_shape) * (end_us - begin_us)
-        given = np.isfinite(velocity).all(axis=-1)
-        place = layout.evs_pixel.reshape(layout.evs_shape).astype(np.int64)
-        step_px = [max(1.0, float(np.median(np.diff(places)))) for places in (place[0] % layout.cols,)]
-        row = place[:, 0] // layout.cols
-        step_px.append(max(1.0, float(np.median(np.diff(row)))) if len(row) > 1 else 1.0)
-        known = np.where(given[..., None], velocity, 0.0) * np.array(step_px)
-        on_mosaic = [self._development.on_mosaic(known[..., k]) for k in range(2)]
-        near = self._development.on_mosaic(given.astype(np.float64)) >= 0.5
-        return np.where(near[..., None], np.stack(on_mosaic, axis=-1), np.nan)
+        return self._development.flow_on_mosaic(velocity)
 
     def intensity(self) -> Iterator[Score]:
         """Log intensity from the events alone at each sharp image, where every pixel gives frames and events."""

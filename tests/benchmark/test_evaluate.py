@@ -114,6 +114,21 @@ def test_exposures_of_a_still_scene_are_merged_and_light_comes_from_events(tmp_p
     assert found["intensity"]["leaky-sum"]["log_rmse"]["mean"] > 0.5 and len(found["intensity"]) == 1
 
 
+def test_flow_of_the_event_grid_is_in_pixels_of_the_mosaic(built):
+    """A flow to the next event pixel ends at the place of that pixel, whatever their pitch."""
+    development = Development(next(built.clips()))
+    layout = development.layout
+    rows, cols = layout.evs_shape
+    flow = np.full((rows, cols, 2), [1.0, 2.0])
+    flow[:, cols // 2 :] = np.nan
+    found = development.flow_on_mosaic(flow)
+    place = layout.evs_pixel.reshape(rows, cols).astype(int)
+    row, col = np.divmod(place, layout.shape[1])
+    to_right, down = (col[0, -1] - col[0, 0]) / (cols - 1), (row[-1, 0] - row[0, 0]) / (rows - 1)
+    assert found[row[2, 0], col[2, 0]] == pytest.approx([to_right, 2 * down], rel=0.2)  # places alternate by a pixel
+    assert np.isnan(found[row[2, -1], col[2, -1]]).all() and to_right >= 2
+
+
 def test_means_are_over_finite_values():
     scores = [Score("a", "t", "m", k, {"v": value}) for k, value in enumerate((1.0, 3.0, np.inf))]
     assert summary(scores)["t"]["m"]["v"] == {"count": 2, "mean": 2.0, "std": 1.0}
