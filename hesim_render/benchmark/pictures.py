@@ -67,7 +67,7 @@ class Development:
         return (1 - weight) * along[low] + weight * along[np.minimum(low + 1, len(row_of) - 1)]
 
     def flow_on_mosaic(self, flow: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Flow of the event grid [y, x, 2], in its pixels, at all pixels of the mosaic [row, col, 2], in pixels of that.
+        """Flow of the event grid [y, x, 2], px of that grid, on the mosaic [row, col, 2], px of the mosaic.
 
         Pixels whose event pixels around have no flow (NaN) have none.
         """
