@@ -53,6 +53,7 @@ def simulate(
     truth: str | Sequence[str] = (),
     truth_every_us: int | None = None,
     audit: bool = True,
+    renderer: tuple[Any, dict[str, Any]] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
@@ -82,6 +83,8 @@ def simulate(
         frame, or every 10 ms where there are none.
     audit : measure the error of the render with random numbers of its own. Without it the run is shorter, all else is
         the same to the bit, and ``settings.render`` has no audit.
+    renderer : from `flux_source` with the same scene, sensor, seed and quality, fresh; it can be used again afterwards.
+        None makes one. What a renderer has rendered decides no value, it only saves time later.
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
@@ -142,7 +145,7 @@ def simulate(
         settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
         seen, level = in_absolute_light(scene)
-        flux, mode = flux_source(seen, sensor, seed, quality, samples, exact, told)
+        flux, mode = renderer or flux_source(seen, sensor, seed, quality, samples, exact, told)
         warn_if_unseen(scene.spec, flux.view, duration_us)
         settings |= mode
         if level is not None:

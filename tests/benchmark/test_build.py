@@ -24,7 +24,9 @@ from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan
 from hesim_render.benchmark.verify import digest_of, discard_damaged
 from hesim_render.benchmark.worker import attempt, order_of
+from hesim_render.capture.simulate import flux_source
 from hesim_render.core.errors import BackendError, OutputError, RangeError, SpecError
+from hesim_render.sources.render.light_level import in_absolute_light
 
 MATT = {"plastic": 0, "rough_plastic": 0, "metal": 0}
 
@@ -81,6 +83,29 @@ def test_the_blurred_frame_is_the_integral_of_the_sharp_flux(tmp_path):
     # RAW of the sharp image: gain, black and rounding
     expected = np.minimum(flux * 0.01, aps.full_well_e) * aps.system_gain_dn_per_e + aps.black_level_dn
     assert np.abs(raw - expected).max() <= 0.5 + 1e-3 * expected.max()
+
+
+@pytest.mark.slow
+def test_sharp_images_are_those_of_a_renderer_of_their_own(tmp_path):
+    """The renderer that made the recording gives them to the bit; they have its crosstalk, here none."""
+    level = {"name": "plain", "without": ["aps.crosstalk"]}
+    keys = {"geometry.crosstalk": 0.1}
+    spec = small(
+        scenes={"given": [{"scene": "rotating-star", "split": "train"}]}, truth=[], noise=[level], audit=0,
+        sensors=[{"sensor": "reference-mono", "roi": "16x12", "set": keys}],
+        sharp={"times_us": [8000], "window_us": 500},
+    )  # fmt: skip
+    plan = Plan(spec)
+    build_clip(plan, plan.clips[0], tmp_path)
+    with h5py.File(clip_folder(tmp_path, plan.clips[0]) / "sharp.h5") as file:
+        made = file["flux_e_per_s"][0]
+    sensor = plan.sensor(plan.clips[0])
+    scene = in_absolute_light(hr.load_scene("rotating-star"))[0]
+    own = flux_source(scene, sensor, 7, spec.quality, None, False, None)[0]
+    pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
+    a, b = own.mean_flux(pixel, 7750, 8250)
+    expected = 0.5 * (np.array(a, np.float32) + np.array(b, np.float32))
+    assert np.array_equal(made.ravel()[pixel], expected)
 
 
 @pytest.mark.slow
