@@ -75,7 +75,7 @@ def build_benchmark(
     plan = Plan(spec)
     plan.check()
     with _client(scheduler) as client:
-        root = _opened(plan, Path(out))
+        root = opened(plan, Path(out))
         missing = [clip for clip in plan.clips if not is_complete(root, clip)]
         expected = estimate_build(plan, missing) if estimate and missing else None
         if expected is not None and on_estimate is not None:
@@ -157,8 +157,12 @@ def _plan_content(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _opened(plan: Plan, out: Path) -> Path:
+def opened(plan: Plan, out: Path) -> Path:
     """The folder of the benchmark, with its plan in it.
+
+    Parameters
+    ----------
+    plan, out : the plan, and the folder.
 
     Raises
     ------

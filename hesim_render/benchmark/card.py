@@ -73,7 +73,7 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
     splits = Counter(clip["split"] for clip in clips)
     scenes = {split: len({c["scene"] for c in clips if c["split"] == split}) for split in SPLITS}
     size = sum(entry["bytes"] for clip in clips for entry in clip["files"].values())
-    verdicts = Counter(clip["render"].get("audit", {}).get("verdict", "none") for clip in clips)
+    verdicts = Counter(clip["render"].get("audit", {}).get("verdict", "not audited") for clip in clips)
     kinds = ", ".join(spec["truth"]) or "none"
     lines = [
         f"# {manifest['name']}", "", spec["description"], "",

@@ -12,8 +12,11 @@ from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.benchmark.sharp import SHARP_FILE, write_sharp
 from hesim_render.benchmark.statistics import figures
-from hesim_render.capture.simulate import simulate
+from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.simulate import flux_source, simulate
 from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.sources.crosstalk import with_crosstalk
+from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import load_scene
 
 CLIP_FILE, RECORDING, SCENE = "clip.json", "recording", "scene"
@@ -95,21 +98,25 @@ def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
     else:
         scene, parts = plan.given_scene(clip), plan.given_parts(clip)
     sensor, level = plan.sensor(clip), spec.noise[clip.noise]
+    seed = spec.seeds[clip.seed]
+    # one renderer for both: what rests is rendered once
+    renderer = flux_source(in_absolute_light(scene)[0], sensor, seed, spec.quality, None, False, None)
     recording = simulate(
-        scene, sensor, duration_s=spec.duration_s, seed=spec.seeds[clip.seed], clean=level.clean,
-        without=level.without, quality=spec.quality, truth=spec.truth, out=folder / RECORDING, progress=False,
+        scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
+        quality=spec.quality, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
+        out=folder / RECORDING, progress=False,
     )  # fmt: skip
     sharp = 0
     if spec.sharp is not None:
         with output_errors(folder):
-            sharp = write_sharp(
-                folder / SHARP_FILE, scene, sensor, spec.sharp, spec.duration_us, spec.seeds[clip.seed], spec.quality
-            )
+            aps, _ = noise_models(sensor, level.clean, level.without)
+            source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
+            sharp = write_sharp(folder / SHARP_FILE, source, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
     manifest = recording.manifest
     return {
         "schema_version": SCHEMA,
         **clip.as_dict(),
-        "seed": spec.seeds[clip.seed],
+        "seed": seed,
         "noise": level.name,
         "sensor": sensor.name,
         "scene_name": scene.name,

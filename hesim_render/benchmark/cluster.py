@@ -7,7 +7,7 @@ from typing import Any
 
 from hesim_render.benchmark.plan import Clip
 from hesim_render.benchmark.worker import attempt
-from hesim_render.core.errors import OutputError, RangeError
+from hesim_render.core.errors import BackendError, OutputError, RangeError
 
 _PATIENCE_S = 10
 
@@ -53,8 +53,14 @@ def run_on_cluster(
     ------
     OutputError
         If a clip cannot be written; the finished clips stay.
+    BackendError
+        If the scheduler is gone; the finished clips stay.
     """
-    from distributed import as_completed
+    from asyncio import CancelledError as Cancelled
+    from concurrent.futures import CancelledError
+
+    import distributed
+    from distributed.comm.core import CommClosedError
     from distributed.scheduler import KilledWorker
 
     failed: dict[str, str] = {}
@@ -63,9 +69,15 @@ def run_on_cluster(
         # the key is of this call: a result of an earlier build must not stand for this one
         future = client.submit(attempt, order, clip.as_dict(), pure=False, retries=0)
         futures[future.key] = (future, clip)
-    for future in as_completed([future for future, _ in futures.values()], loop=client.loop):
+    for future in distributed.as_completed([future for future, _ in futures.values()], loop=client.loop):
         clip = futures[future.key][1]
-        failure = future.exception()
+        try:
+            failure = future.exception()
+        except (Cancelled, CancelledError, CommClosedError):  # a client without a scheduler gives its tasks up
+            raise BackendError(
+                "the scheduler is gone, or has given the clips up; the finished ones stay, and the same command with a "
+                "running scheduler builds the others"
+            ) from None
         if failure is None:
             answer = future.result()
         elif isinstance(failure, KilledWorker):

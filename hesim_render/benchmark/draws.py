@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 #: Streams of random numbers; a new kind of draw gets a new number, so that it changes no other.
-SOLIDS, MOTIONS, LIGHTS, EXPOSURES, CLIPS, ORDER = range(6)
+SOLIDS, MOTIONS, LIGHTS, EXPOSURES, CLIPS, AUDITS = range(6)
 Item = TypeVar("Item")
 
 

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from hesim_render.benchmark.clip import CLIP_FILE
-from hesim_render.benchmark.folder import Benchmark
+from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
 from hesim_render.benchmark.generator import file_hash
+from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import TASKS, ClipTasks, Score
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.output import check_place, replacing
+from hesim_render.core.plain import finite
 from hesim_render.core.progress import Progress
 from hesim_render.specs.benchmark import SPLITS
 
@@ -27,23 +29,25 @@ def evaluate_benchmark(
     *,
     split: str | None = "test",
     tasks: Sequence[str] = (),
+    predictions: str | Path | None = None,
     out: str | Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure the baselines on the clips of a benchmark.
+    """Measure the baselines, and results of your own, on the clips of a benchmark.
 
     Parameters
     ----------
     root : folder of the benchmark.
     split : whose clips; None takes all.
     tasks : names (`TASKS`); default all. A clip without what a task needs is left out of it.
+    predictions : folder of your own results, ``TASK/CLIP/000000.npy``, which are scored beside the baselines.
     out : JSON file of the result; None writes none. It is replaced if it exists.
     progress : called with (done, total, what).
 
     Returns
     -------
     ``summary`` [task][method][measure]: mean, std and number of values; ``scores``, a list of every single one;
-    ``digest`` of the benchmark and ``split``.
+    ``digest`` of the benchmark and ``split``; ``unused``: files of `predictions` that belong to no item of these tasks.
 
     Raises
     ------
@@ -65,12 +69,15 @@ def evaluate_benchmark(
     if not clips:
         raise RangeError("split", split, "a split that has clips")
     hashes = {entry["name"]: entry["sha256"] for entry in benchmark.manifest["clips"]}
-    scores: list[Score] = []
-    for done, clip in enumerate(clips):
+    for clip in clips:
         if not (clip.folder / CLIP_FILE).is_file() or file_hash(clip.folder / CLIP_FILE) != hashes[clip.folder.name]:
             raise SpecError("was changed or removed after the build (benchmark verify)", file=clip.folder / CLIP_FILE)
+    given = None if predictions is None else Predictions(predictions, TASKS, {clip.folder.name for clip in clips})
+    longer = _longer_exposures(clips) if "hdr" in (tasks or TASKS) else {}
+    scores: list[Score] = []
+    for done, clip in enumerate(clips):
         for name in tasks or TASKS:
-            scores += TASKS[name](ClipTasks(clip))
+            scores += TASKS[name](ClipTasks(clip, given, longer.get(clip.folder.name, ())))
         if progress is not None:
             progress(done + 1, len(clips), "clips")
     result = {
@@ -78,24 +85,30 @@ def evaluate_benchmark(
         "digest": digest_of(benchmark),
         "split": split or "all",
         "clips": len(clips),
+        "unused": [] if given is None else given.unused,
         "summary": summary(scores),
         "scores": [vars(score) for score in scores],
     }
     if target is not None:
         with replacing(target) as unfinished:
-            unfinished.write_text(json.dumps(_plain(result), indent=1) + "\n", encoding="utf-8")
+            unfinished.write_text(json.dumps(finite(result), indent=1) + "\n", encoding="utf-8")
     return result
 
 
-def _plain(node: Any) -> Any:
-    """JSON has no NaN or infinity: both are null."""
-    if isinstance(node, dict):
-        return {key: _plain(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_plain(value) for value in node]
-    if isinstance(node, float):
-        return node if np.isfinite(node) else None
-    return node
+def _longer_exposures(clips: Sequence[BenchmarkClip]) -> dict[str, list[BenchmarkClip]]:
+    """Clips that differ in their exposure only: those of longer ones, in order, by the name of that of the shortest."""
+    alike: dict[tuple[Any, ...], list[BenchmarkClip]] = {}
+    for clip in clips:
+        content = clip.content
+        if content.get("exposure_us") is not None:
+            key = tuple(content[name] for name in ("scene", "motion", "light", "sensor", "noise", "seed"))
+            alike.setdefault(key, []).append(clip)
+    found = {}
+    for group in alike.values():
+        first, *others = sorted(group, key=lambda clip: clip.content["exposure_us"])
+        if others:
+            found[first.folder.name] = others
+    return found
 
 
 def summary(scores: Sequence[Score]) -> Summary:

@@ -9,34 +9,50 @@ from numpy.typing import NDArray
 
 #: Default time within which a neighbour supports an event, µs.
 SUPPORT_US = 5000
+_LONG_AGO = np.iinfo(np.int64).min // 2
 
 
-def _last_before(events: NDArray, shape: tuple[int, int], step_row: int, step_col: int) -> NDArray[np.int64]:
+def last_before(
+    events: NDArray, shape: tuple[int, int], step_row: int, step_col: int, among: NDArray | None = None
+) -> NDArray[np.int64]:
     """Time of the last earlier event of the pixel at an offset from each event's own, µs; a far past where none is.
 
     An event counts as earlier if it comes before in the array, or at the same time: pixels of a fixed tick give their
-    events at the same instant.
+    events at the same instant. At an offset of 0 the event itself does not count.
+
+    Parameters
+    ----------
+    events : structured array of `EVENT_DTYPE`, in order of time.
+    shape : rows and columns of the event grid.
+    step_row, step_col : the offset, px.
+    among : the events that are looked for, in order of time; default all.
+
+    Returns
+    -------
+    [event], µs.
     """
     rows, cols = shape
-    place = events["y"].astype(np.int64) * cols + events["x"]
+    given = events if among is None else among
+    if len(given) == 0:
+        return np.full(len(events), _LONG_AGO)
+    place = given["y"].astype(np.int64) * cols + given["x"]
     y, x = events["y"].astype(np.int64) + step_row, events["x"].astype(np.int64) + step_col
     inside = (y >= 0) & (y < rows) & (x >= 0) & (x < cols)
     asked = np.where(inside, y * cols + x, -1)
-    span = int(events["t_us"][-1] - events["t_us"][0]) + 1 if len(events) else 1
-    first = int(events["t_us"][0]) if len(events) else 0
-    time = events["t_us"].astype(np.int64) - first
-    keys = np.sort(place * span + time)  # by pixel, then by time
-    wanted = asked * span + time
-    found = np.searchsorted(keys, wanted, side="right") - 1
+    first = int(events["t_us"][0])
+    span = int(events["t_us"][-1]) - first + 1
+    keys = np.sort(place * span + (given["t_us"].astype(np.int64) - first))  # by pixel, then by time
+    wanted = asked * span + (events["t_us"].astype(np.int64) - first)
+    found = np.searchsorted(keys, wanted, side="left" if step_row == step_col == 0 else "right") - 1
     last = keys[np.maximum(found, 0)]
     same = (found >= 0) & inside & (last // span == asked)
-    return np.where(same, last % span + first, np.iinfo(np.int64).min // 2)
+    return np.where(same, last % span + first, _LONG_AGO)
 
 
 def _newest(events: NDArray, shape: tuple[int, int], steps: list[tuple[int, int]]) -> NDArray[np.int64]:
-    newest = np.full(len(events), np.iinfo(np.int64).min // 2)
+    newest = np.full(len(events), _LONG_AGO)
     for row, col in steps:
-        newest = np.maximum(newest, _last_before(events, shape, row, col))
+        newest = np.maximum(newest, last_before(events, shape, row, col))
     return newest
 
 

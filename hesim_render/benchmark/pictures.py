@@ -67,6 +67,34 @@ class Development:
         weight = (at - low)[:, None]
         return (1 - weight) * along[low] + weight * along[np.minimum(low + 1, len(row_of) - 1)]
 
+    def flow_on_mosaic(self, flow: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Flow of the event grid [y, x, 2], px of that grid, on the mosaic [row, col, 2], px of the mosaic.
+
+        Pixels whose event pixels around have no flow (NaN) have none.
+        """
+        tile = self.sensor.tile_rows
+        grid = self.sensor.evs_grid
+        assert grid is not None
+        pitch = np.array([len(tile[0]) / grid.cols_per_tile, len(tile) / grid.rows_per_tile])
+        given: NDArray[np.bool_] = np.asarray(np.isfinite(flow).all(axis=-1))
+        known: NDArray[np.float64] = np.where(given[..., None], flow, 0.0) * pitch
+        found = np.stack([self.on_mosaic(known[..., k]) for k in range(2)], axis=-1)
+        near = self.on_mosaic(given.astype(np.float64)) >= 0.5
+        return np.where(near[..., None], found, np.nan)
+
+    def grey_pair(self, first: NDArray, second: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Two RAW frames as 8-bit grey pictures (BT.709 luma, encoded as sRGB), both with the exposure of the first.
+
+        Parameters
+        ----------
+        first, second : [row, col], DN.
+        """
+        a, b = (self.linear(raw) @ np.array([0.2126, 0.7152, 0.0722], np.float32) for raw in (first, second))
+        bright = float(np.percentile(a, _PERCENTILE))
+        gain = _WHITE / bright if bright > 0 else 1.0
+        codes = [np.rint(255 * encode_exactly(np.clip(grey * gain, 0, 1))).astype(np.uint8) for grey in (a, b)]
+        return codes[0], codes[1]
+
     def scores(self, raw: NDArray, truth: NDArray) -> dict[str, float]:
         """Measures of a RAW frame against the noise-free one.
 

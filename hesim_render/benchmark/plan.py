@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from hesim_render.benchmark.draws import CLIPS, EXPOSURES, draws, log_uniform
+from hesim_render.benchmark.draws import AUDITS, CLIPS, EXPOSURES, draws, log_uniform
 from hesim_render.benchmark.generator import Generator, SceneFiles
 from hesim_render.core.errors import SpecError
 from hesim_render.sensor.sensor import Sensor, load_sensor
@@ -109,7 +109,7 @@ class Plan:
         """The scene file that a clip names."""
         entry = self.spec.scenes.given[clip.scene - self.spec.scenes.count]
         key = f"scenes.given.{clip.scene - self.spec.scenes.count}.scene"
-        return load_scene(self._found(entry.scene, key))
+        return load_scene(file_of(self.spec.folder, entry.scene, key))
 
     def given_parts(self, clip: Clip) -> tuple[str, ...]:
         """The parts of a given scene: its content, and each of its objects and its target."""
@@ -119,30 +119,18 @@ class Plan:
             parts.append(f"target:{content_hash(spec.target)}")
         return tuple(sorted(set(parts)))
 
-    def _found(self, name: str, key: str) -> str | Path:
-        """A shipped name, or a path relative to the specification."""
-        path = self.spec.folder / name
-        if Path(name).suffix in (".yaml", ".yml"):
-            if not path.is_file():
-                raise SpecError(f"no such file: {path}", key=key)
-            return path
-        return name
-
     def sensor(self, clip: Clip) -> Sensor:
         """The sensor of a clip, with its region, exposure and changed keys."""
         choice, level = self.spec.sensors[clip.sensor], self.spec.noise[clip.noise]
         changes: dict[str, Any] = {**choice.set, **level.set}
         if clip.exposure_us is not None:
             changes["aps.exposure_us"] = clip.exposure_us
-        return self._sensor(choice, clip.sensor, changes)
+        return chosen_sensor(choice, self.spec.folder, f"sensors.{clip.sensor}.sensor", changes)
 
-    def _sensor(self, choice: SensorChoice, number: int, changes: Mapping[str, Any]) -> Sensor:
-        sensor = load_sensor(self._found(choice.sensor, f"sensors.{number}.sensor"), changes)
-        if choice.roi is None:
-            return sensor
-        size, *offset = choice.roi.split("+")
-        width, height = map(int, size.split("x"))
-        return sensor.crop(width, height, *map(int, offset))
+    def is_audited(self, clip: Clip) -> bool:
+        """True if the render of a clip is audited; a pure function of the specification and the clip's numbers."""
+        numbers = (clip.scene, clip.motion, clip.light, clip.sensor, clip.exposure, clip.noise, clip.seed)
+        return bool(draws(self.spec.seed, AUDITS, *numbers).random() < self.spec.audit)
 
     def check(self) -> None:
         """Load every sensor and given scene once, and see that splits share no part of a given scene.
@@ -163,8 +151,9 @@ class Plan:
                 seen.add((clip.sensor, clip.noise))
                 level = self.spec.noise[clip.noise]
                 for limit in self._exposure_limits(clip):
-                    changes = {**self.spec.sensors[clip.sensor].set, **level.set, **limit}
-                    sensor = self._sensor(self.spec.sensors[clip.sensor], clip.sensor, changes)
+                    choice = self.spec.sensors[clip.sensor]
+                    changes = {**choice.set, **level.set, **limit}
+                    sensor = chosen_sensor(choice, self.spec.folder, f"sensors.{clip.sensor}.sensor", changes)
                 noise_models(sensor, level.clean, level.without)
                 if self.spec.exposures_us and sensor.spec.aps is None:
                     raise SpecError(f"{sensor.name} has no frames to expose", key="exposures_us")
@@ -185,6 +174,38 @@ class Plan:
             return [{}]
         low, high = self.spec.exposures_us[clip.exposure]
         return [{"aps.exposure_us": round(low)}, {"aps.exposure_us": round(high)}]
+
+
+def file_of(folder: Path, name: str, key: str) -> str | Path:
+    """A shipped name, or the path of a YAML file relative to a folder.
+
+    Raises
+    ------
+    SpecError
+        If there is no such file; the message names the key.
+    """
+    path = folder / name
+    if Path(name).suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise SpecError(f"no such file: {path}", key=key)
+        return path
+    return name
+
+
+def chosen_sensor(choice: SensorChoice, folder: Path, key: str, changes: Mapping[str, Any]) -> Sensor:
+    """A sensor with its region, and with changed keys in place of those of the choice.
+
+    Parameters
+    ----------
+    choice, folder, key : the choice, the folder of its file, and its key, for errors.
+    changes : keys of the sensor file.
+    """
+    sensor = load_sensor(file_of(folder, choice.sensor, key), changes)
+    if choice.roi is None:
+        return sensor
+    size, *offset = choice.roi.split("+")
+    width, height = map(int, size.split("x"))
+    return sensor.crop(width, height, *map(int, offset))
 
 
 def sensor_name(choice: SensorChoice) -> str:

@@ -10,23 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.simulate import flux_source
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
 from hesim_render.core.hdf5 import COMPRESSION, Disk
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.crosstalk import with_crosstalk
-from hesim_render.sources.render.light_level import in_absolute_light
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.protocol import FluxSource
 from hesim_render.specs.benchmark import SharpSpec
 
 SHARP_FILE = "sharp.h5"
 
 
 def write_sharp(
-    path: Path, scene: Scene, sensor: Sensor, spec: SharpSpec, duration_us: int, seed: int, quality: float
+    path: Path, source: FluxSource, sensor: Sensor, spec: SharpSpec, duration_us: int, seed: int, quality: float
 ) -> int:
     """Write the sharp images of a clip.
 
@@ -35,7 +32,7 @@ def write_sharp(
     path : the HDF5 file: ``time_us`` [time] (middle of row 0's window), ``row_offset_us`` [row], ``flux_e_per_s`` and
         ``stderr_e_per_s`` [time, row, col] (NaN where there is no frame value), and ``raw_dn`` [time, row, col], what
         the sensor without noise would read of a still scene of that flux in its own exposure.
-    scene, sensor : of the clip.
+    source, sensor : of the clip: the light with the lens and the crosstalk that its frames have.
     spec : times and windows.
     duration_us, seed, quality : of the clip. The error of a flux is that part of the noise of a whole exposure.
 
@@ -49,10 +46,8 @@ def write_sharp(
     offset = np.arange(sensor.rows) * (aps.line_time_us if rolling else 0.0)
     middles = spec.middles_us(duration_us, float(offset[-1]))
     types = jit()
-    flux, _ = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, None, False, None)
     clean, _ = noise_models(sensor, clean=True)
     assert clean is not None
-    source = with_crosstalk(flux, sensor.layout.shape, sensor.aps.crosstalk)
     pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
     row = pixel // sensor.cols
     shape, exposure_s = (len(middles), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US

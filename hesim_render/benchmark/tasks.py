@@ -1,8 +1,8 @@
-"""Tasks of a clip with their baselines: deblurring, frame interpolation, event denoising, fidelity of events."""
+"""Tasks of a clip with their baselines: deblurring, interpolation, denoising, fidelity, flow, intensity, high range."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 
 from hesim_render.benchmark.double_integral import sharp_over_blurred
 from hesim_render.benchmark.event_filters import FILTERS
+from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged
 from hesim_render.benchmark.folder import BenchmarkClip
+from hesim_render.benchmark.intensity import intensity_scores, leaky_sum
 from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error
+from hesim_render.benchmark.optical_flow import flow_scores, of_pictures, picture_methods, plane_fit
 from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.predictions import Predictions
 from hesim_render.pixels.evs.events import Label
 from hesim_render.recording.frame import Frame
 
@@ -42,10 +46,20 @@ class ClipTasks:
     Parameters
     ----------
     clip : the clip.
+    predictions : results of a user, which are scored beside the baselines; None for none.
+    longer : clips of the same scene, sensor, noise and seed with longer exposures, if this one has the shortest.
     """
 
-    def __init__(self, clip: BenchmarkClip) -> None:
+    def __init__(
+        self, clip: BenchmarkClip, predictions: Predictions | None = None, longer: Sequence[BenchmarkClip] = ()
+    ) -> None:
         self._clip, self._development = clip, Development(clip)
+        self._predictions, self._longer = predictions, longer
+
+    def _predicted(self, task: str, item: int, shape: tuple[int, ...]) -> dict[str, NDArray]:
+        """The user's result for an item, by the name of its method; empty where there is none."""
+        found = None if self._predictions is None else self._predictions.read(task, self._clip.name, item, shape)
+        return {} if found is None else {"prediction": found}
 
     def _truth(self, frame: Frame) -> tuple[float, NDArray] | None:
         """Time and RAW of the sharp image in the middle of a frame's exposure; None where there is none."""
@@ -85,9 +99,11 @@ class ClipTasks:
             truth = self._truth(frame)
             if truth is None:
                 continue
-            yield self._score("deblur", "blurred", frame.index, frame.raw.astype(np.float64), truth[1])
+            found = {"blurred": frame.raw.astype(np.float64)}
             if self._has_events():
-                yield self._score("deblur", "double-integral", frame.index, self._sharpened(frame, truth[0]), truth[1])
+                found["double-integral"] = self._sharpened(frame, truth[0])
+            for name, raw in (found | self._predicted("deblur", frame.index, frame.raw.shape)).items():
+                yield self._score("deblur", name, frame.index, raw, truth[1])
 
     def interpolate(self) -> Iterator[Score]:
         """Every second frame is left out and made from its neighbours, as in the H-ESIM paper.
@@ -109,6 +125,7 @@ class ClipTasks:
                 found["double-integral"] = (1 - weight) * self._sharpened(before, t) + weight * self._sharpened(
                     after, t
                 )
+            found |= self._predicted("interpolate", left_out.index, left_out.raw.shape)
             for name, raw in found.items():
                 yield self._score("interpolate", name, left_out.index, raw, truth[1])
 
@@ -123,6 +140,7 @@ class ClipTasks:
         is_signal = np.isin(labels.label, [Label.SIGNAL, Label.MISMATCH])
         kept = {"none": np.ones(len(is_signal), bool)}
         kept |= {name: filtered(recording.events, recording.event_shape) for name, filtered in FILTERS.items()}
+        kept |= {name: mask > 0 for name, mask in self._predicted("denoise", 0, is_signal.shape).items()}
         for name, mask in kept.items():
             yield Score(self._clip.name, "denoise", name, 0, denoising_scores(mask, is_signal))
 
@@ -133,6 +151,8 @@ class ClipTasks:
             return
         shape = recording.event_shape
         every: dict[str, Any] = {"none": lambda events, shape: np.ones(len(events), bool), **FILTERS}
+        for name, mask in self._predicted("fidelity", 0, (len(recording.events),)).items():
+            every[name] = lambda events, shape, mask=mask: mask > 0
         for name, filtered in every.items():
             events = recording.events[filtered(recording.events, shape)]
             values = {
@@ -142,10 +162,79 @@ class ClipTasks:
             }
             yield Score(self._clip.name, "fidelity", name, 0, values)
 
+    def flow(self) -> Iterator[Score]:
+        """Flow from each frame to the next, over the pixels whose point is seen again.
+
+        Methods: none at all, OpenCV's on both frames as they are shown, and planes through the events between them.
+        """
+        stored, frames = self._clip.recording.stored_truth, self._clip.recording.frames
+        if stored is None or "frames/flow_forward_px" not in stored.names:
+            return
+        for frame, after in zip(frames[:-1], frames[1:], strict=True):
+            truth = stored.read("frames/flow_forward_px", frame.index)
+            valid = stored.read("frames/visible_forward", frame.index) & np.isfinite(truth).all(axis=-1)
+            found: dict[str, NDArray] = {"zero": np.zeros(truth.shape)}
+            if picture_methods():
+                first, second = self._development.grey_pair(frame.raw, after.raw)
+                found |= {name: of_pictures(name, first, second) for name in picture_methods()}
+            if self._has_events():
+                found["plane-fit"] = self._event_flow(_middle_us(frame), _middle_us(after))
+            found |= self._predicted("flow", frame.index, truth.shape)
+            for name, flow in found.items():
+                yield Score(self._clip.name, "flow", name, frame.index, flow_scores(flow, truth, valid))
+
+    def _event_flow(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
+        """Flow of the mosaic between two times, px, from planes through the events between them."""
+        recording = self._clip.recording
+        events = recording.event_slice(int(begin_us), int(np.ceil(end_us)) + 1)
+        velocity = plane_fit(events, recording.event_shape) * (end_us - begin_us)
+        return self._development.flow_on_mosaic(velocity)
+
+    def intensity(self) -> Iterator[Score]:
+        """Log intensity from the events alone at each sharp image, where every pixel gives frames and events."""
+        sharp, layout = self._clip.sharp, self._development.layout
+        if sharp is None or not self._has_events() or layout.evs_shape != layout.shape:
+            return
+        spec = self._development.sensor.evs
+        assert spec is not None
+        thresholds = spec.contrast_threshold_on, spec.contrast_threshold_off
+        for number, t_us in enumerate(sharp.time_us):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                truth = np.log(sharp.flux_e_per_s(number).astype(np.float64))
+            events = self._clip.recording.event_slice(0, int(t_us) + 1)
+            found: dict[str, NDArray] = {"leaky-sum": leaky_sum(events, layout.shape, float(t_us), thresholds)}
+            found |= self._predicted("intensity", number, layout.shape)
+            for name, picture in found.items():
+                yield Score(self._clip.name, "intensity", name, number, intensity_scores(picture, truth))
+
+    def hdr(self) -> Iterator[Score]:
+        """Flux in the middle of the shortest exposure, from frames of several exposures that begin at the same time."""
+        if not self._longer or self._clip.sharp is None:
+            return
+        aps, sharp = self._development.sensor.aps, self._clip.sharp
+        assert aps is not None
+        clips = [self._clip, *self._longer]
+        for number in range(min(len(clip.recording.frames) for clip in clips)):
+            frames = [clip.recording.frames[number] for clip in clips]
+            middle = _middle_us(frames[0])
+            nearest = sharp.nearest(middle)
+            if abs(sharp.time_us[nearest] - middle) > _NEAR * frames[-1].exposure_us:
+                continue
+            truth, valid = sharp.flux_e_per_s(nearest), self._development.layout.aps_mask
+            exposures = [flux_of(frame.raw, frame.exposure_us, aps, self._clip.recording.mosaic) for frame in frames]
+            found: dict[str, NDArray] = {"shortest": exposures[0][0], "longest": exposures[-1][0]}
+            found["merge"] = merged(exposures)
+            found |= self._predicted("hdr", number, truth.shape)
+            for name, flux in found.items():
+                yield Score(self._clip.name, "hdr", name, number, flux_scores(flux, truth, valid))
+
 
 TASKS: dict[str, Callable[[ClipTasks], Iterator[Score]]] = {
     "deblur": ClipTasks.deblur,
     "interpolate": ClipTasks.interpolate,
     "denoise": ClipTasks.denoise,
     "fidelity": ClipTasks.fidelity,
+    "flow": ClipTasks.flow,
+    "intensity": ClipTasks.intensity,
+    "hdr": ClipTasks.hdr,
 }

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from hesim_render.benchmark.clip import CLIP_FILE
-from hesim_render.benchmark.folder import Benchmark, read_clip
+from hesim_render.benchmark.folder import MANIFEST_FILE, PLAN_FILE, Benchmark, read_clip
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import shared_parts
 from hesim_render.core.errors import HesimError
+from hesim_render.core.output import output_errors
 from hesim_render.core.progress import Progress
 
 
@@ -52,13 +55,42 @@ def verify_benchmark(root: str | Path, progress: Progress | None = None) -> list
             continue
         parts[content["name"]] = (content["split"], set(content["parts"]))
         problems += [f"{entry['name']}/{line}" for line in _files(clip.folder, content["files"])]
-    known = {entry["name"] for entry in entries}
-    present = {path.name for path in (benchmark.root / "clips").iterdir() if not path.name.startswith(".")}
+    plan, expected = benchmark.root / PLAN_FILE, benchmark.manifest.get("plan_sha256")
+    if not plan.is_file() or file_hash(plan) != expected:
+        problems.append(f"{PLAN_FILE}: was changed, or is missing")
+    known, folder = {entry["name"] for entry in entries}, benchmark.root / "clips"
+    listed = folder.iterdir() if folder.is_dir() else ()
+    present = {path.name for path in listed if not path.name.startswith(".")}
     problems += [f"{name}: is not in the manifest" for name in sorted(present - known)]
     problems += [
         f"the splits {first} and {second} share the part {part}" for part, first, second in shared_parts(parts)
     ]
     return problems
+
+
+def discard_damaged(root: str | Path, problems: Sequence[str]) -> list[str]:
+    """Remove the clips in which something is wrong, so that the next build makes them again.
+
+    The manifest is removed as well, because the set is not whole then. Folders that are no clips are left alone.
+
+    Parameters
+    ----------
+    root : folder of the benchmark.
+    problems : from `verify_benchmark`.
+
+    Returns
+    -------
+    Names of the removed clips.
+    """
+    benchmark = Benchmark(root)
+    wrong = {line.split(":")[0].split("/")[0] for line in problems}
+    found = [clip.folder for clip in benchmark.clips() if clip.folder.name in wrong]
+    if found:
+        with output_errors(benchmark.root):
+            (benchmark.root / MANIFEST_FILE).unlink()
+            for folder in found:
+                shutil.rmtree(folder, ignore_errors=not folder.exists())
+    return [folder.name for folder in found]
 
 
 def _files(folder: Path, files: dict[str, dict[str, object]]) -> list[str]:

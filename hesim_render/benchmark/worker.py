@@ -11,11 +11,13 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from pathlib import Path
 from typing import Any
 
 from hesim_render import __version__
 from hesim_render.benchmark.clip import build_clip
+from hesim_render.benchmark.devices import claim_device
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.core.errors import HesimError, OutputError
 from hesim_render.core.output import discard_unfinished
@@ -38,6 +40,12 @@ def _opened(order: str) -> tuple[Plan, Path, str]:
     return Plan(spec), Path(content["root"]), content["version"]
 
 
+@functools.cache
+def _claimed() -> str | None:
+    """The GPU of this process, chosen before the first clip."""
+    return claim_device()
+
+
 def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
     """Build a clip and tell what became of it.
 
@@ -51,6 +59,7 @@ def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
     ``name``, and ``seconds`` and ``bytes``, or ``error`` and ``fatal`` (True where other clips would fail as well).
     """
     with _one_at_a_time:
+        _claimed()
         name = str(clip["name"])
         try:
             plan, root, version = _opened(order)
@@ -60,6 +69,9 @@ def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
             built = build_clip(plan, Clip(**clip), root)
         except HesimError as error:
             return {"name": name, "error": str(error), "fatal": isinstance(error, OutputError)}
+        except Exception as error:  # a fault of ours in one clip must not end the build of the others
+            traceback.print_exc()
+            return {"name": name, "error": f"{type(error).__name__}: {error}", "fatal": False}
         return {"name": name, "seconds": built.seconds, "bytes": built.bytes}
 
 
@@ -79,6 +91,7 @@ def main() -> None:
         answers.write(json.dumps(content) + "\n")
         answers.flush()
 
+    _claimed()
     order = sys.stdin.readline()
     threads = int(sys.stdin.readline() or 0)
     if threads:

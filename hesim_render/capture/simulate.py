@@ -52,6 +52,8 @@ def simulate(
     max_minutes: float | None = None,
     truth: str | Sequence[str] = (),
     truth_every_us: int | None = None,
+    audit: bool = True,
+    renderer: tuple[Any, dict[str, Any]] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
@@ -79,6 +81,10 @@ def simulate(
         Without `out`, `Recording.truth` computes them when they are asked for.
     truth_every_us : interval between the times at which event pixels are described, µs; default: the middle of each
         frame, or every 10 ms where there are none.
+    audit : measure the error of the render with random numbers of its own. Without it the run is shorter, all else is
+        the same to the bit, and ``settings.render`` has no audit.
+    renderer : from `flux_source` with the same scene, sensor, seed and quality, fresh; it can be used again afterwards.
+        None makes one. What a renderer has rendered decides no value, it only saves time later.
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
@@ -139,7 +145,7 @@ def simulate(
         settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
         seen, level = in_absolute_light(scene)
-        flux, mode = flux_source(seen, sensor, seed, quality, samples, exact, told)
+        flux, mode = renderer or flux_source(seen, sensor, seed, quality, samples, exact, told)
         warn_if_unseen(scene.spec, flux.view, duration_us)
         settings |= mode
         if level is not None:
@@ -150,7 +156,8 @@ def simulate(
         labels = EVENTS in kinds
         plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=labels and not rendering)
         sample = plain.sample_of_event_blocks() if rendering and not flux.is_static else BlockSample([], 1.0)
-        if rendering:
+        is_asked = told is not None or on_estimate is not None or max_minutes is not None
+        if rendering and is_asked:  # it takes as long as a short run, and changes nothing
             expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
             if on_estimate is not None:
                 on_estimate(expected)
@@ -166,10 +173,11 @@ def simulate(
                 told.expect(expected.seconds)
             if flux.is_static:
                 rendering[0].progress = _share_progress(expected.rays, told)
-        noted = _noted(flux, plain, round(sample.windows), seed) if rendering else None
+        noted = _noted(flux, plain, round(sample.windows), seed) if rendering and audit else None
         capture = plain
-        if noted is not None:
-            capture = Capture(noted, flux.sensor, *noise, duration_us, seed, labels=labels)
+        if rendering:
+            seen_by = flux if noted is None else noted
+            capture = Capture(seen_by, flux.sensor, *noise, duration_us, seed, labels=labels)
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
             overwrite=overwrite,
@@ -178,10 +186,11 @@ def simulate(
             render: dict[str, Any] = {
                 "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
             }
+            if rendering:
+                render |= _work_done(rendering)
             if noted is not None:
                 if told is not None:
                     told(0, 1, "audit")
-                render |= _work_done(rendering)
                 model = flux.sensor.evs if flux.sensor.spec.evs is not None else None
                 render["audit"] = Audit(noted, flux, rendering[0].quality, model, capture.event_pixels, seed).run()
             writer.add_settings({"render": render})

@@ -17,7 +17,8 @@ SPLITS = ("train", "val", "test")
 Split = Literal["train", "val", "test"]
 #: Largest number of clips of one benchmark.
 MOST_CLIPS = 1_000_000
-_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}"
+#: Form of names that become parts of file names.
+NAME = r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}"
 
 
 def _one_value(given: Any) -> Any:
@@ -121,13 +122,13 @@ class SensorChoice(Strict):
     sensor: str = Field(min_length=1, description="name of a shipped sensor, or a path relative to this file")
     roi: str | None = Field(None, pattern=r"^[0-9]{1,5}x[0-9]{1,5}(\+[0-9]{1,5}\+[0-9]{1,5})?$")
     set: dict[str, Any] = Field({}, description="keys of the sensor file, dotted, and their values")
-    name: str | None = Field(None, pattern=f"^{_NAME}$", description="in the names of clips; default the sensor's")
+    name: str | None = Field(None, pattern=f"^{NAME}$", description="in the names of clips; default the sensor's")
 
 
 class NoiseLevel(Strict):
     """Which noise the clips have."""
 
-    name: str = Field(pattern=f"^{_NAME}$")
+    name: str = Field(pattern=f"^{NAME}$")
     clean: bool = False
     without: tuple[str, ...] = ()
     set: dict[str, Any] = Field({}, description="keys of the sensor file, such as aps.read_noise_e")
@@ -188,7 +189,7 @@ class BenchmarkSpec(Strict):
     """A whole benchmark: scenes × motions × lights × sensors × exposures × noise × seeds."""
 
     schema_version: Literal[1]
-    name: str = Field(pattern=f"^{_NAME}$")
+    name: str = Field(pattern=f"^{NAME}$")
     description: str
     seed: int = Field(1, ge=0, lt=2**63, description="of all draws of scenes, motions, lights and exposures")
     duration_s: float = Field(0.1, gt=0, le=3600)
@@ -206,6 +207,7 @@ class BenchmarkSpec(Strict):
     sharp: SharpSpec | None = None
     truth: tuple[str, ...] = Field(("flow", "depth"), description="kinds as of simulate; events labels events")
     quality: float = Field(0.5, gt=0, le=100)
+    audit: float = Field(1.0, ge=0, le=1, description="share of the clips whose render is audited, drawn at random")
     folder: Path = Field(Path(), exclude=True)
 
     @model_validator(mode="after")

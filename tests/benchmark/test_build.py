@@ -22,9 +22,11 @@ from hesim_render.benchmark.clip import CLIP_FILE, build_clip, clip_folder
 from hesim_render.benchmark.forecast import estimate_build
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan
-from hesim_render.benchmark.verify import digest_of
+from hesim_render.benchmark.verify import digest_of, discard_damaged
 from hesim_render.benchmark.worker import attempt, order_of
+from hesim_render.capture.simulate import flux_source
 from hesim_render.core.errors import BackendError, OutputError, RangeError, SpecError
+from hesim_render.sources.render.light_level import in_absolute_light
 
 MATT = {"plastic": 0, "rough_plastic": 0, "metal": 0}
 
@@ -81,6 +83,29 @@ def test_the_blurred_frame_is_the_integral_of_the_sharp_flux(tmp_path):
     # RAW of the sharp image: gain, black and rounding
     expected = np.minimum(flux * 0.01, aps.full_well_e) * aps.system_gain_dn_per_e + aps.black_level_dn
     assert np.abs(raw - expected).max() <= 0.5 + 1e-3 * expected.max()
+
+
+@pytest.mark.slow
+def test_sharp_images_are_those_of_a_renderer_of_their_own(tmp_path):
+    """The renderer that made the recording gives them to the bit; they have its crosstalk, here none."""
+    level = {"name": "plain", "without": ["aps.crosstalk"]}
+    keys = {"geometry.crosstalk": 0.1}
+    spec = small(
+        scenes={"given": [{"scene": "rotating-star", "split": "train"}]}, truth=[], noise=[level], audit=0,
+        sensors=[{"sensor": "reference-mono", "roi": "16x12", "set": keys}],
+        sharp={"times_us": [8000], "window_us": 500},
+    )  # fmt: skip
+    plan = Plan(spec)
+    build_clip(plan, plan.clips[0], tmp_path)
+    with h5py.File(clip_folder(tmp_path, plan.clips[0]) / "sharp.h5") as file:
+        made = file["flux_e_per_s"][0]
+    sensor = plan.sensor(plan.clips[0])
+    scene = in_absolute_light(hr.load_scene("rotating-star"))[0]
+    own = flux_source(scene, sensor, 7, spec.quality, None, False, None)[0]
+    pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
+    a, b = own.mean_flux(pixel, 7750, 8250)
+    expected = 0.5 * (np.array(a, np.float32) + np.array(b, np.float32))
+    assert np.array_equal(made.ravel()[pixel], expected)
 
 
 @pytest.mark.slow
@@ -291,6 +316,46 @@ def test_a_scheduler_that_is_not_there_is_refused(tmp_path):
         build_benchmark(small(), tmp_path / "b", scheduler="tcp://127.0.0.1:9", estimate=False)
 
 
+def test_a_scheduler_that_dies_and_a_clip_that_kills_its_workers_are_told(monkeypatch):
+    """Answers as dask gives them: of a finished clip, of dead workers, and of a scheduler that is gone."""
+    distributed = pytest.importorskip("distributed")
+    from concurrent.futures import CancelledError
+
+    from distributed.scheduler import KilledWorker
+
+    from hesim_render.benchmark.cluster import run_on_cluster
+
+    clips = Plan(generated(3)).clips
+
+    class Answer:
+        def __init__(self, key, failure):
+            self.key, self.failure = key, failure
+
+        def exception(self):
+            if isinstance(self.failure, CancelledError):
+                raise self.failure
+            return self.failure
+
+        def result(self):
+            return {"name": clips[self.key].name, "seconds": 1.0, "bytes": 2}
+
+    class Client:
+        loop = None
+
+        def __init__(self, *failures):
+            self.waiting = [Answer(k, failure) for k, failure in enumerate(failures)][::-1]
+
+        def submit(self, *arguments, **options):
+            return self.waiting.pop()
+
+    monkeypatch.setattr(distributed, "as_completed", lambda futures, loop: futures)
+    dead, told = KilledWorker.__new__(KilledWorker), []
+    failed = run_on_cluster(Client(None, dead, None), "{}", clips, told.append)
+    assert len(told) == 3 and list(failed) == [clips[1].name] and "died again and again" in failed[clips[1].name]
+    with pytest.raises(BackendError, match="the finished ones stay"):
+        run_on_cluster(Client(None, CancelledError()), "{}", clips[:2], told.append)
+
+
 @pytest.mark.slow
 def test_two_workers_of_dask_and_a_kill_leave_the_same_bytes(built, tmp_path):
     distributed = pytest.importorskip("distributed")
@@ -328,6 +393,38 @@ def test_twenty_random_kills_leave_the_same_bytes(built, tmp_path):
     assert verify_benchmark(root) == [] and digest_of(Benchmark(root)) == digest_of(built)
 
 
+def test_damaged_clips_are_discarded_and_made_again(tmp_path):
+    given = [{"scene": "flat-field", "split": "train"}, {"scene": "checkerboard", "split": "test"}]
+    spec = small(
+        scenes={"given": given}, truth=[],
+        sensors=[{"sensor": "reference-mono", "roi": "8x6"}], sharp=None, audit=0,
+    )  # fmt: skip
+    built = build_benchmark(spec, tmp_path / "b", estimate=False)
+    digest, first = digest_of(built), next(built.clips())
+    (first.folder / "recording" / "preview.png").write_bytes(b"")
+    problems = verify_benchmark(built.root)
+    assert problems == [f"{first.name}/recording/preview.png: was changed"]
+    assert discard_damaged(built.root, problems) == [first.name] and not first.folder.exists()
+    again = build_benchmark(spec, built.root, estimate=False)
+    assert digest_of(again) == digest and verify_benchmark(built.root) == []
+    plan = built.root / "plan.json"
+    plan.write_text(plan.read_text() + " ")
+    assert verify_benchmark(built.root) == ["plan.json: was changed, or is missing"]
+    assert discard_damaged(built.root, verify_benchmark(built.root)) == []  # nothing of the clips is wrong
+    shutil.rmtree(built.root / "clips")
+    assert len(verify_benchmark(built.root)) == 3  # two clips and the plan, without a traceback
+
+
+def test_a_fault_of_ours_in_one_clip_does_not_stop_the_others(monkeypatch):
+    def broken(plan, clip, root):
+        raise KeyError("x")
+
+    monkeypatch.setattr("hesim_render.benchmark.worker.build_clip", broken)
+    plan = Plan(small())
+    answer = attempt(order_of(plan.spec, __import__("pathlib").Path("/nowhere")), plan.clips[0].as_dict())
+    assert answer == {"name": plan.clips[0].name, "error": "KeyError: 'x'", "fatal": False}
+
+
 # ---- card and estimate --------------------------------------------------------------------------------
 
 
@@ -339,6 +436,29 @@ def test_the_card_says_how_clips_differ(built):
     assert spread(contents)["contrast"]["max"] == max(values)
     assert spread(contents)["speed_widths_per_s"]["zero"] == 1
     assert (built.root / "histograms.png").stat().st_size > 1000
+
+
+def test_a_share_of_the_clips_is_audited():
+    """A quarter of 400 clips: 100 with a standard deviation of 8.7; 4.5 of these are 39 (false alarm 7e-6)."""
+    plans = [Plan(generated(400, audit=share)) for share in (0.25, 0.25, 0, 1)]
+    counts = [sum(plan.is_audited(clip) for clip in plan.clips) for plan in plans]
+    assert 61 <= counts[0] <= 139 and counts[1:] == [counts[0], 0, 400]
+    assert [plans[0].is_audited(c) for c in plans[0].clips] == [plans[1].is_audited(c) for c in plans[1].clips]
+
+
+def test_without_an_audit_a_clip_has_the_same_bits_and_says_so(tmp_path):
+    found = {}
+    for audit in (0, 1):
+        sensors = [{"sensor": "reference-mono", "roi": "8x6"}]
+        given = {"given": [{"scene": "flat-field", "split": "test"}]}
+        plan = Plan(small(scenes=given, sensors=sensors, truth=[], sharp=None, audit=audit))
+        build_clip(plan, plan.clips[0], tmp_path / str(audit))
+        folder = clip_folder(tmp_path / str(audit), plan.clips[0])
+        content = json.loads((folder / CLIP_FILE).read_text())
+        assert ("audit" in content["render"]) is bool(audit) and content["render"]["rays"] > 0
+        found[audit] = hr.Recording.load(folder / "recording")
+    assert np.array_equal(found[0].frames[0].raw, found[1].frames[0].raw)
+    assert np.array_equal(found[0].events, found[1].events)
 
 
 def test_the_estimate_counts_the_missing_clips():

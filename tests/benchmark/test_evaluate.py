@@ -12,6 +12,7 @@ from hesim_render.benchmark.evaluate import summary, table
 from hesim_render.benchmark.pictures import Development
 from hesim_render.benchmark.tasks import ClipTasks, Score
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.pixels.evs.events import Label
 from hesim_render.specs.files import data_folder
 
 
@@ -22,7 +23,7 @@ def built(tmp_path_factory):
     spec = small(
         scenes={"given": [{"scene": "rotating-star", "split": "test"}]}, duration_s=0.048,
         sensors=[{"sensor": "mipi-hybridevs", "roi": "24x16", "set": keys}],
-        exposures_us=[12_000], sharp={"times_us": [6000, 22667, 39333], "window_us": 500}, truth=["events"],
+        exposures_us=[12_000], sharp={"times_us": [6000, 22667, 39333], "window_us": 500}, truth=["events", "flow"],
     )  # fmt: skip
     return build_benchmark(spec, tmp_path_factory.mktemp("evaluated") / "b", estimate=False)
 
@@ -33,6 +34,13 @@ def test_every_task_has_scores(built, tmp_path):
     assert set(found["deblur"]) == {"blurred", "double-integral"}
     assert set(found["interpolate"]) == {"hold", "average", "double-integral"}
     assert set(found["denoise"]) == set(found["fidelity"]) == {"none", "nearest-neighbour", "background-activity"}
+    assert {"zero", "plane-fit"} <= set(found["flow"]) and "hdr" not in found and "intensity" not in found
+    stored = next(built.clips()).recording.stored_truth
+    length = np.linalg.norm(stored.read("frames/flow_forward_px", 0), axis=-1)
+    seen = stored.read("frames/visible_forward", 0) & np.isfinite(length)
+    zero = next(s for s in result["scores"] if (s["task"], s["method"], s["item"]) == ("flow", "zero", 0))
+    assert zero["values"]["epe_px"] == pytest.approx(length[seen].mean()) and length[seen].max() > 0.1
+    assert found["flow"]["zero"]["density"]["mean"] == 1
     assert found["denoise"]["none"]["noise_kept"]["mean"] == 1
     assert found["fidelity"]["none"]["count_error"]["count"] + found["denoise"]["none"]["noise_kept"]["count"] >= 1
     blurred = found["deblur"]["blurred"]
@@ -66,6 +74,59 @@ def test_values_of_the_event_grid_reach_the_right_pixels(built):
     r, c = np.mgrid[row.min() : row.max() + 1, col.min(axis=1).max() : col.max(axis=1).min() + 1]
     assert r.size > 100 and on_mosaic[r, c] == pytest.approx(2.0 * r + 0.5 * c)
     assert development.on_mosaic(np.ones(layout.evs_shape)) == pytest.approx(1)
+
+
+def test_results_of_a_user_are_scored_beside_the_baselines(built, tmp_path):
+    """The truth as a result has no error; a file without an item is told."""
+    clip = next(built.clips())
+    recording = clip.recording
+    signal = np.isin(recording.event_labels.label, [Label.SIGNAL, Label.MISMATCH])
+    given = {
+        "deblur/{}/000000": clip.sharp.raw_dn(0), "interpolate/{}/000001": clip.sharp.raw_dn(1),
+        "denoise/{}/000000": signal, "fidelity/{}/000000": signal, "deblur/{}/000077": np.zeros(3),
+        "flow/{}/000000": recording.stored_truth.read("frames/flow_forward_px", 0),
+    }  # fmt: skip
+    for name, values in given.items():
+        file = tmp_path / f"{name.format(clip.name)}.npy"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.save(file, values)
+    result = evaluate_benchmark(built.root, predictions=tmp_path)
+    assert result["unused"] == [f"deblur/{clip.name}/000077.npy"]
+    scores = {s["task"]: s["values"] for s in result["scores"] if s["method"] == "prediction"}
+    assert scores["deblur"]["raw_psnr_db"] == scores["interpolate"]["raw_psnr_db"] == np.inf
+    assert scores["denoise"]["noise_kept"] == 0 and scores["flow"]["epe_px"] == 0
+    assert not signal.any() and scores["fidelity"]["count_error"] == 0  # these few pixels see no edge pass
+
+
+@pytest.mark.slow
+def test_exposures_of_a_still_scene_are_merged_and_light_comes_from_events(tmp_path):
+    """Grey steps in 0.3, 3 and 20 ms; nothing moves, so the events are noise, and their sum knows nothing."""
+    spec = small(
+        scenes={"given": [{"scene": "step-wedge", "split": "test"}]}, truth=["events"], quality=1,
+        exposures_us=[20_000, 300, 3000], sharp={"times_us": [250], "window_us": 200}, duration_s=0.021,
+    )  # fmt: skip
+    built = build_benchmark(spec, tmp_path / "b", estimate=False)
+    found = evaluate_benchmark(built.root, tasks=["hdr", "intensity"])["summary"]
+    print(found)
+    assert found["hdr"]["merge"]["log2_rmse"]["count"] == 1  # one item of the shortest clip, not one of each
+    assert found["hdr"]["merge"]["log2_rmse"]["mean"] < 0.5 * found["hdr"]["shortest"]["log2_rmse"]["mean"]
+    assert found["hdr"]["merge"]["psnr_mu_db"]["mean"] > found["hdr"]["longest"]["psnr_mu_db"]["mean"]
+    assert found["intensity"]["leaky-sum"]["log_rmse"]["mean"] > 0.5 and len(found["intensity"]) == 1
+
+
+def test_flow_of_the_event_grid_is_in_pixels_of_the_mosaic(built):
+    """A flow to the next event pixel ends at the place of that pixel, whatever their pitch."""
+    development = Development(next(built.clips()))
+    layout = development.layout
+    rows, cols = layout.evs_shape
+    flow = np.full((rows, cols, 2), [1.0, 2.0])
+    flow[:, cols // 2 :] = np.nan
+    found = development.flow_on_mosaic(flow)
+    place = layout.evs_pixel.reshape(rows, cols).astype(int)
+    row, col = np.divmod(place, layout.shape[1])
+    to_right, down = (col[0, -1] - col[0, 0]) / (cols - 1), (row[-1, 0] - row[0, 0]) / (rows - 1)
+    assert found[row[2, 0], col[2, 0]] == pytest.approx([to_right, 2 * down], rel=0.2)  # places alternate by a pixel
+    assert np.isnan(found[row[2, -1], col[2, -1]]).all() and to_right >= 2
 
 
 def test_means_are_over_finite_values():

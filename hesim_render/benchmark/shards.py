@@ -1,0 +1,205 @@
+"""Benchmarks as few large files for training: WebDataset (tar) or HDF5 shards, in a folder or at any fsspec address."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.benchmark.folder import Benchmark
+from hesim_render.benchmark.generator import file_hash
+from hesim_render.benchmark.samples import samples
+from hesim_render.benchmark.store import Store, store_of
+from hesim_render.benchmark.verify import digest_of
+from hesim_render.core.errors import OutputError, RangeError, SpecError, did_you_mean
+from hesim_render.core.guard import reading
+from hesim_render.core.hdf5 import COMPRESSION
+from hesim_render.core.progress import Progress
+from hesim_render.specs.benchmark import SPLITS
+
+INDEX_FILE = "index.json"
+FORMATS = {"webdataset": "tar", "hdf5": "h5"}
+_SCHEMA = 1
+_Sample = tuple[str, dict[str, NDArray], dict[str, Any]]
+
+
+class _TarShard:
+    """A tar of ``NAME.KEY.npy`` and ``NAME.json``; the same samples give the same bytes."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
+        self.bytes = 0
+
+    def add(self, sample: _Sample) -> None:
+        name, arrays, figures = sample
+        for key, values in arrays.items():
+            content = io.BytesIO()
+            np.save(content, values, allow_pickle=False)
+            self._write(f"{name}.{key}.npy", content.getvalue())
+        self._write(f"{name}.json", json.dumps(figures, sort_keys=True).encode())
+
+    def _write(self, name: str, content: bytes) -> None:
+        entry = tarfile.TarInfo(name)  # its times and owners are 0
+        entry.size = len(content)
+        self._file.addfile(entry, io.BytesIO(content))
+        self.bytes += len(content)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Hdf5Shard:
+    """An HDF5 file with a group for each sample: arrays as data sets, figures as a text attribute."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = h5py.File(path, "w", track_order=True)
+        self.bytes = 0
+
+    def add(self, sample: _Sample) -> None:
+        name, arrays, figures = sample
+        group = self._file.create_group(name, track_order=True)
+        for key, values in arrays.items():
+            packed = {"compression": COMPRESSION} if values.size else {}
+            stored = group.create_dataset(key, data=values, track_times=False, **packed)
+            self.bytes += stored.id.get_storage_size()
+        group.attrs["figures"] = json.dumps(figures, sort_keys=True)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def pack_benchmark(
+    root: str | Path,
+    target: str | Path,
+    *,
+    format: str = "webdataset",
+    shard_mb: float = 256.0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> int:
+    """Write all samples of a benchmark (`samples`) into shards of each split: ``train-000000.tar``, …
+
+    A shard appears at the target when all of it is written, and ``index.json`` comes last: with it the set is whole.
+
+    Parameters
+    ----------
+    root : folder of the benchmark.
+    target : a folder, or an address that fsspec knows, such as ``s3://bucket/set``.
+    format : ``webdataset`` or ``hdf5``.
+    shard_mb : size at which a shard is closed, MB.
+    overwrite : replace a finished set.
+    progress : called with (done, total, what).
+
+    Returns
+    -------
+    The number of samples.
+
+    Raises
+    ------
+    RangeError
+        If the format is unknown, or the size is not above 0.
+    SpecError
+        If the folder is no finished benchmark.
+    OutputError
+        If the target holds a finished set, or cannot be written.
+    """
+    if format not in FORMATS:
+        raise RangeError("format", format, f"one of {', '.join(FORMATS)}{did_you_mean(format, FORMATS)}")
+    if not 0 < shard_mb < float("inf"):
+        raise RangeError("shard_mb", shard_mb, "a size above 0, MB")
+    benchmark, store = Benchmark(root), store_of(target)
+    if store.has(INDEX_FILE) and not overwrite:
+        raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
+    shards: list[dict[str, Any]] = []
+    total, done = len(benchmark.manifest["clips"]), 0
+    with tempfile.TemporaryDirectory() as folder:
+        for split in SPLITS:
+            clips = list(benchmark.clips(split))
+
+            def made(clips: list = clips) -> Iterator[_Sample]:
+                nonlocal done
+                for clip in clips:
+                    yield from samples(clip)
+                    done += 1
+                    if progress is not None:
+                        progress(done, total, "clips")
+
+            shards += _write_split(split, made(), store, Path(folder), format, shard_mb * 1e6)
+        index = {
+            "schema_version": _SCHEMA, "benchmark": benchmark.manifest["name"], "digest": digest_of(benchmark),
+            "format": format, "shards": shards,
+        }  # fmt: skip
+        file = Path(folder) / INDEX_FILE
+        file.write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
+        store.put(INDEX_FILE, file)
+    return sum(shard["samples"] for shard in shards)
+
+
+def _write_split(
+    split: str, given: Iterator[_Sample], store: Store, folder: Path, format: str, most_bytes: float
+) -> list[dict[str, Any]]:
+    """Write the shards of a split; returns their entries of the index."""
+    found: list[dict[str, Any]] = []
+    sample = next(given, None)
+    while sample is not None:
+        name = f"{split}-{len(found):06d}.{FORMATS[format]}"
+        path, count = folder / name, 0
+        shard = _TarShard(path) if format == "webdataset" else _Hdf5Shard(path)
+        try:
+            while sample is not None and (count == 0 or shard.bytes < most_bytes):
+                shard.add(sample)
+                count += 1
+                sample = next(given, None)
+        finally:
+            shard.close()
+        store.put(name, path)
+        found.append({
+            "name": name, "split": split, "samples": count, "bytes": path.stat().st_size, "sha256": file_hash(path),
+        })  # fmt: skip
+        path.unlink()
+    return found
+
+
+def verify_shards(target: str | Path, progress: Progress | None = None) -> list[str]:
+    """Compare every shard with its SHA-256.
+
+    Parameters
+    ----------
+    target : folder or address that `pack_benchmark` wrote to.
+    progress : called with (done, total, what).
+
+    Returns
+    -------
+    A line for each shard that is missing or changed; empty if all is as it was written.
+
+    Raises
+    ------
+    SpecError
+        If there is no finished set.
+    """
+    store = store_of(target)
+    with reading(str(target), "as shards"):
+        index = json.loads(b"".join(store.blocks(INDEX_FILE)))
+        shards = [(str(entry["name"]), str(entry["sha256"])) for entry in index["shards"]]
+    problems = []
+    for done, (name, expected) in enumerate(shards):
+        try:
+            digest = hashlib.sha256()
+            for block in store.blocks(name):
+                digest.update(block)
+            if digest.hexdigest() != expected:
+                problems.append(f"{name}: was changed")
+        except SpecError:
+            problems.append(f"{name}: is missing")
+        if progress is not None:
+            progress(done + 1, len(shards), "shards")
+    return problems
