@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import Overwrite
-from hesim_render.cli.terminal import say, summary
+from hesim_render.cli.simulate import tell_recording
+from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.output import output_errors
-from hesim_render.core.progress import progress_report
 
 
 def isp(
@@ -23,6 +23,8 @@ def isp(
         Path | None, typer.Option(help="calibration.yaml of a calibrated sensor, for its maps")
     ] = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Develop the RAW frames of a recording into pictures."""
     from hesim_render.isp import DENOISED_PICTURE, develop_recording, load_pipeline
@@ -31,15 +33,21 @@ def isp(
     steps = DENOISED_PICTURE if pipeline is None else load_pipeline(pipeline)
     if no_denoise:
         steps = steps.without("denoise")
-    with progress_report(f"developing {recording}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"developing {recording}") as progress:
         folder = develop_recording(recording, out, steps, progress, overwrite, calibration)
-    say(f"pictures in {folder}")
+    text = f"pictures in {folder}"
     noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
     if noise is not None and noise["maps"] == "unknown":
-        say("the maps of the sensor's calibration are not in a recording: --calibration FILE takes them out")
+        text += "\nthe maps of the sensor's calibration are not in a recording: --calibration FILE takes them out"
+    told.result(text, {"pictures": folder, "noise": noise})
 
 
-def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:
+def view(
+    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
     """Summarise a recording, and write its previews and recording.html: parameters, pictures and plots."""
     from hesim_render.recording.page import write_page
     from hesim_render.recording.recording import Recording
@@ -50,4 +58,4 @@ def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")
     with output_errors(loaded.path):
         write_previews(loaded, loaded.path)
         page = write_page(loaded, loaded.path)
-    say(f"{summary(loaded)}\n  page: {page}")
+    tell_recording(Told(json_, quiet), loaded, f"\n  page: {page}")

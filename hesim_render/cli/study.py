@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import Overwrite
-from hesim_render.cli.terminal import say
+from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.output import check_target
-from hesim_render.core.progress import progress_report
 
 #: Columns of the summary on the terminal.
 _SHOWN = {
@@ -34,17 +33,20 @@ def study(
     spec: Annotated[str, typer.Argument(metavar="SPEC", help="name of a shipped study or design, or a file")],
     out: Annotated[Path, typer.Option(help="folder to write tables and report to")],
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare filter sets, or design filters: colour, noise and event figures, as tables and a report."""
     if kind is StudyKind.design:
-        _design(spec, out, overwrite)
+        _design(Told(json_, quiet), spec, out, overwrite)
         return
     from hesim_render.studies.run import MARKER
 
     check_target(out, MARKER, overwrite)
     import hesim_render as hr
 
-    with progress_report(f"study {kind.value}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"study {kind.value}") as progress:
         table = hr.study(spec, out=out, overwrite=overwrite, progress=progress)
     shown = {name: title for name, title in _SHOWN.items() if name in table.columns}
     every = ("surfaces", "illuminant", "illuminance_lux", "sensor", "crosstalk", "equal")
@@ -53,14 +55,17 @@ def study(
     for row in list(table)[:_MOST]:
         lines.append([_text(row[name]) for name in (*keys, *shown)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    say(
+    told.text(
         "\n".join(
             "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
         )
     )
     if len(table) > _MOST:
-        say(f"and {len(table) - _MOST} more rows")
-    say(f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}")
+        told.text(f"and {len(table) - _MOST} more rows")
+    told.result(
+        f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}",
+        {"results": out / "results.csv", "report": out / "report.html", "rows": list(table)},
+    )
 
 
 def _text(value: object) -> str:
@@ -69,21 +74,24 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else str(value)
 
 
-def _design(spec: str, out: Path, overwrite: bool) -> None:
+def _design(told: Told, spec: str, out: Path, overwrite: bool) -> None:
     from hesim_render.studies.design_run import MARKER, design
 
     check_target(out, MARKER, overwrite)
-    with progress_report("study design") as progress:
+    with told.progress("study design") as progress:
         found = design(spec, out=out, overwrite=overwrite, progress=progress)
     costs = found.result.costs
-    say(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
+    told.text(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
     for verdict in found.verdicts:
         ratios = ", ".join(
             f"{value:.3f} at {key.split('_')[2]} lx" for key, value in verdict.items() if key.startswith("ysnr_ratio")
         )
-        say(
+        told.text(
             f"against {verdict['against']}: cost {verdict['cost']:.3f} in place of {verdict['cost_against']:.3f} "
             f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), mean ΔE2000 "
             f"{verdict['delta_e_mean']:.3f} in place of {verdict['delta_e_mean_against']:.3f}, YSNR times {ratios}"
         )
-    say(f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}")
+    told.result(
+        f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",
+        {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": found.verdicts},
+    )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
@@ -89,6 +90,24 @@ def open_events(
     if stream.shape == (0, 0):
         raise SpecError("does not state the size of the sensor; give it (--size WIDTHxHEIGHT, shape)", file=file)
     return stream
+
+
+def is_event_file(path: str | Path) -> bool:
+    """True if the begin of a file is that of an event format, and it holds no arrays of a frame (``.npz``).
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read.
+    """
+    file = Path(path).expanduser()
+    with reading(file), file.open("rb") as opened:
+        begin = opened.read(16)
+    name = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
+    if name != "npz":
+        return name is not None
+    with reading(file, "as arrays"), np.load(file) as arrays:
+        return not {"raw", "aps_raw"} & set(arrays.files)
 
 
 def _detect(file: Path) -> str | None:

@@ -35,18 +35,31 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
     from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
     from hesim_render.recording.truth_export import export_truth
 
+    check_format(format, 0 not in recording.event_shape, bool(len(recording.frames)))
     if format in TRUTH_FORMATS:
         return export_truth(recording, format, path, overwrite=overwrite)
     if format in EVENT_FORMATS:
-        if 0 in recording.event_shape:
-            raise RangeError("format", format, f"a format of frames ({', '.join(FRAME_FORMATS)}): there are no events")
         return write_events(event_stream(recording), format, path, overwrite)
-    if format not in FRAME_FORMATS:
-        known = (*EVENT_FORMATS, *FRAME_FORMATS, *TRUTH_FORMATS)
-        raise RangeError("format", format, f"one of {', '.join(known)}{did_you_mean(format, known)}")
-    if not len(recording.frames):
-        raise RangeError("format", format, f"a format of events ({', '.join(EVENT_FORMATS)}): there are no frames")
     return _write_frames(recording, format, path, overwrite)
+
+
+def check_format(format: str, has_events: bool, has_frames: bool) -> None:
+    """Refuse a format that does not exist, or of what a recording does not have.
+
+    Raises
+    ------
+    RangeError
+        With the formats that can be used.
+    """
+    from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
+
+    known = (*EVENT_FORMATS, *FRAME_FORMATS, *TRUTH_FORMATS)
+    if format not in known:
+        raise RangeError("format", format, f"one of {', '.join(known)}{did_you_mean(format, known)}")
+    if format in EVENT_FORMATS and not has_events:
+        raise RangeError("format", format, f"a format of frames ({', '.join(FRAME_FORMATS)}): there are no events")
+    if format in FRAME_FORMATS and not has_frames:
+        raise RangeError("format", format, f"a format of events ({', '.join(EVENT_FORMATS)}): there are no frames")
 
 
 def write_events(stream: EventStream, format: str, path: str | Path, overwrite: bool = False) -> Path:

@@ -16,6 +16,7 @@ from hesim_render.capture.simulate import simulate
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, shown
+from hesim_render.core.region import parse_roi
 from hesim_render.measure import measure_mtf
 from hesim_render.recording.recording import Recording
 from hesim_render.sensor.sensor import load_sensor
@@ -101,10 +102,7 @@ def sweep(
     OutputError
         If `out` holds other things, or cannot be written.
     """
-    if isinstance(spec, Mapping):
-        read: SweepSpec = validate(SweepSpec, dict(spec), None, {})
-    else:
-        read = spec if isinstance(spec, SweepSpec) else read_sweep(spec)
+    read = _read(spec)
     folder = check_target(out, MARKER, overwrite=True)
     runs = list(runs_of(read))
     with output_errors(folder):
@@ -112,8 +110,7 @@ def sweep(
         content = json.dumps(json.loads(read.model_dump_json()), indent=1)
         with replacing(folder / MARKER) as unfinished:
             unfinished.write_text(content + "\n", encoding="utf-8")
-    contents = {name: content_hash(load_scene(read.beside(name)).spec) for name in read.scenes}
-    contents |= {name: content_hash(load_sensor(read.beside(name)).spec) for name in read.sensors}
+    contents = _contents(read)
     rows: list[dict[str, Cell]] = []
     with shown(progress, read.name) as told:
         for done, run in enumerate(runs):
@@ -126,9 +123,38 @@ def sweep(
     return table
 
 
+def check_sweep(spec: str | Path | Mapping[str, Any] | SweepSpec, out: str | Path) -> tuple[int, int]:
+    """What `sweep` would do; nothing is written or simulated.
+
+    Returns
+    -------
+    Number of runs, and of those among them that are still to be made.
+    """
+    read = _read(spec)
+    folder, contents, runs = check_target(out, MARKER, overwrite=True), _contents(read), list(runs_of(read))
+    missing = [run for run in runs if not _file_of(folder, run.number(read, contents)).is_file()]
+    return len(runs), len(missing)
+
+
+def _read(spec: str | Path | Mapping[str, Any] | SweepSpec) -> SweepSpec:
+    if isinstance(spec, Mapping):
+        return validate(SweepSpec, dict(spec), None, {})
+    return spec if isinstance(spec, SweepSpec) else read_sweep(spec)
+
+
+def _contents(spec: SweepSpec) -> dict[str, str]:
+    """Hash of what each named scene and sensor holds."""
+    found = {name: content_hash(load_scene(spec.beside(name)).spec) for name in spec.scenes}
+    return found | {name: content_hash(load_sensor(spec.beside(name)).spec) for name in spec.sensors}
+
+
+def _file_of(folder: Path, number: str) -> Path:
+    return folder / "runs" / f"{number}.json"
+
+
 def _figures(spec: SweepSpec, run: Run, number: str, folder: Path) -> dict[str, Cell]:
     """Figures of a run, from its file if there is one."""
-    file = folder / "runs" / f"{number}.json"
+    file = _file_of(folder, number)
     if file.is_file():
         try:
             stored = json.loads(file.read_text(encoding="utf-8"))
@@ -151,7 +177,7 @@ def _simulated(spec: SweepSpec, run: Run, place: Path) -> Recording:
     try:
         sensor = load_sensor(spec.beside(run.sensor), sensor_changes)
         if spec.roi is not None:
-            sensor = sensor.crop(*_size(spec.roi))
+            sensor = sensor.crop(*parse_roi(spec.roi, "roi"))
         scene = load_scene(spec.beside(run.scene), scene_changes)
         out = place if spec.keep else None
         return simulate(
@@ -160,13 +186,6 @@ def _simulated(spec: SweepSpec, run: Run, place: Path) -> Recording:
         )  # fmt: skip
     except HesimError as error:
         raise SpecError(f"run with {told}: {str(error).splitlines()[0]}") from None
-
-
-def _size(roi: str) -> tuple[int, int]:
-    parts = roi.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise RangeError("roi", roi, "WIDTHxHEIGHT in px, such as 512x384")
-    return int(parts[0]), int(parts[1])
 
 
 def _metric(recording: Recording, metric: str) -> dict[str, Cell]:
