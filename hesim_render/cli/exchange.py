@@ -14,12 +14,14 @@ from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.errors import ConflictError
 
 _EXPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "txt", "nmnist", "tiff", "png", "npy", "mipi")
+#: Of events and frames together.
+_WHOLE = ("mcap", "raw-npz", "mp4", "mp4-colour", "mp4-events")
 _GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv")
-_IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz")
+_IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "mcap")
 
 
 def _complete_export(incomplete: str) -> list[str]:
-    return [name for name in (*_EXPORTS, *_GEOMETRY) if name.startswith(incomplete)]
+    return [name for name in (*_EXPORTS, *_WHOLE, *_GEOMETRY) if name.startswith(incomplete)]
 
 
 def _complete_import(incomplete: str) -> list[str]:
@@ -31,6 +33,7 @@ def export(
     format: Annotated[
         str,
         typer.Option(help=f"events: {', '.join(_EXPORTS[:7])}; frames: {', '.join(_EXPORTS[7:])}; "
+                     f"both: {', '.join(_WHOLE)}; "
                      f"geometric truth: {', '.join(_GEOMETRY)}", autocompletion=_complete_export),
     ],
     out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],
@@ -63,6 +66,10 @@ def export(
             raise ConflictError(name, value, f"only formats of geometric truth take it: {', '.join(_GEOMETRY)}")
     written = loaded.export(format, out, overwrite)
     counts = loaded.manifest["counts"]
+    if format in _WHOLE:
+        facts = {"format": format, "written": written, "events": counts["events"], "frames": counts["frames"]}
+        told.result(f"{format} of {counts['frames']} frames and {counts['events']} events in {written}", facts)
+        return
     noun = "frame" if written.is_dir() else "event"
     count = counts[f"{noun}s"]
     facts = {"format": format, "written": written, f"{noun}s": count}
