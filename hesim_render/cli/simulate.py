@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -98,11 +99,11 @@ def simulate(
     tell_recording(told, recording)
 
 
-def tell_recording(told: Told, recording: Recording, more: str = "") -> None:
+def tell_recording(told: Told, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None) -> None:
     """The result of a run: its recording, with the status that the audit gives."""
     short = is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit"))
     status = ExitStatus.NOT_MET if short else ExitStatus.DONE
-    told.result(summary(recording) + more, recording_facts(recording), status)
+    told.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
 
 
 def _look(
