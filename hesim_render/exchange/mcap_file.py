@@ -196,7 +196,7 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[str, bytes]]:
                 if schema is not None and schema.name.endswith("/EventArray"):
                     yield channel.topic, message.data
         except McapError as error:
-            raise SpecError(f"is a damaged MCAP file ({error})", file=path) from None
+            raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None
 
 
 def _require(path: str | Path) -> None:
