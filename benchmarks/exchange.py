@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hesim_render.exchange import EVENT_FORMATS, EventStream, open_events
+from hesim_render.exchange import EVENT_FORMATS, EventStream, mcap_file, open_events
 from hesim_render.exchange.formats import READABLE
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -50,14 +50,15 @@ def main(millions=2.0):
     print(f"{events.size} events; million events/s, of the clock (of processor time)")
     print(f"{'format':8} {'written':>16} {'read':>16} {'bytes/event':>12}")
     with tempfile.TemporaryDirectory() as folder:
-        for name, kind in EVENT_FORMATS.items():
-            if name == "nmnist":
-                continue  # its sensors have 256x256 px at most
-            path = Path(folder) / f"events{kind.suffix}"
+        writers = {name: (kind.suffix, kind.write) for name, kind in EVENT_FORMATS.items()}
+        writers["mcap"] = ".mcap", lambda stream, *where: mcap_file.write(stream, (), "mono16", *where)
+        del writers["nmnist"]  # its sensors have 256x256 px at most
+        for name, (suffix, encode) in writers.items():
+            path = Path(folder) / f"events{suffix}"
 
-            def write(path=path, kind=kind):
+            def write(path=path, encode=encode):
                 with path.open("wb") as file:
-                    kind.write(EventStream.of(events, SHAPE), file, path)
+                    encode(EventStream.of(events, SHAPE), file, path)
 
             speeds = [best(write)]
             if name in READABLE:

@@ -99,6 +99,20 @@ def build_benchmark(
     return Benchmark(root)
 
 
+def check_build(spec: BenchmarkSpec, out: str | Path) -> tuple[int, list[Clip], BuildEstimate | None]:
+    """What `build_benchmark` would do, with all its checks; nothing is written.
+
+    Returns
+    -------
+    Number of clips, those that are still to be built, and their estimate; None where there are none.
+    """
+    plan = Plan(spec)
+    plan.check()
+    root = _checked(plan, Path(out))
+    missing = [clip for clip in plan.clips if not is_complete(root, clip)]
+    return len(plan.clips), missing, estimate_build(plan, missing) if missing else None
+
+
 def _client(scheduler: str | None) -> Any:
     """A client of the scheduler, to be used in a with statement; None in it where there is no scheduler."""
     if scheduler is None:
@@ -169,8 +183,20 @@ def opened(plan: Plan, out: Path) -> Path:
     OutputError
         If it holds something else, or clips of another plan.
     """
+    root = _checked(plan, out)
+    file = root / PLAN_FILE
+    if not file.is_file():
+        text = json.dumps(_plan_content(plan), indent=1, sort_keys=True, ensure_ascii=False) + "\n"
+        with output_errors(root):
+            (root / "clips").mkdir(parents=True, exist_ok=True)
+        with replacing(file) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+    return root
+
+
+def _checked(plan: Plan, out: Path) -> Path:
+    """The folder of the benchmark, which is empty, missing, or holds clips of this plan."""
     content = _plan_content(plan)
-    text = json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
     root = check_target(out, PLAN_FILE, overwrite=True)
     file = root / PLAN_FILE
     if file.is_file():
@@ -183,11 +209,6 @@ def opened(plan: Plan, out: Path) -> Path:
             raise OutputError(
                 f"{out}: holds a benchmark of another plan (different: {', '.join(different)}); give another folder"
             )
-        return root
-    with output_errors(root):
-        (root / "clips").mkdir(parents=True, exist_ok=True)
-    with replacing(file) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
     return root
 
 

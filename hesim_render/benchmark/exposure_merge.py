@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.benchmark.metrics import psnr
+from hesim_render.measure.pictures import psnr
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.specs.sensor import ApsSpec
 

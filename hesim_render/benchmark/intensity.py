@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.double_integral import log_steps
-from hesim_render.benchmark.metrics import ssim
+from hesim_render.measure.pictures import ssim
 
 #: Time in which the sum falls to 1/e, µs; a choice of ours, not fitted to any data.
 LEAK_US = 200_000.0

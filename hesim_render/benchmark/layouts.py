@@ -22,6 +22,7 @@ from hesim_render.core.errors import OutputError, RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
 from hesim_render.recording.frame import Frame
+from hesim_render.recording.tick_files import write_tick_files
 from hesim_render.spectral.transfer import encode_exactly
 
 _MARKER = "layout.txt"
@@ -185,23 +186,10 @@ def _voxels(clip: _Clip, frame: Frame) -> NDArray[np.float32]:
 
 
 def _raw_npz(clip: _Clip, split: str, root: Path) -> int:
-    """H-ESIM and RGB-Event-ISP: RAW as npz, and the events of every tick as one picture with codes.
-
-    H-ESIM: `events` −1, 0, +1; RGB-Event-ISP: `event_raw` 0, 1 (OFF), 2 (ON). Both are written into one file.
-    """
-    folder, recording = root / split / clip.name, clip.clip.recording
-    for frame in recording.frames:
-        _savez(folder / f"{frame.t_us:09d}_aps_raw.npz", raw=frame.raw, aps_raw=frame.raw)
+    """H-ESIM and RGB-Event-ISP, whose files `write_tick_files` writes."""
     spec = clip.development.sensor.evs
-    if spec is None or spec.tick_us is None:
-        return len(recording.frames)
-    for tick in range(spec.tick_us, recording.duration_us + 1, spec.tick_us):
-        found = recording.event_slice(tick - spec.tick_us + 1, tick + 1)
-        signs = np.zeros(recording.event_shape, np.int8)
-        signs[found["y"], found["x"]] = found["polarity"]
-        codes = np.select([signs > 0, signs < 0], [2, 1], 0).astype(np.uint8)
-        _savez(folder / f"{tick:09d}_evs.npz", events=signs, event_raw=codes)
-    return len(recording.frames)
+    tick_us = None if spec is None else spec.tick_us
+    return write_tick_files(clip.clip.recording, root / split / clip.name, tick_us)
 
 
 #: Layouts by name: a writer of one clip, which returns the number of pictures.

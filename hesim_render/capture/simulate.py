@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from hesim_render.capture.exact_estimate import estimate_exact
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import TERMS, noise_models
 from hesim_render.core import backend
@@ -88,7 +89,8 @@ def simulate(
     out : folder to stream the recording into; None keeps it in memory.
     overwrite : replace an existing recording in `out`.
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
-    on_estimate : called with the estimate of time and memory before the run begins; not in the exact mode.
+    on_estimate : called with the estimate of time and memory before the run begins; an exception that it raises ends
+        the run before anything is written.
 
     Examples
     --------
@@ -156,9 +158,13 @@ def simulate(
         labels = EVENTS in kinds
         plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=labels and not rendering)
         sample = plain.sample_of_event_blocks() if rendering and not flux.is_static else BlockSample([], 1.0)
+        expected: Estimate | None = None
         is_asked = told is not None or on_estimate is not None or max_minutes is not None
         if rendering and is_asked:  # it takes as long as a short run, and changes nothing
             expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
+        elif on_estimate is not None or max_minutes is not None:
+            expected = estimate_exact(flux, plain, settings["samples"])
+        if expected is not None:
             if on_estimate is not None:
                 on_estimate(expected)
             if max_minutes is not None and expected.seconds > 60 * max_minutes:
@@ -166,12 +172,12 @@ def simulate(
                     "max_minutes",
                     max_minutes,
                     f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
-                    "(max_minutes=None), or ask for less: a shorter --duration, a smaller --roi, or a larger error, "
-                    f"such as --quality {2 * rendering[0].quality:g}",
+                    "(max_minutes=None), or ask for less: a shorter --duration, a smaller --roi, or "
+                    + _cheaper(settings),
                 )
             if isinstance(told, ProgressReport):
                 told.expect(expected.seconds)
-            if flux.is_static:
+            if rendering and flux.is_static:
                 rendering[0].progress = _share_progress(expected.rays, told)
         noted = _noted(flux, plain, round(sample.windows), seed) if rendering and audit else None
         capture = plain
@@ -198,6 +204,13 @@ def simulate(
                 step = None if told is None else lambda done, total: told(done, total, "truth")
                 writer.write_truth(SceneTruth(scene, sensor), step)
             return writer.finish()
+
+
+def _cheaper(settings: Mapping[str, Any]) -> str:
+    """What takes less time than these settings, in words."""
+    if "quality" in settings:
+        return f"a larger error, such as --quality {2 * settings['quality']:g}"
+    return f"fewer rays, such as --samples {max(2, settings['samples'] // 4 * 2)}"
 
 
 def _camera_used(flux: Any) -> dict[str, Any]:

@@ -9,27 +9,24 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
+from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.cli.interrupts import Interrupts
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
 from hesim_render.core.output import discard_unfinished
-
-#: Exit status of an error that the user can correct.
-_REFUSED = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point.
 
-    Exit status: 0; 2 with a line on stderr for each mistake of the user; 3 if a recording is complete, but worse than
-    the requested quality; 130 after an interrupt. If the reader of the output is gone (``| head``), a run continues to
-    its end, and its status is unaffected.
+    Exit status: `ExitStatus`; with 2 there is a line on stderr for each mistake of the user. If the reader of the
+    output is gone (``| head``), a run continues to its end, and its status is unaffected.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with Interrupts() as interrupts, warnings.catch_warnings():
         warnings.showwarning = _note(warnings.showwarning)
         status = _run(given, interrupts)
-        if status == INTERRUPTED:  # newer typer turns the exception into this status itself
+        if status == ExitStatus.INTERRUPTED:  # newer typer turns the exception into this status itself
             discard_unfinished()
             complain("interrupted")
             if arguments is None:
@@ -42,7 +39,7 @@ def _leave_at_once() -> None:
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()
-    os._exit(INTERRUPTED)
+    os._exit(ExitStatus.INTERRUPTED)
 
 
 def _note(otherwise: Callable[..., None]) -> Callable[..., None]:
@@ -70,7 +67,7 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
         status = app(args=given or ["--help"], standalone_mode=False)
         return status if isinstance(status, int) else 0
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return ExitStatus.INTERRUPTED
     except SystemExit as stop:
         if stop.code == 1:  # so typer ends where its own output, such as the help, meets a closed pipe
             silence_stdout()
@@ -78,7 +75,7 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
         raise
     except Exception as error:
         if interrupts.happened or type(error).__name__ == "Abort":
-            return INTERRUPTED
+            return ExitStatus.INTERRUPTED
         if isinstance(error, HesimError):
             complain(*str(error).splitlines())
         elif isinstance(error, usage_error):
@@ -88,4 +85,4 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
             complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
         else:
             raise
-        return _REFUSED
+        return ExitStatus.REFUSED

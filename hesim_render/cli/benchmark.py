@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes, listed
-from hesim_render.cli.terminal import complain, say
+from hesim_render.cli.terminal import complain
+from hesim_render.cli.told import DryRun, Json, Quiet, Told, facts_of
 from hesim_render.core.errors import OutputError, RangeError, TooLongError
-from hesim_render.core.progress import progress_report
 
 if TYPE_CHECKING:
     from hesim_render.benchmark.forecast import BuildEstimate
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Build, verify and evaluate benchmarks of many clips.", no_args_is_help=True)
 _Folder = Annotated[Path, typer.Argument(help="folder of a benchmark")]
-_DIFFERENT = 1  # exit status of verify where a file differs, of peers where one of them fails
 
 
 @app.command()
@@ -34,31 +34,43 @@ def build(
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the YAML file")
     ] = None,
+    dry_run: DryRun = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Build all clips of a benchmark, with manifest and card."""
-    from hesim_render.benchmark.build import build_benchmark, last_run
+    from hesim_render.benchmark.build import build_benchmark, check_build, last_run
     from hesim_render.specs.benchmark import read_benchmark
     from hesim_render.specs.files import parse_override
 
     if scheduler is not None and workers != 1:
         raise RangeError("--workers", workers, "nothing beside --scheduler, whose workers build the clips")
     content = read_benchmark(spec, dict(map(parse_override, set_ or [])))
-    with progress_report(content.name) as progress:
+    told = Told(json_, quiet, dry_run)
+    if dry_run:
+        total, missing, expected = check_build(content, out)
+        text = f"{total} clips, {len(missing)} of them not yet built; nothing was written (--dry-run)"
+        told.text("" if expected is None else f"estimate: {expected}")
+        facts = {"dry_run": True, "clips": total, "missing": len(missing), "estimate": expected and facts_of(expected)}
+        told.result(text, facts)
+        return
+    with told.progress(content.name) as progress:
         built = build_benchmark(
             content, out, workers=workers, scheduler=scheduler, estimate=estimate,
-            on_estimate=lambda expected: _estimated(expected, progress, workers, yes or scheduler is not None),
+            on_estimate=lambda expected: _estimated(told, expected, progress, workers, yes or scheduler is not None),
             progress=progress,
         )  # fmt: skip
     clips = built.manifest["clips"]
-    splits = ", ".join(f"{sum(c['split'] == split for c in clips)} {split}" for split in ("train", "val", "test"))
-    say(f"{len(clips)} clips ({splits})\n  {last_run(built.root)}")
-    say(f"  in {built.root}\n  card: {built.root / 'README.md'}")
+    count = {split: sum(c["split"] == split for c in clips) for split in ("train", "val", "test")}
+    splits = ", ".join(f"{number} {split}" for split, number in count.items())
+    text = f"{len(clips)} clips ({splits})\n  {last_run(built.root)}\n  in {built.root}\n"
+    card = built.root / "README.md"
+    told.result(f"{text}  card: {card}", {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count})
 
 
-def _estimated(expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool) -> None:
+def _estimated(told: Told, expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool) -> None:
     """Print the estimate; refuse a long build that nobody has wanted."""
-    with progress.paused():
-        say(f"estimate: {expected}")
+    told.estimated(progress)(expected)
     seconds = expected.seconds / max(1, workers)
     if seconds > 60 * LONG_MINUTES and not is_wanted:
         raise TooLongError(
@@ -73,21 +85,25 @@ def _estimated(expected: BuildEstimate, progress: ProgressReport, workers: int, 
 def verify(
     folder: _Folder,
     discard: Annotated[bool, typer.Option("--discard", help="remove damaged clips; build makes them again")] = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare every file of a benchmark with its SHA-256. Ends with status 1 where anything differs."""
     from hesim_render.benchmark.folder import Benchmark
     from hesim_render.benchmark.verify import digest_of, discard_damaged, verify_benchmark
 
-    with progress_report(f"verify {folder.name}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"verify {folder.name}") as progress:
         problems = verify_benchmark(folder, progress)
     if problems:
         complain(*problems)
-        if discard:
-            removed = discard_damaged(folder, problems)
-            say(f"removed {len(removed)} clips; 'benchmark build' makes them again")
-        raise typer.Exit(_DIFFERENT)
+        removed = discard_damaged(folder, problems) if discard else []
+        text = f"removed {len(removed)} clips; 'benchmark build' makes them again" if discard else ""
+        told.result(text, {"problems": problems, "removed": removed}, ExitStatus.DIFFERENT)
     benchmark = Benchmark(folder)
-    say(f"{len(benchmark.manifest['clips'])} clips are as they were built; digest {digest_of(benchmark)}")
+    count, digest = len(benchmark.manifest["clips"]), digest_of(benchmark)
+    facts = {"problems": [], "clips": count, "digest": digest}
+    told.result(f"{count} clips are as they were built; digest {digest}", facts)
 
 
 @app.command()
@@ -105,23 +121,26 @@ def evaluate(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="JSON file of all single values")] = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Measure the baselines of each task, and your own results, on the clips of a split."""
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
     if out is not None and out.exists() and not overwrite:
         raise OutputError(f"{out} exists; use --overwrite to replace it")
-    with progress_report(f"evaluate {folder.name}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"evaluate {folder.name}") as progress:
         result = evaluate_benchmark(
             folder, split=None if split == "all" else split, tasks=listed(tasks), predictions=predictions, out=out,
             progress=progress,
         )  # fmt: skip
-    say(f"{result['clips']} clips of {result['benchmark']}, split {result['split']}")
-    say(table(result["summary"]) or "no clip has what these tasks need")
+    lines = [f"{result['clips']} clips of {result['benchmark']}, split {result['split']}"]
+    lines += [table(result["summary"]) or "no clip has what these tasks need", *([] if out is None else [f"in {out}"])]
     for name in result["unused"]:
         complain(f"{name}: belongs to no item that was scored")
-    if out is not None:
-        say(f"in {out}")
+    facts = {name: result[name] for name in ("benchmark", "split", "clips", "summary", "unused")}
+    told.result("\n".join(lines), {**facts, "values": out})
 
 
 @app.command()
@@ -130,13 +149,16 @@ def export(
     layout: Annotated[str, typer.Option(help="hs-ergb, bs-ergb, highrev, efnet or raw-npz")],
     out: Annotated[Path, typer.Option(help="folder to write")],
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write a benchmark in the layout that another program loads."""
     from hesim_render.benchmark.layouts import export_benchmark
 
-    with progress_report(f"{folder.name} → {layout}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"{folder.name} → {layout}") as progress:
         count = export_benchmark(folder, layout, out, overwrite=overwrite, progress=progress)
-    say(f"{count} pictures in {out}")
+    told.result(f"{count} pictures in {out}", {"folder": out, "layout": layout, "pictures": count})
 
 
 @app.command()
@@ -146,19 +168,23 @@ def pack(
     format_: Annotated[str, typer.Option("--format", help="webdataset (tar) or hdf5")] = "webdataset",
     shard_mb: Annotated[float, typer.Option(help="size at which a shard is closed, MB")] = 256.0,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write the samples of a benchmark into a few large files for training, each checked after it is there."""
     from hesim_render.benchmark.shards import pack_benchmark, verify_shards
 
-    with progress_report(f"{folder.name} → {out}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"{folder.name} → {out}") as progress:
         count = pack_benchmark(
             folder, out, format=format_, shard_mb=shard_mb, overwrite=overwrite, progress=progress
         )  # fmt: skip
         problems = verify_shards(out, progress)
+    facts = {"address": out, "format": format_, "samples": count, "problems": problems}
     if problems:
         complain(*problems)
-        raise typer.Exit(_DIFFERENT)
-    say(f"{count} samples in {out}")
+        told.result("", facts, ExitStatus.DIFFERENT)
+    told.result(f"{count} samples in {out}", facts)
 
 
 @app.command()
@@ -169,6 +195,8 @@ def peers(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the YAML file")
     ] = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare our sensor and other event simulators in the same light. Ends with status 1 where one of them fails."""
     from hesim_render.benchmark.peers import compare_peers, peers_table
@@ -178,10 +206,9 @@ def peers(
     if out is not None and out.exists() and not overwrite:
         raise OutputError(f"{out} exists; use --overwrite to replace it")
     content = read_peers(spec, dict(map(parse_override, set_ or [])))
-    with progress_report(content.name) as progress:
+    told = Told(json_, quiet)
+    with told.progress(content.name) as progress:
         result = compare_peers(content, out, progress)
-    say(peers_table(result))
-    if out is not None:
-        say(f"in {out}")
-    if any("failed" in told for told in result["peers"].values()) or any("error" in row for row in result["rows"]):
-        raise typer.Exit(_DIFFERENT)
+    failed = any("failed" in peer for peer in result["peers"].values()) or any("error" in row for row in result["rows"])
+    text = peers_table(result) if out is None else f"{peers_table(result)}\nin {out}"
+    told.result(text, result, ExitStatus.DIFFERENT if failed else ExitStatus.DONE)

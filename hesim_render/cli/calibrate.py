@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, Without, cropped, names_of, sensor_keys_only
-from hesim_render.cli.terminal import parse_exposures, say, split_overrides
+from hesim_render.cli.terminal import parse_exposures, split_overrides
+from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.output import check_target
-from hesim_render.core.progress import progress_report
 
 
 class Part(StrEnum):
@@ -42,6 +42,8 @@ def lab(
     set_: SensorKeys = None,
     without: Without = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """A virtual calibration session: dark and lit captures to calibrate from."""
     scene_changes, changes = split_overrides(set_ or [])
@@ -52,14 +54,16 @@ def lab(
     from hesim_render.sensor.sensor import load_sensor
 
     loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
-    with progress_report(f"lab {sensor}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"lab {sensor}") as progress:
         folder = write_captures(
             loaded, out, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
             illuminant=illuminant, overwrite=overwrite, progress=progress,
             dark_exposures_us=dark_us, lit_exposures_us=lit_us,
         )  # fmt: skip
-    for file in sorted(folder.iterdir()):
-        say(f"{file.stat().st_size / 1e6:10.1f} MB  {out / file.name}")
+    sizes = {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
+    lines = [f"{size / 1e6:10.1f} MB  {out / name}" for name, size in sizes.items()]
+    told.result("\n".join(lines), {"captures": folder, "files_bytes": sizes})
 
 
 def calibrate(
@@ -68,14 +72,19 @@ def calibrate(
     out: Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")],
     report: Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace a report of another calibration")] = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Noise parameters from captures, into a file that a sensor file can point at."""
     from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
     from hesim_render.calibrate.summary import summary_lines
 
     run = calibrate_aps if part is Part.aps else calibrate_evs
-    with progress_report(f"calibrate {part.value}") as move:
+    told = Told(json_, quiet)
+    with told.progress(f"calibrate {part.value}") as move:
         run(captures, out, report, lambda what, fraction: move(fraction, 1.0, what), overwrite=overwrite)
     lines = summary_lines(read_calibration(out), part.value)
     where = [f"in {out}"] if report is None else [f"in {out}", f"report: {report}"]
-    say("\n".join([*lines, *where]))
+    told.result(
+        "\n".join([*lines, *where]), {"calibration": out, "report": report, "part": part.value, "summary": lines}
+    )

@@ -16,6 +16,7 @@ from hesim_render.cli import (
     expose,
     look,
     measure,
+    run,
     sensor,
     simulate,
     study,
@@ -46,7 +47,7 @@ def _app(
 
 
 for _command in (
-    doctor.doctor, doctor.list_, simulate.simulate, video.video, expose.expose, simulate.rerun, simulate.demo,
+    doctor.doctor, doctor.list_, simulate.simulate, video.video, expose.expose, run.run, simulate.rerun, simulate.demo,
     calibrate.lab, calibrate.calibrate, look.isp, look.view, exchange.export, exchange.import_, cube.cube,
     measure.measure, study.study, sweep.sweep,
 ):  # fmt: skip

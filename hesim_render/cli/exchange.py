@@ -8,17 +8,20 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, Region, check_output, cropped, names_of
-from hesim_render.cli.terminal import parse_size, say, summary
+from hesim_render.cli.simulate import tell_recording
+from hesim_render.cli.terminal import parse_size
+from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.errors import ConflictError
 
 _EXPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "txt", "nmnist", "tiff", "png", "npy", "mipi")
+#: Of events and frames together.
+_WHOLE = ("mcap", "raw-npz", "mp4", "mp4-colour", "mp4-events")
 _GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv")
-_FRAMES = (".dng", ".tif", ".tiff", ".png", ".npy")
-_IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz")
+_IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "mcap")
 
 
 def _complete_export(incomplete: str) -> list[str]:
-    return [name for name in (*_EXPORTS, *_GEOMETRY) if name.startswith(incomplete)]
+    return [name for name in (*_EXPORTS, *_WHOLE, *_GEOMETRY) if name.startswith(incomplete)]
 
 
 def _complete_import(incomplete: str) -> list[str]:
@@ -30,6 +33,7 @@ def export(
     format: Annotated[
         str,
         typer.Option(help=f"events: {', '.join(_EXPORTS[:7])}; frames: {', '.join(_EXPORTS[7:])}; "
+                     f"both: {', '.join(_WHOLE)}; "
                      f"geometric truth: {', '.join(_GEOMETRY)}", autocompletion=_complete_export),
     ],
     out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],
@@ -40,11 +44,13 @@ def export(
         str | None, typer.Option(help="for truth, the scene file, if it needs files that the recording does not hold")
     ] = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:  # fmt: skip
     """Write the events, the RAW frames or the geometric truth of a recording in the format of another program."""
     from hesim_render.recording.recording import Recording
 
-    loaded = Recording.load(recording)
+    loaded, told = Recording.load(recording), Told(json_, quiet)
     if format in _GEOMETRY:
         from hesim_render.recording.truth_export import export_truth
 
@@ -52,16 +58,22 @@ def export(
             from hesim_render.sources.scene import load_scene
 
             loaded.truth = loaded.truth_with(load_scene(scene))
-        say(f"{format} in {export_truth(loaded, format, out, every_us=every_us, overwrite=overwrite)}")
+        written = export_truth(loaded, format, out, every_us=every_us, overwrite=overwrite)
+        told.result(f"{format} in {written}", {"format": format, "written": written})
         return
     for name, value in (("--every-us", every_us), ("--scene", scene)):
         if value is not None:
             raise ConflictError(name, value, f"only formats of geometric truth take it: {', '.join(_GEOMETRY)}")
     written = loaded.export(format, out, overwrite)
     counts = loaded.manifest["counts"]
+    if format in _WHOLE:
+        facts = {"format": format, "written": written, "events": counts["events"], "frames": counts["frames"]}
+        told.result(f"{format} of {counts['frames']} frames and {counts['events']} events in {written}", facts)
+        return
     noun = "frame" if written.is_dir() else "event"
     count = counts[f"{noun}s"]
-    say(f"{count} {noun}{'' if count == 1 else 's'} in {written}")
+    facts = {"format": format, "written": written, f"{noun}s": count}
+    told.result(f"{count} {noun}{'' if count == 1 else 's'} in {written}", facts)
 
 
 def import_(
@@ -84,20 +96,26 @@ def import_(
     ] = None,
     roi: Region = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Write the events of another program in the layout of events.h5, or a capture of a real sensor as a recording."""
+    from hesim_render.exchange import is_event_file
+
+    told = Told(json_, quiet)
     if sensor is None:
         from hesim_render.recording.exports import import_events
 
         if len(sources) > 1 or roi is not None:
             raise ConflictError("FILE", len(sources), "more than one file, or --roi, needs --sensor")
         shape = None if size is None else parse_size(size)
-        say(f"events in {import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)}")
+        written = import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)
+        told.result(f"events in {written}", {"written": written})
         return
     if size is not None or format is not None:
         raise ConflictError("--sensor", sensor, "give --sensor or --size and --format, not both")
-    frames = [file for file in sources if file.suffix.lower() in _FRAMES]
-    events = [file for file in sources if file not in frames]
+    events = [file for file in sources if is_event_file(file)]
+    frames = [file for file in sources if file not in events]
     if len(events) > 1:
         raise ConflictError("FILE", str(events[1]), f"{events[1]} is a second event file; one is taken")
     check_output(out, overwrite)
@@ -106,4 +124,4 @@ def import_(
 
     loaded = cropped(hr.load_sensor(sensor), roi)
     made = import_recording(out, loaded, events=events[0] if events else None, frames=frames, overwrite=overwrite)
-    say(summary(made))
+    tell_recording(told, made)

@@ -20,9 +20,10 @@ from hesim_render.cli.options import (
     cropped,
     sensor_keys_only,
 )
-from hesim_render.cli.terminal import say, split_overrides, summary
+from hesim_render.cli.simulate import tell_recording
+from hesim_render.cli.terminal import split_overrides
+from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.errors import RangeError
-from hesim_render.core.progress import progress_report
 
 
 def expose(
@@ -49,6 +50,8 @@ def expose(
     clean: Clean = False,
     without: Without = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Put a hyperspectral image in front of a sensor, still or moving, and record it."""
     check_duration(duration)
@@ -64,12 +67,13 @@ def expose(
     import hesim_render as hr
 
     loaded = cropped(hr.load_sensor(sensor, sensor_changes), roi)
-    with progress_report(f"{cube.name} → {sensor}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"{cube.name} → {sensor}") as progress:
         recording = hr.simulate_cube(
             cube, loaded, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed, clean=clean,
             without=without or (), **{key: value for key, value in options.items() if value is not None},
         )  # fmt: skip
-    say(summary(recording))
+    tell_recording(told, recording)
 
 
 def _pair(text: str) -> tuple[float, float]:

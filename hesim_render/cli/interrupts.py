@@ -8,10 +8,9 @@ import sys
 import threading
 from typing import Any
 
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core.output import discard_unfinished
 
-#: Exit status after an interrupt: 128 + SIGINT, as in shells.
-INTERRUPTED = 130
 #: Time for Python to end the run itself, s.
 GRACE_S = 1.2
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -66,7 +65,7 @@ class Interrupts:
         discard_unfinished()
         show_cursor = "\x1b[?25h\r\x1b[2K" if sys.stderr.isatty() else ""
         os.write(2, f"{show_cursor}hesim-render: interrupted\n".encode())
-        os._exit(INTERRUPTED)
+        os._exit(ExitStatus.INTERRUPTED)
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()

@@ -9,9 +9,10 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import Overwrite
-from hesim_render.cli.terminal import say, summary
-from hesim_render.core.output import output_errors
-from hesim_render.core.progress import progress_report
+from hesim_render.cli.simulate import tell_recording
+from hesim_render.cli.told import Json, Quiet, Told
+from hesim_render.core.errors import ConflictError, OutputError
+from hesim_render.core.output import check_place, output_errors, replacing
 
 
 def isp(
@@ -23,6 +24,8 @@ def isp(
         Path | None, typer.Option(help="calibration.yaml of a calibrated sensor, for its maps")
     ] = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Develop the RAW frames of a recording into pictures."""
     from hesim_render.isp import DENOISED_PICTURE, develop_recording, load_pipeline
@@ -31,23 +34,50 @@ def isp(
     steps = DENOISED_PICTURE if pipeline is None else load_pipeline(pipeline)
     if no_denoise:
         steps = steps.without("denoise")
-    with progress_report(f"developing {recording}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"developing {recording}") as progress:
         folder = develop_recording(recording, out, steps, progress, overwrite, calibration)
-    say(f"pictures in {folder}")
+    text = f"pictures in {folder}"
     noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
     if noise is not None and noise["maps"] == "unknown":
-        say("the maps of the sensor's calibration are not in a recording: --calibration FILE takes them out")
+        text += "\nthe maps of the sensor's calibration are not in a recording: --calibration FILE takes them out"
+    told.result(text, {"pictures": folder, "noise": noise})
 
 
-def view(recording: Annotated[Path, typer.Argument(help="folder of a recording")]) -> None:
-    """Summarise a recording, and write its previews and recording.html: parameters, pictures and plots."""
+def view(
+    recording: Annotated[Path, typer.Argument(help="folder of a recording")],
+    rrd: Annotated[
+        Path | None, typer.Option(help="write a file for the viewer rerun, and do not open it; for headless machines")
+    ] = None,
+    viewer: Annotated[
+        bool | None,
+        typer.Option("--viewer/--no-viewer", help="open rerun; default where it is installed and there is a display"),
+    ] = None,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Summarise a recording, write its previews and recording.html, and open it in rerun where that is installed."""
+    from hesim_render.recording import rerun_view
     from hesim_render.recording.page import write_page
     from hesim_render.recording.recording import Recording
     from hesim_render.recording.showcase import write_previews
 
-    loaded = Recording.load(recording)
+    if rrd is not None and viewer:
+        raise ConflictError("--rrd", str(rrd), "give --rrd or --viewer, not both")
+    if rrd is not None and check_place(rrd).exists() and not overwrite:
+        raise OutputError(f"{rrd}: exists; give another name, or overwrite it (--overwrite)")
+    told, loaded = Told(json_, quiet), Recording.load(recording)
     assert loaded.path is not None
     with output_errors(loaded.path):
         write_previews(loaded, loaded.path)
         page = write_page(loaded, loaded.path)
-    say(f"{summary(loaded)}\n  page: {page}")
+    more = f"\n  page: {page}"
+    with told.progress(f"viewing {recording}") as progress:
+        if rrd is not None:
+            with replacing(rrd) as unfinished:
+                rerun_view.write_rrd(loaded, unfinished, progress)
+            more += f"\n  for rerun: {rrd}"
+        elif viewer or (viewer is None and rerun_view.can_show()):
+            rerun_view.show(loaded, progress)
+    tell_recording(told, loaded, more, {"page": page, "rrd": rrd})

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.terminal import parse_roi, say
+from hesim_render.cli.terminal import say
 from hesim_render.core.errors import OutputError, RangeError
+from hesim_render.core.region import parse_roi
 
 
 class Quantity(StrEnum):

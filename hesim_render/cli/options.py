@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hesim_render.cli.terminal import parse_roi, say
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import check_target
+from hesim_render.core.region import parse_roi
 
 if TYPE_CHECKING:
-    from hesim_render.core.progress import ProgressReport
     from hesim_render.sensor.sensor import Sensor
 
 
@@ -21,7 +20,7 @@ def names_of(kind: str) -> Callable[[str], list[str]]:
     """Completion of the names of shipped files of a kind, ``scenes`` or ``sensors``."""
 
     def complete(incomplete: str) -> list[str]:
-        from hesim_render.specs.files import list_names
+        from hesim_render.core.shipped import list_names
 
         return [name for name in list_names(kind) if name.startswith(incomplete)]
 
@@ -88,13 +87,3 @@ def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:
 def cropped(sensor: Sensor, roi: str | None) -> Sensor:
     """The sensor with the region of ``--roi``."""
     return sensor if roi is None else sensor.crop(*parse_roi(roi))
-
-
-def told_beside(progress: ProgressReport) -> Callable[[object], None]:
-    """A function that prints the estimate of a run while the progress display is hidden."""
-
-    def tell(expected: object) -> None:
-        with progress.paused():
-            say(f"estimate: {expected}")
-
-    return tell

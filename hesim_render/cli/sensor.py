@@ -12,6 +12,7 @@ import typer
 
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, names_of, sensor_keys_only
 from hesim_render.cli.terminal import say, split_overrides
+from hesim_render.cli.told import Json
 from hesim_render.core.errors import OutputError
 from hesim_render.core.output import check_place, replacing
 
@@ -37,7 +38,7 @@ def describe(
     out: Annotated[
         Path | None, typer.Option(help="picture of the curves to write, .png, .svg or .pdf; default none")
     ] = None,
-    json_: Annotated[bool, typer.Option("--json", help="print the figures as JSON")] = False,
+    json_: Json = False,
     set_: SensorKeys = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import (
     LONG_MINUTES,
     Clean,
@@ -21,18 +23,16 @@ from hesim_render.cli.options import (
     cropped,
     listed,
     names_of,
-    told_beside,
 )
-from hesim_render.cli.terminal import is_short_of_wish, say, split_overrides, summary
-from hesim_render.core.errors import OutputError
+from hesim_render.cli.terminal import is_short_of_wish, split_overrides, summary
+from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
+from hesim_render.core.errors import ConflictError, OutputError
 from hesim_render.core.guard import printable
 from hesim_render.core.output import check_place, replacing
-from hesim_render.core.progress import progress_report
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
 
-_NOT_MET = 3  # the recording is complete, but worse than the requested quality
 _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
 
 
@@ -74,6 +74,9 @@ def simulate(
         bool, typer.Option("--look", help="only show the framing: a quick picture without light, OUT.png")
     ] = False,
     overwrite: Overwrite = False,
+    dry_run: DryRun = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Render a scene and record it: RAW frames, events and their ground truth.
 
@@ -81,22 +84,31 @@ def simulate(
     """
     check_duration(duration)
     scene_changes, sensor_changes = split_overrides(set_ or [])
+    told = Told(json_, quiet, dry_run)
     if look:
-        _look(scene, sensor, out, scene_changes, sensor_changes, roi, allow_outside, overwrite)
+        if dry_run:
+            raise ConflictError("--look", look, "give --look or --dry-run, not both")
+        _look(told, scene, sensor, out, scene_changes, sensor_changes, roi, allow_outside, overwrite)
         return
     recording = _simulate(
-        scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
+        told, scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
         overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
         max_minutes=None if yes else LONG_MINUTES,
         clean=clean, without=without or (), allow_outside=allow_outside,
         truth=listed(truth), truth_every_us=truth_every_us,
     )  # fmt: skip
-    say(summary(recording))
-    if is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit")):
-        raise typer.Exit(_NOT_MET)
+    tell_recording(told, recording)
+
+
+def tell_recording(told: Told, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None) -> None:
+    """The result of a run: its recording, with the status that the audit gives."""
+    short = is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit"))
+    status = ExitStatus.NOT_MET if short else ExitStatus.DONE
+    told.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
 
 
 def _look(
+    told: Told,
     scene: str,
     sensor: str,
     out: Path,
@@ -121,10 +133,16 @@ def _look(
     with replacing(target) as unfinished:
         Image.fromarray(found.picture).save(unfinished, format="PNG")
     for name, materials in found.materials.items():
-        say(f"materials of {name}:")
+        told.text(f"materials of {name}:")
         for material in materials:
-            say(f"  {printable(str(material))}")
-    say(f"{found.target or 'the scene has no target'}\nframing in {target}")
+            told.text(f"  {printable(str(material))}")
+    told.result(
+        f"{found.target or 'the scene has no target'}\nframing in {target}",
+        {
+            "picture": target, "target": None if found.target is None else str(found.target),
+            "materials": {name: [str(one) for one in materials] for name, materials in found.materials.items()},
+        },
+    )  # fmt: skip
 
 
 def rerun(
@@ -138,6 +156,9 @@ def rerun(
         bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
     ] = False,
     overwrite: Overwrite = False,
+    dry_run: DryRun = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Make a recording again from its recording.json: the same bytes, on the same versions and backend."""
     check_output(out, overwrite)
@@ -147,32 +168,33 @@ def rerun(
 
     loaded = Recording.load(recording)
     given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
-    with progress_report(f"{recording} again") as progress:
+    told = Told(json_, quiet, dry_run)
+    with told.stop_at_estimate(), told.progress(f"{recording} again") as progress:
         again = simulate_again(
-            loaded, out, given, overwrite=overwrite, progress=progress, on_estimate=told_beside(progress),
+            loaded, out, given, overwrite=overwrite, progress=progress, on_estimate=told.estimated(progress),
             max_minutes=None if yes else LONG_MINUTES,
         )  # fmt: skip
-    say(summary(again))
-    if is_short_of_wish(again.manifest["settings"].get("render", {}).get("audit")):
-        raise typer.Exit(_NOT_MET)
+    tell_recording(told, again)
 
 
 def demo(
     out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
 ) -> None:
     """Two small recordings with pictures: a ColorChecker, and a moving scene."""
+    told = Told()
     runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
     for target in runs:
         check_output(target, overwrite=True)
     for target, (scene, sensor) in runs.items():
-        recording = _simulate(scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
-        say(summary(recording) + "\n")
+        recording = _simulate(told, scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        told.text(summary(recording) + "\n")
     still, moving = runs
-    say(f"Look at {still / 'preview.png'} (24 measured patches)")
-    say(f"    and {moving / 'preview.gif'} (events of a moving scene).")
+    told.text(f"Look at {still / 'preview.png'} (24 measured patches)")
+    told.text(f"    and {moving / 'preview.gif'} (events of a moving scene).")
 
 
 def _simulate(
+    told: Told,
     scene: str,
     sensor: str,
     out: Path,
@@ -189,8 +211,8 @@ def _simulate(
 
     loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
     loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
-    with progress_report(f"{scene} → {sensor}") as progress:
+    with told.stop_at_estimate(), told.progress(f"{scene} → {sensor}") as progress:
         return hr.simulate(
             loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
-            on_estimate=told_beside(progress), **options,
+            on_estimate=told.estimated(progress), **options,
         )  # fmt: skip

@@ -9,10 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from hesim_render.cli.options import Overwrite
-from hesim_render.cli.terminal import say
+from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import check_target
-from hesim_render.core.progress import progress_report
 
 #: Columns of the summary on the terminal.
 _SHOWN = {
@@ -44,6 +43,8 @@ def study(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the file; repeatable")
     ] = None,
     overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare filter sets, or design filters: colour, noise and event figures, as tables and a report."""
     from hesim_render.specs.files import parse_override
@@ -53,7 +54,7 @@ def study(
     if kind is StudyKind.design:
         if surfaces:
             raise RangeError("--surfaces", ", ".join(surfaces), "none in a design, which has fit and judge in its file")
-        _design(spec, out, keys, overwrite)
+        _design(Told(json_, quiet), spec, out, keys, overwrite)
         return
     if surfaces:
         keys["surfaces"] = [surfaces_of(text) for text in surfaces]
@@ -63,7 +64,8 @@ def study(
     check_target(out, MARKER, overwrite)
     import hesim_render as hr
 
-    with progress_report(f"study {kind.value}") as progress:
+    told = Told(json_, quiet)
+    with told.progress(f"study {kind.value}") as progress:
         table = hr.study(chosen, out=out, overwrite=overwrite, progress=progress)
     shown = {name: title for name, title in _SHOWN.items() if name in table.columns}
     every = ("surfaces", "illuminant", "illuminance_lux", "sensor", "crosstalk", "equal")
@@ -72,14 +74,17 @@ def study(
     for row in list(table)[:_MOST]:
         lines.append([_text(row[name]) for name in (*varied, *shown)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    say(
+    told.text(
         "\n".join(
             "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
         )
     )
     if len(table) > _MOST:
-        say(f"and {len(table) - _MOST} more rows")
-    say(f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}")
+        told.text(f"and {len(table) - _MOST} more rows")
+    told.result(
+        f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}",
+        {"results": out / "results.csv", "report": out / "report.html", "rows": list(table)},
+    )
 
 
 def _text(value: object) -> str:
@@ -88,23 +93,26 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else str(value)
 
 
-def _design(spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
+def _design(told: Told, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
     from hesim_render.specs.design import read_design
     from hesim_render.studies.design_run import MARKER, design
 
     chosen = read_design(spec, keys)
     check_target(out, MARKER, overwrite)
-    with progress_report("study design") as progress:
+    with told.progress("study design") as progress:
         found = design(chosen, out=out, overwrite=overwrite, progress=progress)
     costs = found.result.costs
-    say(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
+    told.text(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
     for verdict in found.verdicts:
         ratios = ", ".join(
             f"{value:.3f} at {key.split('_')[2]} lx" for key, value in verdict.items() if key.startswith("ysnr_ratio")
         )
-        say(
+        told.text(
             f"against {verdict['against']}: cost {verdict['cost']:.3f} in place of {verdict['cost_against']:.3f} "
             f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), mean ΔE2000 "
             f"{verdict['delta_e_mean']:.3f} in place of {verdict['delta_e_mean_against']:.3f}, YSNR times {ratios}"
         )
-    say(f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}")
+    told.result(
+        f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",
+        {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": found.verdicts},
+    )

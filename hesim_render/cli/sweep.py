@@ -7,17 +7,26 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.terminal import say
-from hesim_render.core.progress import progress_report
+from hesim_render.cli.told import DryRun, Json, Quiet, Told
 
 
 def sweep(
     spec: Annotated[str, typer.Argument(metavar="SPEC", help="path of the sweep's file")],
     out: Annotated[Path, typer.Option(help="folder for the table; a sweep that was ended goes on there")],
+    dry_run: DryRun = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate every combination of varied keys, and tabulate figures of each run; can be resumed."""
+    from hesim_render.studies.sweep import check_sweep
     from hesim_render.studies.sweep import sweep as run
 
-    with progress_report("sweep") as progress:
+    told = Told(json_, quiet, dry_run)
+    if dry_run:
+        total, missing = check_sweep(spec, out)
+        text = f"{total} runs, {missing} of them not yet made; nothing was written (--dry-run)"
+        told.result(text, {"dry_run": True, "runs": total, "missing": missing})
+        return
+    with told.progress("sweep") as progress:
         table = run(spec, out=out, progress=progress)
-    say(f"{len(table)} runs in {out / 'results.csv'}")
+    told.result(f"{len(table)} runs in {out / 'results.csv'}", {"results": out / "results.csv", "runs": len(table)})

@@ -31,16 +31,6 @@ def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any
     return scene, sensor
 
 
-def parse_roi(text: str) -> tuple[int, int, int | None, int | None]:
-    """Width, height and optional first column and row of ``512x384`` or ``512x384+100+200``."""
-    match = re.fullmatch(r"([0-9]{1,9})[xX]([0-9]{1,9})(?:\+([0-9]{1,9})\+([0-9]{1,9}))?", text)
-    if match is None:
-        raise RangeError("--roi", text, "WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, such as 512x384")
-    width, height, x, y = (None if part is None else int(part) for part in match.groups())
-    assert width is not None and height is not None
-    return width, height, x, y
-
-
 def parse_size(text: str) -> tuple[int, int]:
     """Rows and columns of ``1280x720``, which has the width first."""
     match = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text)

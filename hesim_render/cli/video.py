@@ -20,10 +20,10 @@ from hesim_render.cli.options import (
     check_output,
     cropped,
     sensor_keys_only,
-    told_beside,
 )
-from hesim_render.cli.terminal import say, split_overrides, summary
-from hesim_render.core.progress import progress_report
+from hesim_render.cli.simulate import tell_recording
+from hesim_render.cli.terminal import split_overrides
+from hesim_render.cli.told import DryRun, Json, Quiet, Told
 
 
 def video(
@@ -68,6 +68,9 @@ def video(
     clean: Clean = False,
     without: Without = None,
     overwrite: Overwrite = False,
+    dry_run: DryRun = False,
+    json_: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Put a video in front of a sensor and record it: RAW frames, events and their ground truth."""
     if duration is not None:
@@ -79,16 +82,16 @@ def video(
     from hesim_render.mosaic.colour_profile import load_camera
 
     loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
-    with progress_report(f"{Path(source).name} → {sensor}") as progress:
+    told = Told(json_, quiet, dry_run)
+    with told.stop_at_estimate(), told.progress(f"{Path(source).name} → {sensor}") as progress:
         recording = hr.simulate_video(
             source, loaded_sensor, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed,
-            max_minutes=None if yes else LONG_MINUTES, on_estimate=told_beside(progress),
+            max_minutes=None if yes else LONG_MINUTES, on_estimate=told.estimated(progress),
             clean=clean, without=without or (), fps=fps, slow_motion=slow_motion, duty=duty,
             interpolation=interpolation, motion_factor=motion_factor, transfer=transfer, gamma=gamma,
             primaries=primaries, matrix=matrix, range=range_, bit_depth=bit_depth, mode=mode, others=others,
             camera=None if camera is None else load_camera(camera), illuminant=illuminant, white_lux=white_lux,
             white_e_per_s=white_e_per_s, white_filter=white_filter, fit=fit, lens_shading=lens_shading,
         )  # fmt: skip
-    say(
-        "\n".join([summary(recording), *(f"note: {text}" for text in recording.manifest["settings"]["video"]["notes"])])
-    )
+    notes = recording.manifest["settings"]["video"]["notes"]
+    tell_recording(told, recording, "".join(f"\nnote: {text}" for text in notes))

@@ -50,8 +50,8 @@ class Pace:
         """Time since the run began, s."""
         return self._clock() - self._begin_s
 
-    def expect(self, seconds: float) -> None:
-        """Set the estimated time of the run from now on, s."""
+    def expect(self, seconds: float | None) -> None:
+        """Set the estimated time of the run from now on, s; None where there is none."""
         self.estimate_s = seconds
         self._expected_at_s = self._moved_s = self._clock()
 
@@ -133,8 +133,8 @@ class ProgressReport:
         with self._lock:
             self.pace.move(done, total, what)
 
-    def expect(self, seconds: float) -> None:
-        """Set the estimated time of the run from now on, s."""
+    def expect(self, seconds: float | None) -> None:
+        """Set the estimated time of the run from now on, s; None where there is none."""
         with self._lock:
             self.pace.expect(seconds)
 
@@ -256,6 +256,27 @@ class _Notebook:
 
     def close(self) -> None:
         self._handle.update(self._html(self._notes.removeprefix("<br>")))
+
+
+class _Nothing:
+    """No display."""
+
+    def show(self, pace: Pace) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        pass
+
+    def paused(self) -> contextlib.AbstractContextManager[Any]:
+        return contextlib.nullcontext()
+
+    def close(self) -> None:
+        pass
+
+
+def silent_report() -> ProgressReport:
+    """A report that shows nothing."""
+    return ProgressReport(_Nothing())
 
 
 def in_notebook() -> bool:

@@ -41,15 +41,12 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     SpecError
         If the sensor has more than 2048 rows or columns.
     """
-    raw_file.write_header(file, "EVT2", stream.shape, target)
-    high = np.int64(-1)
-    for events in stream:
-        file.write(_encoded(events, int(high)).data)
-        high = events["t_us"][-1] >> _LOW_BITS
+    raw_file.write(stream, file, target, "EVT2", _encoded)
 
 
-def _encoded(events: NDArray, high_before: int) -> NDArray[np.uint32]:
-    """Words of events; `high_before` is the TIME_HIGH (without its end at 28 bits) already written, -1 for none."""
+def _encoded(events: NDArray, before: NDArray | None) -> NDArray[np.uint32]:
+    """Words of events; `before` is the event before them."""
+    high_before = -1 if before is None else int(before["t_us"] >> _LOW_BITS)
     high = events["t_us"] >> _LOW_BITS
     step = np.diff(high, prepend=high_before)
     added = (step > 0).astype(np.int64)

@@ -54,17 +54,12 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     SpecError
         If the sensor has more than 2048 rows or columns, or an event lies after 2⁴⁴ µs (203 days).
     """
-    raw_file.write_header(file, "EVT3", stream.shape, target)
-    before = (np.int64(-1), np.int64(-1))
-    for events in stream:
-        if events["t_us"][-1] > _LATEST_US:
-            raise SpecError(f"EVT3 ends at {_LATEST_US} µs; an event is at {events['t_us'][-1]} µs", file=stream.source)
-        file.write(_encoded(events, *map(int, before)).data)
-        before = events["t_us"][-1], events["y"][-1]
+    raw_file.write(stream, file, target, "EVT3", _encoded, _LATEST_US)
 
 
-def _encoded(events: NDArray, time_before: int, row_before: int) -> NDArray[np.uint16]:
-    """Words of events; time and row of the event before them, -1 for none."""
+def _encoded(events: NDArray, before: NDArray | None) -> NDArray[np.uint16]:
+    """Words of events; `before` is the event before them."""
+    time_before, row_before = (-1, -1) if before is None else (int(before["t_us"]), int(before["y"]))
     times, rows = events["t_us"], events["y"]
     high = times >> _LOW_BITS
     new_high = np.diff(high, prepend=-1 if time_before < 0 else time_before >> _LOW_BITS) > 0

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading
-from hesim_render.exchange import aedat4, dsec, e2vid, evt2, evt3, frame_files, nmnist, raw_file
+from hesim_render.exchange import aedat4, dsec, e2vid, evt2, evt3, frame_files, mcap_file, nmnist, raw_file
 from hesim_render.exchange.stream import EventStream
 
 
@@ -47,8 +48,8 @@ FRAME_FORMATS = {
     "mipi": FrameFormat(".bin", frame_files.write_mipi),
 }
 #: Formats that can be read, by the first bytes of their files.
-_BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz"}
-READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
+_BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz", mcap_file.BEGIN: "mcap"}
+READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz", "mcap")
 
 
 def open_events(
@@ -58,8 +59,9 @@ def open_events(
 
     Parameters
     ----------
-    path : the file: EVT2 or EVT3 RAW, AEDAT4, HDF5 in the layout of DSEC, or ``.npz`` with t, x, y and p.
-    format : ``evt2``, ``evt3``, ``aedat4``, ``dsec`` or ``npz``; default: what the begin of the file says.
+    path : the file: EVT2 or EVT3 RAW, AEDAT4, HDF5 in the layout of DSEC, ``.npz`` with t, x, y and p, or
+        MCAP with messages of type EventArray.
+    format : ``evt2``, ``evt3``, ``aedat4``, ``dsec``, ``npz`` or ``mcap``; default: what the begin of the file says.
     shape : rows and columns of the event grid, px; needed if the file does not state them.
     keep_stated : let the shape that the file states, if it does, come before `shape`.
 
@@ -91,6 +93,24 @@ def open_events(
     return stream
 
 
+def is_event_file(path: str | Path) -> bool:
+    """True if the begin of a file is that of an event format, and it holds no arrays of a frame (``.npz``).
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read.
+    """
+    file = Path(path).expanduser()
+    with reading(file), file.open("rb") as opened:
+        begin = opened.read(16)
+    name = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
+    if name != "npz":
+        return name is not None
+    with reading(file, "as arrays"), np.load(file) as arrays:
+        return not {"raw", "aps_raw"} & set(arrays.files)
+
+
 def _detect(file: Path) -> str | None:
     with reading(file), file.open("rb") as opened:
         begin = opened.read(16)
@@ -118,10 +138,16 @@ def _open_npz(file: Path) -> EventStream:
     return EventStream(lambda: e2vid.read_arrays(file, names), shape or (0, 0), file)
 
 
+def _open_mcap(file: Path) -> EventStream:
+    shape, topic = mcap_file.read_header(file)
+    return EventStream(lambda: mcap_file.read(file, topic), shape, file)
+
+
 _OPENERS: dict[str, Callable[[Path], EventStream]] = {
     "evt2": _open_raw,
     "evt3": _open_raw,
     "aedat4": _open_aedat4,
     "dsec": _open_dsec,
     "npz": _open_npz,
+    "mcap": _open_mcap,
 }

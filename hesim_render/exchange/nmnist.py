@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange.stream import EventStream
@@ -34,13 +35,14 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     rows, cols = stream.shape
     if max(rows, cols) > _LARGEST_SIDE:
         raise SpecError(f"N-MNIST addresses at most 256 rows and columns, not {cols}x{rows} px", file=target)
-    for events in stream:
-        last_us = int(events["t_us"][-1])
-        if last_us >> _TIME_BITS:
-            raise SpecError(f"N-MNIST ends at {1 << _TIME_BITS} µs; an event is at {last_us} µs", file=stream.source)
-        made = np.empty((events.size, 5), dtype=np.uint8)
-        made[:, 0], made[:, 1] = events["x"], events["y"]
-        made[:, 2] = (events["polarity"] > 0).astype(np.uint8) << np.uint8(7) | (events["t_us"] >> 16).astype(np.uint8)
-        made[:, 3] = events["t_us"] >> 8 & 0xFF
-        made[:, 4] = events["t_us"] & 0xFF
-        file.write(made.data)
+    stream.encode_into(file, "N-MNIST", _encoded, (1 << _TIME_BITS) - 1)
+
+
+def _encoded(events: NDArray, _: NDArray | None) -> NDArray[np.uint8]:
+    """Five bytes of each event."""
+    made = np.empty((events.size, 5), dtype=np.uint8)
+    made[:, 0], made[:, 1] = events["x"], events["y"]
+    made[:, 2] = (events["polarity"] > 0).astype(np.uint8) << np.uint8(7) | (events["t_us"] >> 16).astype(np.uint8)
+    made[:, 3] = events["t_us"] >> 8 & 0xFF
+    made[:, 4] = events["t_us"] & 0xFF
+    return made

@@ -7,7 +7,7 @@ the header also ends before the first line that does not begin with ``% ``.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -16,6 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading
+from hesim_render.exchange.stream import EventStream
 
 #: Coordinates have 11 bits in EVT2 and EVT3.
 LARGEST_SIDE = 1 << 11
@@ -25,6 +26,19 @@ _MOST_LINES = 1000
 _VERSIONS = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 #: Words of one piece.
 _PIECE = 1 << 18
+
+
+def write(
+    stream: EventStream,
+    file: IO[bytes],
+    target: str | Path,
+    name: str,
+    encode: Callable[[NDArray, NDArray | None], NDArray],
+    latest_us: int | None = None,
+) -> None:
+    """Write the header of a format, and the words of events; parameters as for `write_header` and `encode_into`."""
+    write_header(file, name, stream.shape, target)
+    stream.encode_into(file, name, encode, latest_us)
 
 
 def write_header(file: IO[bytes], name: str, shape: tuple[int, int], target: str | Path) -> None:

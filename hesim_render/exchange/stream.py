@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,35 @@ class EventStream:
                 raise SpecError(f"event {done + k} ({where}) is outside of {cols}x{rows} px", file=self.source)
             yield events
             last_us, done = int(times[-1]), done + events.size
+
+    def encode_into(
+        self,
+        file: IO[bytes],
+        name: str,
+        encode: Callable[[NDArray, NDArray | None], NDArray],
+        latest_us: int | None = None,
+    ) -> None:
+        """Write the events in the words of a format, block by block.
+
+        Parameters
+        ----------
+        file : where to write.
+        name : the format, for the error.
+        encode : turns events, and the event before them (None before the first), into words.
+        latest_us : last time that the format has, µs; None for no limit.
+
+        Raises
+        ------
+        SpecError
+            If an event is later than that.
+        """
+        before = None
+        for events in self:
+            last_us = int(events["t_us"][-1])
+            if latest_us is not None and last_us > latest_us:
+                raise SpecError(f"{name} ends at {latest_us} µs; an event is at {last_us} µs", file=self.source)
+            file.write(encode(events, before).data)
+            before = events[-1]
 
     def count(self) -> int:
         """Number of events; it reads all of them.

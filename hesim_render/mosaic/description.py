@@ -41,6 +41,8 @@ class Mosaic(BaseModel):
     camera_to_srgb : [3][channel], from channels divided by `neutral` to linear sRGB; rows sum to 1.
     xyz_to_camera : [channel][3], from CIE 1931 XYZ (D65) to channels; the DNG ColorMatrix.
     f_number, focal_length_mm : the lens in use.
+    pitch_um : distance of neighbouring pixels, µm; None in recordings of earlier versions, as the next.
+    noise_profile : S and O of the variance S·x + O, x from 0 at the black to 1 at the white level; None without noise.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -60,6 +62,8 @@ class Mosaic(BaseModel):
     xyz_to_camera: list[list[float]]
     f_number: PositiveFloat
     focal_length_mm: PositiveFloat
+    pitch_um: PositiveFloat | None = None
+    noise_profile: tuple[PositiveFloat, PositiveFloat] | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Mosaic:
@@ -160,6 +164,7 @@ def describe(sensor: Sensor, light: Spectrum | None = None) -> Mosaic:
         xyz_to_camera=from_xyz,
         f_number=sensor.lens.f_number,
         focal_length_mm=sensor.lens.focal_length_mm,
+        pitch_um=spec.geometry.pitch_um,
     )
 
 

@@ -42,6 +42,11 @@ def thumbnail(raw: NDArray[np.uint16], mosaic: Mosaic, max_width: int = 256) -> 
     return encode_srgb(_developed(_binned(raw, mosaic, tiles), mosaic))
 
 
+def linear_view(raw: NDArray[np.uint16], mosaic: Mosaic) -> NDArray[np.float32]:
+    """Linear sRGB [row, col, 3] with a pixel for each tile, exposed as `colour_picture`: white is about 1."""
+    return _developed(_binned(raw, mosaic, 1), mosaic)
+
+
 def _binned(raw: NDArray[np.uint16], mosaic: Mosaic, tiles: int) -> NDArray[np.float32]:
     """Mean DN above black of each channel over blocks of tiles, [row, col, channel]."""
     tile = mosaic.tile_channel

@@ -1,9 +1,9 @@
 """One RAW frame as a DNG file: exact DN, uncompressed, with the true colour pattern of the tile.
 
 The mosaic is the first image of the file, so every TIFF reader gets the DN themselves. A small
-8-bit sRGB picture follows as a second image (NewSubfileType 1). Most readers support 2×2 patterns only and
-develop a 4×4 pattern wrongly, so a recording also holds a 2×2 ``preview.dng``; `binned`
-makes its pixels. Tags follow DNG 1.4 and TIFF/EP (ISO 12234-2).
+8-bit sRGB picture follows as a second image (NewSubfileType 1). Most readers support 2×2 patterns of three colours
+only, so a recording of another tile also holds a ``preview.dng`` (`recording.preview_dng`). Tags follow DNG 1.4 and
+TIFF/EP (ISO 12234-2).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import struct
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -25,8 +26,15 @@ from hesim_render.mosaic.description import Mosaic
 
 PHOTOMETRIC_CFA = 32803
 PHOTOMETRIC_LINEAR_RAW = 34892
-_BYTE, _ASCII, _SHORT, _RATIONAL, _SRATIONAL = 1, 2, 3, 5, 10
-_PHOTOMETRIC_TAG = 262
+_BYTE, _ASCII, _SHORT, _RATIONAL, _SRATIONAL, _DOUBLE = 1, 2, 3, 5, 10, 12
+_LONG, _UNDEFINED = 4, 7
+_CENTIMETRE = 3  # FocalPlaneResolutionUnit
+_UM_PER_CM = 10_000
+#: From CIE XYZ (D65) to linear sRGB, IEC 61966-2-1.
+_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+_PHOTOMETRIC_TAG, _EXIF_TAG = 262, 34665
+#: tifffile writes no tag 34665, so this one keeps its place.
+_EXIF_PLACE = 34666
 _D65 = 21  # EXIF LightSource
 
 
@@ -70,17 +78,51 @@ def write_dng(
             metadata=None,
             software=f"hesim_render {__version__}",
             description=json.dumps(description),
-            extratags=_tags(mosaic, exposure_us),
+            extratags=_tags(mosaic),
         )
         if thumbnail is not None:
             file.write(
                 thumbnail, photometric="rgb", subfiletype=1, rowsperstrip=thumbnail.shape[0], metadata=None,
                 software=False,
             )  # fmt: skip
-    if mosaic.is_mono:
-        with tifffile.TiffFile(path, mode="r+") as written:
-            page = written.pages[0].aspage()
-            page.tags[_PHOTOMETRIC_TAG].overwrite(PHOTOMETRIC_LINEAR_RAW)
+    _write_exif(path, mosaic, exposure_us)
+
+
+def write_linear_dng(
+    path: Path, linear: NDArray[np.float32], mosaic: Mosaic, *, exposure_us: int, description: dict[str, Any]
+) -> None:
+    """Write a picture in linear sRGB, as LinearRaw, which needs no demosaicing.
+
+    Parameters
+    ----------
+    path : the file.
+    linear : [row, col, 3], white is 1.
+    mosaic, exposure_us, description : of the frame, as for `write_dng`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    import tifffile
+
+    from hesim_render import __version__
+
+    top = (1 << 16) - 1
+    colour = [
+        (50721, _SRATIONAL, _SRGB.size, _rationals(_SRGB.ravel()), True),  # ColorMatrix1
+        (50728, _RATIONAL, 3, (1, 1) * 3, True),  # AsShotNeutral
+        (50778, _SHORT, 1, _D65, True),
+    ]
+    levels = [(50714, _SHORT, 3, (0, 0, 0), True), (50717, _SHORT, 3, (top,) * 3, True)]
+    with tifffile.TiffWriter(path, byteorder="<") as file:
+        file.write(
+            np.rint(np.clip(linear, 0, 1) * top).astype(np.uint16), photometric=PHOTOMETRIC_LINEAR_RAW,
+            compression=None, subfiletype=0, rowsperstrip=linear.shape[0], metadata=None,
+            planarconfig="contig", software=f"hesim_render {__version__}", description=json.dumps(description),
+            extratags=[*_camera_tags(mosaic), *levels, *colour],
+        )  # fmt: skip
+    _write_exif(path, mosaic, exposure_us, linear=True)
 
 
 def read_dng(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
@@ -105,6 +147,21 @@ def read_dng(path: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
         return page.asarray()
 
 
+def is_packed(path: Path) -> bool:
+    """True if `read_dng` cannot read a DNG file because its first image is packed, in tiles or small, as of cameras.
+
+    Raises
+    ------
+    SpecError
+        If it is no TIFF file.
+    """
+    import tifffile
+
+    with reading(path, "as a DNG file"), _quiet("tifffile"), tifffile.TiffFile(path) as file:
+        page = file.pages[0].aspage()
+        return page.compression != 1 or page.is_tiled or page.subfiletype & 1 == 1
+
+
 @contextlib.contextmanager
 def _quiet(name: str) -> Iterator[None]:
     """Switch off the log of a library; our own error reports a damaged file."""
@@ -117,22 +174,72 @@ def _quiet(name: str) -> Iterator[None]:
         log.disabled = before
 
 
-def _tags(mosaic: Mosaic, exposure_us: int) -> list[tuple]:
-    """Extra tags as tifffile takes them: (code, type, count, value, write once)."""
+def _write_exif(path: Path, mosaic: Mosaic, exposure_us: int, linear: bool = False) -> None:
+    """Append the directory of the exposure and the lens, of which tifffile has written the place only.
+
+    Its entries are (code, type, values); those that take more than four bytes lie behind it. A mono mosaic gets its
+    photometric interpretation here as well.
+    """
     exposure = Fraction(exposure_us, 1_000_000).limit_denominator(1_000_000)
-    tags = [
+    entries: list[tuple[int, int, tuple[int, ...]]] = [
+        (33434, _RATIONAL, (exposure.numerator, exposure.denominator)),  # ExposureTime
+        (33437, _RATIONAL, _rational(mosaic.f_number)),  # FNumber
+        (36864, _UNDEFINED, tuple(b"0230")),  # ExifVersion
+        (37386, _RATIONAL, _rational(mosaic.focal_length_mm)),  # FocalLength
+    ]
+    if mosaic.pitch_um is not None:
+        per_cm = _rational(_UM_PER_CM / mosaic.pitch_um)
+        # FocalPlaneXResolution, FocalPlaneYResolution and their unit
+        entries += [(41486, _RATIONAL, per_cm), (41487, _RATIONAL, per_cm), (41488, _SHORT, (_CENTIMETRE,))]
+    with path.open("r+b") as file:
+        begin = file.seek(0, 2)
+        begin += file.write(b"\0" * (begin % 2))
+        behind = begin + 2 + 12 * len(entries) + 4
+        fields, values = b"", b""
+        for code, kind, numbers in entries:
+            if kind == _RATIONAL:
+                fields += struct.pack("<HHII", code, kind, 1, behind + len(values))
+                values += struct.pack("<II", *numbers)
+            elif kind == _SHORT:
+                fields += struct.pack("<HHIHH", code, kind, 1, *numbers, 0)
+            else:
+                fields += struct.pack("<HHI4B", code, kind, len(numbers), *numbers)
+        file.write(struct.pack("<H", len(entries)) + fields + bytes(4) + values)
+        changed = {_EXIF_PLACE: struct.pack("<HHII", _EXIF_TAG, _LONG, 1, begin)}
+        if mosaic.is_mono and not linear:
+            changed[_PHOTOMETRIC_TAG] = struct.pack("<HHIHH", _PHOTOMETRIC_TAG, _SHORT, 1, PHOTOMETRIC_LINEAR_RAW, 0)
+        file.seek(4)
+        (first,) = struct.unpack("<I", file.read(4))
+        file.seek(first)
+        (count,) = struct.unpack("<H", file.read(2))
+        codes = [struct.unpack("<H", file.read(12)[:2])[0] for _ in range(count)]
+        for code, entry in changed.items():
+            file.seek(first + 2 + 12 * codes.index(code))
+            file.write(entry)
+
+
+def _camera_tags(mosaic: Mosaic) -> list[tuple]:
+    """Tags of the camera, and the place of those of the exposure: (code, type, count, value, write once)."""
+    return [
         (271, _ASCII, 0, "hesim_render", True),
         (272, _ASCII, 0, _ascii(mosaic.sensor), True),
         (274, _SHORT, 1, 1, True),  # Orientation: row 0 at the top
-        (33434, _RATIONAL, 1, (exposure.numerator, exposure.denominator), True),
-        (33437, _RATIONAL, 1, _rational(mosaic.f_number), True),
-        (37386, _RATIONAL, 1, _rational(mosaic.focal_length_mm), True),
+        (_EXIF_PLACE, _LONG, 1, 0, True),
         (50706, _BYTE, 4, bytes((1, 4, 0, 0)), True),  # DNGVersion
         (50707, _BYTE, 4, bytes((1, 1, 0, 0)), True),  # DNGBackwardVersion
         (50708, _ASCII, 0, f"hesim_render {_ascii(mosaic.sensor)}", True),  # UniqueCameraModel
+    ]
+
+
+def _tags(mosaic: Mosaic) -> list[tuple]:
+    """All further tags of a RAW frame."""
+    tags = [
+        *_camera_tags(mosaic),
         (50714, _RATIONAL, 1, _rational(mosaic.black_level_dn), True),
         (50717, _SHORT, 1, mosaic.white_level_dn, True),
     ]
+    if mosaic.noise_profile is not None:
+        tags.append((51041, _DOUBLE, 2, mosaic.noise_profile, True))
     if mosaic.is_mono:
         return tags
     rows, cols = mosaic.tile_shape
@@ -174,33 +281,3 @@ def _rational(value: float) -> tuple[int, int]:
 
 def _rationals(values: NDArray[np.float64]) -> tuple[int, ...]:
     return tuple(number for value in values for number in _rational(value))
-
-
-def binned(raw: NDArray[np.uint16], mosaic: Mosaic) -> tuple[NDArray[np.uint16], Mosaic] | None:
-    """A quad mosaic as a 2×2 mosaic at half size: each colour cell becomes the mean of its frame pixels.
-
-    Quad sensors bin in the same way. Event pixels do not take part. The result is None if the
-    tile is not made of 2×2 cells of one filter.
-    """
-    channel = mosaic.tile_channel
-    rows, cols = channel.shape
-    if rows % 2 or cols % 2 or (rows, cols) == (2, 2):
-        return None
-    cells = channel.reshape(rows // 2, 2, cols // 2, 2).transpose(0, 2, 1, 3).reshape(rows // 2, cols // 2, 4)
-    first = cells.max(axis=2)
-    if (first < 0).any() or not ((cells == first[..., None]) | (cells < 0)).all():
-        return None
-    blocks = (raw.shape[0] // 2, 2, raw.shape[1] // 2, 2)
-    valid = mosaic.tiled(channel >= 0, raw.shape).reshape(blocks)
-    mean = np.where(valid, raw.reshape(blocks), 0).sum(axis=(1, 3), dtype=np.uint32) / valid.sum(axis=(1, 3))
-    tile_filter = [[mosaic.channels[number] for number in row] for row in first]
-    flags = [[True] * len(row) for row in tile_filter]
-    smaller = mosaic.model_copy(
-        update={
-            "tile_filter": tile_filter,
-            "tile_aps": flags,
-            "tile_evs": [[False] * len(row) for row in tile_filter],
-            "cfa_code": {name: mosaic.cfa_code[name] for name in mosaic.channels},
-        }
-    )
-    return np.rint(mean).astype(np.uint16), smaller

@@ -8,14 +8,20 @@ from typing import TYPE_CHECKING
 
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, check_place, output_errors, replacing
-from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, open_events
+from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, mcap_file, open_events
 from hesim_render.exchange.dsec import stream_events
+from hesim_render.mosaic.description import Mosaic
+from hesim_render.recording.movie import MOVIES, write_movie
+from hesim_render.recording.tick_files import write_tick_files
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
 
 #: File that says what the frames of a folder are, and marks the folder for `overwrite`.
 FRAMES_NAME = "frames.json"
+#: Formats of events and frames together.
+WHOLE_FORMATS = ("mcap", "raw-npz", *MOVIES)
+_NEED_FRAMES = (*FRAME_FORMATS, "mp4-colour")
 
 
 def event_stream(recording: Recording) -> EventStream:
@@ -35,18 +41,41 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
     from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
     from hesim_render.recording.truth_export import export_truth
 
+    check_format(format, 0 not in recording.event_shape, bool(len(recording.frames)))
     if format in TRUTH_FORMATS:
         return export_truth(recording, format, path, overwrite=overwrite)
     if format in EVENT_FORMATS:
-        if 0 in recording.event_shape:
-            raise RangeError("format", format, f"a format of frames ({', '.join(FRAME_FORMATS)}): there are no events")
         return write_events(event_stream(recording), format, path, overwrite)
-    if format not in FRAME_FORMATS:
-        known = (*EVENT_FORMATS, *FRAME_FORMATS, *TRUTH_FORMATS)
-        raise RangeError("format", format, f"one of {', '.join(known)}{did_you_mean(format, known)}")
-    if not len(recording.frames):
-        raise RangeError("format", format, f"a format of events ({', '.join(EVENT_FORMATS)}): there are no frames")
+    if format == "raw-npz":
+        return _write_ticks(recording, path, overwrite)
+    if format in WHOLE_FORMATS:
+        target = _free(path, overwrite)
+        with replacing(target) as temporary:
+            if format == "mcap":
+                _write_mcap(recording, temporary, target)
+            else:
+                write_movie(recording, temporary, format)
+        return target
     return _write_frames(recording, format, path, overwrite)
+
+
+def check_format(format: str, has_events: bool, has_frames: bool) -> None:
+    """Refuse a format that does not exist, or of what a recording does not have.
+
+    Raises
+    ------
+    RangeError
+        With the formats that can be used.
+    """
+    from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
+
+    known = (*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS, *TRUTH_FORMATS)
+    if format not in known:
+        raise RangeError("format", format, f"one of {', '.join(known)}{did_you_mean(format, known)}")
+    if format in (*EVENT_FORMATS, "mp4-events") and not has_events:
+        raise RangeError("format", format, f"a format of frames ({', '.join(FRAME_FORMATS)}): there are no events")
+    if format in _NEED_FRAMES and not has_frames:
+        raise RangeError("format", format, f"a format of events ({', '.join(EVENT_FORMATS)}): there are no frames")
 
 
 def write_events(stream: EventStream, format: str, path: str | Path, overwrite: bool = False) -> Path:
@@ -61,13 +90,19 @@ def write_events(stream: EventStream, format: str, path: str | Path, overwrite: 
     """
     target = check_place(path)
     with output_errors(target):
-        exists = target.exists() or target.is_symlink()
-        if exists and target.resolve() == Path(stream.source).resolve():
+        if target.exists() and target.resolve() == Path(stream.source).resolve():
             raise OutputError(f"{path}: is the file of the events itself; give another name")
-    if exists and not overwrite:
-        raise OutputError(f"{path}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
+    _free(path, overwrite)
     with replacing(target) as temporary, temporary.open("wb") as file:
         EVENT_FORMATS[format].write(stream, file, target)
+    return target
+
+
+def _free(path: str | Path, overwrite: bool) -> Path:
+    """The absolute path of a file to write, where nothing is unless it may be replaced."""
+    target = check_place(path)
+    if (target.exists() or target.is_symlink()) and not overwrite:
+        raise OutputError(f"{path}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
     return target
 
 
@@ -101,6 +136,38 @@ def import_events(
         If `source` is damaged, of another format, or has events out of order or outside of the grid.
     """
     return write_events(open_events(source, format, shape), "dsec", path, overwrite)
+
+
+def _write_mcap(recording: Recording, path: Path, target: Path) -> None:
+    """Events and frames as messages of ROS 2."""
+    events = event_stream(recording) if min(recording.event_shape) > 0 else None
+    frames = ((frame.t_us, frame.raw) for frame in recording.frames)
+    with path.open("wb") as file:
+        mcap_file.write(events, frames, _encoding(recording.mosaic), file, target)
+
+
+def _encoding(mosaic: Mosaic) -> str:
+    """Name of a mosaic in ``sensor_msgs/image_encodings``; ``mono16`` where it has none."""
+    letters = "".join("RGB"[code] if code < len("RGB") else "?" for code in mosaic.tile_code.ravel())
+    known = mosaic.tile_shape == (2, 2) and letters in ("RGGB", "BGGR", "GRBG", "GBRG")
+    return f"bayer_{letters.lower()}16" if known else "mono16"
+
+
+def _write_ticks(recording: Recording, path: str | Path, overwrite: bool) -> Path:
+    """The npz files of H-ESIM and RGB-Event-ISP, with `FRAMES_NAME` to mark the folder."""
+    tick_us = (recording.manifest["sensor"]["spec"].get("evs") or {}).get("tick_us")
+    if tick_us is None and not len(recording.frames):
+        raise RangeError("format", "raw-npz", "a format of events: there are no frames, and no ticks")
+    folder = OutputFolder(path, FRAMES_NAME, overwrite)
+    try:
+        with output_errors(folder.target):
+            write_tick_files(recording, folder.path, tick_us)
+            facts = {"format": "raw-npz", "tick_us": tick_us, "frames": [frame.times for frame in recording.frames]}
+            (folder.path / FRAMES_NAME).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+        return folder.commit()
+    except BaseException:
+        folder.discard()
+        raise
 
 
 def _write_frames(recording: Recording, format: str, path: str | Path, overwrite: bool) -> Path:

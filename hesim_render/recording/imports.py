@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading, require_memory
-from hesim_render.core.npz import read_array
+from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.exchange import EventStream, open_events
-from hesim_render.recording.dng import read_dng
+from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw
+from hesim_render.recording.dng import is_packed, read_dng
 from hesim_render.recording.frame import Frame
 from hesim_render.recording.writer import RecordingWriter
 
@@ -37,8 +38,9 @@ def import_recording(
     path : folder to write.
     sensor : the sensor file that describes the camera, cropped to the region that was read out.
     events : event file of a format that `open_events` reads, with the event grid of the sensor.
-    frames : RAW frames in order of time, uint16 [row, col], DN: DNG and TIFF files (not compressed, the mosaic as first
-        image), PNG or NPY. Frame k begins at k / frame rate of the sensor file, and has the exposure of that file.
+    frames : RAW frames in order of time, uint16 [row, col], DN: DNG and TIFF files (the mosaic as first image), PNG,
+        NPY, npz of H-ESIM and RGB-Event-ISP, or RAW files of cameras, through rawpy, as DNG of cameras. Frame k begins
+        at k / frame rate of the sensor file, and has the exposure of that file.
     overwrite : replace an existing recording.
 
     Returns
@@ -71,7 +73,7 @@ def import_recording(
         unknown = np.full(layout.shape, np.nan, dtype=np.float32)
         for index, (file, start_us) in enumerate(zip(frames, starts, strict=True)):
             assert aps is not None
-            raw = _frame(Path(file).expanduser(), layout.shape, aps.bit_depth)
+            raw = _frame(Path(file).expanduser(), sensor)
             writer.add_frame(
                 Frame(
                     raw=np.where(valid, raw, 0).astype(np.uint16), valid=valid, electrons_mean=unknown,
@@ -99,20 +101,36 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
     return stream
 
 
-def _frame(file: Path, shape: tuple[int, int], bit_depth: int) -> NDArray[np.uint16]:
+def _frame(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
     """The DN of a frame, [row, col]."""
-    suffix = file.suffix.lower()
-    if suffix in (".dng", ".tif", ".tiff"):
+    assert sensor.spec.aps is not None
+    suffix, shape, bit_depth = file.suffix.lower(), sensor.layout.shape, sensor.spec.aps.bit_depth
+    if suffix in CAMERA_SUFFIXES or (suffix == ".dng" and is_packed(file)):
+        raw = read_camera_raw(file, sensor)
+    elif suffix in (".dng", ".tif", ".tiff"):
         raw = read_dng(file, shape)
     elif suffix == ".png":
         raw = _png(file, shape)
     elif suffix == ".npy":
         raw = read_array(file, shape, "u")
+    elif suffix == ".npz":
+        raw = _array_of(file, shape)
     else:
-        raise SpecError("is no frame; expected .dng, .tif, .tiff, .png or .npy", file=file)
+        raise SpecError(
+            "is no frame; expected .dng, .tif, .tiff, .png, .npy, .npz or a RAW file of a camera", file=file
+        )
     if raw.max() >= 1 << bit_depth:
         raise SpecError(f"holds {raw.max()} DN; the sensor has {bit_depth} bit", file=file)
     return raw
+
+
+def _array_of(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """A frame of H-ESIM (``raw``) or RGB-Event-ISP (``aps_raw``)."""
+    with reading(file, "as arrays"), np.load(file) as arrays:
+        names = [name for name in ("aps_raw", "raw") if name in arrays.files]
+    if not names:
+        raise SpecError("holds no array 'raw' or 'aps_raw'", file=file)
+    return read_arrays(file, names, only=names[:1], shapes={names[0]: shape}, kinds="u")[names[0]].astype(np.uint16)
 
 
 def _png(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:

@@ -16,6 +16,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, read_text, reading
 from hesim_render.mosaic import description as mosaic
 from hesim_render.recording.manifest_spec import RecordingSpec
+from hesim_render.recording.noise_profile import noise_profile
 from hesim_render.specs.files import content_hash, validate
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
@@ -63,6 +64,10 @@ def build(
     lamps = getattr(scene, "lamps", ())
     if light is None and lamps:
         light = lamps[0].illuminant.load()
+    described = mosaic.describe(sensor, light)
+    if not settings.get("clean"):
+        profile = noise_profile(sensor, settings.get("without", ()))
+        described = described.model_copy(update={"noise_profile": profile})
     return {
         "schema_version": SCHEMA_VERSION,
         "software": software_versions(),
@@ -71,7 +76,7 @@ def build(
         "time": {"begin_us": 0, "end_us": duration_us},
         "roi": {"x": layout.col0, "y": layout.row0, "width_px": layout.cols, "height_px": layout.rows},
         "event_grid": {"width": layout.evs_shape[1], "height": layout.evs_shape[0]},
-        "mosaic": mosaic.describe(sensor, light).model_dump(mode="json"),
+        "mosaic": described.model_dump(mode="json"),
         "lens": {
             "f_number": sensor.lens.f_number,
             "focal_length_mm": sensor.lens.focal_length_mm,

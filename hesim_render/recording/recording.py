@@ -297,7 +297,8 @@ class Recording:
         Parameters
         ----------
         format : of events ``evt2``, ``evt3``, ``aedat4``, ``dsec``, ``npz``, ``txt`` or ``nmnist``; of frames ``tiff``,
-            ``png``, ``npy`` or ``mipi``; of the truth ``exr``, ``dsec-flow``, ``tum`` or ``kalibr``.
+            ``png``, ``npy`` or ``mipi``; of both ``mcap``, ``raw-npz``, and as videos ``mp4``, ``mp4-colour`` and
+            ``mp4-events``; of the truth ``exr``, ``dsec-flow``, ``tum`` or ``kalibr``.
         path : file of the events, or folder of the frames or of the truth.
         overwrite : replace an existing file, or an existing folder of exported frames.
 

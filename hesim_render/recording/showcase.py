@@ -11,9 +11,10 @@ from PIL import Image
 from hesim_render.core.guard import printable
 from hesim_render.core.output import replacing
 from hesim_render.pixels.evs.events import no_events
-from hesim_render.recording import dng, preview
-from hesim_render.recording.colour_view import Picture, colour_picture, thumbnail
+from hesim_render.recording import preview
+from hesim_render.recording.colour_view import Picture, colour_picture
 from hesim_render.recording.preview import Panel
+from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
 
 if TYPE_CHECKING:
     from hesim_render.recording.frame import Frame
@@ -34,17 +35,10 @@ def write_previews(recording: Recording, folder: Path) -> list[Path]:
     written = [folder / "preview.png"]
     with replacing(written[0]) as temporary:
         contact_sheet(recording).save(temporary, format="PNG")
-    if len(recording.frames):
-        frame = _middle(recording)
-        smaller = dng.binned(frame.raw, recording.mosaic)
-        if smaller is not None:
-            raw, mosaic = smaller
-            written.append(folder / "preview.dng")
-            with replacing(written[-1]) as temporary:
-                dng.write_dng(
-                    temporary, raw, mosaic, exposure_us=frame.exposure_us, description=frame.times,
-                    thumbnail=thumbnail(raw, mosaic),
-                )  # fmt: skip
+    if len(recording.frames) and needs_preview(recording.mosaic):
+        written.append(folder / "preview.dng")
+        with replacing(written[-1]) as temporary:
+            write_preview_dng(temporary, _middle(recording), recording.mosaic)
     pictures = animation(recording) if moves(recording) else []
     if len(pictures) > 1:
         written.append(folder / "preview.gif")

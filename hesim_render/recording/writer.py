@@ -63,7 +63,8 @@ class RecordingWriter:
             sensor, scene=scene, seed=seed, duration_us=duration_us, settings=settings or {}
         )
         if mosaic is not None:
-            self._manifest["mosaic"] = mosaic.model_dump(mode="json")
+            noise = self._manifest["mosaic"]["noise_profile"]
+            self._manifest["mosaic"] = mosaic.model_dump(mode="json") | {"noise_profile": noise}
         self._folder = None if path is None else FolderWriter(path, self._manifest, overwrite)
         self._scene = scene
         self._frames: list[Frame] = []

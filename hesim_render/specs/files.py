@@ -18,6 +18,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.core.shipped import data_folder, list_names
 from hesim_render.specs.problems import spec_error
 from hesim_render.specs.yamlfile import read_yaml
 
@@ -68,18 +69,6 @@ class Strict(BaseModel):
 
 
 Model = TypeVar("Model", bound=BaseModel)
-
-
-def data_folder(kind: str) -> Path:
-    """Folder of the shipped files: ``scenes`` or ``sensors`` (inside the wheel, or beside the sources)."""
-    package = Path(__file__).resolve().parent.parent
-    inside = package / kind
-    return inside if inside.is_dir() else package.parent / kind
-
-
-def list_names(kind: str) -> list[str]:
-    """Names of the shipped files of a kind."""
-    return sorted(path.stem for path in data_folder(kind).glob("*.yaml"))
 
 
 def locate(name_or_path: str | Path, kind: str) -> Path:

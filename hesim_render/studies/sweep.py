@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hesim_render.capture.simulate import simulate
-from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError, did_you_mean
+from hesim_render.core.errors import HesimError, OutputError, SpecError, did_you_mean
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, shown
+from hesim_render.core.region import parse_roi
 from hesim_render.isp.pipeline import DEFAULT, Pipeline, load_pipeline
 from hesim_render.recording.recording import Recording
 from hesim_render.sensor.sensor import load_sensor
@@ -109,10 +110,7 @@ def sweep(
     OutputError
         If `out` holds other things, or cannot be written.
     """
-    if isinstance(spec, Mapping):
-        read: SweepSpec = validate(SweepSpec, dict(spec), None, {})
-    else:
-        read = spec if isinstance(spec, SweepSpec) else read_sweep(spec)
+    read = _read(spec)
     folder = check_target(out, MARKER, overwrite=True)
     runs = list(runs_of(read))
     with output_errors(folder):
@@ -120,7 +118,7 @@ def sweep(
         content = json.dumps(json.loads(read.model_dump_json()), indent=1)
         with replacing(folder / MARKER) as unfinished:
             unfinished.write_text(content + "\n", encoding="utf-8")
-    made: _Studies | _Recordings = _Recordings(read, folder) if read.study is None else _Studies(read)
+    made = _made(read, folder)
     # runs that differ in the ISP alone come one after the other, so that they share a recording
     first = _first_of_each(runs)
     order = sorted(range(len(runs)), key=lambda k: (first[runs[k].simulation], k))
@@ -136,6 +134,33 @@ def sweep(
     return table
 
 
+def check_sweep(spec: str | Path | Mapping[str, Any] | SweepSpec, out: str | Path) -> tuple[int, int]:
+    """What `sweep` would do; nothing is written or simulated.
+
+    Returns
+    -------
+    Number of runs, and of those among them that are still to be made.
+    """
+    read = _read(spec)
+    folder, runs = check_target(out, MARKER, overwrite=True), list(runs_of(read))
+    made = _made(read, folder)
+    return len(runs), sum(not _file_of(folder, made, run).is_file() for run in runs)
+
+
+def _read(spec: str | Path | Mapping[str, Any] | SweepSpec) -> SweepSpec:
+    if isinstance(spec, Mapping):
+        return validate(SweepSpec, dict(spec), None, {})
+    return spec if isinstance(spec, SweepSpec) else read_sweep(spec)
+
+
+def _made(spec: SweepSpec, folder: Path) -> _Studies | _Recordings:
+    return _Recordings(spec, folder) if spec.study is None else _Studies(spec)
+
+
+def _file_of(folder: Path, made: _Studies | _Recordings, run: Run) -> Path:
+    return folder / "runs" / f"{_digest(made.identity(run))}.json"
+
+
 def _first_of_each(runs: Sequence[Run]) -> dict[str, int]:
     found: dict[str, int] = {}
     for k, run in enumerate(runs):
@@ -147,7 +172,7 @@ def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str
     """Rows of a run, from its file if there is one."""
     told = ", ".join(f"{key}={value}" for key, value in run.cells.items())
     try:
-        file = folder / "runs" / f"{_digest(made.identity(run))}.json"
+        file = _file_of(folder, made, run)
         if file.is_file():
             try:
                 stored = json.loads(file.read_text(encoding="utf-8"))
@@ -203,7 +228,7 @@ class _Recordings:
         spec = self._spec
         sensor = load_sensor(spec.beside(run.sensor), run.keys(_SENSOR))
         if spec.roi is not None:
-            sensor = sensor.crop(*_size(spec.roi))
+            sensor = sensor.crop(*parse_roi(spec.roi, "roi"))
         scene = load_scene(spec.beside(run.scene), run.keys(""))
         place = self._folder / "recordings" / _digest(run.simulation)
         recording = simulate(
@@ -267,10 +292,3 @@ class _Studies:
 _NAMES = (
     "surfaces", "illuminant", "illuminance_lux", "sensor", "filter_set", "crosstalk", "equal", "exposure_us",
 )  # fmt: skip
-
-
-def _size(roi: str) -> tuple[int, int]:
-    parts = roi.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and int(part) > 0 for part in parts):
-        raise RangeError("roi", roi, "WIDTHxHEIGHT in px, such as 512x384")
-    return int(parts[0]), int(parts[1])

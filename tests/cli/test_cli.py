@@ -15,11 +15,11 @@ import recordings
 import hesim_render as hr
 from hesim_render import cli
 from hesim_render.capture.noise_terms import NOISE_TERMS
-from hesim_render.cli.terminal import parse_roi
 from hesim_render.core import backend
 from hesim_render.core.backend import Candidate
 from hesim_render.core.errors import RangeError
-from hesim_render.specs.files import data_folder, list_names
+from hesim_render.core.region import parse_roi
+from hesim_render.core.shipped import data_folder, list_names
 
 
 def call(capsys, *arguments):

@@ -9,7 +9,8 @@ import time
 
 import pytest
 
-from hesim_render.cli.interrupts import INTERRUPTED, Interrupts
+from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.cli.interrupts import Interrupts
 from hesim_render.core.interrupts import interrupts_held
 
 #: A lock that is taken twice: native code that never comes back, and that no signal wakes.
@@ -64,7 +65,7 @@ def test_native_code_that_never_returns_is_ended_and_cleaned_up_after(number, tm
     child = _start(sys.executable, "-c", _NEVER, str(tmp_path / "o"))
     assert child.stdout.readline() == "there\n" and len(list(tmp_path.iterdir())) == 1
     status, _, err, seconds = _interrupt(child, number)
-    assert (status, err) == (INTERRUPTED, "hesim-render: interrupted\n")
+    assert (status, err) == (ExitStatus.INTERRUPTED, "hesim-render: interrupted\n")
     assert seconds < 2.0 and list(tmp_path.iterdir()) == []
 
 
@@ -90,7 +91,7 @@ main(["doctor"])
     assert child.stdout.readline() == "there\n"  # it went on
     began = time.monotonic()
     _, err = child.communicate(timeout=60)
-    assert (child.returncode, err) == (INTERRUPTED, "hesim-render: interrupted\n")
+    assert (child.returncode, err) == (ExitStatus.INTERRUPTED, "hesim-render: interrupted\n")
     assert time.monotonic() - began < 2
 
 
@@ -148,13 +149,17 @@ def test_the_status_of_an_interrupt_does_not_depend_on_what_happens_at_the_end()
     """Clearing up may crash where native threads still run; here it does in any case."""
     code = (
         "import atexit, os, signal, sys, hesim_render.cli as cli\n"
-        "cli._run = lambda *_: cli.INTERRUPTED\n"
+        "cli._run = lambda *_: cli.ExitStatus.INTERRUPTED\n"
         "atexit.register(os.kill, os.getpid(), signal.SIGSEGV)\n"
         "print('written')\n"
         "cli.main()\n"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    assert (child.returncode, child.stdout, child.stderr) == (INTERRUPTED, "written\n", "hesim-render: interrupted\n")
+    assert (child.returncode, child.stdout, child.stderr) == (
+        ExitStatus.INTERRUPTED,
+        "written\n",
+        "hesim-render: interrupted\n",
+    )
 
 
 @pytest.mark.slow
@@ -169,7 +174,7 @@ def test_a_command_ends_within_two_seconds_whenever_it_is_interrupted(seed, tmp_
     )  # fmt: skip
     time.sleep(run.uniform(0.4, 12.0))
     status, _, err, seconds = _interrupt(child)
-    assert status == INTERRUPTED and err.endswith("hesim-render: interrupted\n") and "Traceback" not in err
+    assert status == ExitStatus.INTERRUPTED and err.endswith("hesim-render: interrupted\n") and "Traceback" not in err
     assert seconds < 2.0 and list(tmp_path.iterdir()) == []
 
 

@@ -12,6 +12,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.describe import event_curves, figures_of, photon_transfer, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
 from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.specs import read_sensor
 from hesim_render.specs.files import list_names
 from hesim_render.specs.from_data_sheet import electrons_per_s_lux
 from hesim_render.spectral.spectrum import illuminant
@@ -21,6 +22,21 @@ SLOW = {
     "evs.data_sheet.noise_bandwidth_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
     "evs.data_sheet.speed": [{"lux": 5, "bandwidth_hz": 20}], "evs.data_sheet.refractory_us": 5000,
 }  # fmt: skip
+
+
+#: Without noise, and without the queue of the read-out, in which events of all pixels at once would wait.
+NO_QUEUE = ("leak", "shot", "dark_current", "readout_limit")
+#: A jump of light changes the corner from the next node on (32 a period). Where the threshold is low and the bandwidth
+#: depends on the light, this is 7.6 % of the latency (dvxplorer), or 1 of 12 µs (davis240).
+LATE = pytest.mark.xfail(strict=True, reason="the corner frequency follows a jump of light from the next node on")
+#: Shipped sensors whose event pixels are written as a data sheet, and the latencies that the sheets state.
+SHEETS = [name for name in list_names("sensors") if (evs := read_sensor(name).evs) is not None and evs.data_sheet]
+LATENCIES = [
+    pytest.param(name, speed.lux, speed.latency_us, marks=LATE if name in ("davis240", "dvxplorer") else ())
+    for name in SHEETS
+    for speed in read_sensor(name).evs.data_sheet.speed
+    if speed.latency_us is not None
+]
 
 
 def electrons(sensor, lux):
@@ -45,7 +61,7 @@ def simulated_rates(sensor, lux, begin_s, seconds, seed=3):
 
 def after_step(sensor, lux, contrast, wait_us, without=()):
     """First event of each pixel after a step of contrast: µs after the step, and polarity."""
-    stage, begin_us = EvsStage(sensor.evs.without(*without), 3), 1000
+    stage, begin_us = EvsStage(sensor.evs.without(*without), 3), 5000
     for t_us, level in ((0, lux), (begin_us, lux), (begin_us + 1, lux * (1 + contrast))):
         stage.step(electrons(sensor, level), t_us)
     events = stage.step(electrons(sensor, lux * (1 + contrast)), begin_us + wait_us)
@@ -68,14 +84,23 @@ def test_the_background_of_a_data_sheet_is_what_the_sensor_gives():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "lux", "pixels", "begin_s", "seconds"),
-    [("imx636", 5, 64, 0.5, 1.5), ("v2e-noisy", 0, 240, 3, 6), ("v2e-noisy", 100, 240, 3, 6)],
-)
+    [
+        ("imx636", 5, 64, 0.5, 1.5), ("v2e-noisy", 0, 240, 3, 6), ("v2e-noisy", 100, 240, 3, 6),
+        ("genx320", 5, 64, 0.5, 1.5), ("dvxplorer", 100, 64, 0.5, 1.5), ("davis240", 100, 120, 0.5, 1.0),
+    ],
+)  # fmt: skip
 def test_the_background_of_shipped_sensors_is_what_they_give(name, lux, pixels, begin_s, seconds):
     sensor = hr.load_sensor(name).crop(pixels, pixels)
     found = sum(simulated_rates(sensor, lux, begin_s, seconds))
     options = sensor.spec.evs.v2e
-    stated = 10.0 if options is None else options.shot_noise_rate_hz * (1 if lux == 0 else 0.25) + 0.1
-    # 60,000 events or more; the draw of 4096 (57,600) pixels adds 1 % (2 % where rare pixels have most of the noise)
+    if options is None:
+        (sheet,) = sensor.spec.evs.data_sheet.background
+        assert sheet.lux == lux
+        stated = sheet.rate_hz
+    else:
+        stated = options.shot_noise_rate_hz * (1 if lux == 0 else 0.25) + 0.1
+    # 4000 events or more: standard error 1.6 %; the draw of 4096 (57,600) pixels adds 1 % (2 % where rare pixels have
+    # most of the noise)
     assert found == pytest.approx(stated, rel=0.05)
 
 
@@ -136,10 +161,32 @@ def test_threshold_and_mismatch_of_a_data_sheet_are_those_of_simulated_s_curves(
         np.testing.assert_allclose(predicted, share, atol=0.0156)  # four standard errors at most
 
 
-@pytest.mark.parametrize(("lux", "stated_us"), [(1000, 100), (5, 1000)])
-def test_latencies_of_a_data_sheet_are_those_of_simulated_steps(lux, stated_us):
-    sensor = hr.load_sensor("imx636").crop(8, 8)
-    wait_us, polarity = after_step(sensor, lux, 1.0, 5000, ("shot", "dark_current", "mismatch", "leak"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHEETS)
+def test_s_curves_of_shipped_sheets_have_their_threshold_and_mismatch(name):
+    """Without noise, so that one step decides: the spread is that of the pixels' own thresholds, over 8192 of them."""
+    sensor = hr.load_sensor(name)
+    sensor = sensor.crop(min(128, sensor.cols), min(64, sensor.rows))
+    sheet = sensor.spec.evs.data_sheet
+    for sign, stated in ((1, sheet.threshold_on_percent), (-1, sheet.threshold_off_percent)):
+        percent = stated + sheet.threshold_mismatch_percent * np.linspace(-1.8, 1.8, 7)
+        contrast = percent / 100 if sign > 0 else 1 / (1 + percent / 100) - 1
+        share = [
+            np.sum(after_step(sensor, 20_000.0, c, 20_000, NO_QUEUE)[1] == sign) / math.prod(sensor.layout.evs_shape)
+            for c in contrast
+        ]
+        theta = np.log1p(percent / 100)
+        slope, offset = np.polyfit(theta, special.ndtri(share), 1)
+        # standard errors 1 % of the width and 2 % of it for the centre
+        assert -offset / slope == pytest.approx(math.log1p(stated / 100), rel=0.02)
+        assert 1 / slope == pytest.approx(sheet.threshold_mismatch_percent / 100 / (1 + stated / 100), rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "lux", "stated_us"), LATENCIES)
+def test_latencies_of_a_data_sheet_are_those_of_simulated_steps(name, lux, stated_us):
+    sensor = hr.load_sensor(name).crop(8, 8)
+    wait = max(4 * stated_us, 50)
+    wait_us, polarity = after_step(sensor, lux, 1.0, wait, (*NO_QUEUE, "mismatch"))
     assert len(wait_us) == 64 and np.all(polarity == 1)
     assert np.median(wait_us) == pytest.approx(stated_us, rel=0.05)
     assert event_curves(sensor, [float(lux)]).latency_us[0] == pytest.approx(stated_us, rel=0.01)

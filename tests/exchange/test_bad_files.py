@@ -247,8 +247,10 @@ def test_the_commands(tmp_path):
 def test_the_commands_offer_the_formats_that_exist():
     from hesim_render.cli import exchange
     from hesim_render.exchange import FRAME_FORMATS, formats
+    from hesim_render.recording.exports import WHOLE_FORMATS
 
     assert (*EVENT_FORMATS, *FRAME_FORMATS) == exchange._EXPORTS
     assert exchange._IMPORTS == formats.READABLE == tuple(formats._OPENERS)
-    for name in exchange._EXPORTS:
+    assert exchange._WHOLE == WHOLE_FORMATS
+    for name in (*exchange._EXPORTS, *WHOLE_FORMATS):
         assert f"``{name}``" in hr.Recording.export.__doc__

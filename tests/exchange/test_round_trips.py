@@ -166,7 +166,7 @@ def test_evt2_words_are_those_of_the_definition(tmp_path):
     ("evt3", made(), (2049, 10), "at most 2048 rows and columns"),
     ("evt3", made(((1 << 44) + 1, 0, 0, 1)), SHAPE, "ends at 17592186044416"),
     ("nmnist", made(), (34, 257), "at most 256 rows and columns"),
-    ("nmnist", made((1 << 23, 0, 0, 1)), (34, 34), "ends at 8388608"),
+    ("nmnist", made((1 << 23, 0, 0, 1)), (34, 34), "ends at 8388607"),
     ("dsec", made((0, 0, 0, 1), (1 << 32, 0, 0, 1)), SHAPE, "at most 4294967295"),
     ("aedat4", made(), (1 << 16, 10), "at most 32768"),
 ])  # fmt: skip

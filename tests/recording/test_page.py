@@ -1,6 +1,7 @@
 """Plots, web page and short forms of a recording."""
 
 import re
+import sys
 from html.parser import HTMLParser
 
 import numpy as np
@@ -100,3 +101,12 @@ def test_the_picture_of_a_frame_is_not_that_of_a_dark_one():
         np.zeros_like(frame.raw), frame.valid, frame.electrons_mean, frame.electrons_stderr, **frame.times
     )
     assert len(frame._repr_html_()) > 3 * len(dark._repr_html_())
+
+
+def test_without_rerun_a_view_is_as_before_and_its_file_is_refused(recording, capsys, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    for more, status in (["--no-viewer"], 0), (["--rrd", str(tmp_path / "r.rrd")], 2):
+        with pytest.raises(SystemExit) as ended:
+            main(["view", str(recording.path), *more])
+        assert ended.value.code == status
+    assert "pip install 'hesim_render[view]'" in capsys.readouterr().err and not any(tmp_path.iterdir())

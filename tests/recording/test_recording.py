@@ -21,7 +21,7 @@ import hesim_render as hr
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording import manifest as manifests
-from hesim_render.recording.dng import binned
+from hesim_render.recording.preview_dng import binned
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.specs import SensorSpec, read_scene
@@ -106,7 +106,7 @@ def test_dng_holds_the_true_colour_pattern(tmp_path):
         assert list(tags[50710].value) == [red, green, blue, white]
         assert tags[50706].value == bytes((1, 4, 0, 0)) or tuple(tags[50706].value) == (1, 4, 0, 0)
         assert json.loads(tags[270].value)["t_us"] == made.frames[0].t_us
-        exposure = tags[33434].value
+        exposure = tags[34665].value["ExposureTime"]
         assert exposure[0] / exposure[1] == pytest.approx(0.01)
         assert file.pages[1].subfiletype == 1
 

@@ -1,0 +1,206 @@
+"""MCAP of ROS 2: events as ``dvs_msgs/msg/EventArray``, frames as ``sensor_msgs/msg/Image``.
+
+Messages are in CDR, little endian, with every number at a multiple of its size. An event is x, y (16 bits), seconds,
+nanoseconds (32 bits) and polarity (8 bits), so that the events after the first are 16 bytes apart, and NumPy writes
+and reads a packet as one array. The container is that of the package mcap.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import reading
+from hesim_render.exchange.stream import EventStream
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+
+BEGIN = b"\x89MCAP0\r\n"
+EVENT_TOPIC, FRAME_TOPIC, FRAME_ID = "/camera/events", "/camera/image_raw", "camera"
+#: Longest time and most events of one packet.
+_PACKET_US, _PACKET_EVENTS = 10_000, 1 << 16
+_LATEST_US = (1 << 31) * 1_000_000
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+#: What follows x and y of an event: its time and polarity, and x and y of the next one.
+_BLOCK = np.dtype([("sec", "<i4"), ("nanosec", "<u4"), ("p", "u1"), ("pad", "u1"), ("x", "<u2"), ("y", "<u2"),
+                   ("pad2", "<u2")])  # fmt: skip
+_BEHIND_LAST = 7  # bytes of the last block that are not there
+_RULE = "=" * 80
+_HEADER = (
+    f"{_RULE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    f"{_RULE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)
+EVENT_TYPE, FRAME_TYPE = "dvs_msgs/msg/EventArray", "sensor_msgs/msg/Image"
+_TYPES = {
+    EVENT_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
+    f"{_RULE}\nMSG: dvs_msgs/Event\nuint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n{_HEADER}",
+    FRAME_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
+    f"uint32 step\nuint8[] data\n{_HEADER}",
+}
+
+
+def write(
+    events: EventStream | None,
+    frames: Iterable[tuple[int, NDArray[np.uint16]]],
+    encoding: str,
+    file: IO[bytes],
+    target: str | Path,
+) -> None:
+    """Write events and frames in order of time.
+
+    Parameters
+    ----------
+    events : None where there are none.
+    frames : time, µs, and DN [row, col] of each frame, in order of time.
+    encoding : name of the mosaic, of ``sensor_msgs/image_encodings``: ``mono16``, ``bayer_rggb16``, …
+    file : where to write.
+    target : name of the file, for errors.
+
+    Raises
+    ------
+    SpecError
+        If the package mcap is not installed, or an event lies at 2³¹ s or later.
+    """
+    _require(target)
+    from mcap.writer import Writer
+
+    writer = Writer(file)
+    writer.start(profile="ros2", library="hesim_render")
+    channels = {}
+    for topic, kind in ((EVENT_TOPIC, EVENT_TYPE), (FRAME_TOPIC, FRAME_TYPE)):
+        schema = writer.register_schema(kind, "ros2msg", _TYPES[kind].encode())
+        channels[topic] = writer.register_channel(topic, "cdr", schema)
+
+    def send(topic: str, t_us: int, data: bytes) -> None:
+        writer.add_message(channels[topic], 1000 * t_us, data, 1000 * t_us)
+
+    waiting = iter(frames)
+    frame = next(waiting, None)
+    for packet in () if events is None else _packets(events, target):
+        t_us = int(packet["t_us"][-1])
+        while frame is not None and frame[0] <= t_us:
+            send(FRAME_TOPIC, frame[0], _image(*frame, encoding))
+            frame = next(waiting, None)
+        assert events is not None
+        send(EVENT_TOPIC, t_us, _event_array(packet, events.shape))
+    while frame is not None:
+        send(FRAME_TOPIC, frame[0], _image(*frame, encoding))
+        frame = next(waiting, None)
+    writer.finish()
+
+
+def _packets(events: EventStream, target: str | Path) -> Iterator[NDArray]:
+    """The events in parts of at most `_PACKET_US`."""
+    for block in events:
+        if block["t_us"][-1] >= _LATEST_US:
+            raise SpecError(f"ROS ends at {_LATEST_US} µs; an event is at {block['t_us'][-1]} µs", file=target)
+        period = block["t_us"] // _PACKET_US
+        starts = np.flatnonzero(np.diff(period, prepend=period[0] - 1))
+        for first, last in zip(starts, [*starts[1:], block.size], strict=True):
+            for k in range(first, last, _PACKET_EVENTS):
+                yield block[k : min(k + _PACKET_EVENTS, last)]
+
+
+def _head(t_us: int) -> bytes:
+    """Byte order, time and frame of a message, up to a multiple of 4 bytes."""
+    name = FRAME_ID.encode() + b"\0"
+    text = struct.pack("<iII", t_us // 1_000_000, t_us % 1_000_000 * 1000, len(name)) + name
+    return _LITTLE_ENDIAN + text + bytes(-len(text) % 4)
+
+
+def _event_array(events: NDArray, shape: tuple[int, int]) -> bytes:
+    made = np.zeros(events.size, dtype=_BLOCK)
+    made["sec"], micro = np.divmod(events["t_us"], 1_000_000)
+    made["nanosec"] = micro * 1000
+    made["p"] = events["polarity"] > 0
+    made["x"][:-1], made["y"][:-1] = events["x"][1:], events["y"][1:]
+    sizes = struct.pack("<IIIHH", *shape, events.size, events["x"][0], events["y"][0])
+    return _head(int(events["t_us"][0])) + sizes + made.tobytes()[:-_BEHIND_LAST]
+
+
+def _image(t_us: int, raw: NDArray[np.uint16], encoding: str) -> bytes:
+    rows, cols = raw.shape
+    name = encoding.encode() + b"\0"
+    body = struct.pack("<III", rows, cols, len(name)) + name + b"\0"  # the last is is_bigendian
+    body += bytes(-len(body) % 4) + struct.pack("<II", 2 * cols, raw.size * 2)
+    return _head(t_us) + body + raw.astype("<u2").tobytes()
+
+
+def read_header(path: Path) -> tuple[tuple[int, int], str]:
+    """Shape (rows, columns) and topic of the events; of the first topic if there are several.
+
+    Raises
+    ------
+    SpecError
+        If the file is no MCAP file, is damaged, or has no events.
+    """
+    for topic, data in _messages(path, None):
+        rows, cols, _, _ = _parts(data, path)
+        return (rows, cols), topic
+    raise SpecError("has no messages of type EventArray (dvs_msgs, prophesee_event_msgs)", file=path)
+
+
+def read(path: Path, topic: str) -> Iterator[NDArray]:
+    """Blocks of events of a topic, one a message.
+
+    Raises
+    ------
+    SpecError
+        If the file is damaged.
+    """
+    for _, data in _messages(path, topic):
+        _, _, count, begin = _parts(data, path)
+        if not count:
+            continue
+        if len(data) < begin + 4 + _BLOCK.itemsize * count - _BEHIND_LAST:
+            raise SpecError("a packet of events ends early; the file is damaged", file=path)
+        padded = data[begin + 4 :] + bytes(_BEHIND_LAST)
+        made = np.frombuffer(padded, dtype=_BLOCK, count=count)
+        events = np.empty(count, dtype=EVENT_DTYPE)
+        events["t_us"] = made["sec"].astype(np.int64) * 1_000_000 + made["nanosec"] // 1000
+        events["x"][0], events["y"][0] = struct.unpack_from("<HH", data, begin)
+        events["x"][1:], events["y"][1:] = made["x"][:-1], made["y"][:-1]
+        events["polarity"] = np.where(made["p"] > 0, 1, -1)
+        yield events
+
+
+def _parts(data: bytes, path: Path) -> tuple[int, int, int, int]:
+    """Rows, columns and number of events of a message, and where they begin."""
+    try:
+        if data[:2] != _LITTLE_ENDIAN[:2]:
+            raise SpecError("has messages that are not little-endian CDR", file=path)
+        (length,) = struct.unpack_from("<I", data, 12)
+        place = 16 + length
+        place += -place % 4
+        rows, cols, count = struct.unpack_from("<III", data, place)
+    except struct.error:
+        raise SpecError("a packet of events ends early; the file is damaged", file=path) from None
+    return rows, cols, count, place + 12
+
+
+def _messages(path: Path, topic: str | None) -> Iterator[tuple[str, bytes]]:
+    """Topic and content of the messages of events."""
+    _require(path)
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    with reading(path, "as an MCAP file"), path.open("rb") as file:
+        try:
+            found: Any = make_reader(file, validate_crcs=True).iter_messages(topics=None if topic is None else [topic])
+            for schema, channel, message in found:
+                if schema is not None and schema.name.endswith("/EventArray"):
+                    yield channel.topic, message.data
+        except McapError as error:
+            raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None
+
+
+def _require(path: str | Path) -> None:
+    try:
+        import mcap.writer  # noqa: F401
+    except ImportError:
+        raise SpecError("MCAP files need the package mcap: pip install 'hesim_render[ros]'", file=path) from None

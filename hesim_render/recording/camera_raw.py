@@ -1,0 +1,91 @@
+"""RAW files of cameras, read by LibRaw through rawpy: the mosaic, its colours and its levels."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import HesimWarning, SpecError
+from hesim_render.core.guard import printable
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
+
+#: Suffixes of files that are read so; DNG and TIFF only where they are packed.
+CAMERA_SUFFIXES = (".arw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw")
+#: Letters of the colour codes of DNG, as LibRaw names them.
+_LETTERS = "RGBCMYW"
+#: Black levels further apart are told, DN.
+_NEAR_DN = 1.0
+
+
+def read_camera_raw(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
+    """The visible part of the mosaic, [row, col], DN, with the black level in it.
+
+    Parameters
+    ----------
+    file : RAW file of a camera that LibRaw knows.
+    sensor : the sensor file for it, cropped to the region that was read out.
+
+    Raises
+    ------
+    SpecError
+        If rawpy is not installed, LibRaw cannot read the file or does not know the camera, or the file has another
+        size, more than one value for a pixel, or other colours at its corner than the sensor file.
+    """
+    try:
+        import rawpy
+    except ImportError:
+        raise SpecError("RAW files of cameras need rawpy: pip install 'hesim_render[raw]'", file=file) from None
+    try:
+        opened = rawpy.imread(str(file))
+    except (rawpy.LibRawError, OSError) as error:
+        told = printable(str(error.args[0] if error.args else error))
+        raise SpecError(f"cannot be read as a RAW file of a camera ({told})", file=file) from None
+    with opened as raw:
+        try:
+            visible = raw.raw_image_visible
+        except (rawpy.LibRawError, RuntimeError):
+            visible = None
+        if visible is None or raw.raw_type is not rawpy.RawType.Flat or visible.ndim != 2:
+            raise SpecError("has more than one value for a pixel; expected a mosaic", file=file)
+        shape = sensor.layout.shape
+        if visible.shape != shape:
+            size, wanted = f"{visible.shape[1]}x{visible.shape[0]}", f"{shape[1]}x{shape[0]}"
+            raise SpecError(f"is of {size} px; the sensor's region has {wanted} px", file=file)
+        colours = raw.raw_colors_visible
+        if colours.size and raw.num_colors > 1:
+            _check_colours(colours, raw.color_desc.decode("ascii", "replace"), sensor, file)
+        _tell_level(np.array(raw.black_level_per_channel, dtype=np.float64), sensor, file)
+        return visible.astype(np.uint16)
+
+
+def _check_colours(colours: NDArray[np.uint8], names: str, sensor: Sensor, file: Path) -> None:
+    """Refuse a file whose first tile has other colours than the sensor."""
+    from hesim_render.mosaic.description import describe
+
+    code = describe(sensor).tile_code
+    rows, cols = code.shape
+    own = [" ".join(_LETTERS[number] for number in row) for row in code]
+    theirs = [" ".join(names[number] for number in row) for row in colours[:rows, :cols]]
+    if own != theirs:
+        raise SpecError(
+            f"begins with the colours {' / '.join(theirs)}; the sensor's region has {' / '.join(own)}: choose its "
+            "first row and column (--roi WIDTHxHEIGHT+X+Y), or the tile of the sensor file, to fit",
+            file=file,
+        )
+
+
+def _tell_level(levels: NDArray[np.float64], sensor: Sensor, file: Path) -> None:
+    """Warn where the file states another black level."""
+    aps = sensor.spec.aps
+    if aps is not None and levels.size and abs(levels.mean() - aps.black_level_dn) > _NEAR_DN:
+        warnings.warn(
+            f"{file.name} states a black level of {levels.mean():g} DN; the sensor file has {aps.black_level_dn:g}",
+            HesimWarning,
+            stacklevel=4,
+        )

@@ -1,0 +1,89 @@
+"""A recording as a video for people: the colour view, the events, or the events over the colour view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hesim_render.core.errors import RangeError
+from hesim_render.pixels.evs.events import no_events
+from hesim_render.recording.colour_view import Picture, colour_picture
+from hesim_render.recording.preview import events_picture
+
+if TYPE_CHECKING:
+    from hesim_render.recording.recording import Recording
+
+#: What is shown: colour view, events, or both.
+MOVIES = ("mp4", "mp4-colour", "mp4-events")
+#: Pictures per second of the video, and time that one shows where there are no frames, µs.
+_FPS, _STEP_US = 25, 10_000
+_WIDEST_PX = 1280
+#: Constant quality of x264, where 0 is without loss.
+_QUALITY = "18"
+
+
+def write_movie(recording: Recording, path: Path, kind: str) -> int:
+    """Write an MP4 file (H.264) with a picture for each frame, or for each 10 ms where there are no frames.
+
+    The events of a picture are those since the one before. The video has 25 pictures a second, so a recording of 100
+    frames a second plays four times as slow as it was.
+
+    Parameters
+    ----------
+    recording, path, kind : recording, file, and one of `MOVIES`.
+
+    Returns
+    -------
+    The number of pictures.
+
+    Raises
+    ------
+    RangeError
+        If the recording has no frames or no events to show.
+    """
+    import av
+
+    if kind == "mp4-colour" and not len(recording.frames):
+        raise RangeError("format", kind, "mp4-events: there are no frames")
+    if kind == "mp4-events" and 0 in recording.event_shape:
+        raise RangeError("format", kind, "mp4-colour: there are no events")
+    count = 0
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=_FPS)
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": _QUALITY, "threads": "1"}
+        for picture in _pictures(recording, kind):
+            even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+            if not count:
+                stream.height, stream.width = even.shape[:2]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            container.mux(stream.encode(frame))
+            count += 1
+        container.mux(stream.encode(None))
+    return count
+
+
+def _pictures(recording: Recording, kind: str) -> Iterator[Picture]:
+    time = recording.manifest["time"]
+    begin_us, end_us = time["begin_us"], time["end_us"]
+    if len(recording.frames):
+        edges = [begin_us, *(entry["t_us"] for entry in recording.manifest["frames"])]
+    else:
+        edges = [*range(begin_us, end_us, _STEP_US), end_us]
+    black = _black(recording)
+    for number, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        picture = black
+        if kind != "mp4-events" and len(recording.frames):
+            picture = colour_picture(recording.frames[number].raw, recording.mosaic, _WIDEST_PX)
+        if kind != "mp4-colour" and min(recording.event_shape) > 0:
+            events = recording.event_slice(first + 1, last + 1) if last > first else no_events()
+            picture = events_picture(picture, events, recording.event_shape)
+        yield picture
+
+
+def _black(recording: Recording) -> Picture:
+    roi = recording.manifest["roi"]
+    shrink = max(1, -(-roi["width_px"] // _WIDEST_PX))
+    return np.zeros((max(2, roi["height_px"] // shrink), max(2, roi["width_px"] // shrink), 3), dtype=np.uint8)

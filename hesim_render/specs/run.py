@@ -1,0 +1,121 @@
+"""The file of a whole run: what is recorded, and the steps that follow on the recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from hesim_render.core.region import parse_roi
+from hesim_render.specs.files import Strict, load_yaml, validate
+from hesim_render.specs.study import NamesFiles
+
+#: What a run's folder holds besides exports.
+RECORDING, PICTURES, STATE = "recording", "pictures", "run.json"
+
+
+class FileInput(NamesFiles):
+    """A video or a hyperspectral cube in front of the sensor."""
+
+    file: str = Field(min_length=1, description="relative to the file of the run")
+    options: dict[str, Any] = Field({}, description="as the options of `simulate_video` or `simulate_cube`")
+
+
+class IspStep(NamesFiles):
+    """Develop the RAW frames."""
+
+    pipeline: str | None = Field(None, description="file of steps, relative to the file of the run")
+    denoise: bool = True
+    calibration: str | None = Field(None, description="calibration.yaml of a calibrated sensor")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shorthand(cls, data: Any) -> Any:
+        return {} if data is True else data
+
+
+class ExportStep(Strict):
+    """Write the recording in the format of another program."""
+
+    format: str
+    out: str = Field(description="name of the file or folder, in the folder of the run")
+
+    @field_validator("out")
+    @classmethod
+    def _inside(cls, value: str) -> str:
+        path = Path(value)
+        if len(path.parts) != 1 or value in (".", "..", RECORDING, PICTURES, STATE):
+            raise ValueError(f"expected a name in the folder of the run, other than {RECORDING}, {PICTURES}, {STATE}")
+        return value
+
+
+class RunSpec(NamesFiles):
+    """A whole run."""
+
+    schema_version: Literal[1]
+    name: str = Field(min_length=1)
+    description: str = ""
+    scene: str | None = Field(None, description="name or file of a scene")
+    video: FileInput | None = None
+    cube: FileInput | None = None
+    sensor: str = Field(description="name or file of a sensor")
+    set: dict[str, Any] = Field({}, description="keys to change as in --set: light.illuminance_lux, sensor.aps.…")
+    roi: str | None = Field(None, description="part of the sensor: WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y, px")
+    duration_s: float | None = Field(None, gt=0, le=1e6, description="default 0.1; of a video all of it")
+    seed: int = Field(7, ge=0, lt=2**64)
+    clean: bool = False
+    without: list[str] = []
+    quality: float | None = Field(None, gt=0)
+    exact: bool = False
+    samples: int | None = Field(None, ge=2)
+    truth: list[str] = []
+    truth_every_us: int | None = Field(None, ge=1)
+    allow_outside: bool = False
+    isp: IspStep | None = None
+    export: list[ExportStep] = []
+    view: bool = Field(False, description="write recording.html")
+
+    @field_validator("roi")
+    @classmethod
+    def _region(cls, value: str | None) -> str | None:
+        if value is not None:
+            parse_roi(value, "roi")
+        return value
+
+    @field_validator("isp", mode="before")
+    @classmethod
+    def _off(cls, value: Any) -> Any:
+        return None if value is False else value
+
+    @model_validator(mode="after")
+    def _fits(self) -> RunSpec:
+        if sum(given is not None for given in (self.scene, self.video, self.cube)) != 1:
+            raise ValueError("a run is of a 'scene', a 'video' or a 'cube'")
+        if self.scene is None:
+            given = [name for name in ("quality", "samples", "truth_every_us") if getattr(self, name) is not None]
+            given += [name for name in ("exact", "truth", "allow_outside") if getattr(self, name)]
+            if given:
+                raise ValueError(f"{given[0]}: only a run of a scene takes it")
+            for key in self.set:
+                if not key.startswith("sensor."):
+                    raise ValueError(f"set: {key!r} is no key of the sensor file, which begin with 'sensor.'")
+        if self.quality is not None and (self.exact or self.samples is not None):
+            raise ValueError("quality: give it, or exact or samples, not both")
+        names = [step.out for step in self.export]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"export: {name!r} is written twice")
+        return self
+
+
+def read_run(file: str | Path, overrides: dict[str, Any] | None = None) -> RunSpec:
+    """The file of a run.
+
+    Raises
+    ------
+    SpecError
+        With file, line and key of all that is wrong.
+    """
+    path = Path(file)
+    return validate(RunSpec, load_yaml(path), path, overrides or {})

@@ -1,0 +1,122 @@
+"""What commands tell programs: ``--json``, ``--quiet``, ``--dry-run``, and the table of exit statuses."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from test_cli import call, fails
+
+import hesim_render as hr
+from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.core.shipped import data_folder, list_names, read_keys
+from hesim_render.specs.files import load_yaml
+
+DOCS = data_folder("sensors").parent / "docs"
+STILL = ["simulate", "colorchecker", "--sensor", "reference-mono", "--roi", "16x12", "--duration", "0.02"]
+
+
+def test_the_page_has_every_exit_status_and_no_other():
+    page = (DOCS / "command-line.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\d+) \| `(\w+)` \|", page, re.MULTILINE)
+    assert {name: int(number) for number, name in rows} == {each.name: each.value for each in ExitStatus}
+
+
+def test_json_is_one_object_that_agrees_with_the_recording(capsys, tmp_path):
+    status, out, err = call(capsys, *STILL, "--out", tmp_path / "o", "--json")
+    told = json.loads(out)
+    recording = hr.Recording.load(tmp_path / "o")
+    assert status == told["status"] == 0 and err == ""
+    assert told["recording"] == str(tmp_path / "o") and told["counts"] == recording.manifest["counts"]
+    assert told["duration_us"] == 20_000 and told["sensor"] == "reference-mono" and told["scene"] == "colorchecker"
+    assert told["estimate"]["seconds"] > 0 and told["estimate"]["rays"] > 0
+    assert told["render"]["audit"] == recording.manifest["settings"]["render"]["audit"]
+
+
+def test_quiet_prints_nothing_and_errors_all_the_same(capsys, tmp_path):
+    assert call(capsys, *STILL, "--out", tmp_path / "o", "--quiet", "--samples", "4") == (0, "", "")
+    assert "exists; give another name" in fails(capsys, *STILL, "--out", tmp_path / "o", "--quiet")
+    assert fails(capsys, *STILL, "--out", tmp_path / "o", "--json")  # no object where nothing was made
+
+
+@pytest.mark.parametrize("options", [[], ["--samples", "4"], ["--exact"]])
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_dry_run_estimates_and_writes_nothing(options, moving, capsys, tmp_path):
+    words = ["rotating-star" if word == "colorchecker" and moving else word for word in STILL]
+    status, out, _ = call(capsys, *words, *options, "--out", tmp_path / "o", "--dry-run", "--json")
+    told = json.loads(out)
+    assert status == 0 and told["dry_run"] is True and told["estimate"]["seconds"] > 0
+    assert list(tmp_path.iterdir()) == []
+    if options and not moving:  # every pixel once, in the only slice of a still scene
+        assert told["estimate"]["rays"] == 16 * 12 * (4 if "--samples" in options else 64)
+    assert "--duration is 0.0" in fails(capsys, *words, "--duration", "0", "--out", tmp_path / "o", "--dry-run")
+
+
+def test_the_rays_of_an_exact_run_are_near_their_estimate(capsys, tmp_path, monkeypatch):
+    """Rays that the tracer counts in a moving scene under a rolling shutter, without those of the estimate's own."""
+    from hesim_render.sources.render.tracer import Tracer
+
+    tracers = []
+    made = Tracer.__init__
+    monkeypatch.setattr(Tracer, "__init__", lambda self, *a, **k: (made(self, *a, **k), tracers.append(self))[0])
+    given = ["simulate", "rotating-star", "--sensor", "eiger", "--roi", "48x32", "--duration", "0.04", "--samples", "2"]
+    _, out, _ = call(capsys, *given, "--out", tmp_path / "o", "--json")
+    own = 2 * 2 * (48 * 32 * 3 // 4 + 48 * 32 // 4)  # both pictures of all pixels
+    assert json.loads(out)["estimate"]["rays"] == pytest.approx(max(t.rays_done for t in tracers) - own, rel=0.3)
+
+
+def test_a_long_exact_run_has_to_be_wanted(capsys, tmp_path):
+    status, out, line = call(
+        capsys, "simulate", "rotating-star", "--sensor", "gen2", "--duration", "300", "--samples", "1024", "--roi",
+        "256x256", "--out", tmp_path / "o",
+    )  # fmt: skip
+    assert status == 2 and out.startswith("estimate: about ") and "or fewer rays, such as --samples 512" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_of_a_video(capsys, tmp_path):
+    np.save(tmp_path / "v.npy", np.full((4, 12, 16), 90, np.uint8))
+    words = ["video", tmp_path / "v.npy", "--sensor", "reference-mono", "--roi", "16x12", "--fps", "100", "--out"]
+    words += [tmp_path / "o", "--transfer", "srgb", "--primaries", "bt709"]
+    told = json.loads(call(capsys, *words, "--dry-run", "--json")[1])
+    assert told["estimate"]["pictures"] == 4 and told["dry_run"] is True
+    assert [path.name for path in tmp_path.iterdir()] == ["v.npy"]
+
+
+def test_lists_as_json_agree_with_the_files(capsys):
+    """Only some keys of each file are parsed; the whole files say the same."""
+    for kind in ("scenes", "sensors", "study_specs", "filter_sets"):
+        found = {row["name"]: row for row in json.loads(call(capsys, "list", kind, "--json")[1])[kind]}
+        assert list(found) == list_names(kind)
+        for name in list_names(kind)[:: 7 if kind == "scenes" else 1]:
+            file = data_folder(kind) / f"{name}.yaml"
+            whole = load_yaml(file)
+            assert found[name]["description"] == whole.get("description", "")
+            keys = ("geometry", "tile", "pixels", "evs_grid")
+            assert read_keys(file, keys) == {key: whole[key] for key in keys if key in whole}
+    assert found and json.loads(call(capsys, "list", "sensors", "--json")[1])["sensors"][2]["events_px"] == [128, 128]
+
+
+def test_listing_and_completing_load_no_renderer():
+    """Names are completed while somebody waits: 20 scenes were once parsed for it, with 3 s of imports."""
+    code = (
+        "import sys; from hesim_render.cli import main\ntry: main(['list', 'scenes'])\nexcept SystemExit: pass\n"
+        "from hesim_render.cli.options import names_of; print(names_of('sensors')('im'))\n"
+        "print([m for m in ('mitsuba', 'scipy', 'colour', 'numpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *_, names, heavy = done.stdout.splitlines()
+    assert heavy == "[]" and names == "['imx250', 'imx264', 'imx363', 'imx477', 'imx636']"
+
+
+@pytest.mark.parametrize(("shell", "answer"), [("bash", "rotating-star"), ("zsh", '"rotating-star"'), ("fish", "rot")])
+def test_the_shell_completes_names(shell, answer):
+    words = "hesim-render simulate rot"
+    place = {**os.environ, "_HESIM_RENDER_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": words,
+             "COMP_WORDS": words, "COMP_CWORD": "2", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}  # fmt: skip
+    program = "import sys; sys.argv[0] = 'hesim-render'; from hesim_render.cli import main; main([])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=place)
+    assert answer in done.stdout and "Usage" not in done.stdout, done.stderr

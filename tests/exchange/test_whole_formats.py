@@ -1,0 +1,191 @@
+"""Events and frames in one file: MCAP read by libraries of others, the npz of H-ESIM, and videos."""
+
+import cv2
+import numpy as np
+import pytest
+import recordings
+from event_files import SHAPE, columns, joined, made, many
+from hypothesis import HealthCheck, example, given, settings
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from test_round_trips import lists_of_events
+
+import hesim_render as hr
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.exchange import EventStream, mcap_file, open_events
+from hesim_render.recording.imports import import_recording
+
+QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+for _name, _text in (
+    ("dvs_msgs/msg/Event", "uint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n"),
+    ("dvs_msgs/msg/EventArray", "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"),
+):
+    STORE.register(get_types_from_msg(_text, _name))
+
+
+def by_others(path):
+    """Messages by the reader of mcap, decoded by rosbags with the definitions of ROS."""
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            yield channel.topic, message.log_time, STORE.deserialize_cdr(message.data, schema.name)
+
+
+def events_by_others(path):
+    found = [
+        (e.ts.sec * 1_000_000 + e.ts.nanosec // 1000, e.x, e.y, e.polarity)
+        for topic, _, array in by_others(path)
+        if topic == mcap_file.EVENT_TOPIC
+        for e in array.events
+    ]
+    return columns(*np.array(found, dtype=np.int64).reshape(-1, 4).T)
+
+
+def write(events, path, frames=(), shape=SHAPE, encoding="mono16"):
+    with path.open("wb") as file:
+        mcap_file.write(EventStream.of(events, shape), frames, encoding, file, path)
+    return path
+
+
+def test_events_of_mcap_come_back_exactly(tmp_path):
+    @QUICK
+    @example(made((0, 0, 0, 1)))
+    @example(made((5, 1279, 719, -1), (5, 0, 0, -1), (5, 1279, 0, 1)))
+    @example(made(((1 << 24) - 1, 1, 2, 1), (1 << 24, 3, 4, -1), (1 << 40, 1279, 719, 1)))
+    @given(lists_of_events(1 << 42))
+    def check(events):
+        path = write(events, tmp_path / "e.mcap")
+        np.testing.assert_array_equal(events_by_others(path), events)
+        if events.size:
+            opened = open_events(path)
+            assert opened.shape == SHAPE
+            np.testing.assert_array_equal(joined(opened), events)
+        else:
+            with pytest.raises(SpecError, match="no messages of type EventArray"):
+                open_events(path)
+
+    check()
+
+
+def test_packets_are_short_and_in_order_and_name_their_times(tmp_path, monkeypatch):
+    monkeypatch.setattr(mcap_file, "_PACKET_EVENTS", 300)
+    events = many(20_000, 1 << 18)
+    raw = np.arange(48, dtype=np.uint16).reshape(6, 8)
+    frames = [(1000 * k, raw + np.uint16(k)) for k in range(1, 300, 40)]
+    path = write(events, tmp_path / "e.mcap", frames, encoding="bayer_rggb16")
+    np.testing.assert_array_equal(events_by_others(path), events)
+    np.testing.assert_array_equal(joined(open_events(path)), events)
+    times, images = [], []
+    for topic, log_ns, message in by_others(path):
+        times.append(log_ns)
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        if topic == mcap_file.FRAME_TOPIC:
+            assert stamp == log_ns and (message.height, message.width, message.step) == (6, 8, 16)
+            assert (message.encoding, message.is_bigendian, message.header.frame_id) == ("bayer_rggb16", 0, "camera")
+            images.append((stamp // 1000, message.data.view("<u2").reshape(6, 8)))
+        else:
+            assert len(message.events) <= 300 and 0 <= log_ns - stamp < 10_000_000
+    assert times == sorted(times) and [t for t, _ in images] == [t for t, _ in frames]
+    for (_, found), (_, given_) in zip(images, frames, strict=True):
+        np.testing.assert_array_equal(found, given_)
+
+
+@pytest.mark.parametrize("cut", [8, 40, 300, 0.5, -1])
+def test_a_cut_file_is_one_clear_error(cut, tmp_path):
+    data = write(many(2000, 1 << 16), tmp_path / "e.mcap").read_bytes()
+    place = int(cut * len(data)) if isinstance(cut, float) else cut
+    (tmp_path / "cut.mcap").write_bytes(data[:place])
+    with pytest.raises(SpecError, match=r"cut\.mcap: "):
+        open_events(tmp_path / "cut.mcap").count()
+
+
+def test_damaged_bytes_are_a_clear_error_or_no_matter(tmp_path):
+    """300 files with wrong, set or missing bytes; 1500 with other seeds were tried."""
+    data = write(many(300, 40_000, (24, 32)), tmp_path / "e.mcap", shape=(24, 32)).read_bytes()
+    rng = np.random.default_rng(2)
+    refused = 0
+    for _ in range(300):
+        wrong = bytearray(data)
+        at, kind = int(rng.integers(len(wrong))), rng.integers(3)
+        if kind == 2:
+            del wrong[at : at + int(rng.integers(1, 50))]
+        else:
+            wrong[at : at + 1 + 7 * int(kind)] = rng.integers(0, 256, 1 + 7 * int(kind), dtype=np.uint8).tobytes()
+        (tmp_path / "w.mcap").write_bytes(wrong)
+        try:
+            open_events(tmp_path / "w.mcap").count()
+        except SpecError:
+            refused += 1
+    assert refused > 150
+
+
+def test_what_is_damaged_or_too_late(tmp_path):
+    data = bytearray(write(many(2000, 1 << 16), tmp_path / "e.mcap").read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    (tmp_path / "e.mcap").write_bytes(data)
+    with pytest.raises(SpecError, match=r"e\.mcap: "):
+        open_events(tmp_path / "e.mcap").count()
+    with pytest.raises(SpecError, match="ROS ends at"):
+        write(made((1 << 52, 0, 0, 1)), tmp_path / "late.mcap")
+    with pytest.raises(SpecError, match="comes after one at"):
+        write(made((5, 0, 0, 1), (4, 0, 0, 1)), tmp_path / "back.mcap")
+
+
+def test_without_the_package_it_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)
+    recording = recordings.make("davis346")
+    with pytest.raises(SpecError, match=r"pip install 'hesim_render\[ros\]'"):
+        recording.export("mcap", tmp_path / "e.mcap")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["eiger", "davis346", "reference-bayer"])
+def test_a_recording_as_mcap(name, tmp_path):
+    recording = recordings.make(name, tmp_path / "r")
+    path = recording.export("mcap", tmp_path / "r.mcap")
+    images = [m for topic, _, m in by_others(path) if topic == mcap_file.FRAME_TOPIC]
+    assert {m.encoding for m in images} == {"bayer_rggb16" if name == "reference-bayer" else "mono16"}
+    for frame, image in zip(recording.frames, images, strict=True):
+        np.testing.assert_array_equal(image.data.view("<u2").reshape(frame.raw.shape), frame.raw)
+    if min(recording.event_shape):
+        np.testing.assert_array_equal(events_by_others(path), recording.events)
+
+
+def test_the_npz_of_h_esim_hold_every_event_of_each_tick(tmp_path):
+    recording = recordings.make("gen2", tmp_path / "r")
+    tick_us = recording.manifest["sensor"]["spec"]["evs"]["tick_us"]
+    folder = recording.export("raw-npz", tmp_path / "n")
+    frames = sorted(folder.glob("*_aps_raw.npz"))
+    for frame, file in zip(recording.frames, frames, strict=True):
+        assert int(file.name[:9]) == frame.t_us
+        with np.load(file) as arrays:
+            np.testing.assert_array_equal(arrays["raw"], frame.raw)
+            np.testing.assert_array_equal(arrays["aps_raw"], frame.raw)
+    for number, file in enumerate(sorted(folder.glob("*_evs.npz")), 1):
+        assert int(file.name[:9]) == number * tick_us
+        events = recording.event_slice((number - 1) * tick_us + 1, number * tick_us + 1)
+        last = {(int(e["y"]), int(e["x"])): int(e["polarity"]) for e in events}
+        with np.load(file) as arrays:
+            assert {(y, x): arrays["events"][y, x] for y, x in np.argwhere(arrays["events"]).tolist()} == last
+            np.testing.assert_array_equal(np.array([1, 0, 2])[arrays["events"] + 1], arrays["event_raw"])
+    sensor = hr.load_sensor("gen2").crop(*reversed(recording.frames[0].raw.shape))
+    again = import_recording(tmp_path / "again", sensor, frames=frames)
+    np.testing.assert_array_equal(again.frames[1].raw, recording.frames[1].raw)
+
+
+@pytest.mark.parametrize("name", ["eiger", "davis346"])
+def test_videos_are_read_by_opencv(name, tmp_path):
+    recording = recordings.make(name, tmp_path / "r")
+    for kind in ("mp4", "mp4-colour", "mp4-events"):
+        path = recording.export(kind, tmp_path / f"{kind}.mp4")
+        capture = cv2.VideoCapture(str(path))
+        pictures = [picture for ok, picture in iter(capture.read, (False, None)) if ok]
+        assert len(pictures) == len(recording.frames) and round(capture.get(cv2.CAP_PROP_FPS)) == 25
+        assert pictures[0].shape[:2] == tuple(size // 2 * 2 for size in recording.frames[0].raw.shape)
+        strongest = pictures[-1].astype(int).max(axis=(0, 1))
+        assert strongest.max() > 60
+    with pytest.raises(RangeError, match="there are no events"):
+        recordings.make("reference-bayer").export("mp4-events", tmp_path / "x.mp4")
+    with pytest.raises(RangeError, match="there are no frames"):
+        recordings.make("davis346", frames=0).export("mp4-colour", tmp_path / "x.mp4")
+    assert not (tmp_path / "x.mp4").exists()
