@@ -15,6 +15,7 @@ import pytest
 
 import hesim_render as hr
 from benchmarks import SMALL, generated, small
+from hesim_render import cli
 from hesim_render.benchmark import Benchmark, build_benchmark, local, verify_benchmark
 from hesim_render.benchmark.build import UnfinishedError
 from hesim_render.benchmark.card import card, spread
@@ -393,7 +394,7 @@ def test_twenty_random_kills_leave_the_same_bytes(built, tmp_path):
     assert verify_benchmark(root) == [] and digest_of(Benchmark(root)) == digest_of(built)
 
 
-def test_damaged_clips_are_discarded_and_made_again(tmp_path):
+def test_damaged_clips_are_discarded_and_made_again(tmp_path, capsys):
     given = [{"scene": "flat-field", "split": "train"}, {"scene": "checkerboard", "split": "test"}]
     spec = small(
         scenes={"given": given}, truth=[],
@@ -404,7 +405,11 @@ def test_damaged_clips_are_discarded_and_made_again(tmp_path):
     (first.folder / "recording" / "preview.png").write_bytes(b"")
     problems = verify_benchmark(built.root)
     assert problems == [f"{first.name}/recording/preview.png: was changed"]
-    assert discard_damaged(built.root, problems) == [first.name] and not first.folder.exists()
+    with pytest.raises(SystemExit) as end:
+        cli.main(["benchmark", "verify", str(built.root), "--discard"])
+    told = capsys.readouterr()
+    assert end.value.code == 1 and "was changed" in told.err and "removed 1 clips" in told.out
+    assert not first.folder.exists() and not (built.root / "benchmark.json").exists()
     again = build_benchmark(spec, built.root, estimate=False)
     assert digest_of(again) == digest and verify_benchmark(built.root) == []
     plan = built.root / "plan.json"
