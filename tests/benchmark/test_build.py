@@ -420,6 +420,18 @@ def test_damaged_clips_are_discarded_and_made_again(tmp_path, capsys):
     assert len(verify_benchmark(built.root)) == 3  # two clips and the plan, without a traceback
 
 
+def test_samples_ask_for_the_exact_mode_and_have_no_sharp_images(tmp_path):
+    with pytest.raises(ValueError, match="leave one of the two out"):
+        small(samples=8)
+    given = {"given": [{"scene": "flat-field", "split": "test"}]}
+    spec = small(scenes=given, truth=[], sharp=None, samples=8, sensors=[{"sensor": "reference-mono", "roi": "8x6"}])
+    built = build_benchmark(spec, tmp_path / "b")
+    recording = next(built.clips()).recording
+    assert recording.manifest["settings"]["mode"] == "exact" and recording.manifest["settings"]["samples"] == 8
+    text = (built.root / "README.md").read_text()
+    assert "8 rays per pixel" in text and "1 not audited" in text
+
+
 def test_a_fault_of_ours_in_one_clip_does_not_stop_the_others(monkeypatch):
     def broken(plan, clip, root):
         raise KeyError("x")
