@@ -101,7 +101,7 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
         )
     told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
     lines += [
-        "", f"Quality of the render (error over the sensor's noise): {spec['quality']:g}. Audits: {told}.", "",
+        "", f"{_render(spec)}. Audits: {told}.", "",
         "| Folder of a clip | |", "|---|---|",
         "| `clip.json` | numbers on the axes, figures, parts, error and audit, units, versions, hashes |",
         "| `recording/` | RAW frames with blur, events, their truth and labels |",
@@ -109,6 +109,12 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
         "| `scene/` | the generated scene with its meshes and textures |", "",
     ]  # fmt: skip
     return "\n".join(lines)
+
+
+def _render(spec: dict[str, Any]) -> str:
+    if spec.get("samples") is not None:
+        return f"Exact mode: {spec['samples']} rays per pixel and slice, whose noise is not bounded"
+    return f"Quality of the render (error over the sensor's noise): {spec['quality']:g}"
 
 
 def _limits(values: list[float | None]) -> str:

@@ -100,10 +100,11 @@ def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
     sensor, level = plan.sensor(clip), spec.noise[clip.noise]
     seed = spec.seeds[clip.seed]
     # one renderer for both: what rests is rendered once
-    renderer = flux_source(in_absolute_light(scene)[0], sensor, seed, spec.quality, None, False, None)
+    quality = spec.quality if spec.samples is None else None
+    renderer = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
     recording = simulate(
         scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
-        quality=spec.quality, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
+        quality=quality, samples=spec.samples, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
         out=folder / RECORDING, progress=False,
     )  # fmt: skip
     sharp = 0

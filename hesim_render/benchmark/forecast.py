@@ -23,9 +23,11 @@ from hesim_render.sources.scene import Scene, load_scene
 
 #: Clips that stand for all, at most; each takes some seconds.
 _MOST = 3
-#: Compiling, audit and writing of a clip, s of one processor: 3.7 to 22 s for generated scenes of one solid, 2 s for
-#: rotating-star. Bytes of a pixel in a frame with its electrons, in a sharp image, and of an event.
-_CLIP_S, _FRAME_BYTES, _SHARP_BYTES, _EVENT_BYTES = 15.0, 10, 8, 8
+#: Compiling and writing of a clip, and its audit, s of one processor: 6.4 to 8.1 s and 2.2 to 7.6 s for three generated
+#: scenes of 2 to 4 solids whose rays took little (``benchmarks/clips.py``).
+_CLIP_S, _AUDIT_S = 7.0, 5.0
+#: Bytes of a pixel in a frame with its electrons, in a sharp image, and of an event.
+_FRAME_BYTES, _SHARP_BYTES, _EVENT_BYTES = 10, 8, 8
 #: Bytes of a pixel in one image of each kind of truth, packed.
 _TRUTH_BYTES = {"depth": 6, "normals": 6, "position": 9, "ids": 1, "flow": 12, "mixed": 0.3}
 #: Events per pixel and second that are assumed.
@@ -77,7 +79,8 @@ def estimate_build(plan: Plan, clips: list[Clip]) -> BuildEstimate:
             seconds.append(_render_seconds(plan, clip, scene, sensor))
     sizes = {number: _bytes(plan, plan.sensor(clip)) for number, clip in chosen.items()}
     size = sum(sizes[clip.sensor] for clip in clips)
-    return BuildEstimate(len(clips), len(clips) * (float(np.mean(seconds)) + _CLIP_S), size)
+    each = float(np.mean(seconds)) + _CLIP_S + plan.spec.audit * _AUDIT_S
+    return BuildEstimate(len(clips), len(clips) * each, size)
 
 
 def _sharp_exposures(plan: Plan, sensor: Sensor) -> list[Exposure]:
@@ -93,6 +96,8 @@ def _sharp_exposures(plan: Plan, sensor: Sensor) -> list[Exposure]:
 def _render_seconds(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> float:
     spec = plan.spec
     seed = spec.seeds[clip.seed]
+    if spec.samples is not None:
+        return 0.0  # most of the time of small clips is not that of rays
     flux, _ = flux_source(in_absolute_light(scene)[0], sensor, seed, spec.quality, None, False, None)
     parts = [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
     level = spec.noise[clip.noise]

@@ -207,6 +207,13 @@ class BenchmarkSpec(Strict):
     sharp: SharpSpec | None = None
     truth: tuple[str, ...] = Field(("flow", "depth"), description="kinds as of simulate; events labels events")
     quality: float = Field(0.5, gt=0, le=100)
+    samples: int | None = Field(
+        None,
+        ge=2,
+        le=1_000_000,
+        multiple_of=2,
+        description="rays per pixel and slice, in place of quality: exact mode",
+    )
     audit: float = Field(1.0, ge=0, le=1, description="share of the clips whose render is audited, drawn at random")
     folder: Path = Field(Path(), exclude=True)
 
@@ -221,6 +228,8 @@ class BenchmarkSpec(Strict):
         ):
             if len(set(names)) != len(names):
                 raise ValueError(f"{key}: each name once; there are {', '.join(map(str, names))}")
+        if self.samples is not None and self.sharp is not None:
+            raise ValueError("samples: sharp images have an error that follows quality; leave one of the two out")
         if any(limits[1] < limits[0] for limits in self.exposures_us):
             raise ValueError("exposures_us: a range is [smallest, largest]")
         if self.combinations > MOST_CLIPS:

@@ -15,6 +15,7 @@ import pytest
 
 import hesim_render as hr
 from benchmarks import SMALL, generated, small
+from hesim_render import cli
 from hesim_render.benchmark import Benchmark, build_benchmark, local, verify_benchmark
 from hesim_render.benchmark.build import UnfinishedError
 from hesim_render.benchmark.card import card, spread
@@ -393,7 +394,7 @@ def test_twenty_random_kills_leave_the_same_bytes(built, tmp_path):
     assert verify_benchmark(root) == [] and digest_of(Benchmark(root)) == digest_of(built)
 
 
-def test_damaged_clips_are_discarded_and_made_again(tmp_path):
+def test_damaged_clips_are_discarded_and_made_again(tmp_path, capsys):
     given = [{"scene": "flat-field", "split": "train"}, {"scene": "checkerboard", "split": "test"}]
     spec = small(
         scenes={"given": given}, truth=[],
@@ -404,7 +405,11 @@ def test_damaged_clips_are_discarded_and_made_again(tmp_path):
     (first.folder / "recording" / "preview.png").write_bytes(b"")
     problems = verify_benchmark(built.root)
     assert problems == [f"{first.name}/recording/preview.png: was changed"]
-    assert discard_damaged(built.root, problems) == [first.name] and not first.folder.exists()
+    with pytest.raises(SystemExit) as end:
+        cli.main(["benchmark", "verify", str(built.root), "--discard"])
+    told = capsys.readouterr()
+    assert end.value.code == 1 and "was changed" in told.err and "removed 1 clips" in told.out
+    assert not first.folder.exists() and not (built.root / "benchmark.json").exists()
     again = build_benchmark(spec, built.root, estimate=False)
     assert digest_of(again) == digest and verify_benchmark(built.root) == []
     plan = built.root / "plan.json"
@@ -413,6 +418,18 @@ def test_damaged_clips_are_discarded_and_made_again(tmp_path):
     assert discard_damaged(built.root, verify_benchmark(built.root)) == []  # nothing of the clips is wrong
     shutil.rmtree(built.root / "clips")
     assert len(verify_benchmark(built.root)) == 3  # two clips and the plan, without a traceback
+
+
+def test_samples_ask_for_the_exact_mode_and_have_no_sharp_images(tmp_path):
+    with pytest.raises(ValueError, match="leave one of the two out"):
+        small(samples=8)
+    given = {"given": [{"scene": "flat-field", "split": "test"}]}
+    spec = small(scenes=given, truth=[], sharp=None, samples=8, sensors=[{"sensor": "reference-mono", "roi": "8x6"}])
+    built = build_benchmark(spec, tmp_path / "b")
+    recording = next(built.clips()).recording
+    assert recording.manifest["settings"]["mode"] == "exact" and recording.manifest["settings"]["samples"] == 8
+    text = (built.root / "README.md").read_text()
+    assert "8 rays per pixel" in text and "1 not audited" in text
 
 
 def test_a_fault_of_ours_in_one_clip_does_not_stop_the_others(monkeypatch):

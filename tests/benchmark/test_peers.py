@@ -263,7 +263,7 @@ def test_the_noise_free_events_are_those_of_an_ideal_pixel_in_the_same_light(spe
 def test_programs_that_are_installed_here_run():
     """Those of benchmarks/peers/peers.yaml whose environments lie beside it, as the file says."""
     file = Path(__file__).parents[2] / "benchmarks" / "peers" / "peers.yaml"
-    spec = read_peers(file, {"sensor.roi": "24x18", "duration_s": 0.02, "fps": [1000]})
+    spec = read_peers(file, {"sensor.roi": "24x18", "duration_s": 0.03, "fps": [240]})
     there = tuple(peer for peer in spec.peers if (file.parent / peer.command[0]).exists())
     if not there:
         pytest.skip("no peer is installed")

@@ -124,6 +124,17 @@ def test_hdf5_shards_and_what_is_changed_or_wrong(built, tmp_path):
         verify_shards(tmp_path / "none")
 
 
+def test_the_command_packs_and_checks(built, tmp_path, capsys):
+    from hesim_render import cli
+
+    with pytest.raises(SystemExit) as end:
+        cli.main(["benchmark", "pack", str(built.root), "--out", str(tmp_path / "c"), "--format", "hdf5"])
+    assert not end.value.code and "6 samples" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as end:
+        cli.main(["benchmark", "pack", str(built.root), "--out", str(tmp_path / "c")])
+    assert end.value.code == 2 and "overwrite" in capsys.readouterr().err
+
+
 def test_addresses_that_nobody_knows_are_refused():
     pytest.importorskip("fsspec")
     with pytest.raises(OutputError, match="nosuch"):
