@@ -189,7 +189,7 @@ def file_materials(spec: SceneSpec) -> dict[str, list[FileMaterial]]:
 
 def _pbr(part: Any) -> Any:
     """The material of a part in the terms of glTF; None if it has none."""
-    material = getattr(part.visual, "material", None)
+    material: Any = getattr(part.visual, "material", None)
     return material.to_pbr() if hasattr(material, "to_pbr") else material
 
 
