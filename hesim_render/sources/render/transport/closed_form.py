@@ -123,7 +123,9 @@ def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np
     hit.prim_uv = mi.Point2f(np.tile(np.array([[0, 0], [1, 0], [0, 1]], np.float32), (count, 1)).T)
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(True))
+    # evaluated together: each would be a kernel of its own, compiled for this shape alone
     told = {"n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "dp_du": si.dp_du, "dp_dv": si.dp_dv, "uv": si.uv}
+    dr.eval(told)
     return {name: np.array(value, np.float64).T.reshape(count // 2, 2, 3, -1) for name, value in told.items()}
 
 
@@ -145,8 +147,13 @@ class SimpleForm:
     @classmethod
     def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> SimpleForm | None:
         """The faces and balls of a scene; None if it has other shapes, or too many."""
-        form = cls([], [])
-        for shape in scene.shapes():
+        form, shapes = cls([], []), scene.shapes()
+        balls = [shape for shape in shapes if shape.class_name() == "Sphere"]
+        meshes = [shape for shape in shapes if shape.is_mesh()]
+        # known before any shape is looked at, which takes a kernel for each
+        if len(balls) + sum(mesh.face_count() for mesh in meshes) / 2 > _MOST:
+            return None
+        for shape in shapes:
             if shape.class_name() == "Sphere":
                 form.balls.append((_ball_around(shape.bbox(), 3**-0.5), shape))
                 continue
@@ -154,7 +161,7 @@ class SimpleForm:
             if not faces:
                 return None
             form.faces.extend((face, shape) for face in faces)
-        return form if len(form.faces) + len(form.balls) <= _MOST else None
+        return form
 
 
 class Part:
