@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,9 @@ import pytest
 from test_cli import call, fails
 
 import hesim_render as hr
+from hesim_render.core.shipped import data_folder
 from hesim_render.exchange import open_events
+from hesim_render.specs.run import read_run
 
 RUN = """\
 schema_version: 1
@@ -131,3 +134,11 @@ def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys
     status, out, _ = call(capsys, "run", run, "--out", tmp_path / "o")
     assert status == 0 and "made by an earlier run: recording" in out and "estimate: the recording is there" in out
     assert (tmp_path / "o" / "recording" / "recording.json").stat().st_mtime_ns == before
+
+
+def test_the_example_of_the_page_is_a_valid_file(tmp_path):
+    page = (data_folder("sensors").parent / "docs" / "command-line.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    spec = read_run(write(tmp_path, text))
+    assert (spec.scene, spec.sensor, spec.roi, spec.view) == ("rotating-star", "gen2", "256x192", True)
+    assert spec.isp is not None and not spec.isp.denoise and [step.format for step in spec.export] == ["evt3", "png"]

@@ -86,7 +86,7 @@ def test_the_background_of_a_data_sheet_is_what_the_sensor_gives():
     ("name", "lux", "pixels", "begin_s", "seconds"),
     [
         ("imx636", 5, 64, 0.5, 1.5), ("v2e-noisy", 0, 240, 3, 6), ("v2e-noisy", 100, 240, 3, 6),
-        ("genx320", 5, 64, 0.5, 1.5), ("dvxplorer", 100, 64, 0.5, 1.5), ("davis240", 100, 120, 0.5, 1.0),
+        ("genx320", 5, 64, 0.5, 1.5), ("dvxplorer", 100, 128, 4, 2),
     ],
 )  # fmt: skip
 def test_the_background_of_shipped_sensors_is_what_they_give(name, lux, pixels, begin_s, seconds):
@@ -99,8 +99,8 @@ def test_the_background_of_shipped_sensors_is_what_they_give(name, lux, pixels, 
         stated = sheet.rate_hz
     else:
         stated = options.shot_noise_rate_hz * (1 if lux == 0 else 0.25) + 0.1
-    # 4000 events or more: standard error 1.6 %; the draw of 4096 (57,600) pixels adds 1 % (2 % where rare pixels have
-    # most of the noise)
+    # 33,000 events or more; the draw of 4096 (57,600) pixels adds 1 % (2 % where rare pixels have most of the noise).
+    # Sheets of 0.1 to 0.3 Hz and fast pixels (davis240, dvs128, gen31-vga) would take hours
     assert found == pytest.approx(stated, rel=0.05)
 
 

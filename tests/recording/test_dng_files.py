@@ -50,6 +50,8 @@ def test_the_noise_of_frames_is_the_profile_of_their_file():
         assert raw.var() / span**2 == pytest.approx(slope * share + offset, rel=0.05), share
     assert noise_profile(sensor, ["aps.shot"]) is None or noise_profile(sensor, ["aps.shot"])[0] < slope / 100
     assert noise_profile(hr.load_sensor("dvs128")) is None
+    dark = [f"aps.{term}" for term in ("read", "dark_current", "row_noise", "residual", "telegraph")]
+    assert noise_profile(sensor, dark)[1] * span**2 == pytest.approx(1 / 12, rel=1e-3)  # rounding to whole DN is left
 
 
 def sensor_span(sensor):

@@ -6,12 +6,25 @@ rerun has 170 MB and is not part of the test extra; tried with rerun-sdk 0.41.
 import numpy as np
 import pytest
 import recordings
-from test_cli import call, fails
 
 import hesim_render as hr
+from hesim_render.cli import main
 from hesim_render.recording import rerun_view
 
 rerun = pytest.importorskip("rerun")
+
+
+def call(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    out, err = capsys.readouterr()
+    return ended.value.code, out, err
+
+
+def fails(capsys, *words):
+    status, out, err = call(capsys, *words)
+    assert status == 2 and out == "" and err.count("\n") == 1
+    return err
 
 
 def read(path):
