@@ -33,13 +33,16 @@ def equation(source: str, *_: Any, **__: Any) -> str:
     from latex2mathml.converter import convert
 
     lines = [convert(line, display="block") for line in source.split("\n") if line.strip()]
-    return f'<div class="equation">{"".join(lines)}</div>'
+    # a bar is a bracket here, not a relation with space around it
+    whole = "".join(lines).replace("<mo>&#x0007C;</mo>", '<mo lspace="0" rspace="0">&#x0007C;</mo>')
+    return f'<div class="equation">{whole}</div>'
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages that are not written in this folder."""
     for name, page in PAGES.items():
-        files.append(File.generated(config, page, content=moved((ROOT / name).read_text(encoding="utf-8"))))
+        wide = "---\nhide: [toc]\n---\n\n" if page == "index.md" else ""  # its commands need the width
+        files.append(File.generated(config, page, content=wide + moved((ROOT / name).read_text(encoding="utf-8"))))
     files.append(File.generated(config, "references.md", content=bibliography()))
     for file in list(files):
         if file.src_uri.endswith(".ipynb"):

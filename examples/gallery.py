@@ -17,13 +17,17 @@ SCENES = (
     "cornell-box",
 )  # fmt: skip
 
+#: Scenes in bright sun and at night need exposures of their own, µs.
+EXPOSURES_US = {"facade-drive": 1000, "traffic-light": 33000}
+
 rows = -(-len(SCENES) // COLS)
 sheet = Image.new("RGB", (COLS * (WIDTH + 6), rows * (HEIGHT + LINE + 6)), (40, 40, 40))
 draw = ImageDraw.Draw(sheet)
-sensor = hr.load_sensor("reference-bayer").crop(WIDTH, HEIGHT)
 for number, name in enumerate(SCENES):
     at_rest = {} if name == "cornell-box" else {"motion": []}
-    rec = hr.simulate(hr.load_scene(name, at_rest), sensor, duration_s=0.03, samples=64, seed=1)
+    exposure = {"aps.exposure_us": EXPOSURES_US.get(name, 10_000)}
+    sensor = hr.load_sensor("reference-bayer", exposure).crop(WIDTH, HEIGHT)
+    rec = hr.simulate(hr.load_scene(name, at_rest), sensor, duration_s=0.05, samples=64, seed=1)
     picture = Image.fromarray(colour_picture(rec.frames[0].raw, rec.mosaic))
     x, y = number % COLS * (WIDTH + 6) + 3, number // COLS * (HEIGHT + LINE + 6) + 3
     sheet.paste(picture, (x, y + LINE))

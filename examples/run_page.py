@@ -64,7 +64,9 @@ def run(page: Path, folder: Path, installed: bool = False) -> None:
         (folder / "examples").symlink_to(Path(__file__).resolve().parent)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}" if installed else os.environ["PATH"]
     environment = os.environ | {"PATH": path, "MPLBACKEND": "Agg"}
-    subprocess.run(["bash", "-c", script_of(page, installed)], cwd=folder, env=environment, check=True)
+    script = folder / f".{page.stem}.sh"
+    script.write_text(script_of(page, installed), encoding="utf-8")
+    subprocess.run(["bash", script.name], cwd=folder, env=environment, check=True)
 
 
 if __name__ == "__main__":

@@ -77,6 +77,8 @@ def test_files_of_a_page_are_valid(page, tmp_path):
     for block in blocks:
         if block.title:
             (tmp_path / block.title).write_text(block.text)
+        if block.kind == "bash":
+            subprocess.run(["bash", "-n"], input=block.text, text=True, check=True)
         if block.kind == "python":
             compile(block.text, f"{page.name}, line {block.line}", "exec")
         if "pyramid.obj" in block.text and block.kind == "python":
