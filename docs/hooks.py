@@ -29,10 +29,11 @@ def on_config(config: Any) -> Any:
 
 
 def equation(source: str, *_: Any, **__: Any) -> str:
-    """One line of LaTeX a line, as MathML, which browsers draw without a script."""
+    """LaTeX as MathML, which browsers draw without a script; lines of ``gathered`` are equations of their own."""
     from latex2mathml.converter import convert
 
-    lines = [convert(line, display="block") for line in source.split("\n") if line.strip()]
+    rows = (line.strip().removesuffix("\\\\") for line in source.split("\n"))
+    lines = [convert(row, display="block") for row in rows if row and not re.match(r"\\(begin|end)\{gathered\}", row)]
     # a bar is a bracket here, not a relation with space around it
     whole = "".join(lines).replace("<mo>&#x0007C;</mo>", '<mo lspace="0" rspace="0">&#x0007C;</mo>')
     return f'<div class="equation">{whole}</div>'
