@@ -17,6 +17,8 @@ ROOT = Path(__file__).parents[1]
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 #: Keys of cited works in brackets, as in [kirk1991] or [salmon2011, wellons2018].
 CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(\[])")
+#: A symbol of one letter with an index.
+INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
 #: Where docs/cli.md is to have what `--help` says of each command.
 COMMANDS = "<!-- commands -->"
 
@@ -84,6 +86,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return match.group(0)
         return "[" + ", ".join(f"[{key}]({above}references.md#{key})" for key in keys) + "]"
 
+    # symbols with an index in the text, as in I_e; GitHub shows them as they are written
+    pieces = re.split(r"(^```.*?^```$|`[^`\n]*`|\]\([^)]*\)|^    [^\n]*$)", markdown, flags=re.MULTILINE | re.DOTALL)
+    pieces[::2] = (INDEXED.sub(r"\1<sub>\2</sub>", piece) for piece in pieces[::2])
+    markdown = "".join(pieces)
     return CITED.sub(linked, re.sub(r"(\]\([^)]*)\.ipynb\)", r"\1.md)", markdown))
 
 
