@@ -12,7 +12,7 @@ import nbformat
 import pytest
 import run_page
 import typer
-import yaml
+from ruamel.yaml import YAML
 
 import hesim_render as hr
 from hesim_render.cli.commands import app
@@ -85,7 +85,7 @@ def test_files_of_a_page_are_valid(page, tmp_path):
             exec(block.text.replace('Path("', f'Path("{tmp_path}/'), {})
     for block in blocks:
         if block.kind == "yaml" and block.title:
-            content = yaml.safe_load(block.text)
+            content = YAML(typ="safe").load(block.text)
             if "tile" in content:  # a calibration of the page exists only when it runs
                 text = re.sub(r"^noise: .*\n", "", block.text, flags=re.MULTILINE)
                 (tmp_path / block.title).write_text(text)
