@@ -62,8 +62,11 @@ def run(page: Path, folder: Path, installed: bool = False) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "examples").exists():  # pages that start a script do it in a clone of the repository
         (folder / "examples").symlink_to(Path(__file__).resolve().parent)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}" if installed else os.environ["PATH"]
-    environment = os.environ | {"PATH": path, "MPLBACKEND": "Agg"}
+    environment = os.environ | {"MPLBACKEND": "Agg"}
+    if installed:
+        environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
+    else:  # the page makes an environment of its own
+        environment = {key: value for key, value in environment.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
     script = folder / f".{page.stem}.sh"
     script.write_text(script_of(page, installed), encoding="utf-8")
     subprocess.run(["bash", script.name], cwd=folder, env=environment, check=True)

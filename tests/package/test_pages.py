@@ -3,16 +3,14 @@
 import functools
 import re
 import shlex
-import shutil
 import subprocess
 from pathlib import Path
 
-import nbclient
-import nbformat
 import pytest
 import run_page
 import typer
 from ruamel.yaml import YAML
+from source_trees import source_tree
 
 import hesim_render as hr
 from hesim_render.cli.commands import app
@@ -117,13 +115,7 @@ def test_a_page_runs_as_it_stands(page, tmp_path):
 @pytest.mark.slow
 def test_the_tutorial_begins_in_a_fresh_clone(tmp_path):
     """With its installation, and nothing of this environment but Python and pip's settings."""
-    files = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    for file in files:
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / file, tmp_path / file)
-    run_page.run(ROOT / "docs" / "tutorial.md", tmp_path)
+    run_page.run(ROOT / "docs" / "tutorial.md", source_tree(tmp_path))
 
 
 NAMED_TEST = re.compile(r"\b(tests/[\w/]+\.py)(?:::(\w+))?")
@@ -193,6 +185,9 @@ def test_the_api_pages_have_every_public_name():
 @pytest.mark.slow
 @pytest.mark.parametrize("notebook", sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
 def test_a_notebook_runs_and_is_stored_with_its_results(notebook, tmp_path):
+    import nbclient
+    import nbformat
+
     book = nbformat.read(notebook, 4)
     code = [cell for cell in book.cells if cell.cell_type == "code"]
     assert all(cell.execution_count for cell in code) and any(cell.outputs for cell in code)
