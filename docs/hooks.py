@@ -98,7 +98,7 @@ def entries() -> dict[str, dict[str, str]]:
     """The fields of each work in references.bib, by key."""
     text = (ROOT / "docs" / "references.bib").read_text(encoding="utf-8")
     found = re.findall(r"^@\w+\{(\w+),\n(.*?)^\}", text, re.MULTILINE | re.DOTALL)
-    field = re.compile(r"^ *(\w+) = \{(.*?)\},?\n(?= *\w+ = |\Z)", re.MULTILINE | re.DOTALL)
+    field = re.compile(r"(\w+) = \{(.*?)\},?\s*(?=\w+ = \{|\Z)", re.DOTALL)
     return {key: {name: plain(" ".join(value.split())) for name, value in field.findall(body)} for key, body in found}
 
 
@@ -106,7 +106,7 @@ def plain(text: str) -> str:
     """LaTeX of a bibliography as text."""
     accents = {"'": "\u0301", '"': "\u0308", "`": "\u0300", "^": "\u0302", "~": "\u0303", "v": "\u030c", "c": "\u0327"}
     text = re.sub(r"\{?\\(['\"`^~vc])\{?(\w)\}?\}?", lambda m: m.group(2) + accents[m.group(1)], text)
-    text = text.replace("--", "–").replace("\\&", "&").replace("~", " ")
+    text = text.replace("\\textmu", "µ").replace("--", "–").replace("\\&", "&").replace("~", " ")
     return unicodedata.normalize("NFC", re.sub(r"[{}]", "", text))
 
 
@@ -116,7 +116,8 @@ def bibliography() -> str:
     for key, work in sorted(entries().items()):
         where = work.get("journal") or work.get("booktitle") or work.get("publisher") or work.get("institution") or ""
         names = ", ".join(" ".join(reversed(name.split(", "))) for name in work["author"].split(" and "))
-        place = ", ".join(part for part in (where, work["year"]) if part)
+        volume = work.get("volume", "") + (f"({work['number']})" if "number" in work else "")
+        place = ", ".join(part for part in (where, volume, work.get("pages", ""), work["year"]) if part)
         doi = f" [doi:{work['doi']}](https://doi.org/{work['doi']})" if "doi" in work else ""
         lines += [f"### {key}", "", f"{names}: *{work['title']}*. {place}.{doi}", ""]
     return "\n".join(lines)
