@@ -112,7 +112,7 @@ def run(
 
     Parameters
     ----------
-    file : YAML file (``docs/command-line.md``).
+    file : YAML file (``docs/cli.md``).
     out : folder of the results: ``recording``, ``pictures``, exports, and the state of the run.
     overrides : dotted keys of the file and their values.
     overwrite : replace the results of a run of other content.

@@ -1,4 +1,4 @@
-"""The exit statuses of all commands; ``docs/command-line.md`` has the same table."""
+"""The exit statuses of all commands; ``docs/cli.md`` has the same table."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
 
 
 def run(
-    file: Annotated[Path, typer.Argument(metavar="RUN.yaml", help="file of the run (docs/command-line.md)")],
+    file: Annotated[Path, typer.Argument(metavar="RUN.yaml", help="file of the run (docs/cli.md)")],
     out: Annotated[Path, typer.Option(help="folder of all results; a run that was ended goes on there")],
     yes: Yes = False,
     set_: Annotated[

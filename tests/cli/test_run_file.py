@@ -137,7 +137,7 @@ def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys
 
 
 def test_the_example_of_the_page_is_a_valid_file(tmp_path):
-    page = (data_folder("sensors").parent / "docs" / "command-line.md").read_text(encoding="utf-8")
+    page = (data_folder("sensors").parent / "docs" / "cli.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     spec = read_run(write(tmp_path, text))
     assert (spec.scene, spec.sensor, spec.roi, spec.view) == ("rotating-star", "gen2", "256x192", True)

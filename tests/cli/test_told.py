@@ -20,7 +20,7 @@ STILL = ["simulate", "colorchecker", "--sensor", "reference-mono", "--roi", "16x
 
 
 def test_the_page_has_every_exit_status_and_no_other():
-    page = (DOCS / "command-line.md").read_text(encoding="utf-8")
+    page = (DOCS / "cli.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| `(\w+)` \|", page, re.MULTILINE)
     assert {name: int(number) for number, name in rows} == {each.name: each.value for each in ExitStatus}
 

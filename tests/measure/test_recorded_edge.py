@@ -134,7 +134,7 @@ def test_saturated_pixels_are_refused(tmp_path):
     assert measure_mtf(recording, signal="electrons").mtf[25] > 0.8  # the truth is not clipped
 
 
-@pytest.mark.parametrize("page", ["README.md", pytest.param("docs/targets.md", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("page", ["docs/cli.md", pytest.param("docs/targets.md", marks=pytest.mark.slow)])
 def test_the_commands_of_the_docs_measure_an_edge(page, tmp_path, monkeypatch, capsys):
     lines = (Path(__file__).parents[2] / page).read_text(encoding="utf-8").splitlines()
     starts = "hesim-render simulate slanted-edge", "hesim-render measure mtf"

@@ -15,7 +15,7 @@ from hesim_render.core import errors
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "hesim_render"
-DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def names_in_code():
