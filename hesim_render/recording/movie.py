@@ -11,7 +11,7 @@ import numpy as np
 from hesim_render.core.errors import RangeError
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording.colour_view import Picture, colour_picture
-from hesim_render.recording.preview import events_picture
+from hesim_render.recording.event_view import black_picture, events_picture
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
@@ -72,7 +72,7 @@ def _pictures(recording: Recording, kind: str) -> Iterator[Picture]:
         edges = [begin_us, *(entry["t_us"] for entry in recording.manifest["frames"])]
     else:
         edges = [*range(begin_us, end_us, _STEP_US), end_us]
-    black = _black(recording)
+    black = black_picture(recording, _WIDEST_PX)
     for number, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         picture = black
         if kind != "mp4-events" and len(recording.frames):
@@ -81,9 +81,3 @@ def _pictures(recording: Recording, kind: str) -> Iterator[Picture]:
             events = recording.event_slice(first + 1, last + 1) if last > first else no_events()
             picture = events_picture(picture, events, recording.event_shape)
         yield picture
-
-
-def _black(recording: Recording) -> Picture:
-    roi = recording.manifest["roi"]
-    shrink = max(1, -(-roi["width_px"] // _WIDEST_PX))
-    return np.zeros((max(2, roi["height_px"] // shrink), max(2, roi["width_px"] // shrink), 3), dtype=np.uint8)

@@ -19,7 +19,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.colour_view import colour_picture
-from hesim_render.recording.preview import OFF_COLOUR, ON_COLOUR
+from hesim_render.recording.event_view import OFF_COLOUR, ON_COLOUR
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording

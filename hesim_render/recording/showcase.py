@@ -13,6 +13,7 @@ from hesim_render.core.output import replacing
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import preview
 from hesim_render.recording.colour_view import Picture, colour_picture
+from hesim_render.recording.event_view import black_picture, events_picture
 from hesim_render.recording.preview import Panel
 from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
 
@@ -72,14 +73,14 @@ def middle_views(recording: Recording) -> list[Panel]:
         label = "Grey view" if len(mosaic.channels) == 1 else "Colour view"
         panels.append(Panel(colour, f"{label} of frame {frame.index}, {_ms(frame.exposure_us)} exposure"))
     else:
-        colour = _black(recording)
+        colour = black_picture(recording)
     if min(recording.event_shape) > 0:
         # a static scene gives only noise events: show all of them
         window_us = WINDOW_US if moves(recording) else end_us - begin_us
         first = max(begin_us, min(middle_us - window_us // 2, end_us - window_us))
         last = min(first + window_us, end_us)
         events = recording.event_slice(first, last + 1)
-        picture = preview.events_picture(colour, events, recording.event_shape)
+        picture = events_picture(colour, events, recording.event_shape)
         panels.append(Panel(picture, f"{_count(events.size, 'event')} in {_ms(last - first)}: ON orange, OFF blue"))
     return panels
 
@@ -92,7 +93,7 @@ def contact_sheet(recording: Recording) -> Image.Image:
     if len(recording.frames):
         panels += _mosaic_panels(_middle(recording), recording, panels[0].picture, width_px, step)
     if not panels:
-        panels.append(Panel(_black(recording), "no frames and no event pixels"))
+        panels.append(Panel(black_picture(recording), "no frames and no event pixels"))
     counts = recording.manifest["counts"]
     scene = (recording.manifest.get("scene") or {}).get("name", "")
     title = "  ·  ".join(
@@ -135,21 +136,15 @@ def animation(recording: Recording) -> list[Picture]:
     edges = np.linspace(begin_us, end_us + 1, _ANIMATION_STEPS + 1).astype(int)
     shown_at = [entry["t_us"] for entry in recording.manifest["frames"]]
     pictures: list[Picture] = []
-    background, shown = _black(recording), -1
+    background, shown = black_picture(recording), -1
     for first, last in zip(edges[:-1], edges[1:], strict=True):
         latest = max(0, int(np.searchsorted(shown_at, last, side="right")) - 1)
         if shown_at and latest != shown:
             raw = recording.frames[latest].raw
             background, shown = colour_picture(raw, recording.mosaic, _ANIMATION_WIDTH_PX), latest
         events = recording.event_slice(int(first), int(last)) if last > first else no_events()
-        pictures.append(preview.events_picture(background, events, recording.event_shape))
+        pictures.append(events_picture(background, events, recording.event_shape))
     return pictures
-
-
-def _black(recording: Recording) -> Picture:
-    roi = recording.manifest["roi"]
-    shrink = max(1, -(-roi["width_px"] // 1024))
-    return np.zeros((roi["height_px"] // shrink, roi["width_px"] // shrink, 3), dtype=np.uint8)
 
 
 def _size(recording: Recording) -> str:
