@@ -26,7 +26,7 @@ def test_truth_is_written_and_exported(capsys, tmp_path):
     star = ("--format", "kalibr", "--out", tmp_path / "k", "--scene")
     assert call(capsys, "export", out, *star, "rotating-star")[0] == 0
     assert "is not the one of the recording" in fails(capsys, "export", out, *star, "flat-field", "--overwrite")
-    assert "mipi, exr, dsec-flow, tum, kalibr" in fails(
+    assert "mp4-events, exr, dsec-flow, tum, kalibr" in fails(
         capsys, "export", out, "--format", "bag", "--out", tmp_path / "x"
     )
 
