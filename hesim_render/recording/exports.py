@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,6 @@ from hesim_render.core.output import OutputFolder, check_place, output_errors, r
 from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, mcap_file, open_events
 from hesim_render.exchange.dsec import stream_events
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.recording.movie import MOVIES, write_movie
 from hesim_render.recording.tick_files import write_tick_files
 
 if TYPE_CHECKING:
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 #: File that says what the frames of a folder are, and marks the folder for `overwrite`.
 FRAMES_NAME = "frames.json"
 #: Formats of events and frames together.
-WHOLE_FORMATS = ("mcap", "raw-npz", *MOVIES)
+WHOLE_FORMATS = ("mcap", "raw-npz", "mp4", "mp4-colour", "mp4-events")
+#: Writers of the formats that are drawn. The package adds them, as recordings do not know their pictures.
+DRAWN: dict[str, Callable[[Recording, Path], object]] = {}
 _NEED_FRAMES = (*FRAME_FORMATS, "mp4-colour")
 
 
@@ -54,7 +56,7 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
             if format == "mcap":
                 _write_mcap(recording, temporary, target)
             else:
-                write_movie(recording, temporary, format)
+                DRAWN[format](recording, temporary)
         return target
     return _write_frames(recording, format, path, overwrite)
 

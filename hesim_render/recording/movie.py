@@ -16,8 +16,6 @@ from hesim_render.recording.event_view import black_picture, events_picture
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
 
-#: What is shown: colour view, events, or both.
-MOVIES = ("mp4", "mp4-colour", "mp4-events")
 #: Pictures per second of the video, and time that one shows where there are no frames, µs.
 _FPS, _STEP_US = 25, 10_000
 _WIDEST_PX = 1280
@@ -33,7 +31,8 @@ def write_movie(recording: Recording, path: Path, kind: str) -> int:
 
     Parameters
     ----------
-    recording, path, kind : recording, file, and one of `MOVIES`.
+    recording, path, kind : recording, file, and ``mp4`` (events over the colour view), ``mp4-colour`` or
+        ``mp4-events``.
 
     Returns
     -------
