@@ -93,7 +93,9 @@ def test_resolution_is_a_metric_where_there_is_an_edge(tmp_path):
     assert found.row(0)["mtf50_cy_per_px"] == pytest.approx(0.6, abs=0.05)  # sinc f = 1/2 at 0.603
     assert found.row(1)["mtf50_cy_per_px"] is None
     spec |= {"metrics": ["mtf10", "mtf_nyquist", "picture_mtf50"], "scenes": ["slanted-edge"]}
-    row = sweep(spec, out=tmp_path / "more").row(0)
+    spec["vary"] = {"light.illuminance_lux": [100, 3000]}
+    row, saturated = sweep(spec, out=tmp_path / "more")
+    assert saturated["picture_mtf50_cy_per_px"] is None
     assert row["mtf_nyquist"] == pytest.approx(np.sinc(0.5), abs=0.03)
     assert row["mtf10_cy_per_px"] == pytest.approx(0.908, abs=0.05)  # sinc f = 0.1
     assert row["picture_mtf50_cy_per_px"] == pytest.approx(0.6, abs=0.05)
