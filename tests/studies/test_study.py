@@ -113,6 +113,23 @@ def test_exposures_are_equal_in_what_the_study_says():
         assert part.where(equal="white")["white_saturation"][0] == pytest.approx(0.9, rel=1e-12)
 
 
+def test_a_grey_card_that_saturates_has_no_noise_figures():
+    table = run(filter_sets=["rggb"], illuminance_lux=[100, 3e4], figures=["noise"])
+    assert table["ysnr"][0] > 0 and np.isnan(table["ysnr"][1]) and np.isnan(table["snr10_lux"][1])
+    # 18 % of white fills the pixel
+    assert 0.18 * table["white_saturation"][1] > 1 > 0.18 * table["white_saturation"][0]
+
+
+def test_sensors_without_frames_have_one_row_for_all_exposures(tmp_path):
+    spec = {**BASE, "sensors": ["dvs128"], "figures": ["events"], "exposures_us": [10, 20]}
+    table = study({**spec, "equal": ["exposure", "light"]}, out=tmp_path / "out")
+    assert len(table) == 1 and table["event_contrast_on"][0] > 0 and "exposure_us" not in table.columns
+    # sensors with exposures of their own stand in one table of the report
+    spec = {**BASE, "sensors": ["reference-bayer", "mt9v034"], "figures": ["noise"]}
+    assert len(set(study(spec, out=tmp_path / "two")["nominal_exposure_us"])) == 2
+    assert (tmp_path / "two" / "report.html").read_text().count("<h3>") == 1
+
+
 def test_crosstalk_mixes_as_the_source_does():
     sensor = set_on("reference-bayer", "rgbw-half").crop(32, 32)
     rates = np.array([10.0, 20.0, 5.0, 40.0])[: len(sensor.spec.filters)]

@@ -141,7 +141,10 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
     file = tmp_path / "study.yaml"
     file.write_text(
         "schema_version: 1\nname: two\nsensors: [reference-bayer]\nfilter_sets: [rggb, ryyb]\nfigures: [noise]\n"
+        "palette: mine.yaml\n"
     )
+    palette = (data_folder("palettes") / "dyes.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(palette)
     spec = {"schema_version": 1, "name": "sweep", "study": str(file), "metrics": ["ysnr"],
             "vary": {"sensor.aps.read_noise_e": [1.0, 20.0], "illuminance_lux": [[5], [50]]}}  # fmt: skip
     table = sweep(spec, out=tmp_path / "out")
@@ -155,6 +158,9 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
     monkeypatch.setattr(sweeps, "study", None)
     assert sweep(spec, out=tmp_path / "out").to_csv() == table.to_csv()
     monkeypatch.undo()
+    assert palette.count("depth_um: 3.0") == 1
+    (tmp_path / "mine.yaml").write_text(palette.replace("depth_um: 3.0", "depth_um: 1.0"))
+    assert np.all(sweep(spec, out=tmp_path / "out")["ysnr"] < table["ysnr"])
     spec["vary"] = {"noise.repeats": [0]}
     assert len(sweep({**spec, "metrics": []}, out=tmp_path / "out")) == 2
     for changes, message in (
