@@ -234,6 +234,15 @@ def test_gradients_of_shares_and_depth_are_central_differences():
         assert np.abs(expected[part]).max() > 1e-3 * np.abs(expected).max()
 
 
+def test_shares_begin_with_those_of_the_tile():
+    """The cost of a hybrid tile is the same, whether its shares are varied or not; event pixels have none."""
+    hybrid = {**SMALL, "sensor": "eiger", "filter_set": "quad-bayer-white-event", "palette": "dyes"}
+    fixed, varied = (Problem(DesignSpec.model_validate({**hybrid, **more})) for more in ({}, {"tile_px": [4, 4]}))
+    start = varied.starts()[0]
+    assert start.size == varied.filter_size + 3
+    assert varied(start)[0] == pytest.approx(fixed(start[: fixed.filter_size])[0], rel=1e-3)
+
+
 def test_shares_become_whole_pixels_that_lie_apart():
     assert counts_of(np.array([0.5, 0.25, 0.25]), 16).tolist() == [8, 4, 4]
     assert counts_of(np.array([0.97, 0.01, 0.02]), 16).sum() == 16

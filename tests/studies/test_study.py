@@ -60,11 +60,15 @@ def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_
     deviation of 36,864 output pixels with an SNR of 1 are known to 0.5 % and 0.4 %: 3 % are 4.6 standard errors.
     """
     names = ["mono", "rccc", "rgbw-half", "rgbw", "rggb"]
-    table = study({
+    every = study({
         "schema_version": 1, "name": "one pixel", "sensors": ["mt9v034"], "palette": "mt9v024", "filter_sets": names,
-        "illuminance_lux": [3.0], "exposures_us": [15_000], "figures": ["noise"],
+        "illuminance_lux": [3.0, 100.0], "exposures_us": [15_000], "figures": ["noise"],
         "noise": {"repeats": 8, "patch_px": 48},
     })  # fmt: skip
+    table, bright = (every.where(illuminance_lux=lux) for lux in (3, 100))
+    # where colour decides the weights
+    np.testing.assert_allclose(bright["ysnr_simulated"], bright["ysnr"], rtol=0.03)
+    assert bright["ysnr"][-1] > bright["ysnr"][-2]
     assert table["filter_set"].tolist() == names and "smi" not in table.columns
     d65, grid = spectra.illuminant("D65"), np.arange(360.0, 831.0)
     power = 3 * d65.at(grid) / np.trapezoid(d65.at(grid) * spectra.photopic().at(grid), grid)

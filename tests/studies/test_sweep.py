@@ -15,6 +15,7 @@ from hesim_render.specs.files import data_folder, list_names
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep
+from hesim_render.studies.sweep_metrics import Figures
 
 BASE = {
     "schema_version": 1, "name": "test", "scenes": ["flat-field"], "sensors": ["reference-mono"], "roi": "32x24",
@@ -129,6 +130,12 @@ def test_keys_of_the_isp_are_varied_on_one_recording(tmp_path, monkeypatch):
     expected = peak_signal_noise_ratio(np.clip(clean, 0, 1), np.clip(picture, 0, 1), data_range=1)
     assert row["picture_psnr_db"] == pytest.approx(expected, rel=1e-6)
     assert 0 < row["picture_ssim"] < 1 and row["picture_delta_e"] > 0
+    # the noise-free picture is never smoothed
+    reduced = Figures(rec, Pipeline.of("black_level", "white_balance", "demosaic", "noise_reduction", "colour_matrix"))
+    plain_steps = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix")
+    clean = (64 + 0.25 * rec.frames[0].electrons_mean).astype(np.float32)
+    np.testing.assert_allclose(reduced.clean_picture, process(clean, rec.mosaic, plain_steps), atol=1e-6)
+    assert not np.allclose(reduced.picture.image, process(rec.frames[0], rec.mosaic, plain_steps), atol=1e-4)
     # twice the gain doubles what is linear and not clipped, noise included: 6.02 dB
     once, twice = (
         table.where(**{"isp.exposure.gain": gain, "isp.encode": False, "light.illuminance_lux": 50}) for gain in (1, 2)
