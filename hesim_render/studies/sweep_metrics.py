@@ -200,8 +200,11 @@ class Figures:
         """Frequency at which luminance on the edge of the noise-free picture falls to half, cycles per pixel."""
         if self.picture is None:
             return None
+        mosaic, signal = self.recording.mosaic, float(self.recording.frames[0].electrons_mean.max())
+        if mosaic.black_level_dn + mosaic.system_gain_dn_per_e * signal >= mosaic.white_level_dn:
+            return None  # a saturated edge has no response
         try:
-            return edge_response(luminance(self._of_clean(self.pipeline.without(_ENCODE)))).frequency_at(0.5)
+            return _number(edge_response(luminance(self._of_clean(self.pipeline.without(_ENCODE)))).frequency_at(0.5))
         except RangeError:
             return None
 
@@ -218,7 +221,11 @@ def _between_0_and_1(picture: NDArray) -> NDArray[np.float64]:
 
 
 def _at(level: float) -> Callable[[Figures], Cell]:
-    return lambda figures: None if figures.edge is None else figures.edge.frequency_at(level)
+    return lambda figures: None if figures.edge is None else _number(figures.edge.frequency_at(level))
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else value
 
 
 #: Column and value of each metric.

@@ -18,13 +18,13 @@ from hesim_render.specs.filter_set import read_filter_set
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colour_difference import delta_e_2000, lab
 from hesim_render.spectral.physical import dye_transmittance, silicon_index, thin_film_transmittance
-from hesim_render.studies import ChannelNoise, reflectance_set
+from hesim_render.studies import ChannelNoise, Table, reflectance_set
 from hesim_render.studies.colour_samples import colour_samples
 from hesim_render.studies.design import BANDS_NM as DESIGN_NM
 from hesim_render.studies.design import Problem, optimise, silicon_depth
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights, best_matrix, difference_weights
 from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
-from hesim_render.studies.design_run import design
+from hesim_render.studies.design_run import _verdicts, design
 from hesim_render.studies.design_tile import counts_of, spread_tile
 
 BANDS = np.arange(360.0, 831.0, 10.0)
@@ -234,6 +234,15 @@ def test_gradients_of_shares_and_depth_are_central_differences():
         assert np.abs(expected[part]).max() > 1e-3 * np.abs(expected).max()
 
 
+def test_shares_begin_with_those_of_the_tile():
+    """The cost of a hybrid tile is the same, whether its shares are varied or not; event pixels have none."""
+    hybrid = {**SMALL, "sensor": "eiger", "filter_set": "quad-bayer-white-event", "palette": "dyes"}
+    fixed, varied = (Problem(DesignSpec.model_validate({**hybrid, **more})) for more in ({}, {"tile_px": [4, 4]}))
+    start = varied.starts()[0]
+    assert start.size == varied.filter_size + 3
+    assert varied(start)[0] == pytest.approx(fixed(start[: fixed.filter_size])[0], rel=1e-3)
+
+
 def test_shares_become_whole_pixels_that_lie_apart():
     assert counts_of(np.array([0.5, 0.25, 0.25]), 16).tolist() == [8, 4, 4]
     assert counts_of(np.array([0.97, 0.01, 0.02]), 16).sum() == 16
@@ -377,6 +386,22 @@ def test_the_shipped_design_beats_the_camera_on_colours_and_lights_that_it_has_n
 
 
 STUDY = {"schema_version": 1, "name": "again", "surfaces": ["cie-tcs"], "illuminants": ["A"], "figures": ["colour"]}
+
+
+def test_events_count_only_against_sets_that_have_event_pixels():
+    spec = DesignSpec.model_validate({**SMALL, "illuminance_lux": [20], "cost": {"events": 2.0}})
+    row = {"illuminance_lux": 20, "delta_e_mean": 1.0, "ysnr_simulated": 5.0, "ysnr_noise_aware_simulated": 6.0,
+           "delta_e_noisy_noise_aware_simulated": 3.0, "delta_e_noisy_noise_aware_low": 2.9,
+           "delta_e_noisy_noise_aware_high": 3.1}  # fmt: skip
+    table = Table([
+        {**row, "filter_set": "designed", "event_contrast_on": 0.3},
+        {**row, "filter_set": "with", "event_contrast_on": 0.5}, {**row, "filter_set": "without"},
+    ])  # fmt: skip
+    both, frames_alone = _verdicts(spec, table)
+    assert both["cost"] == pytest.approx(1 + 0.5 * 3 + 2 * 0.3) and both["cost_difference"] == pytest.approx(-0.4)
+    assert frames_alone["cost"] == frames_alone["cost_against"] == pytest.approx(2.5)
+    half = 0.5 * 0.1 * np.sqrt(2)
+    assert both["cost_difference_high"] - both["cost_difference_low"] == pytest.approx(2 * half)
 
 
 @pytest.mark.parametrize(("changes", "message"), [

@@ -60,11 +60,15 @@ def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_
     deviation of 36,864 output pixels with an SNR of 1 are known to 0.5 % and 0.4 %: 3 % are 4.6 standard errors.
     """
     names = ["mono", "rccc", "rgbw-half", "rgbw", "rggb"]
-    table = study({
+    every = study({
         "schema_version": 1, "name": "one pixel", "sensors": ["mt9v034"], "palette": "mt9v024", "filter_sets": names,
-        "illuminance_lux": [3.0], "exposures_us": [15_000], "figures": ["noise"],
+        "illuminance_lux": [3.0, 100.0], "exposures_us": [15_000], "figures": ["noise"],
         "noise": {"repeats": 8, "patch_px": 48},
     })  # fmt: skip
+    table, bright = (every.where(illuminance_lux=lux) for lux in (3, 100))
+    # where colour decides the weights
+    np.testing.assert_allclose(bright["ysnr_simulated"], bright["ysnr"], rtol=0.03)
+    assert bright["ysnr"][-1] > bright["ysnr"][-2]
     assert table["filter_set"].tolist() == names and "smi" not in table.columns
     d65, grid = spectra.illuminant("D65"), np.arange(360.0, 831.0)
     power = 3 * d65.at(grid) / np.trapezoid(d65.at(grid) * spectra.photopic().at(grid), grid)
@@ -111,6 +115,23 @@ def test_exposures_are_equal_in_what_the_study_says():
     assert other.where(equal="light").row(0)["exposure_us"] == pytest.approx(expected, rel=1e-9)
     for part in (first, other):
         assert part.where(equal="white")["white_saturation"][0] == pytest.approx(0.9, rel=1e-12)
+
+
+def test_a_grey_card_that_saturates_has_no_noise_figures():
+    table = run(filter_sets=["rggb"], illuminance_lux=[100, 3e4], figures=["noise"])
+    assert table["ysnr"][0] > 0 and np.isnan(table["ysnr"][1]) and np.isnan(table["snr10_lux"][1])
+    # 18 % of white fills the pixel
+    assert 0.18 * table["white_saturation"][1] > 1 > 0.18 * table["white_saturation"][0]
+
+
+def test_sensors_without_frames_have_one_row_for_all_exposures(tmp_path):
+    spec = {**BASE, "sensors": ["dvs128"], "figures": ["events"], "exposures_us": [10, 20]}
+    table = study({**spec, "equal": ["exposure", "light"]}, out=tmp_path / "out")
+    assert len(table) == 1 and table["event_contrast_on"][0] > 0 and "exposure_us" not in table.columns
+    # sensors with exposures of their own stand in one table of the report
+    spec = {**BASE, "sensors": ["reference-bayer", "mt9v034"], "figures": ["noise"]}
+    assert len(set(study(spec, out=tmp_path / "two")["nominal_exposure_us"])) == 2
+    assert (tmp_path / "two" / "report.html").read_text().count("<h3>") == 1
 
 
 def test_crosstalk_mixes_as_the_source_does():

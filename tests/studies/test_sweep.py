@@ -15,6 +15,7 @@ from hesim_render.specs.files import data_folder, list_names
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep
+from hesim_render.studies.sweep_metrics import Figures
 
 BASE = {
     "schema_version": 1, "name": "test", "scenes": ["flat-field"], "sensors": ["reference-mono"], "roi": "32x24",
@@ -93,7 +94,9 @@ def test_resolution_is_a_metric_where_there_is_an_edge(tmp_path):
     assert found.row(0)["mtf50_cy_per_px"] == pytest.approx(0.6, abs=0.05)  # sinc f = 1/2 at 0.603
     assert found.row(1)["mtf50_cy_per_px"] is None
     spec |= {"metrics": ["mtf10", "mtf_nyquist", "picture_mtf50"], "scenes": ["slanted-edge"]}
-    row = sweep(spec, out=tmp_path / "more").row(0)
+    spec["vary"] = {"light.illuminance_lux": [100, 3000]}
+    row, saturated = sweep(spec, out=tmp_path / "more")
+    assert saturated["picture_mtf50_cy_per_px"] is None
     assert row["mtf_nyquist"] == pytest.approx(np.sinc(0.5), abs=0.03)
     assert row["mtf10_cy_per_px"] == pytest.approx(0.908, abs=0.05)  # sinc f = 0.1
     assert row["picture_mtf50_cy_per_px"] == pytest.approx(0.6, abs=0.05)
@@ -127,6 +130,12 @@ def test_keys_of_the_isp_are_varied_on_one_recording(tmp_path, monkeypatch):
     expected = peak_signal_noise_ratio(np.clip(clean, 0, 1), np.clip(picture, 0, 1), data_range=1)
     assert row["picture_psnr_db"] == pytest.approx(expected, rel=1e-6)
     assert 0 < row["picture_ssim"] < 1 and row["picture_delta_e"] > 0
+    # the noise-free picture is never smoothed
+    reduced = Figures(rec, Pipeline.of("black_level", "white_balance", "demosaic", "noise_reduction", "colour_matrix"))
+    plain_steps = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix")
+    clean = (64 + 0.25 * rec.frames[0].electrons_mean).astype(np.float32)
+    np.testing.assert_allclose(reduced.clean_picture, process(clean, rec.mosaic, plain_steps), atol=1e-6)
+    assert not np.allclose(reduced.picture.image, process(rec.frames[0], rec.mosaic, plain_steps), atol=1e-4)
     # twice the gain doubles what is linear and not clipped, noise included: 6.02 dB
     once, twice = (
         table.where(**{"isp.exposure.gain": gain, "isp.encode": False, "light.illuminance_lux": 50}) for gain in (1, 2)
@@ -139,7 +148,10 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
     file = tmp_path / "study.yaml"
     file.write_text(
         "schema_version: 1\nname: two\nsensors: [reference-bayer]\nfilter_sets: [rggb, ryyb]\nfigures: [noise]\n"
+        "palette: mine.yaml\n"
     )
+    palette = (data_folder("palettes") / "dyes.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(palette)
     spec = {"schema_version": 1, "name": "sweep", "study": str(file), "metrics": ["ysnr"],
             "vary": {"sensor.aps.read_noise_e": [1.0, 20.0], "illuminance_lux": [[5], [50]]}}  # fmt: skip
     table = sweep(spec, out=tmp_path / "out")
@@ -153,6 +165,9 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
     monkeypatch.setattr(sweeps, "study", None)
     assert sweep(spec, out=tmp_path / "out").to_csv() == table.to_csv()
     monkeypatch.undo()
+    assert palette.count("depth_um: 3.0") == 1
+    (tmp_path / "mine.yaml").write_text(palette.replace("depth_um: 3.0", "depth_um: 1.0"))
+    assert np.all(sweep(spec, out=tmp_path / "out")["ysnr"] < table["ysnr"])
     spec["vary"] = {"noise.repeats": [0]}
     assert len(sweep({**spec, "metrics": []}, out=tmp_path / "out")) == 2
     for changes, message in (
