@@ -70,6 +70,7 @@ class _Hdf5Shard:
         for key, values in arrays.items():
             packed = {"compression": COMPRESSION} if values.size else {}
             stored = group.create_dataset(key, data=values, track_times=False, **packed)
+            stored.flush()  # its chunks have their place in the file now, whoever else refers to the data set
             self.bytes += stored.id.get_storage_size()
         group.attrs["figures"] = json.dumps(figures, sort_keys=True)
 

@@ -72,9 +72,12 @@ def write_sharp(
                 electrons = np.nan_to_num(image[0], nan=0.0) * np.float32(exposure_s)
                 raw = clean.sample_dn(types.Float(electrons), aps.exposure_us, seed).numpy()
                 raw = np.where(sensor.layout.aps_mask, raw.reshape(shape[1:]), 0)
-                file["flux_e_per_s"][number] = image[0].reshape(shape[1:])
-                file["stderr_e_per_s"][number] = image[1].reshape(shape[1:])
-                file["raw_dn"][number] = raw.astype(np.uint16)
+                for name, values in (
+                    ("flux_e_per_s", image[0]), ("stderr_e_per_s", image[1]), ("raw_dn", raw.astype(np.uint16)),
+                ):  # fmt: skip
+                    stored = file[name]
+                    stored[number] = values.reshape(shape[1:])
+                    stored.flush()  # so that its chunks have their place now, see `truth_file`
             file.close()
             disk.close()
     except BaseException:

@@ -79,6 +79,7 @@ class EventFileWriter:
             dataset = self._file[f"events/{name}"]
             dataset.resize((self._written + block.size,))
             dataset[self._written :] = columns[name].astype(kind)
+            dataset.flush()  # its chunks have their place in the file now, whoever else refers to the data set
         # milliseconds after the last indexed one, up to the last event of this block
         new_ms = np.arange(self._first_of_ms.size, relative[-1] // 1000 + 1)
         index = self._written + np.searchsorted(relative, new_ms * 1000, side="left")

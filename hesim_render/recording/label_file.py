@@ -39,7 +39,7 @@ def write_labels(folder: Path, labels: EventLabels, shape: tuple[int, int], begi
                 ("lost/in", labels.lost_in),
                 *((f"lost/{column}", labels.lost[column]) for column in _COLUMNS),
             ):
-                file.create_dataset(name, data=np.ascontiguousarray(values), **(chunks if values.size else {}))
+                file.create_dataset(name, data=np.ascontiguousarray(values), **(chunks if values.size else {})).flush()
             file["label"].attrs.update({label.name.lower(): int(label) for label in Label})
             file["lost/in"].attrs.update({place.name.lower(): int(place) for place in Lost})
             file.close()

@@ -136,7 +136,11 @@ def _write_constants(file: Any, truth: SceneTruth) -> None:
 def _write_images(
     group: Any, truth: SceneTruth, grid: Any, kinds: Sequence[str], rows: NDArray[np.float64], number: int
 ) -> None:
-    """All images of one time, as entry `number` of their data sets."""
+    """All images of one time, as entry `number` of their data sets.
+
+    Each is flushed at once: HDF5 gives a chunk its place in the file when the last reference to its data set goes, and
+    whoever looks into running programs (a debugger, dask's profiler) may hold references for longer.
+    """
     count, now = len(rows), rows[number]
     for name, image in images_at(truth, grid, kinds, rows, number):
         if name not in group:
@@ -145,7 +149,9 @@ def _write_images(
                 name, shape=(count, *image.shape), chunks=(1, *image.shape), dtype=image.dtype, compression=COMPRESSION,
                 fillvalue=fill,
             )  # fmt: skip
-        group[name][number] = image
+        stored = group[name]
+        stored[number] = image
+        stored.flush()
     if "boxes" in kinds:
         boxes = truth.boxes(now, grid)
         for name in ("visible_px", "whole_px", "corners_m"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -68,11 +69,13 @@ def _rigid(matrix: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
 RigidMatrix = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
 
 
-def rotation_vector(matrix: tuple[Row, Row, Row, Row]) -> NDArray[np.float64]:
-    """Axis times angle (0 to π) of a rigid matrix's rotation, the nearest one to its rounded numbers."""
+def rotation_vectors(matrices: Sequence[tuple[Row, Row, Row, Row]]) -> NDArray[np.float64]:
+    """Axis times angle (0 to π) of the rotations of rigid matrices, those nearest to their rounded numbers; [n, 3]."""
     from scipy.spatial.transform import Rotation
 
-    return Rotation.from_matrix(np.array(matrix)[:3, :3]).as_rotvec()
+    if not matrices:
+        return np.empty((0, 3))
+    return Rotation.from_matrix(np.array(matrices)[:, :3, :3]).as_rotvec()
 
 
 def rotation_about(axis: ArrayLike, angle_deg: float) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
-from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vector
+from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vectors
 from hesim_render.specs.poses import PoseFile, read_poses
 
 #: Keys of a track that say how its `file` is read, and the texts that they may be; without any, whole numbers.
@@ -39,11 +39,17 @@ class KeyframeSpec(Strict):
             raise ValueError(f"give matrix or {', '.join(sorted(other))}, not both")
         return self
 
-    def resolved(self, pivot_m: Vector, before: KeyframeSpec | None) -> KeyframeSpec:
-        """The keyframe without a matrix: x → R (x − pivot) + pivot + translation."""
-        if self.matrix is None:
+    def resolved(self, pivot_m: Vector, before: KeyframeSpec | None, turn: NDArray[np.float64] | None) -> KeyframeSpec:
+        """The keyframe without a matrix: x → R (x − pivot) + pivot + translation.
+
+        Parameters
+        ----------
+        pivot_m, before : of the track; and the keyframe before this one, without a matrix.
+        turn : rotation vector of the matrix, from `rotation_vectors`; None without a matrix.
+        """
+        if self.matrix is None or turn is None:
             return self
-        axis, angle_deg = _turn(rotation_vector(self.matrix), before)
+        axis, angle_deg = _turn(turn, before)
         values, pivot = np.array(self.matrix, dtype=np.float64), np.array(pivot_m, dtype=np.float64)
         shift = values[:3, 3] - pivot + rotation_about(axis, angle_deg) @ pivot
         return KeyframeSpec(
@@ -118,8 +124,10 @@ class TrackSpec(Strict):
     @classmethod
     def _without_matrices(cls, frames: list[KeyframeSpec], info: ValidationInfo) -> list[KeyframeSpec]:
         found: list[KeyframeSpec] = []
+        turns = iter(rotation_vectors([frame.matrix for frame in frames if frame.matrix is not None]))
         for frame in frames:
-            found.append(frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), found[-1] if found else None))
+            turn = None if frame.matrix is None else next(turns)
+            found.append(frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), found[-1] if found else None, turn))
         return found
 
     @model_validator(mode="after")

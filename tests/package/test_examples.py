@@ -24,6 +24,13 @@ def test_opencv_finds_the_camera():
 
 
 @pytest.mark.slow
+def test_opencv_finds_the_camera_from_events():
+    found = re.findall(r"^([fc][xy]).* (-?[\d.]+)%$", run("calibrate_from_events.py", 8), re.MULTILINE)
+    assert [name for name, _ in found] == ["fx", "fy", "cx", "cy"]
+    assert all(abs(float(percent)) < 0.3 for _, percent in found)
+
+
+@pytest.mark.slow
 def test_the_measured_mtf_is_the_closed_form():
     rows = re.findall(r"^ +([\d.]+) +([\d.]+) +([\d.]+)$", run("measure_mtf.py"), re.MULTILINE)
     assert len(rows) == 5

@@ -344,3 +344,18 @@ def test_exports_that_cannot_be_made_leave_nothing(recorded, tmp_path):
     with pytest.raises(OutputError, match="holds other things"):
         export_truth(recorded, "tum", tmp_path / "full")
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
+
+
+def test_files_are_the_same_if_somebody_holds_on_to_their_data_sets(recorded, tmp_path, monkeypatch):
+    """A profiler that samples the stack does. HDF5 places a chunk when the last reference to its data set goes."""
+    held, plain = [], h5py.Group.__getitem__
+
+    def held_item(group, name):
+        held.append(plain(group, name))
+        return held[-1]
+
+    monkeypatch.setattr(h5py.Group, "__getitem__", held_item)
+    simulate(moving_scene(), sensor(), duration_s=0.06, samples=2, out=tmp_path / "r", truth=GEOMETRY)
+    for name in ("truth/geometry.h5", "events.h5"):
+        assert (tmp_path / "r" / name).read_bytes() == (recorded.path / name).read_bytes(), name
+    assert len(held) > 20

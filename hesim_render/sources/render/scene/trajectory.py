@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
+from itertools import pairwise
 from math import degrees, radians
 from typing import NamedTuple
 
@@ -22,8 +24,23 @@ def _unit(axis: ArrayLike) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector)
 
 
-def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], float]:
-    """Axis and angle (rad, any number of turns) of the rotation from one keyframe to the next."""
+def _arcs(frames: Sequence[KeyframeSpec]) -> list[tuple[NDArray[np.float64], float]]:
+    """Axis and angle (rad, any number of turns) of the rotation from each keyframe to the next."""
+    found = [_about_one_axis(start, end) for start, end in pairwise(frames)]
+    shortest = [number for number, arc in enumerate(found) if arc is None]
+    if shortest:
+        vectors = np.array([radians(frame.rotation_deg) * _unit(frame.rotation_axis) for frame in frames])
+        every = Rotation.from_rotvec(vectors)
+        first, second = every[shortest], every[[number + 1 for number in shortest]]
+        for number, turn in zip(shortest, (second * first.inv()).as_rotvec(), strict=True):
+            angle = float(np.linalg.norm(turn))
+            axis = _unit(frames[number].rotation_axis)
+            found[number] = (axis, 0.0) if angle < _EPSILON else (turn / angle, angle)
+    return [arc for arc in found if arc is not None]
+
+
+def _about_one_axis(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], float] | None:
+    """Axis and angle where both keyframes turn about one axis; None where the rotation takes the shorter arc."""
     if start.rotation_deg == 0:
         return _unit(end.rotation_axis), radians(end.rotation_deg)
     if end.rotation_deg == 0:
@@ -31,11 +48,7 @@ def _arc(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], f
     a, b = _unit(start.rotation_axis), _unit(end.rotation_axis)
     if abs(abs(a @ b) - 1) < 1e-9:
         return a, radians(end.rotation_deg * np.sign(a @ b) - start.rotation_deg)
-    first = Rotation.from_rotvec(radians(start.rotation_deg) * a)
-    second = Rotation.from_rotvec(radians(end.rotation_deg) * b)
-    turn = (second * first.inv()).as_rotvec()  # the shorter of the two arcs
-    angle = float(np.linalg.norm(turn))
-    return (a, 0.0) if angle < _EPSILON else (turn / angle, angle)
+    return None
 
 
 class Piece(NamedTuple):
@@ -72,7 +85,7 @@ class Trajectory:
         self.pivot_m = np.array(track.pivot_m, dtype=np.float64)
         self.knots_us = np.array([frame.t_us for frame in frames], dtype=np.float64)
         self.translation_m = np.array([frame.translation_m for frame in frames], dtype=np.float64)
-        arcs = [_arc(start, end) for start, end in zip(frames[:-1], frames[1:], strict=True)]
+        arcs = _arcs(frames)
         self.arc_axis = np.array([axis for axis, _ in arcs])
         self.arc_rad = np.array([angle for _, angle in arcs])
         turns = [radians(frame.rotation_deg) * _unit(frame.rotation_axis) for frame in frames[:-1]]
