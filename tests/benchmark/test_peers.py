@@ -271,6 +271,6 @@ def test_programs_that_are_installed_here_run():
     print(peers_table(result))
     rows = {row["peer"]: row for row in result["rows"]}
     assert not [row for row in result["rows"] if "error" in row]
-    # those that keep a reference level, without noise; one that compares neighbouring pictures alone gives no event here
+    # those that keep a reference level, without noise; one that compares neighbouring pictures alone gives none here
     for name in {"evlib-linear", "eventcv"} & set(rows):
         assert abs(rows[name]["count_error"]) < 0.2 and rows[name]["timing_us"] < 1500, rows[name]
