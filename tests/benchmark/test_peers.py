@@ -263,11 +263,14 @@ def test_the_noise_free_events_are_those_of_an_ideal_pixel_in_the_same_light(spe
 def test_programs_that_are_installed_here_run():
     """Those of benchmarks/peers/peers.yaml whose environments lie beside it, as the file says."""
     file = Path(__file__).parents[2] / "benchmarks" / "peers" / "peers.yaml"
-    spec = read_peers(file, {"sensor.roi": "24x18", "duration_s": 0.03, "fps": [240]})
+    spec = read_peers(file, {"sensor.roi": "24x18", "duration_s": 0.02, "fps": [1000]})
     there = tuple(peer for peer in spec.peers if (file.parent / peer.command[0]).exists())
     if not there:
         pytest.skip("no peer is installed")
     result = compare_peers(spec.model_copy(update={"peers": there}))
     print(peers_table(result))
-    for row in result["rows"]:
-        assert "error" not in row and row["events"] > 0, row
+    rows = {row["peer"]: row for row in result["rows"]}
+    assert not [row for row in result["rows"] if "error" in row]
+    # those that keep a reference level, without noise; one that compares neighbouring pictures alone gives none here
+    for name in {"evlib-linear", "eventcv"} & set(rows):
+        assert abs(rows[name]["count_error"]) < 0.2 and rows[name]["timing_us"] < 1500, rows[name]

@@ -124,6 +124,15 @@ def test_hdf5_shards_and_what_is_changed_or_wrong(built, tmp_path):
         verify_shards(tmp_path / "none")
 
 
+def test_webdataset_reads_shards_by_itself(built, tmp_path):
+    webdataset = pytest.importorskip("webdataset")
+    pack_benchmark(built.root, tmp_path / "w")
+    clip = next(built.clips("train"))
+    read = webdataset.WebDataset(str(tmp_path / "w" / "train-000000.tar"), shardshuffle=False).decode()
+    found = {sample["__key__"]: sample for sample in read}
+    assert same_as(clip, found) == 3
+
+
 def test_the_command_packs_and_checks(built, tmp_path, capsys):
     from hesim_render import cli
 
