@@ -255,7 +255,7 @@ class _Studies:
         data = load_yaml(self._file)
         if run.keys(_SENSOR):
             data["sensor_keys"] = {**data.get("sensor_keys", {}), **run.keys(_SENSOR)}
-        if len(self._spec.seeds) > 1:
+        if "seeds" in self._spec.model_fields_set:
             keys = {**keys, "noise.seed": run.seed}
         return validate(StudySpec, data, self._file, keys)
 

@@ -48,6 +48,13 @@ def test_families_are_the_filters_that_files_name():
     indices = [2.35 if k % 2 == 0 else 1.46 for k in range(5)]
     expected = 0.97 * thin_film_transmittance(indices, values, 1.52, 1.52, grid_nm=BANDS).values
     np.testing.assert_allclose(FAMILIES["film"].transmittance(numbers(values)).numpy(), expected, rtol=2e-5)
+    # what passes a filter where it is darkest
+    for family, bare in ((Dyes(BANDS, 2, 0.95, 0.05), FAMILIES["dye"]),
+                         (ThinFilms(BANDS, 5, 0.97, 0.05), FAMILIES["film"])):  # fmt: skip
+        values = drawn(bare)
+        share = bare.transmittance(numbers(values)).numpy() / bare.most
+        expected = 0.05 + (bare.most - 0.05) * share
+        np.testing.assert_allclose(family.transmittance(numbers(values)).numpy(), expected, rtol=1e-6)
     values = drawn(FAMILIES["free"])
     expected = np.interp(BANDS, FAMILIES["free"].knots_nm, values)
     np.testing.assert_allclose(FAMILIES["free"].transmittance(numbers(values)).numpy(), expected, rtol=1e-5)

@@ -168,6 +168,10 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
     assert palette.count("depth_um: 3.0") == 1
     (tmp_path / "mine.yaml").write_text(palette.replace("depth_um: 3.0", "depth_um: 1.0"))
     assert np.all(sweep(spec, out=tmp_path / "out")["ysnr"] < table["ysnr"])
+    # seeds are those of the noisy frames
+    noisy = {**spec, "metrics": ["ysnr", "ysnr_simulated"], "seeds": [1, 2], "vary": {"noise.repeats": [1]}}
+    first, second = (sweep(noisy, out=tmp_path / "out").where(seed=seed) for seed in (1, 2))
+    assert np.all(first["ysnr"] == second["ysnr"]) and np.all(first["ysnr_simulated"] != second["ysnr_simulated"])
     spec["vary"] = {"noise.repeats": [0]}
     assert len(sweep({**spec, "metrics": []}, out=tmp_path / "out")) == 2
     for changes, message in (
