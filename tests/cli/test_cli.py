@@ -322,8 +322,9 @@ def test_a_run_that_is_not_what_was_asked_for_says_so_and_has_a_status_of_its_ow
     from hesim_render.sources.render.audit import audit
 
     given = ("simulate", "rotating-star", "--sensor", "reference-mono", "--roi", "48x36", "--duration", 0.02)
-    for tolerance, wanted in ((0.1, 3), (audit.TOLERANCE, 0)):
+    for tolerance, rays, wanted in ((0.1, 2_000_000, 3), (audit.TOLERANCE, audit._RAYS, 0)):
         monkeypatch.setattr(audit, "TOLERANCE", tolerance)
+        monkeypatch.setattr(audit, "_RAYS", rays)  # what can never be shown is not tried for long
         out = tmp_path / str(wanted)
         status, text, err = call(capsys, *given, "--out", out)
         told = json.loads((out / "recording.json").read_text())["settings"]["render"]
