@@ -7,12 +7,15 @@ from typing import Any
 import numpy as np
 
 from hesim_render.benchmark.draws import log_uniform
+from hesim_render.benchmark.motions import CAMERA_WAY, CAMERA_Z
 from hesim_render.specs.benchmark import LightsSpec
 from hesim_render.spectral.spectrum import Spectrum, illuminant, scale_to_lux
 
 #: Samples of the lamps' spectra, nm. Illuminants are given every 1 or 5 nm; lines of fluorescent lamps need 5 nm.
 _WAVELENGTH_NM = np.arange(360.0, 831.0, 5.0)
 _SMALLEST, _LARGEST = 0.05, 0.6
+#: Smallest and largest coordinates of a lamp, m.
+_PLACES = [-1.4, -0.6, 0.9], [1.4, 1.8, 2.2]
 
 
 def _emission(spectrum: Spectrum, factor: float) -> dict[str, Any]:
@@ -22,13 +25,26 @@ def _emission(spectrum: Spectrum, factor: float) -> dict[str, Any]:
     return {"type": "irregular", "wavelengths": _WAVELENGTH_NM.tolist(), "values": (values * factor).tolist()}
 
 
+def _hides_the_view(place: np.ndarray, size: float) -> bool:
+    """True if a lamp of some extent could stand between the camera and what it sees, or around the camera.
+
+    Parameters
+    ----------
+    place : of its middle, m.
+    size : of its side or diameter, m.
+    """
+    half_width = 0.5 * max(0.0, CAMERA_Z - float(place[2])) / CAMERA_Z
+    # corners of a square picture and of a panel; the camera moves a little
+    return float(np.hypot(place[0], place[1])) < np.sqrt(2) * (half_width + size / 2) + CAMERA_WAY
+
+
 def _lamp(rng: np.random.Generator, kind: str, irradiance: Spectrum) -> dict[str, Any]:
     """A lamp that gives an irradiance, W m⁻² nm⁻¹, on the plane z = 0 at the origin, unshadowed; a panel or a ball of
     some extent gives it to within a few percent, as its distance differs over its surface.
     """
     if kind == "sky":
         return {"type": "constant", "radiance": _emission(irradiance, 1 / np.pi)}
-    place = rng.uniform([-1.4, -0.6, 0.9], [1.4, 1.8, 2.2])
+    place = rng.uniform(*_PLACES)
     square = float(place @ place)
     cosine = float(place[2] / np.sqrt(square))
     if kind == "sun":
@@ -42,6 +58,10 @@ def _lamp(rng: np.random.Generator, kind: str, irradiance: Spectrum) -> dict[str
             "intensity": _emission(irradiance, square / cosine),
         }  # fmt: skip
     size = log_uniform(rng, (_SMALLEST, _LARGEST))
+    while _hides_the_view(place, size):
+        place = rng.uniform(*_PLACES)
+    square = float(place @ place)
+    cosine = float(place[2] / np.sqrt(square))
     matrix = np.eye(4)
     matrix[:3, 3] = place
     if kind == "ball":

@@ -12,7 +12,7 @@ from hesim_render.specs.benchmark import MotionsSpec
 #: Longest straight way of a solid, view widths; a longer one is a way to and fro.
 _LONGEST_WAY = 0.7
 #: Largest way and turn of the camera.
-_CAMERA_WAY, _CAMERA_TURN_DEG = 0.15, 5.0
+CAMERA_WAY, _CAMERA_TURN_DEG = 0.15, 5.0
 CAMERA_Z = 2.0
 
 
@@ -82,8 +82,8 @@ def camera_track(rng: np.random.Generator, speed: float, duration_us: int) -> di
     whole = speed * duration_us / 1e6
     way = _direction(rng, 0.2)
     track: dict[str, Any] = {"object": "camera", "pivot_m": [0.0, 0.0, CAMERA_Z]}
-    if whole > _CAMERA_WAY:
-        return {**track, "repeat": True, "keyframes": _to_and_fro(way * _CAMERA_WAY, speed, rng.random())}
+    if whole > CAMERA_WAY:
+        return {**track, "repeat": True, "keyframes": _to_and_fro(way * CAMERA_WAY, speed, rng.random())}
     turn = float(rng.uniform(-1, 1)) * min(_CAMERA_TURN_DEG, np.degrees(whole / CAMERA_Z))
     keys = [
         {"t_us": 0, "rotation_axis": [0, 1, 0], "rotation_deg": 0.0, "translation_m": (-0.5 * whole * way).tolist()},

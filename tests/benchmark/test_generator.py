@@ -1,5 +1,6 @@
 """Generated scenes: pure functions of their numbers, within their ranges, and without parts that splits share."""
 
+import itertools
 import json
 from collections import Counter
 
@@ -316,3 +317,26 @@ def test_sharp_times_lie_within_the_run():
 def test_the_specification_survives_its_own_text(tmp_path):
     spec = generated(2, exposures_us=[[1000, 2000]])
     assert type(spec).model_validate(json.loads(json.dumps(spec.model_dump(mode="json")))) == spec
+
+
+def test_no_lamp_of_some_extent_stands_in_the_view():
+    """Points of panels and balls, projected: the camera at z = 2 m sees 1 m across at z = 0, and moves a little."""
+    from hesim_render.benchmark.lamps import lamps
+
+    spec = generated(1, lights={"lamps": 3}).lights
+    unit = np.array(list(itertools.product((-1, 0, 1), repeat=3)), dtype=float)
+    seen, count = [], 0
+    for number in range(600):
+        for emitter in lamps(np.random.default_rng(number), spec)[0].values():
+            if emitter["type"] not in ("rectangle", "sphere"):
+                continue
+            count += 1
+            of_ball = unit / np.maximum(1, np.linalg.norm(unit, axis=1))[:, None]
+            corners = unit * [1, 1, 0] if emitter["type"] == "rectangle" else of_ball
+            matrix = np.array(emitter["to_world"])
+            points = corners @ matrix[:3, :3].T + matrix[:3, 3]
+            for step in (-0.1, 0, 0.1):  # of the camera, along each axis
+                depth = 2 - points[:, 2]
+                inside = (depth > 0) & (np.abs(points[:, :2] - step) < 0.25 * depth[:, None]).all(axis=1)
+                seen.append(bool(inside.any()))
+    assert count > 600 and not any(seen)
