@@ -158,9 +158,11 @@ def test_a_run_says_that_it_is_exact_and_names_the_files(tmp_path):
     (tmp_path / "scene.yaml").write_text(json.dumps(content))
     scene, sensor = hr.load_scene(tmp_path / "scene.yaml"), mono(16, 12, aps__exposure_us=1000)
     assert "moving: plate" in repr(scene)
-    recording = hr.simulate(scene, sensor, duration_s=0.004, samples=4, out=tmp_path / "out", progress=False)
+    recording = hr.simulate(
+        scene, sensor, duration_s=0.004, samples=4, out=tmp_path / "out", truth=["events"], progress=False
+    )
     manifest = json.loads((tmp_path / "out" / "recording.json").read_text())
-    assert recording.events.size > 0
+    assert recording.events.size > 0 and recording.event_labels.counts()["signal"] > 0
     assert set(manifest["scene"]["files_sha256"]) == {"plate.ply", "shapes.npz"}
     settings = hr.simulate(scene, sensor, duration_s=0.001, progress=False).manifest["settings"]
     assert settings["mode"] == "exact" and settings["exact_because"] == "object 'plate' changes its shape"

@@ -114,7 +114,7 @@ class MovingScene:
     Raises
     ------
     SpecError
-        If something moves in a scene with instances.
+        If something moves in a scene with instances, or a mesh changes its shape and only geometry is wanted.
     NeedsExactMode
         If a moving shape emits light, a plugin of the scene asks for that mode, the scene's integrator is not Mitsuba's
         path tracer, or it hides lights.
