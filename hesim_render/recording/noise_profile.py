@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hesim_render.pixels.aps.model import ApsNoise
-
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
 
@@ -35,9 +33,7 @@ def noise_profile(sensor: Sensor, without: Sequence[str] = ()) -> tuple[float, f
     aps = sensor.spec.aps
     if aps is None:
         return None
-    model = ApsNoise(aps, sensor.layout, sensor.spec.device_seed).without(
-        *[name[4:] for name in without if name.startswith("aps.")]
-    )
+    model = sensor.aps.without(*[name[4:] for name in without if name.startswith("aps.")])
     white = min(2**aps.bit_depth - 1, round(aps.black_level_dn + aps.system_gain_dn_per_e * aps.full_well_e))
     span = white - aps.black_level_dn
     x = np.linspace(0.0, 1.0, _SIGNALS)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.aps.model import ApsNoise
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.frame import Frame
 from hesim_render.recording.writer import RecordingWriter
@@ -13,12 +14,13 @@ from hesim_render.specs import read_sensor
 
 
 def sensor_like(name, width=128, height=96):
-    """What the writer reads of a Sensor, without the noise models."""
+    """What the writer reads of a Sensor, without event pixels' noise models."""
     spec = read_sensor(name)
     layout = Layout.full(spec).crop(width, height)
     lens = Lens.of(spec)
     responses = {name: response(spec, name, lens) for name in spec.filters}
-    return SimpleNamespace(spec=spec, layout=layout, lens=lens, file=str(name), responses=responses)
+    aps = None if spec.aps is None else ApsNoise(spec.aps, layout, spec.device_seed)
+    return SimpleNamespace(spec=spec, layout=layout, lens=lens, file=str(name), responses=responses, aps=aps)
 
 
 def frame_of(sensor, index=0, seed=3):
