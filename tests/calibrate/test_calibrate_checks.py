@@ -55,6 +55,7 @@ def test_frames_that_break_the_model_are_named(tmp_path, keys, check, advice):
         assert not any(name.startswith("black") or name == "dark line" for name in found)
 
 
+@pytest.mark.slow
 def test_the_sizes_of_drifts_are_told(tmp_path):
     section, _ = frames_of(tmp_path / "a", black_drift=3.0, drift_over="exposure")
     # a ramp of 3 DN over 32 frames: 3·sqrt((1 − 1/32²)/12) rms; the mean over 4096 pixels is good to 0.03 DN
@@ -257,7 +258,7 @@ GOOD_EVENTS = {"plain": {"mismatch": 0.0}, "mismatch": {}, "wide mismatch": {"mi
 @pytest.mark.parametrize(
     "keys",
     [
-        pytest.param(keys, id=name, marks=pytest.mark.slow if name in ("leak", "asymmetry") else ())
+        pytest.param(keys, id=name, marks=pytest.mark.slow if name in ("leak", "asymmetry", "mismatch") else ())
         for name, keys in GOOD_EVENTS.items()
     ],
 )

@@ -458,6 +458,7 @@ def test_bad_input_of_lab_and_calibrate_is_one_line_and_writes_nothing(arguments
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_lab_of_an_asynchronous_sensor_and_keeps_what_is_there(capsys, tmp_path):
     command = ["lab", "davis346", "--out", tmp_path / "o", "--roi", "8x8", "--frames", "8", "--trials", "4"]
     status, out, _ = call(capsys, *command)

@@ -1,8 +1,6 @@
 """Damaged and foreign event files, and outputs that exist: one clear line, and nothing is changed."""
 
 import os
-import subprocess
-import sys
 
 import lz4.frame
 import numpy as np
@@ -11,6 +9,7 @@ import recordings
 from event_files import DATA, SHAPE, columns, made, many, raw, written
 
 import hesim_render as hr
+from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.exchange import EVENT_FORMATS, EventStream, open_events
 from hesim_render.recording.exports import import_events
@@ -224,22 +223,22 @@ def test_what_a_recording_does_not_have(tmp_path):
     assert not os.listdir(tmp_path)
 
 
-def command(*words):
-    program = "import sys; from hesim_render.cli import main; main(sys.argv[1:])"
-    done = subprocess.run([sys.executable, "-c", program, *map(str, words)], capture_output=True, text=True)
-    return done.returncode, done.stdout, done.stderr
+def command(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        main([*map(str, words)])
+    return int(ended.value.code or 0), *capsys.readouterr()
 
 
-def test_the_commands(tmp_path):
+def test_the_commands(capsys, tmp_path):
     recording = recordings.make("davis346", tmp_path / "r")
-    status, told, _ = command("export", tmp_path / "r", "--format", "evt3", "--out", tmp_path / "e.raw")
+    status, told, _ = command(capsys, "export", tmp_path / "r", "--format", "evt3", "--out", tmp_path / "e.raw")
     assert (status, told) == (0, f"20000 events in {tmp_path / 'e.raw'}\n")
-    status, told, _ = command("import", tmp_path / "e.raw", "--out", tmp_path / "e.h5")
+    status, told, _ = command(capsys, "import", tmp_path / "e.raw", "--out", tmp_path / "e.h5")
     assert (status, told) == (0, f"events in {tmp_path / 'e.h5'}\n")
     np.testing.assert_array_equal(np.concatenate(list(open_events(tmp_path / "e.h5"))), recording.events)
-    status, told, error = command("import", tmp_path / "e.raw", "--format", "evt2", "--out", tmp_path / "f.h5")
+    status, told, error = command(capsys, "import", tmp_path / "e.raw", "--format", "evt2", "--out", tmp_path / "f.h5")
     assert (status, told) == (2, "") and error.count("\n") == 1 and "which is evt3" in error
-    status, _, error = command("import", tmp_path / "e.raw", "--size", "12", "--out", tmp_path / "f.h5")
+    status, _, error = command(capsys, "import", tmp_path / "e.raw", "--size", "12", "--out", tmp_path / "f.h5")
     assert status == 2 and "expected WIDTHxHEIGHT, such as 1280x720" in error
     assert not (tmp_path / "f.h5").exists()
 

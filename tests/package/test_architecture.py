@@ -5,6 +5,7 @@ import importlib
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,7 @@ def package_of(name):
     return name.removeprefix("hesim_render").strip(".").rpartition(".")[0]
 
 
+@cache
 def imports(path):
     """Dotted names imported anywhere in a module but under TYPE_CHECKING; of packages, what is taken from them."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -42,14 +44,16 @@ def imports(path):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
         for child in ast.walk(node)
     }
+    found = []
     for node in ast.walk(tree):
         if id(node) in typing_only:
             continue
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return tuple(found)
 
 
 def modules_imported(name):

@@ -153,6 +153,7 @@ def test_a_card_on_the_plane_gives_the_flux_of_that_level_in_every_mode():
     assert recording.manifest["scene"]["spec"]["mitsuba"]["illuminance_lux"] == 1000
 
 
+@pytest.mark.slow
 def test_all_lit_light_counts_once_however_it_flickers():
     lamps = {"one": lamp(), "two": lamp(x=-0.5, radiance=1.0), "off": lamp(y=-0.4, radiance=7.0)}
     waves = {"two": {"type": "pwm", "frequency_hz": 100, "duty": 0.3, "phase_deg": 180}}

@@ -81,7 +81,11 @@ def calibrated(target, model, count, seed, window=None):
 
 
 @pytest.mark.parametrize(
-    "model", [pytest.param(RADIAL, id="opencv"), pytest.param(FISHEYE, id="fisheye", marks=pytest.mark.slow)]
+    "model",
+    [
+        pytest.param(RADIAL, id="opencv", marks=pytest.mark.slow),
+        pytest.param(FISHEYE, id="fisheye", marks=pytest.mark.slow),
+    ],
 )
 def test_opencv_finds_camera_and_distortion_from_a_few_checkerboards(model):
     focal, centre, distortion, count = calibrated(CHECKERBOARD, model, 9, 1)

@@ -132,6 +132,7 @@ def test_bounds_cover_in_99_of_100(kind, monkeypatch):
     assert min(covered.values()) >= 291
 
 
+@pytest.mark.slow
 def test_estimates_are_the_shares_themselves(monkeypatch):
     """Everything is looked at: estimates within five standard errors of the shares over all pairs."""
     run, truth = scene("in calm places", np.random.default_rng(11))
@@ -142,6 +143,7 @@ def test_estimates_are_the_shares_themselves(monkeypatch):
     assert found["deviation_noise"]["largest"] >= (1 - 1 / 1.6) / UNIT * 0.999
 
 
+@pytest.mark.slow  # a run of the command line tells it, too
 def test_verdict_and_the_quality_that_would_do():
     truth = np.full((TICKS, ROWS * COLS), 1e5)
     truth[::2, :40] *= 1.5

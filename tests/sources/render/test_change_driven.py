@@ -91,7 +91,7 @@ def test_flux_does_not_depend_on_what_was_asked_for_before(name):
         np.testing.assert_array_equal(np.array(half)[np.searchsorted(pixels, some)], np.array(other_half))
 
 
-@pytest.mark.parametrize("name", ["rotating-star", "camera-sweep"])
+@pytest.mark.parametrize("name", ["rotating-star", pytest.param("camera-sweep", marks=pytest.mark.slow)])
 def test_a_crop_is_the_full_sensor(name):
     # seen through a lens, so that the region that is read out does not decide what is seen
     camera = {"fit": None, "horizontal_fov_deg": None, "focal_length_mm": 0.6}
@@ -225,11 +225,8 @@ SURPRISES = {
 }  # fmt: skip
 
 
-#: The others take a quarter of a minute each.
-QUICK = ("small fast object",)
-
-
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SURPRISES])
+@pytest.mark.slow  # a quarter of a minute each; plates that pop in are among the quick tests of hidden scenes
+@pytest.mark.parametrize("name", SURPRISES)
 def test_what_passes_meanwhile_is_found(name):
     """Every pair against 1024 rays of other random numbers."""
     shapes, (what, distance, time_us), depth = SURPRISES[name]
@@ -256,6 +253,7 @@ def test_what_passes_meanwhile_is_found(name):
 # ---- the run as a whole -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_crosstalk_and_clean_runs_take_the_same_way():
     sensor = hr.load_sensor("gen2", {"geometry.crosstalk": 0.05}).crop(64, 48)
     rec = hr.simulate(hr.load_scene("rotating-star"), sensor, duration_s=0.02)

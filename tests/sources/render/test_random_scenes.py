@@ -8,8 +8,8 @@ from scipy import stats
 
 import hesim_render as hr
 
-#: Five of the twenty are quick to compile.
-FAST, TWENTY, SLOW = (1000, 1002, 1003, 1005, 1006), range(1000, 1020), range(2000, 2500)
+#: Three of the twenty that are quick to compile.
+FAST, TWENTY, SLOW = (1000, 1002, 1003), range(1000, 1020), range(2000, 2500)
 #: Share of values off by more than three wanted errors that a run should have at most.
 MOST_OFF = 0.01
 

@@ -28,6 +28,7 @@ def test_cube_of_a_flat_field_is_exact_at_every_band():
     assert stderr.max() < 1e-6 * expected.max()  # nothing varies over a flat field at one wavelength
 
 
+@pytest.mark.slow
 def test_photocurrent_of_the_cube_is_the_rendered_flux():
     sensor = hr.load_sensor("reference-bayer").crop(48, 32)
     scene = hr.load_scene("colorchecker")
@@ -38,6 +39,7 @@ def test_photocurrent_of_the_cube_is_the_rendered_flux():
     assert abs(ratio - 1) < 2e-3  # 64 rays at patch borders, 5 nm bands
 
 
+@pytest.mark.slow
 def test_cube_follows_motion():
     scene = hr.load_scene("rotating-star")
     _, early, _ = render_cube(scene, (32, 32), [550], 16, 0.0)

@@ -86,6 +86,7 @@ def test_light_by_way_of_a_mirror_is_that_of_the_image():
     assert abs(flux[1] / flux[0] - 1 - expected) < 5 * error + 1e-4 * expected
 
 
+@pytest.mark.slow
 def test_it_takes_fewer_rays(monkeypatch):
     def square_error():
         halves = traced(room(), 64)
@@ -102,7 +103,7 @@ def test_it_takes_fewer_rays(monkeypatch):
         GREY,
         {"type": "plastic", "diffuse_reflectance": {"type": "uniform", "value": 0.4}},
         {"type": "roughplastic", "diffuse_reflectance": {"type": "uniform", "value": 0.4}, "alpha": 0.2},
-        {"type": "twosided", "nested": GREY},
+        pytest.param({"type": "twosided", "nested": GREY}, marks=pytest.mark.slow),
     ],
     ids=["matt", "plastic", "rough plastic", "both sides"],
 )

@@ -85,7 +85,8 @@ def lamps(count):
     ("depth", "roulette"),
     [(2, 16), pytest.param(4, 16, marks=pytest.mark.slow), pytest.param(12, 16, marks=pytest.mark.slow), (12, 3)],
 )
-@pytest.mark.parametrize("light", [{"sky": SKY}, {"lamp": LAMP, "sky": SKY}, lamps(3), lamps(12)])
+@pytest.mark.parametrize("light", [pytest.param({"sky": SKY}, marks=pytest.mark.slow), {"lamp": LAMP, "sky": SKY},
+                                   pytest.param(lamps(3), marks=pytest.mark.slow), lamps(12)])  # fmt: skip
 def test_paths_are_those_of_mitsuba(light, depth, roulette, draws_of_mitsuba):
     """However long they are, and whatever their last segment may run into: the same rays to the same value.
 

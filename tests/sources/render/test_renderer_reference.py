@@ -192,7 +192,8 @@ def default_against_reference(scene, sensor, window, pixel, seeds=6):
     return (runs.mean(axis=0) - found.flux[0]) / error, runs.sum() / (seeds * found.flux[0].sum())
 
 
-@pytest.mark.parametrize("scene", [pytest.param(crossing, marks=pytest.mark.slow), glint], ids=["crossing", "glint"])
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", [crossing, glint], ids=["crossing", "glint"])
 def test_default_mode_against_it(scene):
     sensor = hr.load_sensor("reference-bayer").crop(40, 32)
     pixel = np.random.default_rng(6).choice(1280, 24, replace=False)

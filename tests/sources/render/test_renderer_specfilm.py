@@ -59,7 +59,9 @@ def assert_agreement(ours, reference):
     assert abs(ours.mean() / theirs.mean() - 1) < 0.01
 
 
-@pytest.mark.parametrize("light", [DIRECTIONAL, AREA], ids=["directional", "area"])
+@pytest.mark.parametrize(
+    "light", [pytest.param(DIRECTIONAL, marks=pytest.mark.slow), AREA], ids=["directional", "area"]
+)
 def test_lit_objects_with_interreflection(light):
     scene = make_scene(**LIT_ROOM, light=light)
     sensor = hr.load_sensor("reference-bayer").crop(48, 32)

@@ -138,6 +138,7 @@ def assert_same(ours, errors, reference, name):
     assert 0.7 < np.mean(z**2) < 1.6, name
 
 
+@pytest.mark.slow
 def test_both_modes_agree_with_mitsubas_thin_lens():
     sensor, t_us = slow_lens(), 4_000.0
     reference = reference_flux(room(), sensor, 256, t_us, repeats=8, seed=50)
