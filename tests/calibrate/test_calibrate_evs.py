@@ -225,6 +225,7 @@ def test_noise_differenced_from_tick_to_tick_gives_wider_errors(tmp_path):
     assert section["dispersion"]["standard_errors"] == "sandwich"
 
 
+@pytest.mark.slow
 def test_asymmetry_and_leak_are_told_apart(tmp_path):
     capture_sets.write_events(tmp_path / "a", size=96, trials=20000, rho=0.01)
     calibrate_evs(tmp_path / "a", tmp_path / "a.yaml")
@@ -297,6 +298,7 @@ def test_steps_that_do_not_reach_the_threshold(tmp_path):
     assert "does not pass ½; capture contrasts" in section["theta"]["reason"]
 
 
+@pytest.mark.slow
 def test_two_hundred_starts_end_at_one_point(plain, mismatched, tmp_path):
     # light from 0.3 to 965 DN as in a virtual session: from far off, A and C could run away with their ratio kept
     theta_v, light = 0.75e-3, np.geomspace(0.3, 965.0, 128)[:, None] * np.ones((1, 128))

@@ -213,6 +213,7 @@ def test_npz_pieces_are_read_by_numpy(tmp_path):
 # ---- events --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_event_counts_follow_the_closed_form(tmp_path):
     """Rates per pixel against P = Q(θ/σ) of nominal thresholds, written out; per-instant noise over-disperses."""
     sensor = hr.load_sensor("eiger", {**BUSY, "evs.threshold_mismatch_std": 0.0}).crop(128, 128)

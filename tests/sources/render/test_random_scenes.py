@@ -9,7 +9,7 @@ from scipy import stats
 import hesim_render as hr
 
 #: Three of the twenty that are quick to compile.
-FAST, TWENTY, SLOW = (1000, 1002, 1003), range(1000, 1020), range(2000, 2500)
+FAST, TWENTY, SLOW = (1002, 1005, 1006), range(1000, 1020), range(2000, 2500)
 #: Share of values off by more than three wanted errors that a run should have at most.
 MOST_OFF = 0.01
 
