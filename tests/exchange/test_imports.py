@@ -52,7 +52,7 @@ def test_what_does_not_fit_the_sensor_is_refused(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_makes_a_recording(tmp_path):
+def test_the_command_makes_a_recording(capsys, tmp_path):
     given = recordings.make("davis346", tmp_path / "r", frames=1)
     events, frames = given.export("aedat4", tmp_path / "e.aedat4"), given.export("png", tmp_path / "frames")
     words = (
@@ -66,8 +66,8 @@ def test_the_command_makes_a_recording(tmp_path):
         "--out",
         tmp_path / "new",
     )
-    status, told, error = command(*words)
+    status, told, error = command(capsys, *words)
     assert (status, error) == (0, "") and "RAW frames: 1 of 128x96 px" in told and "events: 20000" in told
     np.testing.assert_array_equal(Recording.load(tmp_path / "new").events, given.events)
-    status, _, error = command("import", events, events, "--out", tmp_path / "x")
+    status, _, error = command(capsys, "import", events, events, "--out", tmp_path / "x")
     assert (status, error) == (2, "hesim-render: more than one file, or --roi, needs --sensor\n")
