@@ -23,6 +23,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.simulate import flux_source
 from hesim_render.core.errors import HesimError, SpecError
+from hesim_render.core.guard import printable
 from hesim_render.core.output import check_place, replacing
 from hesim_render.core.plain import finite
 from hesim_render.core.progress import Progress
@@ -49,7 +50,11 @@ class _Ours:
 
 
 def compare_peers(
-    spec: PeersSpec | str | Path, out: str | Path | None = None, progress: Progress | None = None
+    spec: PeersSpec | str | Path,
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+    *,
+    run_programs: bool = False,
 ) -> dict[str, Any]:
     """Give the same light to our sensor and to other simulators, and compare their events with the noise-free ones.
 
@@ -58,6 +63,7 @@ def compare_peers(
     spec : the comparison, or the path of its YAML file.
     out : JSON file of the result; None writes none. It is replaced if it exists.
     progress : called with (done, total, what).
+    run_programs : True lets the programs run that the specification names. A file from somebody else may name any.
 
     Returns
     -------
@@ -67,11 +73,18 @@ def compare_peers(
     Raises
     ------
     SpecError
-        If the specification is not valid, or the sensor has no event pixels.
+        If the specification is not valid, the sensor has no event pixels, or programs may not run.
     OutputError
         If `out` cannot be written.
     """
     spec = spec if isinstance(spec, PeersSpec) else read_peers(spec)
+    if not run_programs:
+        named = "; ".join(" ".join(peer.command) for peer in spec.peers)
+        raise SpecError(
+            f"this runs the programs that the file names ({printable(named)}); if you trust them, give --run-programs "
+            "(run_programs=True)",
+            key="peers",
+        )
     target = None if out is None else check_place(out)
     sensor = chosen_sensor(spec.sensor, spec.folder, "sensor.sensor", spec.sensor.set)
     if sensor.spec.evs is None:

@@ -103,6 +103,7 @@ def run(
     out: str | Path,
     *,
     overrides: dict[str, Any] | None = None,
+    allow_outside: bool = False,
     overwrite: bool = False,
     max_minutes: float | None = None,
     progress: Progress | None = None,
@@ -115,6 +116,7 @@ def run(
     file : YAML file (``docs/cli.md``).
     out : folder of the results: ``recording``, ``pictures``, exports, and the state of the run.
     overrides : dotted keys of the file and their values.
+    allow_outside : let the scene name files outside of its folder; no key of the file, which may be somebody else's.
     overwrite : replace the results of a run of other content.
     max_minutes, progress : as for `simulate`.
     on_estimate : called with the estimate of the recording, or with a text where there is none; an exception that it
@@ -133,7 +135,7 @@ def run(
     OutputError
         If `out` holds something else, or a run of other content, or cannot be written.
     """
-    asked = _read(Path(file), Path(out), overrides or {})
+    asked = _read(Path(file), Path(out), overrides or {}, allow_outside)
     _open(asked, overwrite)
     kept = tuple(asked.done)
     recording = _recorded(asked, max_minutes, progress, on_estimate)
@@ -148,7 +150,7 @@ def run(
     return RunResult(recording, written, kept)
 
 
-def _read(file: Path, out: Path, overrides: dict[str, Any]) -> _Run:
+def _read(file: Path, out: Path, overrides: dict[str, Any], allow_outside: bool) -> _Run:
     """The content of the file, and all files that it names, checked."""
     spec = read_run(file, overrides)
     sets: dict[bool, dict[str, Any]] = {True: {}, False: {}}
@@ -160,7 +162,7 @@ def _read(file: Path, out: Path, overrides: dict[str, Any]) -> _Run:
             sensor = sensor.crop(*parse_roi(spec.roi, "roi"))
         scene = None
         if spec.scene is not None:
-            scene = load_scene(spec.beside(spec.scene), sets[False], allow_outside=spec.allow_outside)
+            scene = load_scene(spec.beside(spec.scene), sets[False], allow_outside=allow_outside)
         options: dict[str, Any] = {}
         for key, given, model in (("video", spec.video, VideoOptions), ("cube", spec.cube, CubeOptions)):
             if given is not None:

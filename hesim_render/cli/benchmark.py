@@ -11,7 +11,8 @@ from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes, listed
 from hesim_render.cli.terminal import complain
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, facts_of
-from hesim_render.core.errors import OutputError, RangeError, TooLongError
+from hesim_render.core.errors import RangeError, TooLongError
+from hesim_render.core.output import free_place
 
 if TYPE_CHECKING:
     from hesim_render.benchmark.forecast import BuildEstimate
@@ -127,8 +128,8 @@ def evaluate(
     """Measure the baselines of each task, and your own results, on the clips of a split."""
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
-    if out is not None and out.exists() and not overwrite:
-        raise OutputError(f"{out} exists; use --overwrite to replace it")
+    if out is not None:
+        free_place(out, overwrite)
     told = Told(json_, quiet)
     with told.progress(f"evaluate {folder.name}") as progress:
         result = evaluate_benchmark(
@@ -194,6 +195,9 @@ def peers(
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the YAML file")
     ] = None,
+    run_programs: Annotated[
+        bool, typer.Option("--run-programs", help="let the programs run that the file names; read it before")
+    ] = False,
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -203,12 +207,12 @@ def peers(
     from hesim_render.specs.files import parse_override
     from hesim_render.specs.peers import read_peers
 
-    if out is not None and out.exists() and not overwrite:
-        raise OutputError(f"{out} exists; use --overwrite to replace it")
+    if out is not None:
+        free_place(out, overwrite)
     content = read_peers(spec, dict(map(parse_override, set_ or [])))
     told = Told(json_, quiet)
     with told.progress(content.name) as progress:
-        result = compare_peers(content, out, progress)
+        result = compare_peers(content, out, progress, run_programs=run_programs)
     failed = any("failed" in peer for peer in result["peers"].values()) or any("error" in row for row in result["rows"])
     text = peers_table(result) if out is None else f"{peers_table(result)}\nin {out}"
     told.result(text, result, ExitStatus.DIFFERENT if failed else ExitStatus.DONE)

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.options import Overwrite, Region, SensorFile, cropped, names_of
+from hesim_render.cli.options import AllowOutside, Overwrite, Region, SensorFile, cropped, names_of
 from hesim_render.cli.terminal import say, split_overrides
-from hesim_render.core.errors import OutputError, RangeError
-from hesim_render.core.output import check_place
+from hesim_render.core.errors import RangeError
+from hesim_render.core.output import free_place
 
 #: Largest number of bands.
 _MOST_BANDS = 1000
@@ -41,15 +41,12 @@ def cube(
             "--set", metavar="KEY=VALUE", help="change a key of the scene file, or with sensor. of the sensor file"
         ),
     ] = None,
-    allow_outside: Annotated[
-        bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
-    ] = False,
+    allow_outside: AllowOutside = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Render the spectral radiance on the pixels of a sensor: an instant, or the mean over a window of time."""
     wavelengths = parse_bands(bands)
-    if check_place(out).exists() and not overwrite:
-        raise OutputError(f"{out}: exists; give another name, or overwrite it (--overwrite)")
+    free_place(out, overwrite)
     import hesim_render as hr
 
     scene_changes, sensor_changes = split_overrides(set_ or [])

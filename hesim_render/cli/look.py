@@ -11,8 +11,8 @@ import typer
 from hesim_render.cli.options import Overwrite
 from hesim_render.cli.simulate import tell_recording
 from hesim_render.cli.told import Json, Quiet, Told
-from hesim_render.core.errors import ConflictError, OutputError
-from hesim_render.core.output import check_place, output_errors, replacing
+from hesim_render.core.errors import ConflictError
+from hesim_render.core.output import free_place, output_errors, replacing
 
 
 def isp(
@@ -65,8 +65,8 @@ def view(
 
     if rrd is not None and viewer:
         raise ConflictError("--rrd", str(rrd), "give --rrd or --viewer, not both")
-    if rrd is not None and check_place(rrd).exists() and not overwrite:
-        raise OutputError(f"{rrd}: exists; give another name, or overwrite it (--overwrite)")
+    if rrd is not None:
+        free_place(rrd, overwrite)
     told, loaded = Told(json_, quiet), Recording.load(recording)
     assert loaded.path is not None
     with output_errors(loaded.path):

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.terminal import say
-from hesim_render.core.errors import OutputError, RangeError
+from hesim_render.core.errors import RangeError
 from hesim_render.core.region import parse_roi
 
 
@@ -43,15 +43,13 @@ def measure(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing file")] = False,
 ) -> None:
     """Measure the spatial frequency response (MTF) of a recording on a slanted edge."""
-    from hesim_render.core.output import check_place, replacing
+    from hesim_render.core.output import free_place, replacing
     from hesim_render.measure import measure_mtf
     from hesim_render.recording.recording import Recording
 
     region = None if roi is None else _region(roi)
     if out is not None:
-        check_place(out)
-        if out.exists() and not overwrite:
-            raise OutputError(f"{out} exists; use --overwrite to replace it")
+        free_place(out, overwrite)
     found = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
     for frequency in (0.125, 0.25, 0.5):
         value = found.mtf[abs(found.frequency_cy_per_px - frequency).argmin()]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes
+from hesim_render.cli.options import LONG_MINUTES, AllowOutside, Overwrite, Yes
 from hesim_render.cli.terminal import is_short_of_wish, summary
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
 
@@ -20,6 +20,7 @@ def run(
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the file of the run")
     ] = None,
+    allow_outside: AllowOutside = False,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     json_: Json = False,
@@ -33,7 +34,7 @@ def run(
     changes = dict(map(parse_override, set_ or []))
     with told.stop_at_estimate(), told.progress(file.name) as progress:
         made = run_all(
-            file, out, overrides=changes, overwrite=overwrite, progress=progress,
+            file, out, overrides=changes, allow_outside=allow_outside, overwrite=overwrite, progress=progress,
             on_estimate=told.estimated(progress), max_minutes=None if yes else LONG_MINUTES,
         )  # fmt: skip
     short = is_short_of_wish(made.recording.manifest["settings"].get("render", {}).get("audit"))

@@ -14,7 +14,7 @@ from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, names_o
 from hesim_render.cli.terminal import say, split_overrides
 from hesim_render.cli.told import Json
 from hesim_render.core.errors import OutputError
-from hesim_render.core.output import check_place, replacing
+from hesim_render.core.output import free_place, replacing
 
 app = typer.Typer(no_args_is_help=True, help="Show what a sensor does, or begin a sensor file.", rich_markup_mode=None)
 
@@ -25,11 +25,6 @@ class Like(StrEnum):
     frames = "frames"
     events = "events"
     hybrid = "hybrid"
-
-
-def _free(out: Path, overwrite: bool) -> None:
-    if check_place(out).exists() and not overwrite:
-        raise OutputError(f"{out}: exists; give another name, or overwrite it (--overwrite)")
 
 
 @app.command()
@@ -46,7 +41,7 @@ def describe(
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     if out is not None:
-        _free(out, overwrite)
+        free_place(out, overwrite)
     from hesim_render.describe import figures_of, table_lines, write_picture
     from hesim_render.sensor.sensor import load_sensor
 
@@ -80,7 +75,7 @@ def new(
     """Write a sensor file to begin with, in which comments explain every key."""
     if out.suffix not in (".yaml", ".yml"):
         raise OutputError(f"{out}: give a name that ends in .yaml")
-    _free(out, overwrite)
+    free_place(out, overwrite)
     from hesim_render.specs.sensor_template import sensor_template
 
     with replacing(out) as unfinished:

@@ -11,6 +11,7 @@ import typer
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import (
     LONG_MINUTES,
+    AllowOutside,
     Clean,
     Overwrite,
     Region,
@@ -26,9 +27,9 @@ from hesim_render.cli.options import (
 )
 from hesim_render.cli.terminal import is_short_of_wish, split_overrides, summary
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
-from hesim_render.core.errors import ConflictError, OutputError
+from hesim_render.core.errors import ConflictError
 from hesim_render.core.guard import printable
-from hesim_render.core.output import check_place, replacing
+from hesim_render.core.output import free_place, replacing
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
@@ -67,9 +68,7 @@ def simulate(
     ] = None,
     clean: Clean = False,
     without: Without = None,
-    allow_outside: Annotated[
-        bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
-    ] = False,
+    allow_outside: AllowOutside = False,
     look: Annotated[
         bool, typer.Option("--look", help="only show the framing: a quick picture without light, OUT.png")
     ] = False,
@@ -120,9 +119,7 @@ def _look(
 ) -> None:
     """Write the picture of ``--look``."""
     target = out if out.suffix == ".png" else out.with_name(f"{out.name}.png")
-    check_place(target)
-    if target.exists() and not overwrite:
-        raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite)")
+    free_place(target, overwrite)
     from PIL import Image
 
     import hesim_render as hr
@@ -152,9 +149,7 @@ def rerun(
         str | None, typer.Option(help="the scene file, if it needs files that the recording does not hold")
     ] = None,
     yes: Yes = False,
-    allow_outside: Annotated[
-        bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")
-    ] = False,
+    allow_outside: AllowOutside = False,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     json_: Json = False,

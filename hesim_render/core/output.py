@@ -136,6 +136,20 @@ def check_place(target: str | Path) -> Path:
     return path
 
 
+def free_place(target: str | Path, overwrite: bool) -> Path:
+    """As `check_place`; a file that is there already must be meant to be replaced.
+
+    Raises
+    ------
+    OutputError
+        If there is something and `overwrite` is False, or a file cannot be there.
+    """
+    path = check_place(target)
+    if (path.exists() or path.is_symlink()) and not overwrite:
+        raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
+    return path
+
+
 def _check_name(path: Path, target: str | Path) -> None:
     """Check that the name is short enough, and that its folder can be created and written to."""
     if len(os.fsencode(path.name)) > _most_bytes(path.parent):

@@ -25,6 +25,8 @@ EVENT_TOPIC, FRAME_TOPIC, FRAME_ID = "/camera/events", "/camera/image_raw", "cam
 #: Longest time and most events of one packet.
 _PACKET_US, _PACKET_EVENTS = 10_000, 1 << 16
 _LATEST_US = (1 << 31) * 1_000_000
+#: Most bytes that a compressed part of a file may unpack to. Writers make parts of 1 to 16 MB.
+_MOST_CHUNK_BYTES = 1 << 28
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 #: What follows x and y of an event: its time and polarity, and x and y of the next one.
 _BLOCK = np.dtype([("sec", "<i4"), ("nanosec", "<u4"), ("p", "u1"), ("pad", "u1"), ("x", "<u2"), ("y", "<u2"),
@@ -137,8 +139,9 @@ def read_header(path: Path) -> tuple[tuple[int, int], str]:
     Raises
     ------
     SpecError
-        If the file is no MCAP file, is damaged, or has no events.
+        If the file is no MCAP file, is damaged, has a part that unpacks to more than it says, or has no events.
     """
+    _check_chunks(path)
     for topic, data in _messages(path, None):
         rows, cols, _, _ = _parts(data, path)
         return (rows, cols), topic
@@ -181,6 +184,45 @@ def _parts(data: bytes, path: Path) -> tuple[int, int, int, int]:
     except struct.error:
         raise SpecError("a packet of events ends early; the file is damaged", file=path) from None
     return rows, cols, count, place + 12
+
+
+def _check_chunks(path: Path) -> None:
+    """Refuse a file of a few kB that would unpack to many GB: the reader of the package unpacks whatever comes."""
+    _require(path)
+    from mcap.exceptions import McapError
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    with reading(path, "as an MCAP file"), path.open("rb") as file:
+        try:
+            for record in StreamReader(file, emit_chunks=True, record_size_limit=_MOST_CHUNK_BYTES).records:
+                if not isinstance(record, Chunk):
+                    continue
+                size = _unpacked_bytes(record)
+                if size > min(record.uncompressed_size, _MOST_CHUNK_BYTES):
+                    raise SpecError(
+                        f"has a part that unpacks to {size} bytes or more; expected {record.uncompressed_size}, as it"
+                        f" says, and at most {_MOST_CHUNK_BYTES}",
+                        file=path,
+                    )
+        except McapError as error:
+            raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None
+
+
+def _unpacked_bytes(chunk: Any) -> int:
+    """Size of a chunk's content; at least one byte above what it may hold if that is too much."""
+    if chunk.compression == "zstd":
+        import zstandard
+
+        # A frame that does not tell its size (-1) is refused by the reader itself.
+        return max(int(zstandard.frame_content_size(chunk.data)), 0)
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        most = min(chunk.uncompressed_size, _MOST_CHUNK_BYTES)
+        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most + 1)
+        return max(int(lz4.frame.get_frame_info(chunk.data)["content_size"]), len(unpacked))
+    return len(chunk.data)
 
 
 def _messages(path: Path, topic: str | None) -> Iterator[tuple[str, bytes]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
-from hesim_render.core.output import OutputFolder, check_place, output_errors, replacing
+from hesim_render.core.output import OutputFolder, check_place, free_place, output_errors, replacing
 from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, mcap_file, open_events
 from hesim_render.exchange.dsec import stream_events
 from hesim_render.mosaic.description import Mosaic
@@ -51,7 +51,7 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
     if format == "raw-npz":
         return _write_ticks(recording, path, overwrite)
     if format in WHOLE_FORMATS:
-        target = _free(path, overwrite)
+        target = free_place(path, overwrite)
         with replacing(target) as temporary:
             if format == "mcap":
                 _write_mcap(recording, temporary, target)
@@ -94,17 +94,9 @@ def write_events(stream: EventStream, format: str, path: str | Path, overwrite: 
     with output_errors(target):
         if target.exists() and target.resolve() == Path(stream.source).resolve():
             raise OutputError(f"{path}: is the file of the events itself; give another name")
-    _free(path, overwrite)
+    free_place(path, overwrite)
     with replacing(target) as temporary, temporary.open("wb") as file:
         EVENT_FORMATS[format].write(stream, file, target)
-    return target
-
-
-def _free(path: str | Path, overwrite: bool) -> Path:
-    """The absolute path of a file to write, where nothing is unless it may be replaced."""
-    target = check_place(path)
-    if (target.exists() or target.is_symlink()) and not overwrite:
-        raise OutputError(f"{path}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
     return target
 
 

@@ -71,7 +71,6 @@ class RunSpec(NamesFiles):
     samples: int | None = Field(None, ge=2)
     truth: list[str] = []
     truth_every_us: int | None = Field(None, ge=1)
-    allow_outside: bool = False
     isp: IspStep | None = None
     export: list[ExportStep] = []
     view: bool = Field(False, description="write recording.html")
@@ -94,7 +93,7 @@ class RunSpec(NamesFiles):
             raise ValueError("a run is of a 'scene', a 'video' or a 'cube'")
         if self.scene is None:
             given = [name for name in ("quality", "samples", "truth_every_us") if getattr(self, name) is not None]
-            given += [name for name in ("exact", "truth", "allow_outside") if getattr(self, name)]
+            given += [name for name in ("exact", "truth") if getattr(self, name)]
             if given:
                 raise ValueError(f"{given[0]}: only a run of a scene takes it")
             for key in self.set:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
-from hesim_render.core.output import check_place, replacing
+from hesim_render.core.output import free_place, replacing
 
 #: Value of a cell: None where a figure has no meaning.
 Cell = str | float | int | bool | None
@@ -178,9 +178,7 @@ class Table:
         OutputError
             If the kind is unknown, the file cannot be written, or pyarrow is missing for a Parquet file.
         """
-        target = check_place(path)
-        if target.exists() and not overwrite:
-            raise OutputError(f"{path}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
+        target = free_place(path, overwrite)
         kind = target.suffix.lower()
         if kind not in (".csv", ".json", ".parquet"):
             raise OutputError(f"{path}: a table is written as .csv, .json or .parquet")

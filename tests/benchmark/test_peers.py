@@ -163,7 +163,7 @@ def light(monkeypatch):
 
 def test_an_ideal_peer_agrees_and_coarse_pictures_cost_events(spec, light, tmp_path):
     """500 pictures/s of a wave of 40 Hz; the ideal pixel interpolates ln Φ between them, within 0.003 of it."""
-    result = compare_peers(spec, tmp_path / "r.json")
+    result = compare_peers(spec, tmp_path / "r.json", run_programs=True)
     rows = {row["peer"]: row for row in result["rows"]}
     assert rows[peers.OURS]["count_error"] == 0 and rows[peers.OURS]["timing_us"] == 0
     ideal, coarse = rows["ideal"], rows["coarse"]
@@ -213,12 +213,12 @@ def test_the_command_reports_and_refuses(tmp_path, spec, light, capsys):
     content = spec.model_dump(mode="json") | {"peers": [spec.model_dump(mode="json")["peers"][0]]}
     file.write_text(json.dumps(content))
     with pytest.raises(SystemExit) as end:
-        cli.main(["benchmark", "peers", str(file), "--out", str(tmp_path / "o.json")])
+        cli.main(["benchmark", "peers", str(file), "--run-programs", "--out", str(tmp_path / "o.json")])
     assert not end.value.code and "| ideal |" in capsys.readouterr().out and (tmp_path / "o.json").is_file()
     broken = content["peers"][0] | {"command": [sys.executable, "broken.py"]}
     file.write_text(json.dumps(content | {"peers": [broken]}))
     with pytest.raises(SystemExit) as end:
-        cli.main(["benchmark", "peers", str(file)])
+        cli.main(["benchmark", "peers", str(file), "--run-programs"])
     assert end.value.code == 1 and "no light" in capsys.readouterr().out
     file.write_text(json.dumps(content | {"fps": [10]}))
     with pytest.raises(SpecError, match="fewer than three pictures"):
@@ -227,7 +227,25 @@ def test_the_command_reports_and_refuses(tmp_path, spec, light, capsys):
     with pytest.raises(SpecError, match="each name once"):
         read_peers(file)
     with pytest.raises(SpecError, match="has no event pixels"):
-        compare_peers(spec.model_copy(update={"sensor": spec.sensor.model_copy(update={"sensor": "imx477"})}))
+        compare_peers(
+            spec.model_copy(update={"sensor": spec.sensor.model_copy(update={"sensor": "imx477"})}), run_programs=True
+        )
+
+
+def test_a_file_runs_no_program_unless_told_so(tmp_path, spec, capsys):
+    """Not even to ask for a version."""
+    mark = tmp_path / "ran"
+    touch = [sys.executable, "-c", f"open({str(mark)!r}, 'w')"]
+    content = spec.model_dump(mode="json")
+    file = tmp_path / "peers.yaml"
+    file.write_text(json.dumps(content | {"peers": [content["peers"][0] | {"command": touch}]}))
+    with pytest.raises(SystemExit) as end:
+        cli.main(["benchmark", "peers", str(file)])
+    told = capsys.readouterr().err
+    assert end.value.code == 2 and "give --run-programs" in told and sys.executable in told
+    with pytest.raises(SpecError, match="run_programs=True"):
+        compare_peers(file)
+    assert not mark.exists()
 
 
 @pytest.mark.slow
@@ -251,7 +269,9 @@ def test_pictures_are_the_light_of_the_sensor(tmp_path):
 def test_the_noise_free_events_are_those_of_an_ideal_pixel_in_the_same_light(spec):
     """The truth of the comparison against a pixel written for this test, in 4000 pictures/s of 16 bit."""
     sized = {"sensor": spec.sensor.model_copy(update={"roi": "24x18"}), "duration_s": 0.03, "fps": (4000.0,)}
-    result = compare_peers(spec.model_copy(update={**sized, "peers": spec.peers[:2], "quality": 0.25}))
+    result = compare_peers(
+        spec.model_copy(update={**sized, "peers": spec.peers[:2], "quality": 0.25}), run_programs=True
+    )
     print(peers_table(result))
     rows = {row["peer"]: row for row in result["rows"]}
     assert rows["ideal"]["true_events"] > 200
@@ -267,7 +287,7 @@ def test_programs_that_are_installed_here_run():
     there = tuple(peer for peer in spec.peers if (file.parent / peer.command[0]).exists())
     if not there:
         pytest.skip("no peer is installed")
-    result = compare_peers(spec.model_copy(update={"peers": there}))
+    result = compare_peers(spec.model_copy(update={"peers": there}), run_programs=True)
     print(peers_table(result))
     rows = {row["peer"]: row for row in result["rows"]}
     assert not [row for row in result["rows"] if "error" in row]

@@ -142,3 +142,21 @@ def test_the_example_of_the_page_is_a_valid_file(tmp_path):
     spec = read_run(write(tmp_path, text))
     assert (spec.scene, spec.sensor, spec.roi, spec.view) == ("rotating-star", "gen2", "256x192", True)
     assert spec.isp is not None and not spec.isp.denoise and [step.format for step in spec.export] == ["evt3", "png"]
+
+
+def test_a_file_cannot_let_its_scene_out_of_its_folder(capsys, tmp_path):
+    """That is for who runs it to say: the file may come from somebody else."""
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    folder = tmp_path / "given"
+    folder.mkdir()
+    (folder / "scene.yaml").write_text(
+        "schema_version: 1\nname: x\ndescription: d\nobjects: [{name: m, shape: mesh, mesh: ../mesh.obj}]\n"
+        "light: {type: uniform, illuminance_lux: 100}\ncamera: {origin_m: [0, 0, 2]}\n"
+    )
+    plain = "schema_version: 1\nname: r\nscene: scene.yaml\nsensor: reference-mono\nroi: 8x8\nsamples: 2\n"
+    (folder / "run.yaml").write_text(plain + "allow_outside: true\n")
+    assert "allow_outside" in fails(capsys, "run", folder / "run.yaml", "--out", tmp_path / "o")
+    (folder / "run.yaml").write_text(plain)
+    assert "--allow-outside" in fails(capsys, "run", folder / "run.yaml", "--out", tmp_path / "o")
+    status, _, _ = call(capsys, "run", folder / "run.yaml", "--out", tmp_path / "o", "--allow-outside", "--dry-run")
+    assert status == 0

@@ -189,3 +189,30 @@ def test_videos_are_read_by_opencv(name, tmp_path):
     with pytest.raises(RangeError, match="there are no frames"):
         recordings.make("davis346", frames=0).export("mp4-colour", tmp_path / "x.mp4")
     assert not (tmp_path / "x.mp4").exists()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("says", [100, 1 << 33])
+def test_a_part_that_unpacks_to_more_than_it_says_or_than_can_be_held_is_refused(
+    tmp_path, monkeypatch, compression, says
+):
+    """64 MB of zeros in some ten kB, where 16 MB can be held."""
+    monkeypatch.setattr(mcap_file, "_MOST_CHUNK_BYTES", 16 << 20)
+    import lz4.frame
+    import zstandard
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import Chunk, Footer, Header
+
+    zeros = bytes(64 << 20)
+    data = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros, store_size=False)
+    builder = RecordBuilder()
+    Header(profile="ros2", library="x").write(builder)
+    Chunk(
+        compression=compression, data=data, message_start_time=0, message_end_time=0, uncompressed_crc=0,
+        uncompressed_size=says,
+    ).write(builder)  # fmt: skip
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    magic = bytes((137, 77, 67, 65, 80, 48, 13, 10))
+    (tmp_path / "bomb.mcap").write_bytes(magic + builder.end() + magic)
+    with pytest.raises(SpecError, match=r"bomb\.mcap: has a part that unpacks to \d+ bytes or more"):
+        open_events(tmp_path / "bomb.mcap")

@@ -58,9 +58,9 @@ class Labeller:
         self._clean: list[NDArray[np.void]] = [no_events()]
         self._label: list[NDArray[np.uint8]] = [np.empty(0, np.uint8)]
         self._events = self._steps = 0
-        #: Pairs of an event and a step of the pixel's own, and of that and a nominal step; and steps in dead time.
         #: Pixels that had steps since they took over the reference level of the real ones.
         self._stepped = np.ones(pixels, np.bool_)
+        #: Pairs of an event and a step of the pixel's own, and of that and a nominal step; and steps in dead time.
         self._pairs: list[tuple[NDArray, NDArray]] = []
         self._nominal_too: list[NDArray] = []
         self._asleep: list[NDArray[np.void]] = [no_events()]
