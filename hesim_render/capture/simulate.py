@@ -32,6 +32,7 @@ from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.lens import LENS_TERMS
+from hesim_render.spectral.waveform import Waveform
 
 #: Default rays per pixel in the exact mode. A static scene is rendered once for the whole run,
 #: a moving one once per slice.
@@ -250,8 +251,8 @@ def flux_source(
     if not exact and samples is None:
         wanted = QUALITY if quality is None else quality
 
-        def make(part: Scene, most_power: float) -> ChangeDrivenFlux:
-            return ChangeDrivenFlux(part, sensor, wanted, seed=seed, most_power=most_power)
+        def make(part: Scene, light: Waveform | None) -> ChangeDrivenFlux:
+            return ChangeDrivenFlux(part, sensor, wanted, seed=seed, light=light)
 
         try:
             return flickering(scene, make, window_us), {"mode": "change-driven", "quality": wanted}

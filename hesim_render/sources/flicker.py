@@ -2,9 +2,12 @@
 
 Light adds up: Φ(t) = Σ w(t)·Φ_w. Φ_w is the flux with only the lights of waveform w on, at their mean level, and w has
 the time mean 1. In a static scene each Φ_w is rendered once, and the mean over an interval is exact: Φ_w times the
-mean of w, in closed form. In a moving scene the mean of the product is replaced by the product of the means, over
-pieces of time. Within a piece either the image hardly moves, or ln w departs from a straight line by 0.002 or less; in
-each cell of time (`schedule.CELL_US`) the kind with fewer pieces is used.
+mean of w, in closed form. In a moving scene the change-driven renderer draws the instants of its rays with density w
+(`change_driven.light_times`). Its mean over an interval, times the mean of w, is the mean of the product.
+
+Sources whose instants have an even density are asked for pieces of time, and the mean of the product is replaced by the
+product of the means. Within a piece either the image hardly moves, or ln w departs from a straight line by 0.002 or
+less; in each cell of time (`schedule.CELL_US`) the kind with fewer pieces is used.
 """
 
 from __future__ import annotations
@@ -28,14 +31,16 @@ from hesim_render.spectral.waveform import Waveform
 _WINDOW_STEPS = 8
 
 
-def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_us: float = 1.0) -> FluxSource:
+def flickering(
+    scene: Scene, make: Callable[[Scene, Waveform | None], FluxSource], window_us: float = 1.0
+) -> FluxSource:
     """The source of a scene's flux, with steady or flickering lights.
 
     Parameters
     ----------
     scene : with or without waveforms.
     make : builds the source of one part of the scene; called once where no light flickers. The second argument is the
-        highest power of the part's light over its mean.
+        waveform of the part's lights, None if they are steady.
     window_us : length of the window in which event pixels integrate, µs. Samples follow a jump of the light through it.
 
     Returns
@@ -44,10 +49,9 @@ def flickering(scene: Scene, make: Callable[[Scene, float], FluxSource], window_
     """
     parts = light_parts(scene)
     if len(parts) == 1 and parts[0][0] is None:
-        return make(parts[0][1], 1.0)
+        return make(parts[0][1], None)
     waveforms = [waveform for waveform, _ in parts]
-    sources = [make(part, 1.0 if waveform is None else waveform.highest) for waveform, part in parts]
-    return FlickerFlux(waveforms, sources, window_us)
+    return FlickerFlux(waveforms, [make(part, waveform) for waveform, part in parts], window_us)
 
 
 class FlickerFlux:
@@ -56,7 +60,8 @@ class FlickerFlux:
     Parameters
     ----------
     waveforms : waveform of each source; None is steady.
-    sources : sources with the same geometry and camera.
+    sources : sources with the same geometry and camera. One whose attribute `light` is its waveform weights its means
+        over intervals with that waveform itself.
     window_us : length of the window in which event pixels integrate, µs.
 
     Attributes
@@ -74,6 +79,10 @@ class FlickerFlux:
         self.sensor, self.view = getattr(first, "sensor", None), getattr(first, "view", None)
         self.is_static = False
         self._still = Kept(self.sources) if first.is_static else None
+        self._is_whole = all(
+            waveform is None or getattr(source, "light", None) is waveform
+            for waveform, source in zip(self._waveforms, self.sources, strict=True)
+        )
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Slice edges of the scene's motion, µs."""
@@ -119,9 +128,11 @@ class FlickerFlux:
         return self._pieces(pixels, begin, end, np.concatenate([[low], cuts, [high]]))
 
     def _cuts_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
-        """Times strictly inside an interval between which the image, or the light, hardly changes; see the module
-        docstring.
+        """Times strictly inside an interval between which the image, or the light, hardly changes; none if all sources
+        weight their means themselves. See the module docstring.
         """
+        if self._is_whole:
+            return np.empty(0)
         light = self._follow_us(begin_us, end_us)
         if light.size == 0:
             return light
@@ -276,18 +287,12 @@ class FlickerFlux:
                 source.reference_flux(asked, zero, zero + 1.0, quality, events)[:, place] for source in self._auditable
             ]
             return np.sum([w * part for w, part in zip(self._weights(begin_us, end_us), parts, strict=True)], axis=0)
-        spans, number = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
-        bounds = [np.concatenate([[low], self._cuts_us(low, high), [high]]) for low, high in spans.T]
-        counts = np.array([each.size - 1 for each in bounds])[number.ravel()]
-        pair = np.repeat(np.arange(pixel.size), counts)
-        low, high = (np.concatenate([bounds[k][part] for k in number.ravel()]) for part in (slice(-1), slice(1, None)))
-        length = (end_us - begin_us)[pair]
-        share = np.divide(high - low, length, out=np.ones_like(length), where=length > 0)
+        assert self._is_whole
         total = np.zeros((2, pixel.size))
-        for source, weight in zip(self._auditable, self._weights(low, high), strict=True):
-            found = share * weight * source.reference_flux(pixel[pair], low, high, quality, events)
-            for values, parts in zip(total, found, strict=True):
-                np.add.at(values, pair, parts)
+        for source, weight in zip(self._auditable, self._weights(begin_us, end_us), strict=True):
+            lit = np.flatnonzero(weight)
+            found = source.reference_flux(pixel[lit], begin_us[lit], end_us[lit], quality, events)
+            total[:, lit] += weight[lit] * found
         return total
 
 

@@ -119,7 +119,7 @@ def test_each_light_is_rendered_once_while_nothing_moves():
         {"type": "point", "position_m": [0, 1, 1], "illuminance_lux": 50, "waveform": {**MAINS, "depth": 0}},
     ]
 
-    def make(part, most_power):
+    def make(part, light):
         rays.append(0)
         number = len(rays) - 1
 

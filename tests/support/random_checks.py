@@ -41,8 +41,8 @@ def event_flux(random: RandomScene, duration_us: int, quality: float = QUALITY):
     """Windows [w, 2], flux and expected error [w, n], of all event pixels in the default mode; and the capture."""
     sensor, spec = random.sensor, random.sensor.spec.evs
 
-    def make(part, most_power):
-        return ChangeDrivenFlux(part, sensor, quality, seed=random.seed, most_power=most_power)
+    def make(part, light):
+        return ChangeDrivenFlux(part, sensor, quality, seed=random.seed, light=light)
 
     source = flickering(random.scene, make, spec.window_us)
     aps, evs = noise_models(source.sensor)
@@ -88,8 +88,8 @@ def check_exposure(random: RandomScene, pixels: int, begin_us: float = 1000.0, e
     rng = np.random.default_rng([76, random.seed])
     window_us = random.sensor.spec.evs.window_us
 
-    def make(part, most_power):
-        return ChangeDrivenFlux(part, random.sensor, QUALITY, seed=random.seed, most_power=most_power)
+    def make(part, light):
+        return ChangeDrivenFlux(part, random.sensor, QUALITY, seed=random.seed, light=light)
 
     source = flickering(random.scene, make, window_us)
     every = np.arange(random.sensor.rows * random.sensor.cols, dtype=np.uint32)

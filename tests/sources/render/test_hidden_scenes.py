@@ -156,8 +156,8 @@ def test_the_stated_error_of_frames_is_that_of_all_lights_together():
     told, electrons = [], []
     for seed in range(5):
 
-        def make(part, most_power, seed=seed):
-            return ChangeDrivenFlux(part, shape, QUALITY, seed=seed, most_power=most_power)
+        def make(part, light, seed=seed):
+            return ChangeDrivenFlux(part, shape, QUALITY, seed=seed, light=light)
 
         flux = flickering(scene, make, WINDOW_US)
         capture = Capture(flux, shape, noise_models(shape, clean=True)[0], None, 4000, seed)

@@ -34,6 +34,7 @@ from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import require_finite, used_responses
 from hesim_render.sources.scene import Scene
+from hesim_render.spectral.waveform import Waveform
 
 #: Default error of the render, as a fraction of the sensor's noise.
 QUALITY = 0.5
@@ -52,12 +53,14 @@ class ChangeDrivenFlux:
     quality : wanted error of the render over the sensor's noise (temporal; with PRNU for frames; at least
         θ/20 for events).
     seed : seed of the run.
-    most_power : largest factor by which the flux is multiplied later (largest over mean power of a flickering light).
+    light : waveform of all lights of the scene, None if they are steady. Φ is the flux at their mean level; means over
+        windows are weighted with the waveform. The flux under the flickering light is this mean times the waveform's.
     progress : called with the number of rays traced so far, after each block.
     tuning : constants of the method.
 
     Attributes
     ----------
+    light : as given.
     sensor : the sensor, with the lens in use.
     view : the placed camera.
     is_static : True where nothing moves.
@@ -77,16 +80,17 @@ class ChangeDrivenFlux:
         quality: float = QUALITY,
         seed: int = 0,
         *,
-        most_power: float = 1.0,
+        light: Waveform | None = None,
         progress: Callable[[int], None] | None = None,
         tuning: Tuning = TUNING,
     ) -> None:
         if not 0 < quality < float("inf"):
             raise RangeError("quality", quality, "a part of the sensor's noise, above 0")
-        self.quality, self.seed, self._scene = quality, seed, scene
-        self._tracer = PairTracer(scene, sensor, seed, used_responses(sensor), progress)
+        self.quality, self.seed, self.light, self._scene = quality, seed, light, scene
+        self._tracer = PairTracer(scene, sensor, seed, used_responses(sensor), progress, light=light)
         self.view, self.sensor = self._tracer.view, self._tracer.sensor
         tracer = self._tracer
+        most_power = 1.0 if light is None else light.highest
         self._renderer = AdaptiveRenderer(tracer, Noise(self.sensor, most_power), quality, tuning)
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self.is_static = not self._tracer.parts.groups and self._tracer.camera is None

@@ -26,6 +26,7 @@ from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.paths import PathIntegrator
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
+from hesim_render.spectral.waveform import Waveform
 
 #: Least and largest number of rays of a pair; one kernel serves all numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
@@ -43,6 +44,8 @@ class PairTracer(Tracer):
     ----------
     scene, sensor, responses, progress, block_rays : see `Tracer`.
     seed : seed of the run.
+    light : waveform of all lights of the scene, None if they are steady. The flux in a window is then the mean over
+        instants whose density is the waveform.
 
     Raises
     ------
@@ -58,11 +61,12 @@ class PairTracer(Tracer):
         responses: dict[str, Spectrum],
         progress: Callable[[int], None] | None = None,
         block_rays: int = BLOCK_RAYS,
+        light: Waveform | None = None,
     ) -> None:
         import drjit as dr
 
         super().__init__(scene, sensor, responses, progress, block_rays)
-        types, self._seed = jit(), seed
+        types, self._seed, self._light = jit(), seed, light
         self.rays.require_one_path()
         self.parts = MovingScene(self.built)
         self._integrator: MattIntegrator | PathIntegrator
@@ -197,7 +201,8 @@ class PairTracer(Tracer):
         """
         groups = self.parts.groups
         tracks = [group.trajectory for group in groups] + ([self.camera] if self.camera else [])
-        return Moments.of(windows, span_us, tracks, len(groups), self._boxes)
+        # where nothing moves, any instant will do
+        return Moments.of(windows, span_us, tracks, len(groups), self._boxes, self._light if tracks else None)
 
     def _boxes_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
         """Boxes that contain each group during some intervals, [interval, group, 2, 3], m."""

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
+from hesim_render.sources.render.change_driven.light_times import LightTimes
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows
+from hesim_render.spectral.waveform import Waveform
 
 #: Largest number of intervals for which one call finds the boxes of moving objects.
 _MOST_BINS = 64
@@ -51,6 +53,7 @@ class Moments:
     times, boxes : tables as in `Moment`.
     bins : UInt32 [window], number of the boxes of each window.
     tracks, groups : numbers of tracks and of moving groups.
+    light : distribution of the instants in each window; None where it is even.
     """
 
     length_us: Float
@@ -59,12 +62,16 @@ class Moments:
     bins: UInt32
     tracks: int
     groups: int
+    light: LightTimes | None = None
 
     def at(self, window: UInt32, share: Float) -> Moment:
-        """Instants in the window of each lane, as shares of its length."""
+        """Instants in the window of each lane, before which a share of its light arrives."""
         import drjit as dr
 
-        instant = share * dr.gather(type(self.length_us), self.length_us, window)
+        if self.light is None:
+            instant = share * dr.gather(type(self.length_us), self.length_us, window)
+        else:
+            instant = self.light.instant_us(window, share)
         where = dr.gather(type(self.bins), self.bins, window)
         return Moment(instant, self.times, self.tracks, window, self.boxes, self.groups, where)
 
@@ -76,6 +83,7 @@ class Moments:
         tracks: Sequence[Trajectory],
         groups: int,
         boxes_of: Callable[[tuple[tuple[float, float], ...]], NDArray[np.float64]],
+        waveform: Waveform | None = None,
     ) -> Moments:
         """Put windows on the device.
 
@@ -86,6 +94,7 @@ class Moments:
         tracks : tracks of everything that moves, those of groups first.
         groups : number of groups.
         boxes_of : maps intervals, µs, to boxes that contain each group, [interval, group, 2, 3], m.
+        waveform : power of the light, None if it is steady.
 
         Returns
         -------
@@ -111,7 +120,8 @@ class Moments:
             )
         )
         numbers = types.UInt32(np.append(bins, bins[-1:]))
-        moments = cls(lengths, local, sides, numbers, len(tracks), groups)
+        light = None if waveform is None else LightTimes.of(waveform, windows.begin_us, windows.end_us)
+        moments = cls(lengths, local, sides, numbers, len(tracks), groups, light)
         dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)
         return moments
 
