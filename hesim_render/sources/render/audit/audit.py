@@ -166,7 +166,7 @@ class Audit:
                 [(np.concatenate([place for place, _ in parts]), Units.joined([units for _, units in parts]))
                  for parts in by_shape.values()]
             )  # fmt: skip
-            first, size = first + chosen.size, min(size + size // 2, _MOST_BATCH)
+            first, size = first + chosen.size, min(2 * size, _MOST_BATCH)
         return found
 
     def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: _Tally, which: str) -> None:

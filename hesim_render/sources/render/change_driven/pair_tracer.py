@@ -97,7 +97,7 @@ class PairTracer(Tracer):
         lit: NDArray[np.bool_],
         stream: Stream = Stream.RENDER,
         span_us: tuple[float, float] | None = None,
-        repeat: int = 0,
+        repeat: NDArray[np.integer] | int = 0,
         aims: PairAims | None = None,
     ) -> PairFlux:
         """Flux of every listed pair.
@@ -111,7 +111,7 @@ class PairTracer(Tracer):
         lit : [n], True takes the lit estimator, False the hidden one, see `MattIntegrator`.
         stream : stream of random numbers.
         span_us : interval in which `PairFlux.met` tests for moving objects, µs; default: the windows themselves.
-        repeat : number of the repetition; each has its own random numbers.
+        repeat : [n] or one number, the repetition; each has random numbers of its own.
         aims : small objects at which half of the rays are aimed, where a pair has any.
 
         Returns
@@ -123,9 +123,9 @@ class PairTracer(Tracer):
         )
         packets = (samples // _PACKET).astype(np.int64)
         moments = self._moments(windows, span_us)
-        key = self._key(stream, repeat)
+        key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
         for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims):
-            lanes = [pixel[part], window[part].astype(np.uint32), lit[part].astype(np.uint32)]
+            lanes = [pixel[part], window[part].astype(np.uint32), lit[part].astype(np.uint32), times[part]]
             self._trace_block(lanes, packets[part], moments, key, aimed, out, part)
             self._report(int(packets[part].sum()) * _PACKET)
         # the lit estimate of a dark pixel may be negative; a flux is not
@@ -181,12 +181,11 @@ class PairTracer(Tracer):
             values *= scale
         return out
 
-    def _key(self, stream: Stream, repeat: int = 0) -> UInt64:
+    def _key(self, stream: Stream) -> UInt64:
         import drjit as dr
 
         mitsuba()  # the variant may have been changed by other code
-        key = stream_key(self._seed, stream)
-        return dr.opaque(jit().UInt64, stream_key(key + repeat, stream) if repeat else key)
+        return dr.opaque(jit().UInt64, stream_key(self._seed, stream))
 
     def _scale(self, pixel: NDArray[np.uint32]) -> NDArray[np.float32]:
         """Factor from the flux on the optical axis to that of each pixel."""
@@ -234,7 +233,7 @@ class PairTracer(Tracer):
         sample = spread_out(types.UInt32, within, packet) * _PACKET + ray_index - packet * _PACKET
         per_half = spread_out(types.UInt32, half_rays, packet)
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
-        pixel, window, lit = (spread_out(types.UInt32, values[pair], packet) for values in lanes)
+        pixel, window, lit, repeat = (spread_out(types.UInt32, values[pair], packet) for values in lanes)
         within_half, aimed = sample - half * per_half, None
         if aims is not None:
             # rays of either kind have random numbers of their own, and are stratified among themselves
@@ -243,7 +242,7 @@ class PairTracer(Tracer):
             aimed = LaneAims.of(aims, pair, packet, is_aimed)
             within_half = dr.select(is_aimed, within_half - per_half, within_half)
             half += dr.select(is_aimed, types.UInt32(2), 0)
-        self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2)
+        self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
         if_lit, if_hidden, _, met = self._rays_of(pixel, window, moments, types.Float(1.0), aimed)
         flux = dr.select(lit != 0, if_lit, if_hidden)
         met = _bits(types.UInt32, met, used * _PACKET)

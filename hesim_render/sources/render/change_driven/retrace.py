@@ -61,14 +61,15 @@ def traced_again(
         gain.rays(scatter / wanted_error), pilot.unshadowed / (np.float32(tuning.audit_ray_weight) * wanted_error)
     )
     rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
-    times = np.clip(np.ceil((gain.error(scatter, rays) / wanted_error) ** 2), 1, tuning.most_audit_times)
-    total = np.zeros((2, pixel.size))
-    for repeat in range(int(times.max())):
-        more = np.flatnonzero(times > repeat)
-        of = pixel[more], window[more], windows, rays[more], lit[more], Stream.AUDIT
-        got = tracer.trace(*of, repeat=repeat, aims=None if aims is None else aims.part(more))
-        total[:, more] += 0.5 * np.stack([got.half_a + got.half_b, got.half_a - got.half_b])
-    return (total / times)[:, place.ravel()]
+    times = np.clip(np.ceil((gain.error(scatter, rays) / wanted_error) ** 2), 1, tuning.most_audit_times).astype(
+        np.int64
+    )
+    each, first = np.repeat(np.arange(pixel.size), times), np.cumsum(times) - times
+    of = pixel[each], window[each], windows, rays[each], lit[each], Stream.AUDIT
+    repeat = np.arange(each.size) - first[each]
+    got = tracer.trace(*of, repeat=repeat, aims=None if aims is None else aims.part(each))
+    values = 0.5 * np.stack([got.half_a + got.half_b, got.half_a - got.half_b]).astype(np.float64)
+    return (np.add.reduceat(values, first, axis=1) / times)[:, place.ravel()]
 
 
 def _aims(

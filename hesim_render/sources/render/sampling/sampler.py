@@ -3,7 +3,7 @@
 Every draw of every pixel and half, of one to three dimensions, is a Sobol' sequence of its own. Sample j
 of n takes point π(j) of the sequence, with π a random permutation, and each coordinate is shifted digitally
 (XOR) by random bits. Permutation and shifts are hashed from the number of the draw and four keys, which
-Philox4x32 computes from the counters (pixel on the full sensor, half). Each sample is uniform, so estimates
+Philox4x32 computes from the counters (pixel on the full sensor, half, repetition). Each sample is uniform, so estimates
 are unbiased. The n samples of a half are stratified in every single dimension, and jointly in the dimensions of one
 draw. Different draws are independent, and so are the halves. (At the vertex of a path one point serves
 two decisions whose results are never multiplied, see `next_vertex`.) (Owen scrambling instead of the shift was
@@ -133,6 +133,7 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             sample: UInt32,
             samples_per_half: UInt32 | int,
             most: int = 0,
+            repeat: UInt32 | int = 0,
         ) -> None:
             """Start one wavefront.
 
@@ -142,8 +143,9 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             pixel, half, sample : UInt32 per lane; `sample` counts within its half.
             samples_per_half : n, a power of two: a number, or with `most` a UInt32 per lane.
             most : largest n of all lanes.
+            repeat : number of the repetition, UInt32 per lane; each has random numbers of its own.
             """
-            self.keys = mi.Philox4x32(key, pixel, half, mi.UInt32(0)).next_uint32x4()
+            self.keys = mi.Philox4x32(key, pixel, half, mi.UInt32(repeat)).next_uint32x4()
             self.sample, self.dimension = sample, dr.zeros(mi.UInt32, dr.width(pixel))
             self._bits = max(0, ((most or samples_per_half) - 1).bit_length())
             self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
