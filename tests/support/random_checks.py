@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
+from unittest import mock
 
 import numpy as np
 from random_scenes import DURATION_US, RandomScene
+from scipy import stats
 
-from hesim_render.capture.loop import Capture
-from hesim_render.capture.noise_terms import noise_models
+import hesim_render as hr
 from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
+from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.error_target import Noise
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.reference import WindowReference
 
 QUALITY = 0.5
-#: Samples in a row whose events are compared.
-_MOST_WINDOWS = 40
+#: Share of values off by more than three wanted errors that a run should have at most.
+MOST_OFF = 0.01
 
 
 @dataclass(frozen=True)
@@ -37,50 +39,10 @@ class Checked:
     reference_error: np.ndarray
 
 
-def event_flux(random: RandomScene, duration_us: int, quality: float = QUALITY):
-    """Windows [w, 2], flux and expected error [w, n], of all event pixels in the default mode; and the capture."""
-    sensor, spec = random.sensor, random.sensor.spec.evs
-
-    def make(part, light):
-        return ChangeDrivenFlux(part, sensor, quality, seed=random.seed, light=light)
-
-    source = flickering(random.scene, make, spec.window_us)
-    aps, evs = noise_models(source.sensor)
-    capture = Capture(source, source.sensor, aps, evs, duration_us, random.seed)
-    blocks = list(capture.event_blocks())
-    windows = np.concatenate([np.stack([b.begin_us[b.wanted], b.end_us[b.wanted]], axis=1) for b in blocks])
-    samples = list(source.flux_of_blocks(capture.event_pixels, blocks))
-    flux = np.array([0.5 * (np.array(s.half_a, np.float64) + np.array(s.half_b)) for s in samples])
-    error = np.array([s.error for s in samples], np.float64)
-    return windows, flux, error, capture
-
-
 def noise_unit(capture_pixels: np.ndarray, sensor, flux: np.ndarray) -> np.ndarray:
     """One standard deviation of the event pixels' noise, e⁻/s."""
     unit = Noise(sensor).of("events", sensor.layout.full_index.ravel()[capture_pixels])
     return unit(flux.astype(np.float32)).astype(np.float64)
-
-
-def check(random: RandomScene, windows: int, pixels: int, duration_us: int = DURATION_US) -> Checked:
-    """Random windows; in each, pixels drawn half at random and half among those that change."""
-    rng = np.random.default_rng([77, random.seed])
-    times, flux, error, capture = event_flux(random, duration_us)
-    reference = WindowReference(random.scene, random.sensor)
-    unit = noise_unit(capture.event_pixels, reference.sensor, flux)
-    deviation, stated, own = [], [], []
-    for window in np.sort(rng.choice(len(times), min(windows, len(times)), replace=False)):
-        change = np.abs(flux - flux[window]).max(axis=0) / unit[window]
-        busy = np.flatnonzero(change > QUALITY)
-        chosen = rng.choice(flux.shape[1], min(pixels, flux.shape[1]), replace=False)
-        if busy.size:
-            chosen[: pixels // 2] = rng.choice(busy, chosen[: pixels // 2].size)
-        chosen = np.unique(chosen)
-        one = np.maximum(unit[window, chosen], 1e-9)
-        found = reference.flux(times[window], capture.event_pixels[chosen], 0.2 * QUALITY * one, seed=random.seed)
-        deviation.append((flux[window, chosen] - found.flux[0]) / one)
-        stated.append(error[window, chosen] / one)
-        own.append(found.stderr[0] / one)
-    return Checked(*map(np.concatenate, (deviation, stated, own)))
 
 
 def check_exposure(random: RandomScene, pixels: int, begin_us: float = 1000.0, end_us: float = 3000.0) -> Checked:
@@ -103,55 +65,120 @@ def check_exposure(random: RandomScene, pixels: int, begin_us: float = 1000.0, e
     return Checked((flux - found.flux[0]) / unit, np.abs(half) / unit, found.stderr[0] / unit)
 
 
-@dataclass(frozen=True)
-class EventErrors:
-    """Events of some pixels over a whole run, noise-free: of the default mode and of the reference.
+class _Seen(NotedFlux):
+    """A source that keeps what passes through it."""
 
-    Parameters
-    ----------
-    counted : as `renderer.compare` counts them.
-    off, values : of their samples, those off by more than three wanted errors, and all.
+    made: list[_Seen] = []
+
+    def __init__(self, source, event_pixel, *rest) -> None:
+        super().__init__(source, event_pixel, *rest)
+        self.pixels, self.windows, self.flux, self.error = event_pixel, [], [], []
+        _Seen.made.append(self)
+
+    def flux_of_blocks(self, pixel, blocks):
+        assert not self.windows and np.array_equal(pixel, self.pixels)
+
+        def told():
+            for block in blocks:
+                self.windows += np.stack([block.begin_us, block.end_us], axis=1)[block.wanted].tolist()
+                yield block
+
+        for sample in super().flux_of_blocks(pixel, told()):
+            self.flux.append(0.5 * (np.array(sample.half_a) + np.array(sample.half_b)))
+            self.error.append(sample.error)
+            yield sample
+
+
+def judged_run(random: RandomScene, pixels: int = 4, most_windows: int = 24) -> dict[str, Any]:
+    """Simulate a random scene, and compare what the manifest says with the reference from elsewhere.
+
+    Some pixels are looked at in a stretch of windows: half of them drawn at random, half among those that change.
+
+    Returns
+    -------
+    Plain values: `mode` and `verdict` of the run. ``off``, ``missed`` and ``extra``: count, total, and the bound of the
+    audit; values that are off are those of the pixels drawn at random. `values`: of all values, in noise units, where
+    the reference is exact enough (`exact` of `all`): mean deviation, number off, and mean square over the errors.
     """
-
-    counted: Counted
-    off: int
-    values: int
-
-    def against(self, audit: dict) -> Iterator[tuple[str, float, int, float]]:
-        """Name, count, total and bound of each share that an audit bounds."""
-        yield "off", self.off, self.values, audit["off_at_most"]
-        for name, of in (("missed", "true"), ("extra", "found")):
-            total = int(getattr(self.counted, of).sum())
-            yield name, float(getattr(self.counted, name).sum()), total, audit[f"{name}_at_most"]
-
-
-def event_errors(random: RandomScene, pixels: int, duration_us: int = DURATION_US) -> EventErrors:
-    """Of pixels drawn among those that change most, half of them, and at random."""
+    _Seen.made.clear()
+    with mock.patch("hesim_render.capture.simulate.NotedFlux", _Seen):
+        run = hr.simulate(
+            random.scene, random.sensor, duration_s=DURATION_US * 1e-6, seed=random.seed, max_minutes=None
+        )
+    settings, (seen,) = run.manifest["settings"], _Seen.made
+    audit = settings["render"]["audit"]
     rng = np.random.default_rng([78, random.seed])
-    times, flux, error, capture = event_flux(random, duration_us)
+    first = int(rng.integers(max(1, len(seen.windows) - most_windows + 1)))
+    part = slice(first, first + most_windows)
+    flux, error = np.array(seen.flux, np.float64), np.array(seen.error, np.float64)
     reference = WindowReference(random.scene, random.sensor)
-    sensor = reference.sensor
-    unit = noise_unit(capture.event_pixels, sensor, flux)
-    swing = np.ptp(flux, axis=0) / unit.max(axis=0)
-    busy = np.flatnonzero(swing > QUALITY)
+    unit = noise_unit(seen.pixels, reference.sensor, flux)
+    busy = np.flatnonzero(np.ptp(flux, axis=0) / unit.max(axis=0) > QUALITY)
     chosen = rng.choice(flux.shape[1], pixels, replace=False)
+    at_random = np.arange(pixels) >= pixels // 2
     if busy.size:
         chosen[: pixels // 2] = rng.choice(busy, pixels // 2)
-    chosen = np.unique(chosen)
-    # of an asynchronous sensor's many samples a stretch is looked at
-    first = int(rng.integers(max(1, len(times) - _MOST_WINDOWS + 1)))
-    part = slice(first, first + _MOST_WINDOWS)
-    own, unit = flux[part, chosen], np.maximum(unit[part, chosen], 1e-9)
-    found = reference.flux(times[part], capture.event_pixels[chosen], 0.2 * QUALITY * unit, seed=random.seed)
+    own, stated, unit = flux[part, chosen], error[part, chosen], np.maximum(unit[part, chosen], 1e-9)
+    found = reference.flux(seen.windows[part], seen.pixels[chosen], 0.2 * QUALITY * unit, seed=random.seed)
+    counted = _counted(reference.sensor, chosen, own, found.flux, stated)
+    deviation, exact = (own - found.flux) / unit, found.stderr <= 1.5 * 0.2 * QUALITY * unit
+    square = (deviation**2 / ((stated**2 + found.stderr**2) / unit**2 + QUALITY**2))[exact]
+    off = np.abs(deviation) > 3 * QUALITY
+    events = audit["events"]
+    counts = {"off": (int(off[:, at_random].sum()), int(off[:, at_random].size))}
+    for name, of in (("missed", "true"), ("extra", "found")):
+        counts[name] = float(getattr(counted, name).sum()), float(getattr(counted, of).sum())
+    return {
+        "seed": random.seed, "scene": random.text, "mode": settings["mode"], "verdict": audit["verdict"],
+        **{name: [*both, events[f"{name}_at_most"]] for name, both in counts.items()},
+        "values": {
+            "all": int(exact.size), "exact": int(exact.sum()), "off": int((off & exact).sum()),
+            "mean": float(deviation[exact].mean()) if exact.any() else 0.0,
+            "mean_square": float(square.mean()) if exact.any() else 0.0,
+        },
+    }  # fmt: skip
+
+
+def _counted(sensor, chosen, own, reference, stated) -> Counted:
+    """Events of some pixels by their own flux and by the reference, both [window, pixel]."""
     noise = sensor.evs
-    levels = [noise.log_signal(values, chosen) for values in (own, found.flux, own + error[part, chosen])]
+    levels = [noise.log_signal(values, chosen) for values in (own, reference, own + stated)]
     shape = noise.layout.evs_shape
     maps = (noise.threshold_on_map, noise.threshold_off_map)
     thresholds = tuple(np.broadcast_to(theta, shape).ravel()[chosen].astype(np.float64) for theta in maps)
     arguments = levels[0], levels[1], levels[2] - levels[0], thresholds, np.ones(len(own), np.bool_)
     if noise.spec.reference == "previous_sample":
-        counted = compare_ticks(*arguments)
-    else:
-        counted = compare_crossings(*arguments, 1 << 30)
-    off = np.abs(own - found.flux) > 3 * QUALITY * unit
-    return EventErrors(counted, int(off.sum()), off.size)
+        return compare_ticks(*arguments)
+    return compare_crossings(*arguments, 1 << 30)
+
+
+def judge(records: list[dict[str, Any]]) -> list[str]:
+    """What many runs say that does not hold; empty if all holds.
+
+    Scenes are independent, values of one scene are not: all tests are Student's t over scenes, false alarm 1e-4.
+    """
+    wrong = [f"seed {one['seed']}: mode {one['mode']}" for one in records if one["mode"] != "change-driven"]
+
+    def t(values) -> float:
+        values = np.array(values)
+        return float(values.mean() / (values.std(ddof=1) / np.sqrt(values.size))) if np.ptp(values) > 0 else 0.0
+
+    for name in ("off", "missed", "extra"):
+        count, total, bound = np.array([one[name] for one in records], float).T
+        if t(count - bound * total) > stats.t.isf(1e-4, count.size - 1):
+            wrong.append(f"{name}: {count.sum():.0f} of {total.sum():.0f}, where the bounds allow {bound @ total:.1f}")
+    values = [one["values"] for one in records]
+    every, exact = (sum(one[name] for one in values) for name in ("all", "exact"))
+    if exact <= 0.85 * every:
+        wrong.append(f"the reference is exact enough in {exact} of {every} values only")
+    means = [one["mean"] for one in values if one["exact"]]
+    if abs(t(means)) > stats.t.isf(5e-5, len(means) - 1):
+        wrong.append(f"bias: {np.mean(means):.4f} noise units")
+    off = [one["off"] - MOST_OFF * one["exact"] for one in values]
+    if t(off) > stats.t.isf(1e-4, len(off) - 1):
+        wrong.append(f"off by more than three wanted errors: {sum(one['off'] for one in values)} of {exact}")
+    # what is filled in may be off by a part of the tolerance on top of its stated error
+    square = sum(one["mean_square"] * one["exact"] for one in values) / max(exact, 1)
+    if square >= 1:
+        wrong.append(f"mean square over the errors: {square:.2f}")
+    return wrong
