@@ -23,9 +23,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from random_checks import judge, judged_run
-from random_scenes import random_scene
-
-COLS, ROWS = 24, 20
+from random_scenes import small_scene
 
 
 def run(seeds: range, out: Path) -> None:
@@ -46,7 +44,7 @@ def run(seeds: range, out: Path) -> None:
             continue
         start = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
-            record = judged_run(random_scene(seed, Path(folder), COLS, ROWS))
+            record = judged_run(small_scene(seed, Path(folder)))
         record |= {"commit": commit, "cpu_s": round(time.process_time() - start, 1)}
         with out.open("a") as file:
             file.write(json.dumps(record) + "\n")

@@ -73,6 +73,12 @@ def random_scene(seed: int, folder: Path, cols: int = COLS, rows: int = ROWS) ->
     return RandomScene(seed, hr.load_scene(file), sensor, text, kind == "asynchronous")
 
 
+def small_scene(seed: int, folder: Path) -> RandomScene:
+    """The scene of a seed in a picture that takes about a minute to judge; asynchronous sensors have many more samples."""
+    found = random_scene(seed, folder, 24, 20)
+    return random_scene(seed, folder, 12, 10) if found.is_asynchronous else found
+
+
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return float(low * (high / low) ** rng.random())
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from random_checks import MOST_OFF, QUALITY, check_exposure, judge, judged_run
-from random_scenes import random_scene
+from random_scenes import random_scene, small_scene
 from scipy import stats
 
 #: Three of the twenty that are quick to compile.
@@ -49,4 +49,4 @@ def test_flux_of_twenty_against_the_reference(tmp_path):
 @pytest.mark.parametrize("begin", range(SLOW.start, SLOW.stop, 25))
 def test_runs_are_as_right_as_they_say(begin, tmp_path):
     """Values, events and the bounds of the audit; `benchmarks/random_scenes.py` does the same in parts."""
-    assert not judge([judged_run(random_scene(seed, tmp_path, 24, 20)) for seed in range(begin, begin + 25)])
+    assert not judge([judged_run(small_scene(seed, tmp_path)) for seed in range(begin, begin + 25)])
