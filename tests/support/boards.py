@@ -14,8 +14,8 @@ CHECKERBOARD = {"type": "checkerboard", "rows": 6, "cols": 9, "width_m": 0.36, "
 #: dictionary are large.
 CHARUCO = {"type": "charuco", "rows": 6, "cols": 9, "square_m": 0.04, "marker_m": 0.02, "dictionary": "DICT_4X4_50"}
 #: Standard deviation of the Gaussian that smooths a picture before OpenCV refines the corners of ChArUco boards, px.
-#: Sharp pixels mislead `cornerSubPix`: with a search window of 9x9 px corners scatter by 0.05 px without it and by 0.03 px
-#: with it. Board, smoothing and window were chosen on seeds 100 to 109, the tests judge others.
+#: Sharp pixels mislead `cornerSubPix`: in a search window of 9x9 px, corners scatter by 0.05 px without it and by 0.03
+#: px with it. Board, smoothing and window were chosen on seeds 100 to 109, the tests judge others.
 SMOOTHING_PX = 1.0
 
 
