@@ -96,6 +96,38 @@ def test_exr_pictures_and_spectral_exr_cubes_are_read(tmp_path):
     OpenEXR.File(header, {"Y": planes["T.400,000000nm"]}).write(str(tmp_path / "grey.exr"))
     with pytest.raises(SpecError, match=r"grey\.exr: expected channels T\.550,0nm … .*R, G, B.; found Y"):
         read_cube(tmp_path / "grey.exr")
+    # a spectral file may show its picture in R, G, B besides
+    OpenEXR.File(header, {**planes, **colours}).write(str(tmp_path / "both.exr"))
+    np.testing.assert_array_equal(read_cube(tmp_path / "both.exr").values, values)
+    OpenEXR.File({**header, "emissiveUnits": "W.m^-2.sr^-1.nm^-1"}, planes).write(str(tmp_path / "light.exr"))
+    with pytest.raises(SpecError, match=r"light\.exr: holds radiance, as it says, and a surface needs reflectances"):
+        read_cube(tmp_path / "light.exr")
+
+
+def test_exr_pictures_that_do_not_fit_into_memory_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    planes = {name: np.zeros((64, 128), np.float32) for name in "RGB"}
+    OpenEXR.File(header, planes).write(str(tmp_path / "large.exr"))
+    monkeypatch.setattr("hesim_render.core.guard._machine_bytes", lambda: 2 * 16 * 64 * 128 - 1)
+    with pytest.raises(SpecError, match=r"large\.exr: the picture would take 0\.000131 GB"):
+        read_cube(tmp_path / "large.exr")
+
+
+def test_photographs_stand_upright_and_transparent_pictures_are_refused(tmp_path):
+    codes = np.zeros((2, 3, 3), np.uint8)
+    codes[0, 0] = 255
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned: the first row is the right side
+    Image.fromarray(codes).save(tmp_path / "turned.png", exif=exif)
+    values = read_cube(tmp_path / "turned.png").values
+    assert values.shape == (3, 2, 3) and values[0, 1].tolist() == [1, 1, 1] and values.sum() == 3
+    alpha = np.full((2, 3, 4), 255, np.uint8)
+    Image.fromarray(alpha, "RGBA").save(tmp_path / "opaque.png")
+    assert (read_cube(tmp_path / "opaque.png").values == 1).all()
+    alpha[1, 2, 3] = 254
+    Image.fromarray(alpha, "RGBA").save(tmp_path / "hole.png")
+    with pytest.raises(SpecError, match=r"hole\.png: has transparent parts"):
+        read_cube(tmp_path / "hole.png")
 
 
 WRONG = {
