@@ -5,10 +5,12 @@ import pytest
 
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs import partners
 from hesim_render.pixels.evs.balance import Balance, Steps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.nominal import NominalSteps
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.specs.sensor import read_sensor
 
@@ -300,6 +302,47 @@ def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
         shares.append(np.mean(label == Label.SIGNAL))
     assert max(held[1:]) <= 1.1 * held[0]
     assert np.ptp(shares[1:]) < 0.01
+
+
+def test_what_is_let_go_of_changes_no_label(monkeypatch):
+    noise = model(True, evs__threshold_mismatch_std=0.1, evs__refractory_period_us=300)
+    found = []
+    for few in (0, 10**9):
+        monkeypatch.setattr(partners, "_FEW", few)
+        labeller = Labeller(noise, 9, 0, 10**9)
+        stage = EvsStage(noise, 9, labels=labeller)
+        for t in TICKS:
+            stage.step(jit().Float(((np.exp(light(t)) - 1) / 2).astype(np.float32)), int(t))
+        verdicts = labeller._partners._verdicts
+        found.append((EventLabels.of([labeller.taken()]).label, verdicts._open.shape[1], verdicts._given.size))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert found[0][1] < 0.5 * found[1][1] and found[0][2] < found[1][2]
+
+
+def test_labels_where_nothing_happens_between_two_samples():
+    """One rise by 0.195 at once, in reach of some thresholds; later a slow one by 0.02, past the nominal 0.2."""
+    noise = model(True, {**NOISY, "beta4": 0.0}, evs__threshold_mismatch_std=0.1)
+
+    def rise(t_us):
+        return np.full(SIDE * SIDE, np.log(101.0) + 0.195 * (t_us > 500) + max(0, t_us - 20_000) * 1e-6)
+
+    for samples, label, highest in ((40, Label.MISMATCH, 0.195), (80, Label.SIGNAL, 0.215)):
+        events, found = run(noise, 500 * np.arange(1, samples + 1), rise)
+        assert (noise.threshold_on_map < highest - 1e-5).sum() <= events.size > 500
+        assert (noise.threshold_on_map < highest + 1e-5).sum() >= events.size
+        assert (found.label == label).all()
+
+
+def test_steps_that_wait_follow_the_reference_of_their_pixel():
+    """Two pixels of θ = 0.2 of their own and 0.3 nominal, at ln x = 1.25. The reference of one moves up by 0.1."""
+    own, nominal = (0.2, 0.2), (0.3, 0.3)
+    both = NominalSteps(own, nominal, 2)
+    reference, level = np.full(2, 1.2, np.float32), np.full(2, 1.25, np.float32)
+    assert both.take(steps((5, 0, 1, 10), (5, 1, 1, 11)), reference, level).size == 0
+    both.shift(np.array([1]), np.array([0.1], np.float32))
+    assert both.take(steps(), reference, np.full(2, 1.35, np.float32)).tolist() == [10]
+    assert both.undecided.tolist() == [11]
+    assert both.take(steps(), reference, np.full(2, 1.41, np.float32)).tolist() == [11]
 
 
 def nbytes(thing):

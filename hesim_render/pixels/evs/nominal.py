@@ -71,12 +71,12 @@ class NominalSteps:
         # from the reference at the end back to those after each step
         new_pixel = np.diff(pixel, prepend=-1) != 0
         moved = np.cumsum(sign * own)
-        last = np.append(np.flatnonzero(new_pixel)[1:], pixel.size) - 1
+        last = np.append(np.flatnonzero(new_pixel), pixel.size)[1:] - 1
         of_pixel = np.cumsum(new_pixel) - 1
         after = reference[pixel].astype(np.float64) - (moved[last[of_pixel]] - moved)
         # runs of steps in one direction; the last of a pixel goes on to the level at the end
         starts = np.flatnonzero(new_pixel | (np.diff(sign, prepend=0) != 0))
-        ends = np.append(starts[1:], pixel.size) - 1
+        ends = np.append(starts, pixel.size)[1:] - 1
         run = np.repeat(np.arange(starts.size), ends - starts + 1)
         goes_on = np.isin(ends, last)
         farthest = sign[ends] * after[ends]
