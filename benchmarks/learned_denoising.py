@@ -22,7 +22,7 @@ from hesim_render.benchmark.learned_filter import LearnedFilter, area_under_curv
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core import backend
-from hesim_render.pixels.evs.events import Label, no_events
+from hesim_render.pixels.evs.events import EventLabels, Label, no_events
 from hesim_render.sources.video.flux import VideoFlux
 from hesim_render.sources.video.options import VideoOptions
 
@@ -71,7 +71,7 @@ def clip(seed, changes, duration_s, lux):
     capture = Capture(flux, sensor, None, noise_models(sensor)[1], duration_us, seed, labels=True)
     events = np.concatenate([no_events(), *(item for item in capture.run() if isinstance(item, np.ndarray))])
     flux.close()
-    labels = capture.labeller.finish()
+    labels = EventLabels.of([capture.labeller.taken()])
     return events, np.isin(labels.label, [Label.SIGNAL, Label.MISMATCH]), labels.clean, duration_us
 
 

@@ -132,7 +132,7 @@ def _our_events(scene: Scene, sensor: Sensor, spec: PeersSpec) -> _Ours:
     capture = Capture(flux, sensor, None, evs, spec.duration_us, spec.seed, labels=True)
     events = np.concatenate([no_events(), *(item for item in capture.run() if isinstance(item, np.ndarray))])
     assert capture.labeller is not None
-    truth = capture.labeller.finish().clean
+    truth = capture.labeller.taken().clean
     return _Ours(events, truth, capture.errors["events"].as_dict(spec.quality), time.monotonic() - begin)
 
 

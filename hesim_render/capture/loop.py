@@ -76,7 +76,7 @@ class Capture:
 
     Attributes
     ----------
-    errors, labeller : error of the render, for frames and for events; labels of the events so far, or None.
+    errors, labeller : error of the render, for frames and for events; what labels the events, or None.
     """
 
     def __init__(
@@ -218,13 +218,15 @@ class Capture:
         for item in self.run(progress):
             if isinstance(item, np.ndarray):
                 writer.add_events(item)
+                if self.labeller is not None:
+                    writer.add_event_labels(self.labeller.taken())
             else:
                 writer.add_frame(item)
         if self._stage is not None:
             writer.set_event_truth(self.event_flux.mean_e_per_s(), self.event_flux.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
         if self.labeller is not None:
-            writer.set_event_labels(self.labeller.finish())
+            writer.add_event_labels(self.labeller.taken())
 
     def _compare(self, sample: Sample, t_us: int) -> NDArray:
         """Events up to a sample."""

@@ -26,6 +26,8 @@ def psnr(picture: NDArray, truth: NDArray, peak: float = 1.0, valid: NDArray[np.
     dB; infinite for equal pictures.
     """
     a, b = in_range(picture, truth, peak)
+    if valid is not None and not np.any(valid):
+        raise RangeError("valid", 0, "at least one pixel that counts")
     square = (a - b) ** 2
     mse = float(square.mean() if valid is None else square[valid].mean())
     return float("inf") if mse == 0 else 10 * float(np.log10(peak**2 / mse))

@@ -57,6 +57,8 @@ def measure_mtf(
         If the frame, the region or the filter does not exist, a RAW value is saturated, or the region has no edge that
         can be measured.
     """
+    if not recording.frames:
+        raise RangeError("frame", frame, "a frame of a recording that has frames; this one has none")
     if not 0 <= frame < len(recording.frames):
         raise RangeError("frame", frame, f"0 to {len(recording.frames) - 1}")
     mosaic, chosen = recording.mosaic, recording.frames[frame]

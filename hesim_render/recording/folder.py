@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.exchange.dsec import EventFileWriter
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.pixels.evs.events import EventLabels
+from hesim_render.pixels.evs.events import LabelBlock
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.colour_view import thumbnail
 from hesim_render.recording.dng import write_dng
 from hesim_render.recording.frame import EventTruth, Frame
-from hesim_render.recording.label_file import write_labels
+from hesim_render.recording.label_file import LabelFileWriter
 
 #: Functions called with each complete folder before it gets its name. A module that draws pictures of recordings
 #: appends its function here, so that the writer does not need to import it.
@@ -41,6 +41,7 @@ class FolderWriter:
         self._on = self._off = self._dropped = 0
         self._mosaic = Mosaic.model_validate(manifest["mosaic"])
         self._finished = False
+        self._labels: LabelFileWriter | None = None
         time, grid = manifest["time"], manifest["event_grid"]
         try:
             with output_errors(self._folder.target):
@@ -95,11 +96,13 @@ class FolderWriter:
                 flux_stderr_e_per_s=np.asarray(truth.flux_stderr_e_per_s, dtype=np.float32),
             )
 
-    def set_event_labels(self, labels: EventLabels) -> None:
+    def add_event_labels(self, block: LabelBlock) -> None:
         time, grid = self.manifest["time"], self.manifest["event_grid"]
-        shape = grid["height"], grid["width"]
         with output_errors(self._folder.target):
-            write_labels(self._folder.path, labels, shape, time["begin_us"], time["end_us"])
+            if self._labels is None:
+                shape = grid["height"], grid["width"]
+                self._labels = LabelFileWriter(self._folder.path, shape, time["begin_us"], time["end_us"])
+            self._labels.append(block)
 
     def set_events_dropped(self, count: int) -> None:
         self._dropped = int(count)
@@ -117,6 +120,8 @@ class FolderWriter:
         """Write the manifest, call `DRAWERS`, and rename the folder to its final name, which is returned."""
         with output_errors(self._folder.target):
             self._events.close()
+            if self._labels is not None:
+                self._labels.close()
             self.manifest["counts"] = {
                 "frames": len(self.manifest["frames"]),
                 "events": self._on + self._off,
@@ -138,4 +143,6 @@ class FolderWriter:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if not self._finished:
             self._events.abandon()
+            if self._labels is not None:
+                self._labels.abandon()
             self._folder.discard()

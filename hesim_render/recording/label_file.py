@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -13,48 +15,126 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, reading, require_memory
 from hesim_render.core.hdf5 import COMPRESSION, Disk, dataset_of
 from hesim_render.exchange.dsec import EventFileWriter, read_events
-from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, Label, Lost
+from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, Label, LabelBlock, Lost
 
 LABEL_FILE, CLEAN_FILE = "truth/event_labels.h5", "truth/clean_events.h5"
 _COLUMNS = {"t_us": "i8", "x": "u2", "y": "u2", "polarity": "i1"}
+#: A lost event while it waits.
+_LOST = np.dtype([*_COLUMNS.items(), ("in", "u1")])
+#: Entries that are read at once.
+_PIECE = 1 << 18
 
 
-def write_labels(folder: Path, labels: EventLabels, shape: tuple[int, int], begin_us: int, end_us: int) -> None:
-    """Write both files.
+class LabelFileWriter:
+    """Takes labels block by block, with memory for one chunk only.
+
+    Labels may change until the end of the run, which packed data sets cannot. So both lists wait in files without
+    packing, which become data sets of known size at the end.
 
     Parameters
     ----------
     folder : of the recording.
-    labels : of its events.
     shape : rows and columns of the event grid.
     begin_us, end_us : time of the recording, µs.
     """
-    disk = Disk(folder / LABEL_FILE)
-    file = h5py.File(disk, "w")
-    try:
-        with disk.told():
-            chunks = {"chunks": True, "compression": COMPRESSION}
-            for name, values in (
-                ("label", labels.label),
-                ("lost/in", labels.lost_in),
-                *((f"lost/{column}", labels.lost[column]) for column in _COLUMNS),
-            ):
-                file.create_dataset(name, data=np.ascontiguousarray(values), **(chunks if values.size else {})).flush()
-            file["label"].attrs.update({label.name.lower(): int(label) for label in Label})
-            file["lost/in"].attrs.update({place.name.lower(): int(place) for place in Lost})
+
+    def __init__(self, folder: Path, shape: tuple[int, int], begin_us: int, end_us: int) -> None:
+        self._path = folder / LABEL_FILE
+        self._parts = [self._path.with_suffix(suffix) for suffix in (".label", ".lost")]
+        self._count = 0
+        with contextlib.ExitStack() as opened:
+            self._label, self._lost = (opened.enter_context(part.open("w+b", buffering=0)) for part in self._parts)
+            self._clean = EventFileWriter(folder / CLEAN_FILE, shape, begin_us, end_us)
+            self._files = opened.pop_all()
+
+    def append(self, block: LabelBlock) -> None:
+        """Append a block."""
+        self._label.seek(0, os.SEEK_END)
+        _write(self._label, block.label)
+        self._count += block.label.size
+        self._change(block.changed, block.changed_to)
+        lost = np.empty(block.lost.size, _LOST)
+        for name in _COLUMNS:
+            lost[name] = block.lost[name]
+        lost["in"] = block.lost_in
+        _write(self._lost, lost)
+        self._clean.append(block.clean)
+
+    def _change(self, event: NDArray[np.int64], to: NDArray[np.uint8]) -> None:
+        """Change labels where they lie, one piece of the file at a time."""
+        order = np.argsort(event, kind="stable")
+        event, to = event[order], to[order]
+        piece = event // _PIECE
+        for these in np.split(np.arange(event.size), np.flatnonzero(np.diff(piece)) + 1):
+            if these.size == 0:
+                continue
+            begin, end = int(event[these[0]]), int(event[these[-1]]) + 1
+            self._label.seek(begin)
+            values = np.frombuffer(_read(self._label, end - begin), np.uint8).copy()
+            values[event[these] - begin] = to[these]
+            self._label.seek(begin)
+            _write(self._label, values)
+
+    def close(self) -> None:
+        """Write both files."""
+        disk = Disk(self._path)
+        file = h5py.File(disk, "w")
+        try:
+            with disk.told():
+                self._pack(file, "label", self._label, np.dtype([("label", "u1")]))
+                for column in ("in", *_COLUMNS):
+                    self._pack(file, f"lost/{column}", self._lost, _LOST)
+                file["label"].attrs.update({label.name.lower(): int(label) for label in Label})
+                file["lost/in"].attrs.update({place.name.lower(): int(place) for place in Lost})
+                file.close()
+                disk.close()
+        except BaseException:
             file.close()
             disk.close()
-    except BaseException:
-        file.close()
-        disk.close()
-        raise
-    clean = EventFileWriter(folder / CLEAN_FILE, shape, begin_us, end_us)
-    try:
-        clean.append(labels.clean)
-        clean.close()
-    except BaseException:
-        clean.abandon()
-        raise
+            raise
+        self._clean.close()
+        self._drop_parts()
+
+    @staticmethod
+    def _pack(file: Any, name: str, stored: IO[bytes], rows: np.dtype) -> None:
+        """Make a data set of one column of a file of rows."""
+        column = name.rsplit("/")[-1]
+        count = stored.seek(0, os.SEEK_END) // rows.itemsize
+        stored.seek(0)
+        chunks = {"chunks": True, "compression": COMPRESSION} if count else {}
+        made = file.create_dataset(name, (count,), rows[column], **chunks)
+        # whole chunks, so that none is packed twice
+        step = made.chunks[0] * max(1, _PIECE // made.chunks[0]) if count else 1
+        for begin in range(0, count, step):
+            size = min(step, count - begin)
+            made[begin : begin + size] = np.frombuffer(_read(stored, size * rows.itemsize), rows)[column]
+        made.flush()
+
+    def abandon(self) -> None:
+        """Close the unfinished files before they are removed."""
+        self._clean.abandon()
+        self._drop_parts()
+
+    def _drop_parts(self) -> None:
+        self._files.close()
+        for part in self._parts:
+            part.unlink(missing_ok=True)
+
+
+def _write(file: IO[bytes], values: NDArray) -> None:
+    """Write all bytes; a file without a buffer may take only some of them at a time."""
+    view = memoryview(values.tobytes())
+    while len(view):
+        view = view[file.write(view) :]
+
+
+def _read(file: IO[bytes], size: int) -> bytes:
+    """Read this many bytes, which are there."""
+    parts = []
+    while size:
+        parts.append(file.read(size))
+        size -= len(parts[-1])
+    return b"".join(parts)
 
 
 def read_labels(folder: Path, shape: tuple[int, int], count: int) -> EventLabels:

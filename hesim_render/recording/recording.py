@@ -275,7 +275,7 @@ class Recording:
                 writer.set_event_truth(self.event_truth)
             writer.set_events_dropped(self.manifest["counts"].get("events_dropped", 0))
             if self.event_labels is not None:
-                writer.set_event_labels(self.event_labels)
+                writer.add_event_labels(self.event_labels.as_block())
             self._save_truth(writer)
             return writer.finish()
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.pixels.evs.events import EventLabels, no_events
+from hesim_render.pixels.evs.events import EventLabels, LabelBlock, no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
@@ -70,7 +70,7 @@ class RecordingWriter:
         self._frames: list[Frame] = []
         self._events: list[NDArray] = []
         self._truth: EventTruth | None = None
-        self._labels: EventLabels | None = None
+        self._labels: list[LabelBlock] = []
         self._dropped = 0
 
     def add_frame(self, frame: Frame) -> None:
@@ -116,17 +116,17 @@ class RecordingWriter:
         else:
             self._truth = truth
 
-    def set_event_labels(self, labels: EventLabels) -> None:
-        """Set what caused each event; all events have been added.
+    def add_event_labels(self, block: LabelBlock) -> None:
+        """Add the labels of the events since the previous block, after these events.
 
         Parameters
         ----------
-        labels : in the order of the events.
+        block : may change labels of earlier events, too.
         """
         if self._folder is not None:
-            self._folder.set_event_labels(labels)
+            self._folder.add_event_labels(block)
         else:
-            self._labels = labels
+            self._labels.append(block)
 
     def set_events_dropped(self, count: int) -> None:
         """Set how many events were lost in the read-out. No other count includes them.
@@ -176,8 +176,9 @@ class RecordingWriter:
             "events_dropped": self._dropped,
         }  # fmt: skip
         return Recording(
-            self._frames, self._manifest, events=events, event_truth=self._truth, scene=scene, labels=self._labels
-        )
+            self._frames, self._manifest, events=events, event_truth=self._truth, scene=scene,
+            labels=EventLabels.of(self._labels) if self._labels else None,
+        )  # fmt: skip
 
     def __enter__(self) -> RecordingWriter:
         return self

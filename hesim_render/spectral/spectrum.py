@@ -208,6 +208,12 @@ def colorchecker(dataset: str = "ISO 17321-1") -> dict[str, Spectrum]:
     dataset : ``ISO 17321-1`` and ``ColorChecker N Ohta`` reach from 380 to 780 nm;
         ``BabelColor Average`` (30 charts averaged) ends at 730 nm.
     """
+    return dict(_patches(dataset))
+
+
+@functools.cache
+def _patches(dataset: str) -> dict[str, Spectrum]:
+    """The patches of a chart; a scene of many tiles asks for them as often."""
     charts = colour_science().SDS_COLOURCHECKERS
     return {name: _from_colour(sd) for name, sd in _lookup(charts, dataset, "ColorChecker data set").items()}
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading, require_memory
+from hesim_render.targets.cube_file import EXR_CHANNELS, open_cube
 from hesim_render.targets.cube_file import READERS as CUBE_READERS
-from hesim_render.targets.cube_file import open_cube
 
 #: Ends of the names of files with hyperspectral cubes.
 _CUBES = tuple(CUBE_READERS)
@@ -49,6 +49,8 @@ def read_cube(file: Path, wavelength_nm: Sequence[float] | None = None) -> Cube:
         raise SpecError("a .npy file needs wavelength_nm beside it", file=file, key="target.wavelength_nm")
     if file.suffix.lower() in _CUBES and not _is_rgb(file):
         opened = open_cube(file, wavelength_nm)
+        if opened.is_absolute:
+            raise SpecError("holds radiance, as it says, and a surface needs reflectances", file=file)
         return Cube(opened.whole(), opened.wavelength_nm)
     if wavelength_nm is not None:
         raise SpecError(f"a {file.suffix} file takes no wavelength_nm", file=file, key="target.wavelength_nm")
@@ -64,8 +66,8 @@ def read_cube(file: Path, wavelength_nm: Sequence[float] | None = None) -> Cube:
 
 
 def _codes(file: Path) -> Cube:
-    """8-bit sRGB codes as linear values (IEC 61966-2-1)."""
-    from PIL import Image
+    """8-bit sRGB codes as linear values (IEC 61966-2-1), upright as their EXIF orientation says."""
+    from PIL import Image, ImageOps
 
     from hesim_render.spectral.transfer import decode
 
@@ -73,7 +75,9 @@ def _codes(file: Path) -> Cube:
         if image.mode not in ("RGB", "RGBA", "L", "LA", "P", "1"):
             raise SpecError(f"expected 8-bit colours, found mode {image.mode}; use EXR for more bits", file=file)
         require_memory(12 * image.width * image.height, "the picture", file)
-        codes = np.asarray(image.convert("RGB"))
+        if image.has_transparency_data and np.asarray(image.convert("RGBA"))[..., 3].min() < 255:
+            raise SpecError("has transparent parts, and a picture needs a colour everywhere", file=file)
+        codes = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
     table = decode(np.arange(256) / 255.0, "srgb").astype(np.float32)
     return Cube(table[codes], None)
 
@@ -86,12 +90,17 @@ def _is_rgb(file: Path) -> bool:
 
     with reading(file, "as a picture"), OpenEXR.File(str(file), separate_channels=True, header_only=True) as opened:
         names = {channel.name for channel in opened.header()["channels"]}
-    return {"R", "G", "B"} <= names
+    # spectral files often hold a small picture in R, G, B besides
+    return {"R", "G", "B"} <= names and not any(pattern.fullmatch(name) for pattern in EXR_CHANNELS for name in names)
 
 
 def _exr(file: Path) -> Cube:
     import OpenEXR
 
+    with OpenEXR.File(str(file), separate_channels=True, header_only=True) as opened:
+        low, high = opened.header()["dataWindow"]
+        size = np.asarray(high, dtype=np.int64) - np.asarray(low, dtype=np.int64) + 1
+        require_memory(16 * int(size.prod()), "the picture", file)
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = opened.channels()
         return Cube(np.stack([channels[name].pixels for name in "RGB"], axis=-1).astype(np.float32), None)

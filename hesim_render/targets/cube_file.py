@@ -20,7 +20,7 @@ from hesim_render.targets.matlab_cube import read_hdf5, read_matlab
 from hesim_render.targets.opened_cube import CubeFile, Rows, known_bands
 
 #: Channels of a spectral EXR file, [fichet2021], and those of the EXR files of KAIST.
-_EXR_CHANNELS = (re.compile(r"(?:T|S0)\.(\d+(?:,\d+)?)nm"), re.compile(r"w(\d+(?:\.\d+)?)nm"))
+EXR_CHANNELS = (re.compile(r"(?:T|S0)\.(\d+(?:,\d+)?)nm"), re.compile(r"w(\d+(?:\.\d+)?)nm"))
 #: A plane of a folder of CAVE.
 _CAVE = re.compile(r"(.+)_ms_(\d\d)\.png")
 #: Attribute emissiveUnits of spectral EXR files in absolute units.
@@ -115,7 +115,7 @@ def _exr(file: Path) -> CubeFile:
     names = header["channels"]
     units = header.get("emissiveUnits", b"")
     is_absolute = (units.decode() if isinstance(units, bytes) else units) == RADIANCE_UNITS
-    for pattern in _EXR_CHANNELS:
+    for pattern in EXR_CHANNELS:
         found = sorted(
             (float(match[1].replace(",", ".")), name) for name in names if (match := pattern.fullmatch(name))
         )

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.specs.charts import DeadLeavesTarget
-from hesim_render.targets.piece import Picture, Piece, picture_piece
+from hesim_render.targets.piece import Picture, Piece, picture_piece, require_texels
 
 #: Leaves drawn at a time.
 _BATCH = 4096
@@ -17,9 +17,15 @@ def dead_leaves(target: DeadLeavesTarget) -> list[Piece]:
 
     A texel has the grey of the front-most disc over its centre [cao2010]. Discs fall evenly on the target widened by
     the largest radius, so that the texture is the same everywhere.
+
+    Raises
+    ------
+    SpecError
+        If the picture would be too large.
     """
     texel = target.width_m / target.texels_across
     rows = int(np.ceil(target.height_m / texel))
+    require_texels(rows, target.texels_across, "target.texels_across")
     values = leaves_picture(
         rows,
         target.texels_across,

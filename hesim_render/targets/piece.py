@@ -10,6 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import MOST_PIXELS
 from hesim_render.spectral.spectrum import Spectrum
 
 #: Corners of the polygon of a disc. Its area is that of the disc, and its rim departs from the circle by 1.5e-4 of
@@ -90,6 +92,18 @@ def picture_piece(
         np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
         np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]),
     )
+
+
+def require_texels(rows: int, cols: int, key: str) -> None:
+    """Refuse a drawn picture of more texels than the largest frame has pixels.
+
+    Raises
+    ------
+    SpecError
+        If it has.
+    """
+    if rows * cols > MOST_PIXELS:
+        raise SpecError(f"the picture would have {cols:.3g} x {rows:.3g} texels, more than {MOST_PIXELS:.3g}", key=key)
 
 
 def box(x0: float, x1: float, y0: float, y1: float) -> list[tuple[float, float]]:

@@ -15,7 +15,16 @@ from hesim_render.specs.resolution import (
     SlantedEdgeTarget,
     ZonePlateTarget,
 )
-from hesim_render.targets.piece import Picture, Piece, around, box, patch_boxes, picture_piece, polygons_piece
+from hesim_render.targets.piece import (
+    Picture,
+    Piece,
+    around,
+    box,
+    patch_boxes,
+    picture_piece,
+    polygons_piece,
+    require_texels,
+)
 
 #: Largest angle of one straight piece of the rim of a Siemens star; its sagitta is 4e-6 of the diameter.
 _RIM_STEP_RAD = radians(0.5)
@@ -152,12 +161,19 @@ def _wedge(
 
 
 def zone_plate(target: ZonePlateTarget) -> list[Piece]:
-    """Sinusoidal rings as a picture with square texels."""
+    """Sinusoidal rings as a picture with square texels.
+
+    Raises
+    ------
+    SpecError
+        If the picture would be too large.
+    """
     # the finest rings are in the corners: their frequency is that of the side times the ratio of the distances
     w, h = target.width_m, target.height_m
     finest = target.cycles * float(np.hypot(w, h)) / w
     cols = int(np.ceil(_TEXELS_PER_CYCLE * finest))
     rows = int(np.ceil(cols * h / w))
+    require_texels(rows, cols, "target.cycles")
     x = (np.arange(cols) + 0.5) / cols - 0.5
     y = (0.5 - (np.arange(rows) + 0.5) / rows) * h / w
     phase = 2 * pi * target.cycles * (x[None, :] ** 2 + y[:, None] ** 2)

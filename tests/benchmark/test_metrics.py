@@ -36,6 +36,11 @@ def test_psnr_and_ssim_are_those_of_skimage(pair):
     assert psnr(a, a) == np.inf and ssim(a, a) == pytest.approx(1)
 
 
+def test_psnr_of_no_pixels_is_refused(pair):
+    with pytest.raises(RangeError, match="at least one pixel that counts"):
+        psnr(*pair, valid=np.zeros(pair[0].shape[:2], np.bool_))
+
+
 def test_psnr_of_a_known_error(pair):
     _, truth = pair
     truth = 0.2 + 0.5 * truth

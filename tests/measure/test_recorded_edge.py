@@ -126,6 +126,12 @@ def test_the_command_prints_and_writes_the_response(recording, tmp_path, capsys)
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+def test_a_recording_without_frames_says_so():
+    events = hr.simulate(hr.load_scene("slanted-edge"), hr.load_sensor("reference-mono").crop(8, 8), duration_s=0.002)
+    with pytest.raises(RangeError, match="a frame of a recording that has frames; this one has none"):
+        measure_mtf(events)
+
+
 def test_saturated_pixels_are_refused(tmp_path):
     bright = hr.load_scene("slanted-edge", {"light.illuminance_lux": 1e6})
     recording = hr.simulate(bright, mono(64, 48), duration_s=0.02, clean=True)

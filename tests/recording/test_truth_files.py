@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 import zlib
 
 import cv2
@@ -15,7 +16,9 @@ from ruamel.yaml import YAML
 import hesim_render as hr
 from hesim_render.capture.simulate import simulate
 from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, LabelBlock
 from hesim_render.recording.camera_files import write_kalibr_aprilgrid, write_kalibr_camchain, write_opencv_camera
+from hesim_render.recording.label_file import LabelFileWriter, read_labels
 from hesim_render.recording.truth_export import dsec_flow_image, export_truth, tum_lines
 from hesim_render.recording.truth_kinds import TRUTH_KINDS, truth_kinds
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
@@ -189,6 +192,55 @@ def test_labels_of_a_recording_are_kept_saved_and_checked(tmp_path):
         opened["label"] = np.full(values.size, 9, np.uint8)
     with pytest.raises(SpecError, match="label holds 9; expected 0 to 4"):
         _ = hr.Recording.load(again.path).event_labels
+
+
+def label_blocks(count, size, seed=2):
+    """Blocks of a run, which change labels of earlier ones all over the run."""
+    rng, t_us = np.random.default_rng(seed), 0
+    for number in range(count):
+        events = np.zeros(size // 4, EVENT_DTYPE)
+        events["t_us"], events["x"], events["polarity"] = t_us + np.arange(events.size), 3, 1
+        changed = rng.integers(0, (number + 1) * size, 50)
+        yield LabelBlock(
+            rng.integers(0, 5, size).astype(np.uint8), changed, rng.integers(0, 5, 50).astype(np.uint8),
+            events, rng.integers(0, 2, events.size).astype(np.uint8), events,
+        )  # fmt: skip
+        t_us += size
+
+
+def written_labels(folder, blocks):
+    (folder / "truth").mkdir(parents=True)
+    writer = LabelFileWriter(folder, (8, 8), 0, 10**9)
+    for block in blocks:
+        writer.append(block)
+    writer.close()
+    return folder
+
+
+def test_labels_written_block_by_block_are_those_written_at_once(tmp_path):
+    blocks = list(label_blocks(70, 9_001))
+    whole = EventLabels.of(blocks)
+    streamed = written_labels(tmp_path / "a", blocks)
+    at_once = written_labels(tmp_path / "b", [whole.as_block()])
+    assert (streamed / "truth/event_labels.h5").read_bytes() == (at_once / "truth/event_labels.h5").read_bytes()
+    assert sorted(path.name for path in (streamed / "truth").iterdir()) == ["clean_events.h5", "event_labels.h5"]
+    found = read_labels(streamed, (8, 8), 70 * 9_001)
+    for name in ("label", "lost", "lost_in", "clean"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    # the last change of each event holds
+    last = dict(zip(blocks[-1].changed.tolist(), blocks[-1].changed_to.tolist(), strict=True))
+    assert all(found.label[event] == label for event, label in last.items()) and len(last) > 40
+
+
+def test_writing_labels_takes_memory_for_one_chunk(tmp_path):
+    """4 M events and 1 M lost ones, 38 MB in all."""
+    most = []
+    for count in (15, 60):
+        tracemalloc.start()
+        written_labels(tmp_path / str(count), label_blocks(count, 1 << 16))
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert most[1] < most[0] + 1e6 and most[1] < 25e6
 
 
 # ---- formats of others ---------------------------------------------------------------------------------------------

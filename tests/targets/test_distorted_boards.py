@@ -102,8 +102,8 @@ def test_opencv_finds_camera_and_distortion_in_19_of_20_seeds(model):
 
 
 @pytest.mark.slow
-def test_opencv_finds_camera_and_distortion_from_charuco_boards():
-    """In a search window of 8 px, the markers would be seen beside the corners."""
-    for seed in range(3):
-        focal, centre, distortion, count = calibrated(CHARUCO, RADIAL, 20, seed, window=6)
-        assert count >= 15 and focal < 1e-3 and centre < 1e-3 and distortion < 0.02
+def test_opencv_finds_camera_and_distortion_from_charuco_boards_in_19_of_20_seeds():
+    """A search window of 4 px sees no marker beside a corner."""
+    found = np.array([calibrated(CHARUCO, RADIAL, 20, seed, window=4) for seed in range(20)])
+    assert found[:, 3].min() >= 15
+    assert np.sum((found[:, :2].max(axis=1) < 1e-3) & (found[:, 2] < 0.02)) >= 19, found

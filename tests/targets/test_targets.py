@@ -198,3 +198,17 @@ def test_reflectance_outside_0_to_1_is_refused():
     for value in (1.01, -0.1):
         with pytest.raises(ValidationError, match=r"\[0, 1\]"):
             target_of({"type": "flat", "reflectance": {"flat": value}})
+
+
+@pytest.mark.parametrize(
+    ("target", "key"),
+    [
+        ({"type": "zone-plate", "width_m": 0.01, "height_m": 1.0, "cycles": 300}, "target.cycles"),
+        ({"type": "dead-leaves", "width_m": 0.01, "height_m": 10.0, "texels_across": 16384, "radius_min_m": 1e-4},
+         "target.texels_across"),
+    ],
+)  # fmt: skip
+def test_pictures_that_would_be_too_large_are_refused_before_they_are_drawn(target, key):
+    with pytest.raises(SpecError, match=r"the picture would have .* texels, more than 2.68e.08") as caught:
+        build_target(TypeAdapter(TargetSpec).validate_python(target))
+    assert key in str(caught.value)

@@ -7,6 +7,7 @@ in the same sequence cancel if neither has a partner by then: the pixel went bac
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +56,12 @@ class Balance:
         """True for pixels of which no step waits, and that are not in their dead time."""
         return ~self._count[:, pixel].any(axis=0) & (self._ready_us[pixel] <= t_us)
 
+    def waiting(self, side: int) -> NDArray[np.int64]:
+        """Numbers of the steps of one sequence, CAUSE or EFFECT, that wait for their partners, in no order."""
+        pixel = np.flatnonzero(self._count[side])
+        held = np.arange(self._waiting.shape[2]) < np.abs(self._count[side, pixel])[:, None]
+        return self._waiting[side, pixel][held]
+
     def take(self, causes: Steps, effects: Steps) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Take the next steps of both sequences.
 
@@ -67,16 +74,10 @@ class Balance:
         cause, effect : [k], numbers of the steps of each new pair.
         lost : numbers of causes within the dead time of a pixel.
         """
-        both = [np.concatenate(values) for values in zip(causes, effects, strict=True)]
-        t_us, pixel, sign, number = both
-        side = np.repeat([CAUSE, EFFECT], [causes.pixel.size, effects.pixel.size])
         pairs: list[tuple[NDArray, NDArray]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
         lost: list[NDArray[np.int64]] = [np.empty(0, np.int64)]
-        for here in _rounds(pixel, np.lexsort((side, t_us, pixel))):
-            for own in (CAUSE, EFFECT):
-                which = here[side[here] == own]
-                if which.size:
-                    self._step(own, t_us[which], pixel[which], sign[which], number[which], pairs, lost)
+        for own, steps in _rounds(causes, effects):
+            self._step(own, *steps, pairs, lost)
         cause, effect = (np.concatenate(values) for values in zip(*pairs, strict=True))
         return cause, effect, np.concatenate(lost)
 
@@ -127,12 +128,61 @@ class Balance:
         self._count[side, pixel] += sign.astype(np.int32)
 
 
-def _rounds(pixel: NDArray[np.int64], order: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """The steps in rounds, each with the next step of every pixel that has one; `order` is by pixel, then by time."""
-    if order.size == 0:
-        return []
-    sorted_pixel = pixel[order]
-    first = np.flatnonzero(np.diff(sorted_pixel, prepend=sorted_pixel[0] - 1))
+class LastSteps:
+    """Steps of both sequences of pixels with a dead time. Each waits until the next step of its own sequence.
+
+    A pixel that was released compares with the level of that moment. So there is no step back that undoes another one,
+    and of two steps in one direction, with none of the other sequence between them, only the second can find a partner.
+
+    Parameters
+    ----------
+    pixels : number of pixels.
+    dead_us : dead time after each step, µs.
+    """
+
+    def __init__(self, pixels: int, dead_us: float) -> None:
+        self._dead_us = dead_us
+        self._ready_us = np.full(pixels, -np.inf)
+        #: Direction of the waiting step, 0 for none, and its number, [sequence, pixel].
+        self._sign = np.zeros((2, pixels), np.int8)
+        self._number = np.zeros((2, pixels), np.int64)
+
+    def waiting(self, side: int) -> NDArray[np.int64]:
+        """Numbers of the steps of one sequence, CAUSE or EFFECT, that wait for their partners."""
+        return self._number[side, self._sign[side] != 0]
+
+    def is_idle(self, pixel: NDArray[np.int64], t_us: int) -> NDArray[np.bool_]:
+        """True for pixels of which no step waits, and that are in the dead time of neither sequence."""
+        return ~self._sign[:, pixel].any(axis=0) & (self._ready_us[pixel] <= t_us)
+
+    def take(self, causes: Steps, effects: Steps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Take the next steps of both sequences, as `Balance.take`. Returns numbers of the steps of each new pair."""
+        pairs: list[tuple[NDArray, NDArray]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+        for own, (t_us, pixel, sign, number) in _rounds(causes, effects):
+            match = self._sign[1 - own, pixel] == sign
+            found = self._number[1 - own, pixel[match]]
+            pairs.append((found, number[match]) if own == EFFECT else (number[match], found))
+            self._sign[1 - own, pixel[match]] = 0
+            self._sign[own, pixel] = np.where(match, 0, sign)
+            self._number[own, pixel] = number
+            self._ready_us[pixel] = t_us + self._dead_us
+        cause, effect = (np.concatenate(values) for values in zip(*pairs, strict=True))
+        return cause, effect
+
+
+def _rounds(causes: Steps, effects: Steps) -> Iterator[tuple[int, Steps]]:
+    """The steps of both in rounds, in order of time; each has at most one step of a pixel, all of one sequence."""
+    every = Steps(*(np.concatenate(values) for values in zip(causes, effects, strict=True)))
+    if every.pixel.size == 0:
+        return
+    side = np.repeat([CAUSE, EFFECT], [causes.pixel.size, effects.pixel.size])
+    order = np.lexsort((side, every.t_us, every.pixel))
+    pixel = every.pixel[order]
+    first = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
     rank = np.arange(order.size) - np.repeat(first, np.diff(np.append(first, order.size)))
     by_rank = np.argsort(rank, kind="stable")
-    return np.split(order[by_rank], np.cumsum(np.bincount(rank))[:-1])
+    for here in np.split(order[by_rank], np.cumsum(np.bincount(rank))[:-1]):
+        for own in (CAUSE, EFFECT):
+            which = here[side[here] == own]
+            if which.size:
+                yield own, Steps(*(values[which] for values in every))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -44,6 +45,34 @@ class Lost(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
+class LabelBlock:
+    """Labels of the next events of a run, and what has become of earlier ones.
+
+    Parameters
+    ----------
+    label : uint8 [event], numbers of `Label`, of the events since the previous block.
+    changed, changed_to : int64 [k] and uint8 [k], numbers of events from the start of the run that have another label
+        now, and that; later entries hold.
+    lost : events (`EVENT_DTYPE`) that the read-out or the dead time has lost since then, in order of time.
+    lost_in : uint8 [lost], numbers of `Lost`.
+    clean : events of the noise-free pixels since the previous block, `EVENT_DTYPE`, in order of time.
+    """
+
+    label: NDArray[np.uint8]
+    changed: NDArray[np.int64]
+    changed_to: NDArray[np.uint8]
+    lost: NDArray[np.void]
+    lost_in: NDArray[np.uint8]
+    clean: NDArray[np.void]
+
+    @classmethod
+    def empty(cls) -> LabelBlock:
+        """Nothing."""
+        none = np.empty(0, np.uint8)
+        return cls(none, np.empty(0, np.int64), none, no_events(), none, no_events())
+
+
+@dataclass(frozen=True, eq=False)
 class EventLabels:
     """Labels of all events of a run.
 
@@ -59,6 +88,24 @@ class EventLabels:
     lost: NDArray[np.void]
     lost_in: NDArray[np.uint8]
     clean: NDArray[np.void]
+
+    @classmethod
+    def of(cls, blocks: Sequence[LabelBlock]) -> EventLabels:
+        """The labels of a whole run from all its blocks.
+
+        Parameters
+        ----------
+        blocks : in order of time.
+        """
+        every = [LabelBlock.empty(), *blocks]
+        label = np.concatenate([block.label for block in every])
+        for block in every:
+            label[block.changed] = block.changed_to
+        return cls(label, *(np.concatenate([getattr(b, name) for b in every]) for name in ("lost", "lost_in", "clean")))
+
+    def as_block(self) -> LabelBlock:
+        """All labels as one block."""
+        return LabelBlock(self.label, np.empty(0, np.int64), np.empty(0, np.uint8), self.lost, self.lost_in, self.clean)
 
     def counts(self) -> dict[str, int]:
         """Number of events of each cause, of lost ones, and of noise-free ones."""

@@ -78,8 +78,8 @@ class EvsStage:
     change of several thresholds gives several events, each at its own crossing, rounded up to whole µs. The
     noise is stationary and band-limited at the photoreceptor's cut-off (`BandNoise`), on time nodes of
     the sensor's own; its time-averaged variance is s²/x² at the current signal; `noise_mode` has no
-    meaning. Leak events come as a Poisson process
-    and do not change the reference. The result does not depend on how often `step` is called.
+    meaning. Leak events come as a Poisson process and do not change the reference. The result does not depend on how
+    often `step` is called.
 
     Where the sensor has a photoreceptor, ln x (without its noise) first passes its low-pass, with ln x
     linear in time between samples in both modes. With a refractory period (``last_event``), see `Refractory`; with
@@ -116,6 +116,12 @@ class EvsStage:
         """Level with which each asynchronous pixel compares, ln x; None before the first sample."""
         assert isinstance(self._mode, _LastEvent)
         return self._mode._reference
+
+    @property
+    def level(self) -> Float:
+        """Level of each asynchronous pixel at the last sample, ln x, with its noise."""
+        assert isinstance(self._mode, _LastEvent)
+        return self._mode._level
 
     def compare_with(self, reference: Float) -> None:
         """Let the asynchronous pixels compare with other levels, ln x, from now on."""

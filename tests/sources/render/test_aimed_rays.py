@@ -9,6 +9,7 @@ from scipy import stats
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.camera import place_camera
+from hesim_render.sources.render.change_driven import retrace
 from hesim_render.sources.render.change_driven.aim import Aims, PairAims, in_blocks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
@@ -139,9 +140,41 @@ def test_an_audit_of_the_same_pair_twice_gives_the_same_value():
     pixel = crossed[[0, 1, 0, 2, 1]].astype(np.uint32)
     begin = np.array([2000.0, 2000.0, 2000.0, 4000.0, 4000.0])
     twice = source.reference_flux(pixel, begin, begin + 1000, 0.5, True)[0]
-    alone = source.reference_flux(pixel[1:4], begin[1:4], begin[1:4] + 1000, 0.5, True)[0]
+    fresh = source_and_aims()[0]
+    alone = fresh.reference_flux(pixel[1:4], begin[1:4], begin[1:4] + 1000, 0.5, True)[0]
     np.testing.assert_array_equal(twice[1:4], alone)
     assert twice[0] == twice[2] and twice[1] != twice[4]
+    # what is known takes no more rays, and only for the same error
+    done = source.rays_traced
+    again = source.reference_flux(pixel[::-1], begin[::-1], begin[::-1] + 1000, 0.5, True)[0]
+    np.testing.assert_array_equal(again[::-1], twice)
+    assert source.rays_traced == done
+    finer = source.reference_flux(pixel[:1], begin[:1], begin[:1] + 1000, 0.1, True)[0]
+    assert source.rays_traced > done and finer[0] != twice[0]
+
+
+@pytest.mark.parametrize(("alike", "room"), [(False, 1 << 18), (True, 1 << 18), (False, 20)])
+def test_known_pairs_are_those_that_were_traced(monkeypatch, alike, room):
+    """Also where two pairs have the same hash, and where there is no room for all."""
+    monkeypatch.setattr(retrace, "_MOST_KNOWN", room)
+    if alike:
+        monkeypatch.setattr(retrace, "_hash", lambda pairs: (pairs[0] % 2).astype(np.uint64))
+    known, rng, asked = retrace.KnownPairs(), np.random.default_rng(3), []
+
+    def value(index, begin, end):
+        return np.stack([index + 10 * begin + 100 * end, -begin])
+
+    for _ in range(6):
+        index, begin = rng.integers(0, 5, 12).astype(np.uint32), rng.integers(0, 4, 12).astype(float)
+        end = begin + rng.integers(1, 3, 12)
+
+        def traced(which, given=(index, begin, end)):
+            asked.extend(zip(*(values[which].tolist() for values in given), strict=True))
+            return value(*(values[which].astype(float) for values in given))
+
+        np.testing.assert_array_equal(known.values(index, begin, end, traced), value(index.astype(float), begin, end))
+    if not alike and room > 40:  # a pair that is listed twice in one call is traced by one of them
+        assert len(asked) < 1.5 * len(set(asked)) and len(set(asked)) > 25
 
 
 def test_lists_of_objects():

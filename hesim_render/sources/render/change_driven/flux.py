@@ -28,7 +28,7 @@ from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import Blocks
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
-from hesim_render.sources.render.change_driven.retrace import traced_again
+from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
 from hesim_render.sources.render.change_driven.sample_instants import MotionClock
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -95,6 +95,8 @@ class ChangeDrivenFlux:
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self.is_static = not self._tracer.parts.groups and self._tracer.camera is None
         self._index = self._renderer.index
+        #: References of the audit; a small run asks for the same pairs again and again.
+        self._known: dict[tuple[Role, float], KnownPairs] = {}
 
     @property
     def progress(self) -> Callable[[int], None] | None:
@@ -224,10 +226,15 @@ class ChangeDrivenFlux:
         renderer, index = self._renderer, self._index[pixel]
         role: Role = "events" if events else "any"
         wanted = quality if events else quality / renderer.tuning.frame_margin
-        return traced_again(
-            *(self._tracer, renderer.zoom, index, begin_us, end_us, partial(renderer.noise.of, role)),
-            *(wanted, renderer.gain, renderer.tuning),
-        )
+
+        def traced(which: NDArray[np.int64]) -> NDArray[np.float64]:
+            return traced_again(
+                *(self._tracer, renderer.zoom, index[which], begin_us[which], end_us[which]),
+                *(partial(renderer.noise.of, role), wanted, renderer.gain, renderer.tuning),
+            )
+
+        known = self._known.setdefault((role, wanted), KnownPairs())
+        return known.values(index, begin_us, end_us, traced)
 
     # ---- many windows -----------------------------------------------------------------------------
 

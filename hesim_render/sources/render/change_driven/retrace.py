@@ -17,6 +17,66 @@ from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 
+#: Largest number of pairs that are kept.
+_MOST_KNOWN = 1 << 18
+
+
+class KnownPairs:
+    """Values of pairs of a pixel and a window that were traced again; they depend on nothing but the pair.
+
+    The audit draws its units at random, with replacement. Of a small region or a short run it draws the same ones many
+    times, in calls of a few pairs, and each call costs as much as thousands of rays.
+    """
+
+    def __init__(self) -> None:
+        self._hash = np.empty(0, np.uint64)
+        self._pairs, self._values = np.empty((3, 0)), np.empty((2, 0))
+
+    def values(
+        self,
+        index: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        traced: Callable[[NDArray[np.int64]], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Values of the listed pairs, [2, n].
+
+        Parameters
+        ----------
+        index : [n], numbers on the full sensor.
+        begin_us, end_us : [n], the windows, µs.
+        traced : gives the values of some of them, by their places in these lists.
+        """
+        pairs = np.stack([index.astype(np.float64), begin_us, end_us])
+        hashed = _hash(pairs)
+        place = np.minimum(np.searchsorted(self._hash, hashed), max(0, self._hash.size - 1))
+        is_known = np.zeros(index.size, np.bool_)
+        if self._hash.size:
+            is_known = np.all(self._pairs[:, place] == pairs, axis=0)
+        found = np.empty((2, index.size))
+        found[:, is_known] = self._values[:, place[is_known]]
+        new = np.flatnonzero(~is_known)
+        if new.size:
+            found[:, new] = traced(new)
+            self._keep(hashed[new], pairs[:, new], found[:, new])
+        return found
+
+    def _keep(self, hashed: NDArray[np.uint64], pairs: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        every, first = np.unique(np.concatenate([self._hash, hashed]), return_index=True)
+        if every.size <= _MOST_KNOWN:
+            self._hash = every
+            self._pairs = np.concatenate([self._pairs, pairs], axis=1)[:, first]
+            self._values = np.concatenate([self._values, values], axis=1)[:, first]
+
+
+def _hash(pairs: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """One number for each pair; two pairs may share it."""
+    mixed = np.zeros(pairs.shape[1], np.uint64)
+    for bits in np.ascontiguousarray(pairs).view(np.uint64):
+        mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return mixed
+
 
 def traced_again(
     tracer: PairTracer,

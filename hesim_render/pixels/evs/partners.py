@@ -1,0 +1,229 @@
+"""Partners of the events of asynchronous pixels: which steps of noise-free pixels they follow from.
+
+The noise-free pixels compare with the reference level that the real pixel has, wherever no step waits for its partner.
+With a dead time, each pixel begins anew from the level at its release. There, the noise-free pixels have the dead time
+as well. Others without it tell what is lost in it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
+from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, Steps
+from hesim_render.pixels.evs.events import Label, Origin
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.nominal import NominalSteps
+from hesim_render.pixels.evs.stage import EvsStage
+
+#: Pairs and steps that may wait for each other before those without hope are looked for.
+_FEW = 4096
+
+
+class Told(NamedTuple):
+    """What a step of the stage has told.
+
+    Parameters
+    ----------
+    asleep : steps of the noise-free pixels within a dead time, `EVENT_DTYPE`.
+    changed, changed_to : numbers of events whose label is another now, and that.
+    """
+
+    asleep: NDArray[np.void]
+    changed: NDArray[np.int64]
+    changed_to: NDArray[np.uint8]
+
+
+class Partners:
+    """Noise-free pixels beside asynchronous ones.
+
+    Parameters
+    ----------
+    own, nominal : noise models without noise, with the dead time of the sensor: with each pixel's own thresholds and
+        with nominal ones; the latter None if they are alike.
+    seed : seed of the stage.
+    """
+
+    def __init__(self, own: EvsNoise, nominal: EvsNoise | None, seed: int) -> None:
+        self._cols = own.layout.evs_shape[1]
+        pixels = int(np.prod(own.layout.evs_shape))
+        dead_us = own.refractory_period_us
+        #: Pixels without a dead time; what they do within that of the real ones is lost.
+        self._own = EvsStage(own.without("refractory"), seed)
+        self._of_events = Balance(pixels, dead_us)
+        #: Pixels that had steps since they took over the reference level of the real ones.
+        self._stepped = np.ones(pixels, np.bool_)
+        self._nominal: NominalSteps | None = None
+        self._with_dead_time = None if dead_us is None else _WithDeadTime(own, nominal, seed)
+        if dead_us is None and nominal is not None:
+            by_own, by_nominal = ((noise.threshold_on_map, noise.threshold_off_map) for noise in (own, nominal))
+            self._nominal = NominalSteps(by_own, by_nominal, pixels)
+        self._steps = 0
+        self._verdicts = _Verdicts(nominal is not None)
+
+    def take(
+        self,
+        stage: EvsStage,
+        electrons: Float,
+        events: NDArray[np.void],
+        origin: NDArray[np.int8],
+        number: NDArray[np.int64],
+    ) -> Told:
+        """Take one step of the stage.
+
+        Parameters
+        ----------
+        stage : the real pixels, after the step.
+        electrons : the sample, as the stage got it.
+        events, origin : all events since the previous sample, and their `Origin`.
+        number : what names them; −1 for those that need no label.
+        """
+        assert stage.t_us is not None
+        is_first = self._own.t_us is None
+        own = self._own.step(electrons, stage.t_us)
+        steps = as_steps(own, self._steps + np.arange(own.size), self._cols)
+        compared = events[origin == Origin.COMPARATOR]
+        effects = as_steps(compared, number[origin == Origin.COMPARATOR], self._cols)
+        cause, effect, lost = self._of_events.take(steps, effects)
+        asleep = own[np.sort(lost) - self._steps]
+        self._steps += own.size
+        self._stepped[steps.pixel] = self._stepped[effects.pixel] = True
+        if self._with_dead_time is not None:
+            told = self._with_dead_time.take(stage, electrons, stage.t_us, effects, self._verdicts)
+        else:
+            given = undecided = np.empty(0, np.int64)
+            if self._nominal is not None and (steps.pixel.size or self._nominal.undecided.size):
+                given = self._nominal.take(steps, self._own.reference.numpy(), self._own.level.numpy())
+            undecided = undecided if self._nominal is None else self._nominal.undecided
+            told = self._verdicts.take(cause, effect, given, undecided, self._of_events)
+        self._share_reference(stage, stage.t_us, is_first)
+        return Told(asleep, *told)
+
+    def _share_reference(self, stage: EvsStage, t_us: int, is_first: bool) -> None:
+        """Let noise-free pixels compare with the level of the real one where no step of either waits for its partner.
+
+        Noise moves the level of a real pixel whose two thresholds differ: an event up and one down leave it beside
+        where it was, and so does a dead time.
+        """
+        place = np.flatnonzero(self._stepped)
+        idle = place if is_first else place[self._of_events.is_idle(place, t_us)]
+        if idle.size == 0:
+            return
+        self._stepped[idle] = False
+        moved = _take_over(self._own, stage.reference, idle)
+        if self._nominal is not None:
+            self._nominal.shift(idle, moved)
+
+
+def _take_over(pixels: EvsStage, reference: Float, which: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Let some pixels compare with other levels. Returns how far their references have moved, ln x."""
+    import drjit as dr
+
+    if which.size == 0:
+        return np.empty(0, np.float32)
+    types = jit()
+    index = types.UInt32(which.astype(np.uint32))
+    before, now = (dr.gather(types.Float, level, index) for level in (pixels.reference, reference))
+    dr.eval(before, now)
+    own = dr.copy(pixels.reference)
+    dr.scatter(own, now, index)
+    dr.eval(own)
+    pixels.compare_with(own)
+    return np.asarray(now.numpy() - before.numpy())
+
+
+class _WithDeadTime:
+    """Noise-free pixels with the dead time of the real ones.
+
+    Parameters
+    ----------
+    own, nominal, seed : of `Partners`.
+    """
+
+    def __init__(self, own: EvsNoise, nominal: EvsNoise | None, seed: int) -> None:
+        self._cols = own.layout.evs_shape[1]
+        pixels = int(np.prod(own.layout.evs_shape))
+        self._own, self._nominal = EvsStage(own, seed), None if nominal is None else EvsStage(nominal, seed)
+        dead_us = own.refractory_period_us
+        assert dead_us is not None
+        self._of_events, self._of_own = LastSteps(pixels, dead_us), LastSteps(pixels, dead_us)
+        self._steps = 0
+        self._stepped = np.ones(pixels, np.bool_)
+
+    def take(
+        self, stage: EvsStage, electrons: Float, t_us: int, effects: Steps, verdicts: _Verdicts
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        own = self._own.step(electrons, t_us)
+        steps = as_steps(own, self._steps + np.arange(own.size), self._cols)
+        self._steps += own.size
+        cause, effect = self._of_events.take(steps, effects)
+        given = np.empty(0, np.int64)
+        if self._nominal is not None:
+            nominal = self._nominal.step(electrons, t_us)
+            _, given = self._of_own.take(as_steps(nominal, np.zeros(nominal.size, np.int64), self._cols), steps)
+        self._stepped[steps.pixel] = self._stepped[effects.pixel] = True
+        place = np.flatnonzero(self._stepped)
+        idle = place[self._of_events.is_idle(place, t_us) & self._of_own.is_idle(place, t_us)]
+        self._stepped[idle] = False
+        for pixels in filter(None, (self._own, self._nominal)):
+            _take_over(pixels, stage.reference, idle)
+        return verdicts.take(cause, effect, given, self._of_own.waiting(EFFECT), self._of_events)
+
+
+class _Verdicts:
+    """Labels of events that have partners. Those of a pair and of its step come in any order.
+
+    Parameters
+    ----------
+    differ : nominal and own thresholds differ; if not, all events with partners are signal.
+    """
+
+    def __init__(self, differ: bool) -> None:
+        self._differ = differ
+        #: Pairs of a step and an event, [2, n], whose step the nominal threshold has not given yet, and steps that it
+        #: has given, without an event yet.
+        self._open, self._given = np.empty((2, 0), np.int64), np.empty(0, np.int64)
+        self._enough = _FEW
+
+    def take(
+        self,
+        cause: NDArray[np.int64],
+        effect: NDArray[np.int64],
+        given: NDArray[np.int64],
+        undecided: NDArray[np.int64],
+        pairs: Balance | LastSteps,
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Events whose label is decided now, or another for the time being, and these labels.
+
+        Parameters
+        ----------
+        cause, effect : new pairs of the numbers of a step and of an event.
+        given : steps, new ones or earlier ones, that the nominal threshold has given now.
+        undecided : steps that it may give later.
+        pairs : where steps wait for events.
+        """
+        new = np.stack([cause, effect])[:, effect >= 0]
+        if not self._differ:
+            return new[1], np.full(new.shape[1], Label.SIGNAL, np.uint8)
+        old = self._open.shape[1]
+        self._open = np.concatenate([self._open, new], axis=1)
+        self._given = np.concatenate([self._given, given])
+        cause, effect = self._open
+        signal = np.isin(cause, self._given)
+        told = signal | (np.arange(cause.size) >= old)
+        self._open, self._given = self._open[:, ~signal], self._given[~np.isin(self._given, cause[signal])]
+        if self._open.shape[1] + self._given.size > self._enough:
+            self._open = self._open[:, np.isin(self._open[0], undecided)]
+            self._given = self._given[np.isin(self._given, pairs.waiting(CAUSE))]
+            self._enough = 2 * (self._open.shape[1] + self._given.size) + _FEW
+        return effect[told], np.where(signal[told], Label.SIGNAL, Label.MISMATCH).astype(np.uint8)
+
+
+def as_steps(events: NDArray[np.void], number: NDArray[np.int64], cols: int) -> Steps:
+    """Events as steps, with numbers that name them; `cols` of the event grid."""
+    pixel = events["y"].astype(np.int64) * cols + events["x"]
+    return Steps(events["t_us"], pixel, events["polarity"].astype(np.int64), number)
