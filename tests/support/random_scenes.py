@@ -74,7 +74,7 @@ def random_scene(seed: int, folder: Path, cols: int = COLS, rows: int = ROWS) ->
 
 
 def small_scene(seed: int, folder: Path) -> RandomScene:
-    """The scene of a seed in a picture that takes about a minute to judge; asynchronous sensors have many more samples."""
+    """The scene of a seed, small enough to be judged in a minute; asynchronous sensors have many more samples."""
     found = random_scene(seed, folder, 24, 20)
     return random_scene(seed, folder, 12, 10) if found.is_asynchronous else found
 
