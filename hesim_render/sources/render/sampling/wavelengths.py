@@ -57,7 +57,7 @@ class WavelengthSampler:
             table(types.Float, values.astype(np.float32))
             for values in (np.concatenate(cells), np.concatenate(shares), np.array(totals))
         )
-        self._starts = types.UInt32(np.concatenate(starts).astype(np.uint32).ravel())
+        self._starts = table(types.UInt32, np.concatenate(starts).astype(np.uint32))
         dr.make_opaque(self._cells, self._shares, self._totals, self._starts)
 
     def total(self, filter_index: UInt32) -> Float:
