@@ -26,9 +26,6 @@ from hesim_render.pixels.evs.model import EvsNoise
 #: Nodes per period of the highest corner frequency. Between nodes, y is taken as a straight line.
 NODES_PER_CORNER_PERIOD = 32
 
-#: The series of p is good to 1e-8 up to this ah. Two nodes have at most 0.305 between them.
-_LARGEST_OF_SERIES = 0.31
-
 #: z − u and y − u of each pixel.
 _State = tuple[Float, Float]
 
@@ -108,11 +105,8 @@ class Photoreceptor:
         import drjit as dr
 
         h = self.rate_per_us * elapsed_us
-        decay = math.exp(-h), 0.0
-        if h < _LARGEST_OF_SERIES:
-            decay = 1.0, math.expm1(-h)
-        numbers = (dr.opaque(jit().Float, number) for number in (h, -math.expm1(-h) / h, *decay))
-        return _advance(self._state, change, *numbers)
+        loss = -math.expm1(-h)
+        return _advance(self._state, change, *(dr.opaque(jit().Float, number) for number in (h, loss / h, loss)))
 
     def _followed(self, change: Float, elapsed_us: float) -> _State:
         """State at the end of a line, with the corner of the light at each instant of it.
@@ -133,7 +127,7 @@ class Photoreceptor:
 
         def at_limit(state: _State, light: Float, part: Float) -> _State:
             h = dr.select(light < bright, least, largest) * (part * elapsed)
-            return _advance(state, part * change, h, lag := _lag(h), 1.0, -h * lag)
+            return _advance(state, part * change, h, lag := _lag(h), h * lag)
 
         part = last - first
         state = at_limit(self._state, begin, first)
@@ -154,7 +148,7 @@ class Photoreceptor:
         decays = [weight * dr.exp(-rest) for weight, rest in zip(_WEIGHTS, rests, strict=True)]
         lag = sum(decays)
         later = sum(decay * rest for decay, rest in zip(decays, rests, strict=True))
-        return _decayed(state, total, (1.0, -total * _lag(total)), (lag * change, (lag + later) * change))
+        return _decayed(state, total, total * _lag(total), (lag * change, (lag + later) * change))
 
     def follow(self, log: Float, t_us: int) -> Float:
         """y at the next sample, over all nodes in between. The first call begins in the settled state.
@@ -176,22 +170,21 @@ class Photoreceptor:
         return self.to(log, float(t_us))
 
 
-def _advance(state: _State, change: Float, h: Float, lag: Float, *decay: Float) -> _State:
-    """State at the end of a line of constant corner: `h` is H, `lag` is p, `decay` as in `_decayed`."""
-    return _decayed(state, h, decay, (lag * change, (2.0 * lag - sum(decay)) * change))
+def _advance(state: _State, change: Float, h: Float, lag: Float, loss: Float) -> _State:
+    """State at the end of a line of constant corner: `h` is H, `lag` is p, `loss` is 1 − E."""
+    return _decayed(state, h, loss, (lag * change, (2.0 * lag - (1.0 - loss)) * change))
 
 
-def _decayed(state: _State, h: Float, decay: tuple[Float, ...], shift: _State) -> _State:
-    """State after a decay by E and a shift down. E is a sum of two: E − 1 would lose its digits next to 1."""
+def _decayed(state: _State, h: Float, loss: Float, shift: _State) -> _State:
+    """State after its decay and a shift down. Next to 1, E would lose the digits of `loss`, which is 1 − E."""
     import drjit as dr
 
     z, y = state[0], dr.fma(h, *state)
-    whole, rest = decay
-    return dr.fma(rest, z, whole * z) - shift[0], dr.fma(rest, y, whole * y) - shift[1]
+    return dr.fma(-loss, z, z) - shift[0], dr.fma(-loss, y, y) - shift[1]
 
 
 def _lag(h: Float) -> Float:
-    """p = (1 − exp(−h))/h by its series."""
+    """p = (1 − exp(−h))/h by its series, good to 1e-8 up to the 0.305 that two nodes have between them at most."""
     import drjit as dr
 
     series = dr.fma(h, 1 / 5040, -1 / 720)
