@@ -257,8 +257,8 @@ def _recorded(
         made = simulate_video(source, asked.sensor, **limits, **common, **asked.options)
     else:
         assert spec.cube is not None
-        begin("none for a cube, which is not rendered")
-        made = simulate_cube(spec.cube.beside(spec.cube.file, shipped=False), asked.sensor, **common, **asked.options)
+        source = spec.cube.beside(spec.cube.file, shipped=False)
+        made = simulate_cube(source, asked.sensor, on_estimate=begin, **common, **asked.options)
     asked.note(RECORDING)
     return made
 
