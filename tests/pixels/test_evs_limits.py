@@ -171,6 +171,24 @@ def test_large_change_of_light_against_the_differential_equation(rise_us, bound)
     assert exact[times == 6000] > 5.5 and exact[times == 18_000] > 3.0
 
 
+@pytest.mark.parametrize("spec", (FIXED, FOLLOWING), ids=("fixed", "following"))
+def test_a_settled_filter_rests_until_the_light_changes(spec):
+    low_pass = photoreceptor.Photoreceptor(model(evs__photoreceptor=spec))
+    dim, bright = logs([1.0, 2.0]), logs([1.0, 3.0])
+    low_pass.follow(dim, 0)
+    assert low_pass.rests(dim, 700)
+    before = np.array(low_pass.follow(bright, 1000))
+    assert not low_pass.rests(bright, 1100)  # one pixel of two is on its way
+    np.testing.assert_allclose(before[0], 1.0, atol=1e-7)
+    plain = photoreceptor.Photoreceptor(model(evs__photoreceptor=spec))
+    plain.follow(dim, 700)
+    np.testing.assert_array_equal(np.array(plain.follow(bright, 1000)), before)
+    settled = np.array(low_pass.follow(bright, 1_000_000))
+    np.testing.assert_allclose(settled, [1.0, 3.0], atol=3e-7)
+    assert low_pass.rests(bright, 9_000_000) and low_pass.nodes_us(9_000_000) == []
+    assert not low_pass.rests(dim, 9_000_500)
+
+
 def test_static_light_stays_silent_behind_the_photoreceptor():
     for build in (model, asynchronous):
         noise = build(evs__photoreceptor=FOLLOWING)

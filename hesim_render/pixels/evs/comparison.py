@@ -30,6 +30,11 @@ def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, co
     return events
 
 
+def _nodes_us(t_us: int, *parts: BandNoise | Photoreceptor | None) -> list[float]:
+    """Ends of the segments up to the sample at `t_us`, in each of which the level goes on a straight line."""
+    return [*sorted(set().union(*(part.nodes_us(t_us) for part in parts if part))), float(t_us)]
+
+
 class PreviousSample:
     """Compares successive samples."""
 
@@ -128,11 +133,14 @@ class LastEvent:
                 self._leak.start(t_us)
         else:
             begin_us = float(self._t_us)
-            for end_us in self._nodes_us(t_us):
+            low_pass = self._photoreceptor
+            if low_pass and low_pass.rests(log, t_us):
+                low_pass = None
+            for end_us in _nodes_us(t_us, self._band_noise, low_pass):
                 part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
                 level = dr.fma(log - self._log, part, self._log)
-                if self._photoreceptor:
-                    level = self._photoreceptor.to(level, end_us)
+                if low_pass:
+                    level = low_pass.to(level, end_us)
                 if self._band_noise:
                     level = dr.fma(
                         dr.fma(spread - self._spread, part, self._spread), self._band_noise.at(end_us), level
@@ -151,11 +159,6 @@ class LastEvent:
             events = self._defects.alive(events, self._cols)
         # stable: the events of a pixel in one microsecond keep their order
         return events[np.lexsort((events["x"], events["y"], events["t_us"]))]
-
-    def _nodes_us(self, t_us: int) -> list[float]:
-        """Ends of the segments up to the sample at `t_us`, in each of which the level goes on a straight line."""
-        grids = [grid.nodes_us(t_us) for grid in (self._band_noise, self._photoreceptor) if grid]
-        return [*sorted(set().union(*grids)), float(t_us)]
 
     def _stamp(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """Whole µs after the last sample: the end of the microsecond of each event, so that steps do not overlap."""

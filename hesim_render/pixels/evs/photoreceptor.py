@@ -26,6 +26,9 @@ from hesim_render.pixels.evs.model import EvsNoise
 #: Nodes per period of the highest corner frequency. Between nodes, y is taken as a straight line.
 NODES_PER_CORNER_PERIOD = 32
 
+#: ln x so near to the light is the light itself, in single precision.
+_SETTLED = 1e-7
+
 #: z − u and y − u of each pixel.
 _State = tuple[Float, Float]
 
@@ -89,6 +92,27 @@ class Photoreceptor:
         """Times of the nodes after the present and before `end_us`."""
         last = math.ceil(end_us / self._period_us - 1e-6) - 1
         return [node * self._period_us for node in range(self._node + 1, last + 1)]
+
+    def rests(self, log: Float, t_us: int) -> bool:
+        """Go to `t_us`, µs, at once if y stays as it is: the light is that of before, and all pixels have settled.
+
+        Parameters
+        ----------
+        log : ln x of each pixel at `t_us`.
+        t_us : time of the sample, µs.
+
+        Returns
+        -------
+        True if the filter is at `t_us` now, where y is `log`; False if it is where it was.
+        """
+        import drjit as dr
+
+        z, y = self._state
+        still = (log == self._input) & (z * z + y * y < _SETTLED**2)
+        if not dr.all(still)[0]:
+            return False
+        self.start(log, t_us)
+        return True
 
     def to(self, log: Float, t_us: float) -> Float:
         """y at `t_us`, µs, if ln x goes on a straight line to `log`. No node lies in between."""
@@ -162,6 +186,8 @@ class Photoreceptor:
 
         if self._input is None:
             return self.start(log, t_us)
+        if self.rests(log, t_us):
+            return log
         if self._spec.follows_light:
             before, begin_us = self._input, self._t_us
             for node_us in self.nodes_us(t_us):
