@@ -1,10 +1,14 @@
 """A run that was interrupted and goes on gives the bytes of one that ran through."""
 
+import numpy as np
 import pytest
 
 import hesim_render as hr
 from hesim_render.core.errors import OutputError
+from hesim_render.core.journal import Journal
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.tracer import PixelTracer
 
 MAINS = {"light.waveform": {"type": "mains", "frequency_hz": 50, "depth": 0.4}}
@@ -68,3 +72,29 @@ def test_another_command_does_not_go_on(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [journal]
     record("exact static", tmp_path / "out", monkeypatch=monkeypatch, seed=6, samples=4, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_entries_are_told_apart_by_all_that_they_depend_on(exact, tmp_path):
+    """The same pixels in other windows, and of another part of the light; each twice, the second time from the file."""
+    sensor, pixel = hr.load_sensor("gen2").crop(24, 16), np.arange(384, dtype=np.uint32)
+    scenes = [hr.load_scene("rotating-star", {"light.illuminance_lux": lux}) for lux in (100, 300)]
+
+    def sources():
+        if exact:
+            return [RenderedFlux(scene, sensor, samples=4, seed=3) for scene in scenes]
+        return [ChangeDrivenFlux(scene, sensor, seed=3) for scene in scenes]
+
+    asked = [(number, window) for window in ((0, 1000), (0, 30_000), (9000, 30_000)) for number in (0, 1)]
+    made = sources()
+    expected = [np.array(made[number].mean_flux(pixel, *window)) for number, window in asked]
+    assert len({values.tobytes() for values in expected}) == (4 if exact else 6)  # two windows in one slice of time
+    for again in (False, True):
+        with pytest.raises(KeyboardInterrupt), Journal(tmp_path / "out", {}) as journal:
+            assert (journal.found > 0) == again
+            made = sources()
+            for number, source in enumerate(made):
+                source.go_on(journal, number)
+            for (number, window), values in zip(asked, expected, strict=True):
+                np.testing.assert_array_equal(np.array(made[number].mean_flux(pixel, *window)), values)
+            raise KeyboardInterrupt
