@@ -143,7 +143,8 @@ def report(name, ours_s, numpy_s, goal, goal_ratio):
 
 def run_speed(repetitions):
     from hesim_render.core.backend import select
-    from hesim_render.pixels.evs.stage import EVENT_DTYPE, EvsStage
+    from hesim_render.pixels.evs.events import EVENT_DTYPE
+    from hesim_render.pixels.evs.stage import EvsStage
 
     print(f"{ROWS * COLS / 1e6:.1f} Mpixel, {select().describe()}, {os.cpu_count()} cores, median of {repetitions}")
     print(f"{'':34s} {'ours':>8s} {'NumPy':>8s} {'ratio':>8s}   goal      (Mpixel/s)")

@@ -32,7 +32,7 @@ def simulate_again(
     recording : a recording of a scene.
     out : folder of the new one; None keeps it in memory.
     scene : the scene, if it needs files that a recording does not hold.
-    options : `overwrite`, `progress`, `on_estimate` and `max_minutes` of `simulate`.
+    options : `overwrite`, `progress`, `on_estimate`, `max_minutes` and `resume` of `simulate`.
 
     Returns
     -------

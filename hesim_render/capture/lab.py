@@ -7,7 +7,7 @@ is that of `hesim_render.capture.bench`.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,7 @@ def write_captures(
     illuminant: str = "D65",
     overwrite: bool = False,
     progress: Progress | None = None,
+    on_estimate: Callable[[object], None] | None = None,
 ) -> Path:
     """Run a calibration session and write its capture set, which appears whole or not at all.
 
@@ -83,6 +84,8 @@ def write_captures(
     illuminant : name of the light's spectrum.
     overwrite : replace an existing capture set.
     progress : called with (done, total, what).
+    on_estimate : called with the size of the set before the session begins, a text; an exception that it raises ends
+        the session before anything is written.
 
     Returns
     -------
@@ -124,6 +127,16 @@ def write_captures(
         session.total += sum(session.work_of(plan.duration_s) for plan in plans.values())
     elif bench.evs is not None:
         session.total += 2 * ticks + 2 * step_trials * _CONTRASTS
+    if on_estimate is not None:
+        shots = 0 if bench.aps is None else frames * (len(dark_exposures_us) + len(lit_exposures_us))
+        gigabytes = shots * sensor.rows * sensor.cols * 2e-9
+        told = [f"{shots} frames, {gigabytes:.3g} GB"] if shots else []
+        if plans:
+            seconds = sum(plan.duration_s for plan in plans.values())
+            told.append(f"event pixels for {seconds:.3g} s, in {len(plans)} kinds of trials")
+        elif bench.evs is not None:
+            told.append(f"{2 * ticks + 2 * step_trials * _CONTRASTS} comparisons of event pixels")
+        on_estimate("; ".join(told))
     folder = OutputFolder(out, CAPTURE_NAME, overwrite)
     try:
         with output_errors(folder.target):

@@ -16,6 +16,7 @@ from hesim_render.capture.simulate import simulate
 from hesim_render.capture.simulate_cube import simulate_cube
 from hesim_render.capture.simulate_video import simulate_video
 from hesim_render.core.errors import HesimError, OutputError, SpecError
+from hesim_render.core.journal import journal_of
 from hesim_render.core.output import check_target, output_errors, replacing
 from hesim_render.core.progress import Progress, ProgressReport
 from hesim_render.core.region import parse_roi
@@ -249,26 +250,28 @@ def _recorded(
     if asked.scene is not None:
         made = simulate(
             asked.scene, asked.sensor, quality=spec.quality, exact=spec.exact, samples=spec.samples, truth=spec.truth,
-            truth_every_us=spec.truth_every_us, **limits, **common,
+            truth_every_us=spec.truth_every_us, resume=True, **limits, **common,
         )  # fmt: skip
     elif spec.video is not None:
         source = spec.video.beside(spec.video.file, shipped=False)
         made = simulate_video(source, asked.sensor, **limits, **common, **asked.options)
     else:
         assert spec.cube is not None
-        begin("none for a cube, which is not rendered")
-        made = simulate_cube(spec.cube.beside(spec.cube.file, shipped=False), asked.sensor, **common, **asked.options)
+        source = spec.cube.beside(spec.cube.file, shipped=False)
+        made = simulate_cube(source, asked.sensor, on_estimate=begin, **common, **asked.options)
     asked.note(RECORDING)
     return made
 
 
 def _clear(folder: Path) -> None:
-    """Remove all but the state, which marks the folder as that of a run."""
+    """Remove all but the state, which marks the folder as that of a run, and what an interrupted recording goes on
+    from.
+    """
     with output_errors(folder):
         for path in folder.iterdir():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
-            elif path.name != STATE:
+            elif path.name not in (STATE, journal_of(folder / RECORDING).name):
                 path.unlink()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import TERMS, noise_models
 from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
+from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, ProgressReport, shown
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.schedule import BlockSample, require_countable
@@ -60,6 +62,7 @@ def simulate(
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
     on_estimate: Callable[[Estimate], None] | None = None,
+    resume: bool = False,
 ) -> Recording:
     """Simulate a sensor in front of a scene: RAW frames, events, and their noise-free truth.
 
@@ -92,6 +95,8 @@ def simulate(
     progress : called with (done, total, what). None shows a bar in notebooks only, False never shows one.
     on_estimate : called with the estimate of time and memory before the run begins; an exception that it raises ends
         the run before anything is written.
+    resume : keep what is rendered in a file beside `out`, until the recording is complete. The same call goes on from
+        what an interrupted one has left there, and gives the same bytes.
 
     Examples
     --------
@@ -123,7 +128,8 @@ def simulate(
     SpecError
         If scene and sensor do not fit together (a spectrum that does not cover the response).
     OutputError
-        If `out` exists or cannot be written. No partial output is left.
+        If `out` exists or cannot be written, or, with `resume`, if another run was interrupted there. No partial
+        output is left.
     """
     duration_us = _duration_us(duration_s)
     if not 0 <= seed < 2**64:
@@ -188,7 +194,10 @@ def simulate(
         with RecordingWriter(
             out, flux.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=settings,
             overwrite=overwrite,
-        ) as writer:  # fmt: skip
+        ) as writer, _journal(resume and renderer is None, out, writer, overwrite) as journal:  # fmt: skip
+            if journal is not None:
+                for number, part in enumerate(_renderers(flux)):
+                    part.go_on(journal, number)
             capture.record(writer, told)
             render: dict[str, Any] = {
                 "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
@@ -271,7 +280,21 @@ def flux_source(
 
 def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
     """The change-driven renderers of a source, one per waveform of its lights; none in the exact mode."""
-    return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
+    return [part for part in _renderers(flux) if isinstance(part, ChangeDrivenFlux)]
+
+
+def _renderers(flux: Any) -> tuple[Any, ...]:
+    """The renderers of a source, one per waveform of its lights."""
+    return getattr(flux, "sources", (flux,))
+
+
+def _journal(
+    is_kept: bool, out: str | Path | None, writer: RecordingWriter, overwrite: bool
+) -> AbstractContextManager[Journal | None]:
+    """The journal of a run whose recording goes to `out`; nothing where none is kept."""
+    if not is_kept or out is None:
+        return nullcontext()
+    return Journal(out, writer.run, overwrite)
 
 
 def _noted(flux: Any, capture: Capture, windows: int, seed: int) -> NotedFlux:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +33,7 @@ def simulate_cube(
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
+    on_estimate: Callable[[object], None] | None = None,
     **options: Any,
 ) -> Recording:
     """Simulate a sensor in front of a hyperspectral cube: RAW frames, events, and their noise-free truth.
@@ -43,6 +44,8 @@ def simulate_cube(
     sensor : from `load_sensor` (crop it for a region of interest).
     duration_s : simulated time, s.
     seed, clean, without, out, overwrite, progress : as for `simulate`.
+    on_estimate : called with the work before the run begins, a text, as a cube takes no rays; an exception that it
+        raises ends the run before anything is written.
     options : options of `sources.cube.CubeOptions`: ``quantity``, ``illuminance_lux`` or ``mean_luminance_cd_m2``,
         ``illuminant``, ``beyond``, ``fit``, ``pan_px_per_s``, ``zoom_per_s``, ``rotation_deg_per_s``, …
 
@@ -97,6 +100,9 @@ def simulate_cube(
         "clean": clean, "without": list(without), "backend": backend.select().describe(), "cube": flux.describe(),
     }  # fmt: skip
     capture = Capture(flux, sensor, aps, evs, duration_us, seed)
+    if on_estimate is not None:
+        samples = round(capture.sample_of_event_blocks().windows)
+        on_estimate(f"{len(capture.frame_exposures[1])} frames and {samples} samples of event pixels; no rays")
     mosaic = describe(sensor, chosen.illuminant.load())
     with RecordingWriter(
         out, sensor, seed=seed, duration_us=duration_us, settings=settings, overwrite=overwrite, mosaic=mosaic

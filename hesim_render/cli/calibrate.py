@@ -10,7 +10,7 @@ import typer
 
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, Without, cropped, names_of, sensor_keys_only
 from hesim_render.cli.terminal import parse_exposures, split_overrides
-from hesim_render.cli.told import Json, Quiet, Told
+from hesim_render.cli.told import DryRun, Json, Quiet, Told
 from hesim_render.core.output import check_target
 
 
@@ -42,6 +42,7 @@ def lab(
     set_: SensorKeys = None,
     without: Without = None,
     overwrite: Overwrite = False,
+    dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -54,12 +55,12 @@ def lab(
     from hesim_render.sensor.sensor import load_sensor
 
     loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
-    told = Told(json_, quiet)
-    with told.progress(f"lab {sensor}") as progress:
+    told = Told(json_, quiet, dry_run)
+    with told.stop_at_estimate(), told.progress(f"lab {sensor}") as progress:
         folder = write_captures(
             loaded, out, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
             illuminant=illuminant, overwrite=overwrite, progress=progress,
-            dark_exposures_us=dark_us, lit_exposures_us=lit_us,
+            dark_exposures_us=dark_us, lit_exposures_us=lit_us, on_estimate=told.estimated(progress),
         )  # fmt: skip
     sizes = {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
     lines = [f"{size / 1e6:10.1f} MB  {out / name}" for name, size in sizes.items()]

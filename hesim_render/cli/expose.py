@@ -22,7 +22,7 @@ from hesim_render.cli.options import (
 )
 from hesim_render.cli.simulate import tell_recording
 from hesim_render.cli.terminal import split_overrides
-from hesim_render.cli.told import Json, Quiet, Told
+from hesim_render.cli.told import DryRun, Json, Quiet, Told
 from hesim_render.core.errors import RangeError
 
 
@@ -50,6 +50,7 @@ def expose(
     clean: Clean = False,
     without: Without = None,
     overwrite: Overwrite = False,
+    dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -67,11 +68,12 @@ def expose(
     import hesim_render as hr
 
     loaded = cropped(hr.load_sensor(sensor, sensor_changes), roi)
-    told = Told(json_, quiet)
-    with told.progress(f"{cube.name} → {sensor}") as progress:
+    told = Told(json_, quiet, dry_run)
+    with told.stop_at_estimate(), told.progress(f"{cube.name} → {sensor}") as progress:
         recording = hr.simulate_cube(
             cube, loaded, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed, clean=clean,
-            without=without or (), **{key: value for key, value in options.items() if value is not None},
+            without=without or (), on_estimate=told.estimated(progress),
+            **{key: value for key, value in options.items() if value is not None},
         )  # fmt: skip
     tell_recording(told, recording)
 

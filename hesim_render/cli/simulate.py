@@ -167,7 +167,7 @@ def rerun(
     with told.stop_at_estimate(), told.progress(f"{recording} again") as progress:
         again = simulate_again(
             loaded, out, given, overwrite=overwrite, progress=progress, on_estimate=told.estimated(progress),
-            max_minutes=None if yes else LONG_MINUTES,
+            max_minutes=None if yes else LONG_MINUTES, resume=True,
         )  # fmt: skip
     tell_recording(told, again)
 
@@ -209,5 +209,5 @@ def _simulate(
     with told.stop_at_estimate(), told.progress(f"{scene} → {sensor}") as progress:
         return hr.simulate(
             loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
-            on_estimate=told.estimated(progress), **options,
+            on_estimate=told.estimated(progress), resume=True, **options,
         )  # fmt: skip

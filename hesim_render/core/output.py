@@ -49,12 +49,17 @@ def _remove(path: Path) -> None:
     _unfinished.pop(path, None)
 
 
-def _prefix(target: Path) -> str:
-    """Common begin of the names of temporary files for a target; the process number follows."""
+def short_name(target: Path) -> str:
+    """Name of a target, shortened where names made of it would be too long."""
     name = target.name
     if len(os.fsencode(name)) > _LONGEST_NAME:
         name = f"{name[: _LONGEST_NAME // 4]}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:16]}"
-    return f".{name}.{socket.gethostname()[:64]}-"
+    return name
+
+
+def _prefix(target: Path) -> str:
+    """Common begin of the names of temporary files for a target; the process number follows."""
+    return f".{short_name(target)}.{socket.gethostname()[:64]}-"
 
 
 def _tidy_up(target: Path) -> None:

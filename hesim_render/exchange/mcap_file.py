@@ -37,6 +37,8 @@ _HEADER = (
     f"{_RULE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     f"{_RULE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 )
+#: Ends of the names of types, of whichever package.
+_EVENT_TYPES, _FRAME_TYPES = "/EventArray", "/Image"
 EVENT_TYPE, FRAME_TYPE = "dvs_msgs/msg/EventArray", "sensor_msgs/msg/Image"
 _TYPES = {
     EVENT_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
@@ -142,7 +144,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], str]:
         If the file is no MCAP file, is damaged, has a part that unpacks to more than it says, or has no events.
     """
     _check_chunks(path)
-    for topic, data in _messages(path, None):
+    for topic, data in _messages(path, None, _EVENT_TYPES):
         rows, cols, _, _ = _parts(data, path)
         return (rows, cols), topic
     raise SpecError("has no messages of type EventArray (dvs_msgs, prophesee_event_msgs)", file=path)
@@ -156,7 +158,7 @@ def read(path: Path, topic: str) -> Iterator[NDArray]:
     SpecError
         If the file is damaged.
     """
-    for _, data in _messages(path, topic):
+    for _, data in _messages(path, topic, _EVENT_TYPES):
         _, _, count, begin = _parts(data, path)
         if not count:
             continue
@@ -172,14 +174,73 @@ def read(path: Path, topic: str) -> Iterator[NDArray]:
         yield events
 
 
+def holds(path: Path) -> tuple[bool, bool]:
+    """Whether a file has messages of events, and messages of images.
+
+    Raises
+    ------
+    SpecError
+        If the file is no MCAP file, or is damaged.
+    """
+    _check_chunks(path)
+    return tuple(next(_messages(path, None, kind), None) is not None for kind in (_EVENT_TYPES, _FRAME_TYPES))  # type: ignore[return-value]
+
+
+def read_frames(path: Path) -> Iterator[tuple[int, NDArray[np.uint16], str]]:
+    """Time, µs, values [row, col] and encoding of each image of the first topic of type Image.
+
+    Raises
+    ------
+    SpecError
+        If the file is damaged, or an image is not of one grey or Bayer mosaic of 8 or 16 bits.
+    """
+    _check_chunks(path)
+    first: str | None = None
+    for topic, data in _messages(path, None, _FRAME_TYPES):
+        first = first or topic
+        if topic == first:
+            yield _frame(data, path)
+
+
+def _frame(data: bytes, path: Path) -> tuple[int, NDArray[np.uint16], str]:
+    place = _behind_header(data, path)
+    try:
+        sec, nanosec = struct.unpack_from("<iI", data, 4)
+        rows, cols, length = struct.unpack_from("<III", data, place)
+        place += 12
+        encoding, place = data[place : place + length].rstrip(b"\0").decode("ascii", "replace"), place + length
+        is_big, place = data[place], place + 1
+        place += -(place - len(_LITTLE_ENDIAN)) % 4
+        step, size = struct.unpack_from("<II", data, place)
+    except (struct.error, IndexError):
+        raise SpecError("an image ends early; the file is damaged", file=path) from None
+    bits = 16 if encoding.endswith("16") else 8
+    if not (encoding in ("mono8", "mono16") or encoding.startswith("bayer_")):
+        raise SpecError(f"has images of encoding {encoding!r}; expected mono8, mono16 or bayer_…", file=path)
+    values = data[place + 8 : place + 8 + size]
+    if len(values) < size or size < rows * step or step < cols * bits // 8 or step * 8 % bits:
+        raise SpecError("an image is shorter than its size; the file is damaged", file=path)
+    kind = np.dtype(f"{'>' if is_big else '<'}u{bits // 8}")
+    lines = np.frombuffer(values, kind, rows * step // kind.itemsize).reshape(rows, -1)
+    return sec * 1_000_000 + nanosec // 1000, lines[:, :cols].astype(np.uint16), encoding
+
+
+def _behind_header(data: bytes, path: Path) -> int:
+    """Place behind the header of a message."""
+    if data[:2] != _LITTLE_ENDIAN[:2]:
+        raise SpecError("has messages that are not little-endian CDR", file=path)
+    try:
+        (length,) = struct.unpack_from("<I", data, 12)
+    except struct.error:
+        raise SpecError("a message ends early; the file is damaged", file=path) from None
+    place = 16 + length
+    return place + -place % 4
+
+
 def _parts(data: bytes, path: Path) -> tuple[int, int, int, int]:
     """Rows, columns and number of events of a message, and where they begin."""
+    place = _behind_header(data, path)
     try:
-        if data[:2] != _LITTLE_ENDIAN[:2]:
-            raise SpecError("has messages that are not little-endian CDR", file=path)
-        (length,) = struct.unpack_from("<I", data, 12)
-        place = 16 + length
-        place += -place % 4
         rows, cols, count = struct.unpack_from("<III", data, place)
     except struct.error:
         raise SpecError("a packet of events ends early; the file is damaged", file=path) from None
@@ -225,8 +286,8 @@ def _unpacked_bytes(chunk: Any) -> int:
     return len(chunk.data)
 
 
-def _messages(path: Path, topic: str | None) -> Iterator[tuple[str, bytes]]:
-    """Topic and content of the messages of events."""
+def _messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, bytes]]:
+    """Topic and content of the messages of a topic, or of all, whose type ends with `kind`."""
     _require(path)
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
@@ -235,7 +296,7 @@ def _messages(path: Path, topic: str | None) -> Iterator[tuple[str, bytes]]:
         try:
             found: Any = make_reader(file, validate_crcs=True).iter_messages(topics=None if topic is None else [topic])
             for schema, channel, message in found:
-                if schema is not None and schema.name.endswith("/EventArray"):
+                if schema is not None and schema.name.endswith(kind):
                     yield channel.topic, message.data
         except McapError as error:
             raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None

@@ -137,10 +137,10 @@ def _write_mcap(recording: Recording, path: Path, target: Path) -> None:
     events = event_stream(recording) if min(recording.event_shape) > 0 else None
     frames = ((frame.t_us, frame.raw) for frame in recording.frames)
     with path.open("wb") as file:
-        mcap_file.write(events, frames, _encoding(recording.mosaic), file, target)
+        mcap_file.write(events, frames, mosaic_encoding(recording.mosaic), file, target)
 
 
-def _encoding(mosaic: Mosaic) -> str:
+def mosaic_encoding(mosaic: Mosaic) -> str:
     """Name of a mosaic in ``sensor_msgs/image_encodings``; ``mono16`` where it has none."""
     letters = "".join("RGB"[code] if code < len("RGB") else "?" for code in mosaic.tile_code.ravel())
     known = mosaic.tile_shape == (2, 2) and letters in ("RGGB", "BGGR", "GRBG", "GBRG")

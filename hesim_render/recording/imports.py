@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading, require_memory
 from hesim_render.core.npz import read_array, read_arrays
-from hesim_render.exchange import EventStream, open_events
+from hesim_render.exchange import EventStream, mcap_file, open_events
+from hesim_render.mosaic.description import describe
 from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw
 from hesim_render.recording.dng import is_packed, read_dng
+from hesim_render.recording.exports import mosaic_encoding
 from hesim_render.recording.frame import Frame
 from hesim_render.recording.writer import RecordingWriter
 
@@ -37,10 +39,12 @@ def import_recording(
     ----------
     path : folder to write.
     sensor : the sensor file that describes the camera, cropped to the region that was read out.
-    events : event file of a format that `open_events` reads, with the event grid of the sensor.
+    events : event file of a format that `open_events` reads, with the event grid of the sensor. Of an MCAP file the
+        images are taken as well, unless `frames` are given.
     frames : RAW frames in order of time, uint16 [row, col], DN: DNG and TIFF files (the mosaic as first image), PNG,
         NPY, npz of H-ESIM and RGB-Event-ISP, or RAW files of cameras, through rawpy, as DNG of cameras. Frame k begins
-        at k / frame rate of the sensor file, and has the exposure of that file.
+        at k / frame rate of the sensor file, and has the exposure of that file. Or one MCAP file, whose images are
+        taken with their own times, which are those of the ends of their first rows' exposures.
     overwrite : replace an existing recording.
 
     Returns
@@ -57,6 +61,11 @@ def import_recording(
         If a file is damaged, or does not fit the sensor.
     """
     aps, layout = sensor.spec.aps, sensor.layout
+    if events is not None and Path(events).suffix.lower() == ".mcap":
+        has_events, has_frames = mcap_file.holds(Path(events).expanduser())
+        if has_frames and aps is not None and not frames:
+            frames = [events]
+        events = events if has_events and sensor.spec.evs is not None else None
     if events is None and not frames:
         raise RangeError("frames", list(frames), "events, frames or both")
     if frames and aps is None:
@@ -65,15 +74,14 @@ def import_recording(
     end_us = 0 if stream is None else stream.span_us()[1]
     starts: list[int] = []
     if aps is not None and frames:
-        starts = [round(k * 1e6 / aps.frame_rate_hz) for k in range(len(frames))]
+        starts = _starts_us(frames, aps.frame_rate_hz, aps.exposure_us)
         end_us = max(end_us, starts[-1] + aps.exposure_us + round((layout.rows - 1) * aps.line_time_us))
     settings = {"imported": {"events": _name(events), "frames": [_name(file) for file in frames]}}
     with RecordingWriter(path, sensor, seed=0, duration_us=end_us, settings=settings, overwrite=overwrite) as writer:
         valid = layout.aps_mask
         unknown = np.full(layout.shape, np.nan, dtype=np.float32)
-        for index, (file, start_us) in enumerate(zip(frames, starts, strict=True)):
+        for index, (raw, start_us) in enumerate(zip(_frames(frames, sensor), starts, strict=True)):
             assert aps is not None
-            raw = _frame(Path(file).expanduser(), sensor)
             writer.add_frame(
                 Frame(
                     raw=np.where(valid, raw, 0).astype(np.uint16), valid=valid, electrons_mean=unknown,
@@ -101,10 +109,47 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
     return stream
 
 
+def _images_of(frames: Sequence[str | Path]) -> Path | None:
+    """The MCAP file that holds the frames; None where each has a file."""
+    files = [Path(file).expanduser() for file in frames]
+    messages = next((file for file in files if file.suffix.lower() == ".mcap"), None)
+    if messages is not None and len(files) > 1:
+        raise SpecError("has all frames or none; give no other files of frames", file=messages)
+    return messages
+
+
+def _starts_us(frames: Sequence[str | Path], frame_rate_hz: float, exposure_us: int) -> list[int]:
+    """Begin of each frame, µs."""
+    messages = _images_of(frames)
+    if messages is None:
+        return [round(k * 1e6 / frame_rate_hz) for k in range(len(frames))]
+    starts = [max(0, t_us - exposure_us) for t_us, *_ in mcap_file.read_frames(messages)]
+    if not starts:
+        raise SpecError("has no messages of type Image", file=messages)
+    if np.any(np.diff(starts) < 0):
+        raise SpecError("has images that are not in order of time", file=messages)
+    return starts
+
+
+def _frames(frames: Sequence[str | Path], sensor: Sensor) -> Iterator[NDArray[np.uint16]]:
+    """The DN of each frame, [row, col]."""
+    messages = _images_of(frames)
+    if messages is None:
+        yield from (_frame(Path(file).expanduser(), sensor) for file in frames)
+        return
+    own = mosaic_encoding(describe(sensor, None))
+    for _, raw, encoding in mcap_file.read_frames(messages):
+        if encoding.startswith("bayer_") and encoding.removesuffix("8").removesuffix("16") != own.removesuffix("16"):
+            raise SpecError(f"has images of encoding {encoding}; the region of the sensor is {own}", file=messages)
+        if raw.shape != sensor.layout.shape:
+            told = f"has an image of {raw.shape[1]}x{raw.shape[0]} px"
+            raise SpecError(f"{told}; the region has {sensor.cols}x{sensor.rows}", file=messages)
+        yield _checked(raw, sensor, messages)
+
+
 def _frame(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
     """The DN of a frame, [row, col]."""
-    assert sensor.spec.aps is not None
-    suffix, shape, bit_depth = file.suffix.lower(), sensor.layout.shape, sensor.spec.aps.bit_depth
+    suffix, shape = file.suffix.lower(), sensor.layout.shape
     if suffix in CAMERA_SUFFIXES or (suffix == ".dng" and is_packed(file)):
         raw = read_camera_raw(file, sensor)
     elif suffix in (".dng", ".tif", ".tiff"):
@@ -119,6 +164,13 @@ def _frame(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
         raise SpecError(
             "is no frame; expected .dng, .tif, .tiff, .png, .npy, .npz or a RAW file of a camera", file=file
         )
+    return _checked(raw, sensor, file)
+
+
+def _checked(raw: NDArray[np.uint16], sensor: Sensor, file: Path) -> NDArray[np.uint16]:
+    """A frame, which must fit the bit depth of the sensor."""
+    assert sensor.spec.aps is not None
+    bit_depth = sensor.spec.aps.bit_depth
     if raw.max() >= 1 << bit_depth:
         raise SpecError(f"holds {raw.max()} DN; the sensor has {bit_depth} bit", file=file)
     return raw

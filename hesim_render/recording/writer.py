@@ -73,6 +73,16 @@ class RecordingWriter:
         self._labels: list[LabelBlock] = []
         self._dropped = 0
 
+    @property
+    def run(self) -> dict[str, Any]:
+        """All that decides what is recorded, by name; plain values."""
+        named = {
+            name: self._manifest[name] for name in ("scene", "sensor", "roi", "time", "seed", "settings", "software")
+        }
+        for name in ("scene", "sensor"):
+            named[name] = {key: value for key, value in (named[name] or {}).items() if key != "spec"}
+        return named
+
     def add_frame(self, frame: Frame) -> None:
         """Add the next frame; frames come in order of time.
 

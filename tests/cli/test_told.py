@@ -86,6 +86,41 @@ def test_a_dry_run_of_a_video(capsys, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["v.npy"]
 
 
+def test_a_dry_run_of_a_cube(capsys, tmp_path):
+    np.save(tmp_path / "c.npy", np.full((12, 16, 31), 0.3, np.float32))
+    words = [
+        "expose",
+        tmp_path / "c.npy",
+        "--bands",
+        "400:700:10",
+        "--hold",
+        "--lux",
+        "500",
+        "--sensor",
+        "reference-mono",
+    ]
+    words += ["--roi", "16x12", "--duration", "0.1", "--out", tmp_path / "o"]
+    told = json.loads(call(capsys, *words, "--dry-run", "--json")[1])
+    # 30 frames a second and 1000 comparisons a second
+    assert told["dry_run"] is True and told["estimate"]["text"] == "3 frames and 100 samples of event pixels; no rays"
+    assert [path.name for path in tmp_path.iterdir()] == ["c.npy"]
+    assert "pan" in fails(capsys, *words, "--pan", "x", "--dry-run")
+    assert json.loads(call(capsys, *words, "--json")[1])["counts"]["frames"] == 3
+
+
+def test_a_dry_run_of_a_lab(capsys, tmp_path):
+    words = ["lab", "reference-mono", "--roi", "16x12", "--frames", "8", "--ticks", "500", "--out", tmp_path / "o"]
+    words += ["--dark-ms", "1,5", "--lit-ms", "1,5,9", "--dry-run", "--json"]
+    told = json.loads(call(capsys, *words)[1])
+    # 5 exposures of 8 frames of 192 pixels; 500 ticks lit and dark, and 50 at each of 21 contrasts of both signs
+    assert told["estimate"]["text"] == "40 frames, 1.54e-05 GB; 3100 comparisons of event pixels"
+    assert told["dry_run"] is True and list(tmp_path.iterdir()) == []
+    words[1] = "imx636"
+    assert "event pixels for" in json.loads(call(capsys, *words)[1])["estimate"]["text"]
+    assert "frames is 2" in fails(capsys, *words, "--frames", "2")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_lists_as_json_agree_with_the_files(capsys):
     """Only some keys of each file are parsed; the whole files say the same."""
     for kind in ("scenes", "sensors", "study_specs", "filter_sets"):

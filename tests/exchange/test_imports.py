@@ -71,3 +71,78 @@ def test_the_command_makes_a_recording(capsys, tmp_path):
     np.testing.assert_array_equal(Recording.load(tmp_path / "new").events, given.events)
     status, _, error = command(capsys, "import", events, events, "--out", tmp_path / "x")
     assert (status, error) == (2, "hesim-render: more than one file, or --roi, needs --sensor\n")
+
+
+@pytest.mark.parametrize("name", ["davis346", "reference-bayer", "eiger"])
+def test_events_and_images_of_an_mcap_file_come_back(name, tmp_path, capsys):
+    given = recordings.make(name, tmp_path / "r", frames=2)
+    file, sensor = given.export("mcap", tmp_path / "c.mcap"), recordings.sensor_like(name)
+    again = import_recording(tmp_path / "again", sensor, events=file)
+    np.testing.assert_array_equal(again.events, given.events)
+    assert len(again.frames) == len(given.frames) == 2
+    for found, frame in zip(again.frames, given.frames, strict=True):
+        np.testing.assert_array_equal(found.raw, frame.raw)
+        assert found.times == frame.times
+    words = ("import", file, "--sensor", name, "--roi", "128x96", "--out", tmp_path / "x")
+    status, told, _ = command(capsys, *words)
+    assert status == 0 and "RAW frames: 2 of 128x96 px" in told
+    np.testing.assert_array_equal(Recording.load(tmp_path / "x").events, given.events)
+
+
+def test_images_of_other_writers(tmp_path):
+    """By rosbags: mono8 with padded lines, big-endian mono16, and mosaics that are not the sensor's."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    sensor = recordings.sensor_like("davis346")
+    rows, cols = sensor.layout.shape
+    rng = np.random.default_rng(0)
+
+    def image(encoding, values, step, big=0, t_us=70_000):
+        kind = store.types
+        stamp = kind["builtin_interfaces/msg/Time"](sec=t_us // 10**6, nanosec=t_us % 10**6 * 1000)
+        header = kind["std_msgs/msg/Header"](stamp=stamp, frame_id="a longer name")
+        data = np.frombuffer(values.tobytes(), np.uint8)
+        message = kind["sensor_msgs/msg/Image"](
+            header=header, height=rows, width=cols, encoding=encoding, is_bigendian=big, step=step, data=data
+        )
+        return bytes(store.serialize_cdr(message, "sensor_msgs/msg/Image"))
+
+    def file_of(*messages):
+        from mcap.writer import Writer
+
+        with (tmp_path / "i.mcap").open("wb") as file:
+            writer = Writer(file)
+            writer.start(profile="ros2", library="test")
+            schema = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
+            channel = writer.register_channel("/image", "cdr", schema)
+            for number, message in enumerate(messages):
+                writer.add_message(channel, number, message, number)
+            writer.finish()
+        return tmp_path / "i.mcap"
+
+    small = rng.integers(0, 256, (rows, cols), dtype=np.uint8)
+    padded = np.pad(small, ((0, 0), (0, 3)))
+    large = rng.integers(0, 1 << 10, (rows, cols), dtype=np.uint16)
+    messages = image("mono8", padded, cols + 3), image("mono16", large.astype(">u2"), 2 * cols, 1, 3_000_000)
+    made_of = import_recording(tmp_path / "r", sensor, frames=[file_of(*messages)])
+    assert [frame.t_us for frame in made_of.frames] == [70_000, 3_000_000]
+    for frame, values in zip(made_of.frames, (small, large), strict=True):
+        np.testing.assert_array_equal(frame.raw[frame.valid], values[frame.valid])
+    assert made_of.events is None or made_of.events.size == 0
+    cut = image("mono16", large, 2 * cols)[:-7]
+    for given, told in (
+        ([image("bayer_rggb8", small, cols)], "encoding bayer_rggb8; the region of the sensor is mono16"),
+        ([image("rgb8", small, cols)], "encoding 'rgb8'; expected mono8"),
+        ([cut], "shorter than its size|not little|damaged"),
+        ([cut[:40]], "ends early"),
+        ([image("mono16", large, cols)], "shorter than its size"),
+        ([image("mono16", large | 1024, 2 * cols)], "the sensor has 10 bit"),
+        (messages[::-1], "not in order of time"),
+        ([], "has no messages of type Image"),
+    ):
+        with pytest.raises(HesimError, match=told):
+            import_recording(tmp_path / "s", sensor, frames=[file_of(*given)])
+    with pytest.raises(HesimError, match="give no other files"):
+        import_recording(tmp_path / "s", sensor, frames=[file_of(*messages), tmp_path / "x.png"])
+    assert not (tmp_path / "s").exists()

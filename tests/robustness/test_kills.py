@@ -232,6 +232,43 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("command", ["simulate", "rerun", "run"])
+def test_a_killed_run_goes_on(command, number, tmp_path):
+    """Ended twice while it renders, it ends with the bytes of one that ran through, and traces only what is missing."""
+    run = ["simulate", "rotating-star", "--sensor", "gen2", "--roi", "96x64", "--duration", "0.02"]
+    given = {
+        "simulate": [*run, "--out", "out"],
+        "rerun": ["rerun", "whole", "--out", "out"],
+        "run": ["run", "r.yaml", "--out", "r"],
+    }[command]
+    (tmp_path / "r.yaml").write_text(
+        "schema_version: 1\nname: r\nscene: rotating-star\nsensor: gen2\nroi: 96x64\nduration_s: 0.02\n"
+    )
+    finish(tmp_path, [*run, "--out", "whole"])
+    out = tmp_path / ("r/recording" if command == "run" else "out")
+    journal = out.parent / f".{out.name}.unfinished"
+    before = 0
+    for _ in range(2):
+        child = start(tmp_path, given)
+        while child.poll() is None and not (journal.is_file() and journal.stat().st_size > before + 50_000):
+            time.sleep(0.01)
+        child.send_signal(number)
+        _, err = child.communicate(timeout=60)
+        assert child.returncode in (130, -number) and "Traceback" not in err, err
+        assert not out.exists() and journal.stat().st_size > before
+        before = journal.stat().st_size
+    kept = journal.read_bytes()
+    refused = start(tmp_path, [*run, "--seed", "8", "--out", out])
+    assert "an interrupted run, which would go on there, had another seed" in refused.communicate(timeout=60)[1]
+    assert refused.returncode == 2 and journal.read_bytes() == kept
+    finish(tmp_path, given)
+    assert files_in(out) == files_in(tmp_path / "whole") and not journal.exists()
+    for path in files_in(out):
+        assert (out / path).read_bytes() == (tmp_path / "whole" / path).read_bytes(), path
+
+
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on(tmp_path):
     """Started again after each of ten kills, it ends with the bytes of one that ran through."""
     for name in ("whole", "killed"):

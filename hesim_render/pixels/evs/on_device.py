@@ -70,6 +70,14 @@ class EventPixels:
         limits = spec.min_cutoff_hz, spec.cutoff_hz
         return formulas.corner_hz(self._coefficients, log, self._reference_level, *limits, device_namespace())
 
+    def limits_of_corner(self, spec: PhotoreceptorSpec) -> tuple[Float, Float]:
+        """ln x up to which a photoreceptor's corner is its least, and from which on it is its largest."""
+        import drjit as dr
+
+        assert spec.min_cutoff_hz is not None
+        base, level = self._coefficients.base, self._reference_level
+        return dr.log(dr.fma(level, spec.min_cutoff_hz / spec.cutoff_hz, base)), dr.log(level + base)
+
 
 def _by_position(layout: Layout) -> Callable[[NDArray[np.float64]], Float]:
     """Function that spreads values [position] over the pixels.

@@ -1,18 +1,22 @@
 """The photoreceptor's bandwidth: ln x through two equal poles, stepped exactly.
 
 With u = ln x of the light and a the rate of both poles, z' = a(u − z) and y' = a(z − y); y is the input of the
-comparator. For u on a straight line from u₀ to u₁ in a time h, with E = exp(−ah) and p = (1 − E)/(ah)::
+comparator. For u on a straight line from u₀ to u₁, with x the integral of a from a point of the line to its end,
+H that over the whole line, E = exp(−H), and means over the time of the line::
 
-    z₁ = u₁ + E (z₀ − u₀) − p (u₁ − u₀)
-    y₁ = u₁ + E (y₀ − u₀ + ah (z₀ − u₀)) − (2p − E)(u₁ − u₀)
+    z₁ = u₁ + E (z₀ − u₀) − mean(exp(−x)) (u₁ − u₀)
+    y₁ = u₁ + E (y₀ − u₀ + H (z₀ − u₀)) − mean((1 + x) exp(−x)) (u₁ − u₀)
 
-The step is exact for every h. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A photoreceptor is a
-second-order system whose corner rises with the photocurrent [graca2021] until its bias current limits it.
+Where a is constant over a time h, H = ah, and with p = (1 − E)/H the means are p and 2p − E. The step is exact for
+every h. Both poles together are −3 dB at f_c, so that a = 2π f_c/√(√2 − 1). A photoreceptor is a second-order system
+whose corner rises with the photocurrent [graca2021] until its bias current limits it.
 """
 
 from __future__ import annotations
 
 import math
+
+import numpy as np
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
@@ -22,8 +26,11 @@ from hesim_render.pixels.evs.model import EvsNoise
 #: Nodes per period of the highest corner frequency. Between nodes, y is taken as a straight line.
 NODES_PER_CORNER_PERIOD = 32
 
-#: Below this a·h, 1 − E is a difference of nearly equal numbers. A series of five terms is accurate to 2e-8 there.
-_SERIES_BELOW = 0.1
+#: ln x so near to the light is the light itself, in single precision.
+_SETTLED = 1e-7
+
+#: z − u and y − u of each pixel.
+_State = tuple[Float, Float]
 
 
 def _rate(corner_hz: Float) -> Float:
@@ -34,8 +41,7 @@ def _rate(corner_hz: Float) -> Float:
 class Photoreceptor:
     """State of each pixel's low-pass, with its own time grid.
 
-    A corner frequency that follows the light is constant from one node of the grid to the next. Its value is that
-    at the middle of the stretch, on the straight line through the previous node and this one. Steps within a stretch
+    A corner frequency that follows the light does so at every instant: a jump of the light changes it at once. Steps
     add up exactly, so the result does not depend on how often the filter is asked.
 
     Parameters
@@ -43,7 +49,7 @@ class Photoreceptor:
     noise : with `photoreceptor` given.
     """
 
-    STATE = ("_t_us", "_node", "_input", "_state", "_rate", "_node_rate")
+    STATE = ("_t_us", "_node", "_input", "_state")
 
     def __init__(self, noise: EvsNoise) -> None:
         spec = noise.photoreceptor
@@ -53,18 +59,16 @@ class Photoreceptor:
         self._t_us = 0.0
         self._node = 0  # the last node at or before the present
         self._input: Float = None  # u
-        self._state: tuple[Float, Float] = (None, None)  # z, y
-        self._rate: Float = None  # a in 1/µs up to the next node: a number, or one per pixel
-        self._node_rate: Float = None  # a at the last node
+        #: Not z and y: in slow pixels single precision would swallow the last 1e-4 of their way to u.
+        self._state: _State = (None, None)
 
     def _rate_at(self, log: Float) -> Float:
-        spec = self._spec
-        return _rate(self._noise.on_device.corner_hz(log, spec) if spec.follows_light else spec.cutoff_hz)
+        return _rate(self._noise.on_device.corner_hz(log, self._spec))
 
     @property
     def rate_per_us(self) -> Float:
-        """a of both poles up to the next node, 1/µs: a number, or one per pixel."""
-        return self._rate
+        """a of both poles in the present light, 1/µs: a number, or one per pixel."""
+        return self._rate_at(self._input) if self._spec.follows_light else _rate(self._spec.cutoff_hz)
 
     def _node_at(self, t_us: float) -> int:
         return math.floor(t_us / self._period_us + 1e-6)  # reached, but for rounding
@@ -77,9 +81,11 @@ class Photoreceptor:
         log : ln x of each pixel.
         t_us : time of the sample, µs.
         """
+        import drjit as dr
+
         self._t_us, self._node = float(t_us), self._node_at(t_us)
-        self._input, self._state = log, (log, log)
-        self._rate = self._node_rate = self._rate_at(log)
+        settled = dr.zeros(jit().Float, dr.width(log))
+        self._input, self._state = log, (settled, settled)
         return log
 
     def nodes_us(self, end_us: float) -> list[float]:
@@ -87,39 +93,86 @@ class Photoreceptor:
         last = math.ceil(end_us / self._period_us - 1e-6) - 1
         return [node * self._period_us for node in range(self._node + 1, last + 1)]
 
+    def rests(self, log: Float, t_us: int) -> bool:
+        """Go to `t_us`, µs, at once if y stays as it is: the light is that of before, and all pixels have settled.
+
+        Parameters
+        ----------
+        log : ln x of each pixel at `t_us`.
+        t_us : time of the sample, µs.
+
+        Returns
+        -------
+        True if the filter is at `t_us` now, where y is `log`; False if it is where it was.
+        """
+        import drjit as dr
+
+        z, y = self._state
+        still = (log == self._input) & (z * z + y * y < _SETTLED**2)
+        if not dr.all(still)[0]:
+            return False
+        self.start(log, t_us)
+        return True
+
     def to(self, log: Float, t_us: float) -> Float:
         """y at `t_us`, µs, if ln x goes on a straight line to `log`. No node lies in between."""
         import drjit as dr
 
-        types = jit()
-        elapsed_us = t_us - self._t_us
-        if self._spec.follows_light:
-            h = self._rate * dr.opaque(types.Float, elapsed_us)
-            decay = dr.exp(-h)
-            series = dr.fma(h, dr.fma(h, dr.fma(h, dr.fma(h, 1 / 120, -1 / 24), 1 / 6), -0.5), 1.0)
-            lag = dr.select(h < _SERIES_BELOW, series, (1.0 - decay) / h)
-        else:
-            exact = self._rate * elapsed_us
-            h, decay, lag = (
-                dr.opaque(types.Float, value) for value in (exact, math.exp(-exact), -math.expm1(-exact) / exact)
-            )
-        z, y = self._state
-        change, z_off = log - self._input, z - self._input
-        self._state = (
-            log + (decay * z_off - lag * change),
-            log + (decay * dr.fma(h, z_off, y - self._input) - (2.0 * lag - decay) * change),
-        )
-        self._input, self._t_us = log, t_us
+        line = self._followed if self._spec.follows_light else self._held
+        self._state = line(log - self._input, t_us - self._t_us)
+        self._input, self._t_us, self._node = log, t_us, self._node_at(t_us)
         dr.eval(self._input, self._state)
-        node = self._node_at(t_us)
-        if self._spec.min_cutoff_hz is not None and node > self._node:
-            before, now = self._node_rate, self._rate_at(log)
-            lowest = dr.maximum(0.5 * now, _rate(self._spec.min_cutoff_hz))
-            highest = dr.minimum(2.0 * now, _rate(self._spec.cutoff_hz))
-            self._node_rate, self._rate = now, dr.clip(dr.fma(0.5, now - before, now), lowest, highest)
-            dr.eval(self._rate, self._node_rate)
-        self._node = node
-        return self._state[1]
+        return log + self._state[1]
+
+    def _held(self, change: Float, elapsed_us: float) -> _State:
+        """State at the end of a line, with the same corner in any light."""
+        import drjit as dr
+
+        h = self.rate_per_us * elapsed_us
+        loss = -math.expm1(-h)
+        return _advance(self._state, change, *(dr.opaque(jit().Float, number) for number in (h, loss / h, loss)))
+
+    def _followed(self, change: Float, elapsed_us: float) -> _State:
+        """State at the end of a line, with the corner of the light at each instant of it.
+
+        The line has up to three parts: one in which the corner is held at one of its limits, one in which it follows
+        the light, and again one at a limit.
+        """
+        import drjit as dr
+
+        types, spec = jit(), self._spec
+        assert spec.min_cutoff_hz is not None
+        begin, elapsed = self._input, dr.opaque(types.Float, elapsed_us)
+        dark, bright = self._noise.on_device.limits_of_corner(spec)
+        least, largest = (dr.opaque(types.Float, _rate(hz)) for hz in (spec.min_cutoff_hz, spec.cutoff_hz))
+        line = dr.select(change == 0, types.Float(1e-30), change)
+        reached = [dr.clip((limit - begin) / line, 0.0, 1.0) for limit in (dark, bright)]
+        first, last = dr.minimum(*reached), dr.maximum(*reached)
+
+        def at_limit(state: _State, light: Float, part: Float) -> _State:
+            h = dr.select(light < bright, least, largest) * (part * elapsed)
+            return _advance(state, part * change, h, lag := _lag(h), h * lag)
+
+        part = last - first
+        state = at_limit(self._state, begin, first)
+        state = self._follow_inside(state, dr.fma(first, change, begin), part * change, part * elapsed)
+        return at_limit(state, begin + change, 1.0 - last)
+
+    def _follow_inside(self, state: _State, begin: Float, change: Float, elapsed_us: Float) -> _State:
+        """State at the end of a line on which the corner is between its limits.
+
+        The integrals are quadratures of Gauss and Legendre. In y they are good to 1e-6 for changes of ln x up to 1
+        between two nodes, and to 1e-4 for changes of 4.
+        """
+        import drjit as dr
+
+        rates = [self._rate_at(dr.fma(change, place, begin)) * elapsed_us for place in _PLACES]
+        total = sum(weight * rate for weight, rate in zip(_WEIGHTS, rates, strict=True))
+        rests = [sum(weight * rate for weight, rate in zip(row, rates, strict=True)) for row in _REST]
+        decays = [weight * dr.exp(-rest) for weight, rest in zip(_WEIGHTS, rests, strict=True)]
+        lag = sum(decays)
+        later = sum(decay * rest for decay, rest in zip(decays, rests, strict=True))
+        return _decayed(state, total, total * _lag(total), (lag * change, (lag + later) * change))
 
     def follow(self, log: Float, t_us: int) -> Float:
         """y at the next sample, over all nodes in between. The first call begins in the settled state.
@@ -133,9 +186,45 @@ class Photoreceptor:
 
         if self._input is None:
             return self.start(log, t_us)
+        if self.rests(log, t_us):
+            return log
         if self._spec.follows_light:
             before, begin_us = self._input, self._t_us
             for node_us in self.nodes_us(t_us):
                 part = dr.opaque(jit().Float, (node_us - begin_us) / (t_us - begin_us))
                 self.to(dr.fma(log - before, part, before), node_us)
         return self.to(log, float(t_us))
+
+
+def _advance(state: _State, change: Float, h: Float, lag: Float, loss: Float) -> _State:
+    """State at the end of a line of constant corner: `h` is H, `lag` is p, `loss` is 1 − E."""
+    return _decayed(state, h, loss, (lag * change, (2.0 * lag - (1.0 - loss)) * change))
+
+
+def _decayed(state: _State, h: Float, loss: Float, shift: _State) -> _State:
+    """State after its decay and a shift down. Next to 1, E would lose the digits of `loss`, which is 1 − E."""
+    import drjit as dr
+
+    z, y = state[0], dr.fma(h, *state)
+    return dr.fma(-loss, z, z) - shift[0], dr.fma(-loss, y, y) - shift[1]
+
+
+def _lag(h: Float) -> Float:
+    """p = (1 − exp(−h))/h by its series, good to 1e-8 up to the 0.305 that two nodes have between them at most."""
+    import drjit as dr
+
+    series = dr.fma(h, 1 / 5040, -1 / 720)
+    for term in (1 / 120, -1 / 24, 1 / 6, -1 / 2, 1.0):
+        series = dr.fma(h, series, term)
+    return series
+
+
+# A quadrature of three points on [0, 1], exact for polynomials of degree 5: its points and weights, and the weights
+# of the same points for the integral from each of them to 1, exact for polynomials of degree 2.
+_points, _weights = np.polynomial.legendre.leggauss(3)
+_PLACES: list[float] = (0.5 * (1 + _points)).tolist()
+_WEIGHTS: list[float] = (0.5 * _weights).tolist()
+_powers = np.power.outer(_PLACES, np.arange(3))
+_REST: list[list[float]] = (
+    (1 - np.power.outer(_PLACES, np.arange(1, 4))) / np.arange(1, 4) @ np.linalg.inv(_powers)
+).tolist()

@@ -6,27 +6,19 @@ sensor's own tick sets the sample times; in ``last_event`` mode the source may b
 
 from __future__ import annotations
 
-import math
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
-from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
-from hesim_render.pixels.arrays import restore, saved, take
+from hesim_render.pixels.arrays import restore, saved
+from hesim_render.pixels.evs.comparison import LastEvent, PreviousSample
 from hesim_render.pixels.evs.defects import DefectEvents
-from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin, no_events
-from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.photoreceptor import Photoreceptor
-from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
 from hesim_render.pixels.evs.readout import EventReadout
-from hesim_render.pixels.evs.refractory import Refractory
-from hesim_render.pixels.normal import normal_pair
 
 
 class _Mode(Protocol):
@@ -46,14 +38,6 @@ class Labels(Protocol):
         origin: NDArray[np.int8],
         kept: NDArray[np.bool_] | None,
     ) -> None: ...
-
-
-def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
-    """Structured array of events at flat pixel indices of an event grid `cols` wide."""
-    events = np.empty(len(pixel), EVENT_DTYPE)
-    events["t_us"], events["polarity"] = t_us, polarity
-    events["y"], events["x"] = np.divmod(pixel.astype(np.uint32), np.uint32(cols))
-    return events
 
 
 class EvsStage:
@@ -96,7 +80,7 @@ class EvsStage:
         if defects is None and noise.defects:
             tick_s = noise.spec.tick_us * S_PER_US if has_ticks and noise.spec.tick_us else None
             defects = DefectEvents(noise.defects, int(seed), tick_s)
-        self._mode: _Mode = (_PreviousSample if has_ticks else _LastEvent)(noise, int(seed), defects)
+        self._mode: _Mode = (PreviousSample if has_ticks else LastEvent)(noise, int(seed), defects)
         self._t_us: int | None = None
         self._readout: EventReadout | None = None
         if noise.readout_max_events_per_s is not None:
@@ -114,8 +98,8 @@ class EvsStage:
     @property
     def reference(self) -> Float:
         """Level with which each asynchronous pixel compares, ln x; None before the first sample."""
-        assert isinstance(self._mode, _LastEvent)
-        return self._mode._reference
+        assert isinstance(self._mode, LastEvent)
+        return self._mode.reference
 
     @property
     def level(self) -> Float:
@@ -125,8 +109,8 @@ class EvsStage:
 
     def compare_with(self, reference: Float) -> None:
         """Let the asynchronous pixels compare with other levels, ln x, from now on."""
-        assert isinstance(self._mode, _LastEvent)
-        self._mode._reference = reference
+        assert isinstance(self._mode, LastEvent)
+        self._mode.reference = reference
 
     @property
     def t_us(self) -> int | None:
@@ -172,192 +156,3 @@ class EvsStage:
         if self._labels is not None:
             self._labels.take(self, electrons, events, origin, kept)
         return events if kept is None else events[kept]
-
-
-class _PreviousSample:
-    """Compares successive samples."""
-
-    STATE = ("_t_us", "_level", "_variance", "_photoreceptor")
-
-    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None) -> None:
-        self._noise, self._seed, self._defects = noise, seed, defects
-        self._cols = noise.layout.evs_shape[1]
-        self._independent = noise.spec.noise_mode == "independent"
-        self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
-        self._t_us = 0
-        self._level: Float = None  # ln x, with the noise of its instant where that is shared
-        self._variance: Float = None  # s²/x² of the last sample, where noise is independent
-
-    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
-        import drjit as dr
-
-        types = jit()
-        level, variance = self._noise.log_level(electrons)
-        if self._photoreceptor:
-            level = self._photoreceptor.follow(level, t_us)
-        word = philox(self._seed, Stream.EVS, self._noise.on_device.key, t_us).next_uint32x4()
-        deviate = normal_pair(word[0], word[1])[0]
-        if not self._independent:
-            level = dr.fma(dr.sqrt(variance), deviate, level)
-        if self._level is None:
-            self._keep(level, variance, t_us)
-            return no_events()
-        change = level - self._level
-        if self._independent:
-            change = dr.fma(dr.sqrt(variance + self._variance), deviate, change)
-        theta_on, theta_off = self._noise.on_device.thresholds
-        on, off = change > theta_on, change < -theta_off
-        polarity = dr.select(on, types.Int8(1), dr.select(off, types.Int8(-1), types.Int8(0)))
-        if self._noise.leak_rate_hz > 0:
-            probability = leak_probability(self._noise.leak_rate_hz, (t_us - self._t_us) * S_PER_US)
-            leaks = word[2] < dr.opaque(types.UInt32, min(round(probability * 2**32), 2**32 - 1))
-            polarity = dr.select(~on & ~off & leaks, types.Int8(Origin.LEAK), polarity)
-        begin_us = self._t_us
-        dr.schedule(polarity)
-        self._keep(level, variance, t_us)
-        found = polarity.numpy()
-        if self._defects is not None:
-            found = self._defects.at_tick(found, begin_us, t_us)
-        pixel = np.flatnonzero(found != 0)  # in row-major order
-        return _events(t_us, pixel, found[pixel], self._cols)
-
-    def _keep(self, level: Float, variance: Float, t_us: int) -> None:
-        import drjit as dr
-
-        self._t_us, self._level = t_us, level
-        if self._independent:
-            self._variance = variance
-            dr.schedule(variance)
-        dr.eval(self._level)
-
-
-class _LastEvent:
-    """Keeps the level of each pixel's last event."""
-
-    STATE: tuple[str, ...] = (
-        *("_t_us", "_log", "_spread", "_level", "_reference"),
-        *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
-    )
-
-    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None) -> None:
-        self._noise, self._defects = noise, defects
-        self._cols = noise.layout.evs_shape[1]
-        self._t_us = 0
-        self._log: Float = None  # ln x of the last sample
-        self._spread: Float = None  # s/x of the last sample
-        self._level: Float = None  # ln x with its noise, at the end of the last segment
-        self._reference: Float = None  # level of the last event
-        self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
-        self._band_noise: BandNoise | None = None
-        if not noise.is_noiseless:
-            self._band_noise = BandNoise(noise, seed, self._photoreceptor if noise.filters_noise else None)
-        self._refractory: Refractory | None = None
-        if noise.refractory_period_us is not None:
-            self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
-        self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
-
-    def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
-        import drjit as dr
-
-        parts: list[NDArray[np.void]] = []
-        log, variance = self._noise.log_level(electrons)
-        spread = dr.sqrt(variance)
-        dr.eval(log, spread)
-        if self._log is None:
-            start = self._photoreceptor.start(log, t_us) if self._photoreceptor else log
-            self._level = start + (spread * self._band_noise.start(t_us) if self._band_noise else 0.0)
-            self._reference = dr.copy(self._level)
-            dr.eval(self._level, self._reference)
-            if self._leak:
-                self._leak.start(t_us)
-        else:
-            begin_us = float(self._t_us)
-            for end_us in self._nodes_us(t_us):
-                part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
-                level = dr.fma(log - self._log, part, self._log)
-                if self._photoreceptor:
-                    level = self._photoreceptor.to(level, end_us)
-                if self._band_noise:
-                    level = dr.fma(
-                        dr.fma(spread - self._spread, part, self._spread), self._band_noise.at(end_us), level
-                    )
-                parts.append(self._crossings(level, begin_us, end_us))
-                begin_us = end_us
-            if self._leak and not self._refractory:
-                for due_us, pixel in self._leak.until(t_us):
-                    parts.append(_events(self._stamp(due_us), pixel, Origin.LEAK, self._cols))
-            if self._defects and not self._refractory:
-                own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
-                parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
-        self._t_us, self._log, self._spread = t_us, log, spread
-        events = np.concatenate(parts) if parts else no_events()
-        if self._defects:
-            events = self._defects.alive(events, self._cols)
-        # stable: the events of a pixel in one microsecond keep their order
-        return events[np.lexsort((events["x"], events["y"], events["t_us"]))]
-
-    def _nodes_us(self, t_us: int) -> list[float]:
-        """Ends of the segments up to the sample at `t_us`, in each of which the level goes on a straight line."""
-        grids = [grid.nodes_us(t_us) for grid in (self._band_noise, self._photoreceptor) if grid]
-        return [*sorted(set().union(*grids)), float(t_us)]
-
-    def _stamp(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Whole µs after the last sample: the end of the microsecond of each event, so that steps do not overlap."""
-        return np.maximum(np.ceil(t_us), self._t_us + 1)
-
-    def _crossings(self, level: Float, begin_us: float, end_us: float) -> NDArray[np.void]:
-        """Events of one segment in which the level goes on a straight line to `level`, unsorted."""
-        import drjit as dr
-
-        if self._refractory:
-            return self._crossings_with_dead_time(self._refractory, level, begin_us, end_us)
-        types = jit()
-        theta_on, theta_off = self._noise.on_device.thresholds
-        distance = level - self._reference
-        theta = dr.select(distance > 0, theta_on, theta_off)
-        crossed = dr.mulsign(dr.floor(dr.abs(distance) / theta), distance)  # thresholds, with the direction
-        reference = dr.fma(crossed, theta, self._reference)
-        dr.eval(level, reference, crossed)
-        before = self._reference, self._level
-        self._reference, self._level = reference, level
-        found = np.flatnonzero(crossed.numpy())
-        if len(found) == 0:
-            return no_events()
-        pixel = types.UInt32(found.astype(np.uint32))
-        gathered = [dr.gather(types.Float, value, pixel) for value in (crossed, *before, level)]
-        gathered.append(dr.select(gathered[0] > 0, take(theta_on, pixel), -take(theta_off, pixel)))
-        dr.eval(gathered)
-        count, *values = (np.array(value).astype(np.float64) for value in gathered)
-        repeats = np.abs(count).astype(np.int64)
-        number = np.arange(1, repeats.sum() + 1) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-        reference_0, level_0, level_1, theta_signed = (np.repeat(value, repeats) for value in values)
-        travel = level_1 - level_0
-        # a crossing that rounding moved out of the previous segment is due at once
-        part = (reference_0 + number * theta_signed - level_0) / np.where(travel == 0, np.inf, travel)
-        t_us = begin_us + np.clip(part, 0.0, 1.0) * (end_us - begin_us)
-        return _events(self._stamp(t_us), np.repeat(found, repeats), np.sign(theta_signed), self._cols)
-
-    def _crossings_with_dead_time(
-        self, refractory: Refractory, level: Float, begin_us: float, end_us: float
-    ) -> NDArray[np.void]:
-        """Events of one segment where pixels rest after each event, including leak events. Both kinds are returned
-        together.
-
-        Parameters
-        ----------
-        refractory : dead time of the pixels.
-        level : level at the end of the segment, one value per pixel.
-        begin_us, end_us : bounds of the segment, µs.
-        """
-        due = [(np.empty(0), np.empty(0, np.uint32)), *(self._leak.until(end_us) if self._leak else ())]
-        origins = [np.full(len(part[0]), Origin.LEAK, np.float64) for part in due]
-        if self._defects:  # of asynchronous sensors they are ON events, as those of leak
-            due.append(self._defects.between(begin_us, end_us)[:2])
-            origins.append(np.full(len(due[-1][0]), Origin.DEFECT, np.float64))
-        due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
-        levels, thresholds = (self._level, level), self._noise.on_device.thresholds
-        self._reference, t_us, pixel, polarity = refractory.crossings(
-            self._reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel, np.concatenate(origins))
-        )
-        self._level = level
-        return _events(self._stamp(t_us), pixel, polarity, self._cols)

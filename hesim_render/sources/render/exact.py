@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.journal import Journal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.glare import VeilingGlare
@@ -133,6 +134,10 @@ class RenderedFlux(WindowByWindow):
         if self.sensor.optics.veiling_glare > 0 and not self._tracer.built.is_dark:
             filters = np.unique(self.sensor.layout.filter_index).tolist()
             self._glare = VeilingGlare(self._tracer, self._wavelengths, filters, seed)
+
+    def go_on(self, journal: Journal, part: int) -> None:
+        """See `Tracer.go_on`."""
+        self._tracer.go_on(journal, part)
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval at which moving objects take their next pose, µs."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32, UInt64
 from hesim_render.core.errors import RangeError
+from hesim_render.core.journal import Journal, key_of
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor.sensor import Sensor
@@ -68,6 +70,8 @@ class Tracer:
         import drjit as dr
 
         self.progress, self._block_rays, self.rays_done = progress, block_rays, 0
+        self._journal: Journal | None = None
+        self._run_part: tuple[object, ...] = ()
         scene, _ = in_absolute_light(scene)
         self.built = build(mi, scene.spec, responses)
         self.view = place_camera(scene.spec, sensor, self.built.mitsuba_sensor())
@@ -83,6 +87,16 @@ class Tracer:
         """Row and column of a pixel's number on the full sensor, which also keys its random numbers."""
         row = index // self._full_cols
         return row, index - row * self._full_cols
+
+    def go_on(self, journal: Journal, part: int) -> None:
+        """Keep what is traced in a journal, and take from it what an interrupted run has traced.
+
+        Parameters
+        ----------
+        journal : of this run.
+        part : number of this tracer among those of the run.
+        """
+        self._journal, self._run_part = journal, (part,)
 
     def _report(self, rays: int) -> None:
         self.rays_done += rays
@@ -189,12 +203,27 @@ class PixelTracer(Tracer):
         for first in range(0, pixel.size, room):
             part = slice(first, first + room)
             spread = None if times is None else [values[part] for values in times]
-            parts.append(self._block(pixel[part], full[pixel[part]], key, spread, wavelengths, values))
+            inputs = self._posed_us, elsewhere is None, pixel[part], full[pixel[part]], *(spread or ())
+            trace = partial(self._block, pixel[part], full[pixel[part]], key, spread, wavelengths, values)
+            parts.append(self._remembered(inputs, trace))
             self._report(pixel[part].size * self.samples)
         if len(parts) == 1:
             return parts[0]
         channels = range(len(parts[0]))
         return [(dr.concat([p[k][0] for p in parts]), dr.concat([p[k][1] for p in parts])) for k in channels]
+
+    def _remembered(self, inputs: tuple[object, ...], trace: Callable[[], list[Halves]]) -> list[Halves]:
+        """Both halves of a few pixels: those of an interrupted run, or new ones, which the journal keeps."""
+        if self._journal is None:
+            return trace()
+        key, kind = key_of(*self._run_part, self.samples, *inputs), jit().Float
+        pixels = next(given.size for given in inputs if isinstance(given, np.ndarray))
+        known = np.empty((1, 2, pixels), np.float32)
+        if self._journal.recall(key, [known]):
+            return [(kind(half_a), kind(half_b)) for half_a, half_b in known]
+        found = trace()
+        self._journal.keep(key, [np.array(half) for halves in found for half in halves])
+        return found
 
     def _block(
         self,

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Halves
 from hesim_render.core.errors import RangeError
+from hesim_render.core.journal import Journal
 from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import Sample
@@ -106,6 +107,10 @@ class ChangeDrivenFlux:
     @progress.setter
     def progress(self, progress: Callable[[int], None] | None) -> None:
         self._tracer.progress = progress
+
+    def go_on(self, journal: Journal, part: int) -> None:
+        """See `Tracer.go_on`."""
+        self._tracer.go_on(journal, part)
 
     @property
     def counts(self) -> Counts:

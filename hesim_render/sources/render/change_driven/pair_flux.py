@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hesim_render.core.journal import Journal, key_of
 
 
 @dataclass(frozen=True)
@@ -47,3 +50,32 @@ class PilotFlux:
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
     met: NDArray[np.bool_]
+
+
+def remembered(
+    journal: Journal | None,
+    inputs: tuple[object, ...],
+    out: PairFlux | PilotFlux,
+    part: slice | NDArray[np.int64],
+    trace: Callable[[], None],
+) -> None:
+    """Put the results of some pairs into `out`: those of an interrupted run, or new ones, which the journal keeps.
+
+    Parameters
+    ----------
+    journal : None where none is written.
+    inputs : all that the results depend on.
+    out, part : results of all pairs, and which of them are meant.
+    trace : puts new ones into `out`.
+    """
+    if journal is None:
+        trace()
+        return
+    every = [getattr(out, each.name) for each in fields(out)]
+    key, found = key_of(*inputs), [values[part].copy() for values in every]
+    if journal.recall(key, found):
+        for values, known in zip(every, found, strict=True):
+            values[part] = known
+    else:
+        trace()
+        journal.keep(key, [values[part] for values in every])

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, Mask, MitsubaObject, UInt32, UInt64
+from hesim_render.core.device_types import Float, Mask, UInt32, UInt64
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims, in_blocks
-from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, remembered
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
-from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.mitsuba_version import depth_limit, mitsuba
 from hesim_render.sources.render.tracer import BLOCK_RAYS, Tracer
 from hesim_render.sources.render.transport.matt import MattIntegrator
 from hesim_render.sources.render.transport.motion_bounds import stays_in
@@ -73,7 +73,7 @@ class PairTracer(Tracer):
         if self.built.paints is not None:
             self._integrator = MattIntegrator(self.parts, self.built.paints, scene.spec.lights, self.sensor.responses)
         else:
-            depth, roulette = (_told(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
+            depth, roulette = (depth_limit(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
         self._aim = Aim(self.parts, self.rays)
         self._boxes = lru_cache(maxsize=8)(self._boxes_in)
@@ -126,7 +126,9 @@ class PairTracer(Tracer):
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
         for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims):
             lanes = [pixel[part], window[part].astype(np.uint32), lit[part].astype(np.uint32), times[part]]
-            self._trace_block(lanes, packets[part], moments, key, aimed, out, part)
+            inputs = "flux", *lanes, packets[part], stream, *_told_of(windows, span_us, aimed)
+            trace = partial(self._trace_block, lanes, packets[part], moments, key, aimed, out, part)
+            remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * _PACKET)
         # the lit estimate of a dark pixel may be negative; a flux is not
         below = np.minimum(out.mean, 0)
@@ -174,7 +176,9 @@ class PairTracer(Tracer):
             part = slice(first, min(count, first + room))
             lanes = pixel[part], window[part].astype(np.uint32)
             aimed = None if aims is None else aims.part(part)
-            self._pilot_block(lanes, moments, key, samples, footprint, aimed, out, part)
+            inputs = "pilot", *lanes, samples, footprint_px, stream, *_told_of(windows, span_us, aimed)
+            trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part)
+            remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report((part.stop - first) * samples)
         scale = self._scale(pixel)
         for values in (out.lit, out.hidden, out.unshadowed, out.lit_scatter, out.hidden_scatter):
@@ -344,11 +348,7 @@ def _bits(kind: type[UInt32], condition: Mask, count: int) -> UInt32:
     return dr.select(condition, kind(1), dr.zeros(kind, count))
 
 
-def _told(integrator: MitsubaObject, property_name: str) -> int:
-    """A depth limit of an integrator, -1 for none. Mitsuba gives it only in the text of the integrator."""
-    for line in str(integrator).splitlines():
-        name, _, value = line.strip().rstrip(",").partition(" = ")
-        if name == property_name:
-            depth = int(value)
-            return -1 if depth >= 2**31 else depth
-    raise AssertionError(f"a path integrator has a {property_name}")
+def _told_of(windows: Windows, span_us: tuple[float, float] | None, aims: PairAims | None) -> tuple[object, ...]:
+    """What the flux of pairs depends on besides the pairs themselves."""
+    aimed = () if aims is None else (aims.first, aims.count, aims.group)
+    return windows.begin_us, windows.end_us, span_us, *aimed

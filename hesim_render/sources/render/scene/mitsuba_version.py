@@ -301,3 +301,13 @@ def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[
     """The 8 corners of an axis-parallel box, [8, 3]."""
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij")).reshape(3, 8).T
     return low + corners * (high - low)
+
+
+def depth_limit(integrator: MitsubaObject, property_name: str) -> int:
+    """A depth limit of an integrator, -1 for none. Mitsuba gives it only in the text of the integrator."""
+    for line in str(integrator).splitlines():
+        name, _, value = line.strip().rstrip(",").partition(" = ")
+        if name == property_name:
+            depth = int(value)
+            return -1 if depth >= 2**31 else depth
+    raise AssertionError(f"a path integrator has a {property_name}")

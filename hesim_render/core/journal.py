@@ -1,0 +1,189 @@
+"""A journal of long calculations: what a run that was ended has calculated, for the same run to go on from.
+
+The file beside the output begins with one line of JSON, which names all that the results depend on. Entries follow,
+each with the hash of what it was calculated from, its length and a checksum. An entry that was cut off by the end of
+the process is dropped, and so is all that follows it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.errors import HesimError, OutputError
+from hesim_render.core.output import output_errors, short_name
+
+_FORMAT = "hesim_render journal 1"
+#: Hash of an entry's input, number of its bytes, and their checksum.
+_HEAD = struct.Struct("<16sQI")
+#: Longest first line that is read, bytes.
+_LONGEST_LINE = 1 << 20
+
+
+def key_of(*inputs: object) -> bytes:
+    """Hash of inputs: arrays with their types, and plain values."""
+    found = hashlib.blake2b(digest_size=16)
+    for given in inputs:
+        if isinstance(given, np.ndarray):
+            found.update(f"{given.dtype.str}{given.shape};".encode())
+            found.update(np.ascontiguousarray(given).data)
+        else:
+            found.update(f"{given!r};".encode())
+    return found.digest()
+
+
+def journal_of(target: str | Path) -> Path:
+    """The journal of a run whose output is `target`: a hidden file beside it."""
+    place = Path(target).expanduser().resolve()
+    return place.with_name(f".{short_name(place)}.unfinished")
+
+
+class Journal:
+    """Results that a run has calculated, in a file. In a with statement it is closed at the end, and removed if the run
+    has succeeded, or has failed for a reason that would end it again.
+
+    Parameters
+    ----------
+    target : output of the run.
+    run : plain values, by name, of all that the results depend on.
+    overwrite : begin anew where the journal is that of another run.
+
+    Attributes
+    ----------
+    path : the file, from `journal_of`. It appears with the first result.
+    found : number of results of an earlier run.
+
+    Raises
+    ------
+    OutputError
+        If the journal is that of another run and `overwrite` is False. The message names what differs.
+    """
+
+    def __init__(self, target: str | Path, run: Mapping[str, Any], overwrite: bool = False) -> None:
+        self.path = journal_of(target)
+        self._run = json.loads(json.dumps({"format": _FORMAT, **run}, default=str))
+        self._places: dict[bytes, tuple[int, int, int]] = {}
+        self._file: BinaryIO | None = None
+        with output_errors(self.path):
+            self._open(target, overwrite)
+        self.found = len(self._places)
+
+    def _open(self, target: str | Path, overwrite: bool) -> None:
+        if not self.path.is_file():
+            return
+        with self.path.open("rb") as file:
+            line = file.readline(_LONGEST_LINE)
+            try:
+                before = json.loads(line)
+            except ValueError:
+                before = None
+            if not isinstance(before, dict):
+                before = {}
+            if before != self._run:
+                changed = [name for name in {**self._run, **before} if before.get(name) != self._run.get(name)]
+                if not overwrite and before:
+                    raise OutputError(
+                        f"{target}: an interrupted run, which would go on there, had another {', '.join(changed)}; "
+                        f"repeat that run, or begin anew (--overwrite, overwrite=True), or remove {self.path}"
+                    )
+                self.path.unlink()
+                return
+            end = self._read(file)
+        self._file = self._locked()
+        self._file.truncate(end)
+
+    def _locked(self) -> BinaryIO:
+        """The file, which no other process may have open; the lock ends with the process."""
+        file = self.path.open("a+b")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise OutputError(f"{self.path}: another run is writing it") from None
+        except OSError:  # a file system without locks
+            pass
+        return file
+
+    def _read(self, file: BinaryIO) -> int:
+        """Find the places of all whole entries; returns their end."""
+        size, end = self.path.stat().st_size, file.tell()
+        while len(head := file.read(_HEAD.size)) == _HEAD.size:
+            key, length, checksum = _HEAD.unpack(head)
+            begin, end_of_entry = file.tell(), file.tell() + length
+            if end_of_entry > size:
+                break
+            file.seek(end_of_entry)
+            self._places[key] = begin, length, checksum
+            end = end_of_entry
+        return end
+
+    def recall(self, key: bytes, into: Iterable[NDArray]) -> bool:
+        """Fill arrays with a known result.
+
+        Parameters
+        ----------
+        key : from `key_of`.
+        into : contiguous arrays of the types and sizes that were kept.
+
+        Returns
+        -------
+        False where there is none; the arrays are as before.
+        """
+        if key not in self._places or self._file is None:
+            return False
+        begin, length, checksum = self._places[key]
+        with output_errors(self.path):
+            self._file.seek(begin)
+            data = self._file.read(length)
+        arrays = list(into)
+        if zlib.crc32(data) != checksum or len(data) != sum(array.nbytes for array in arrays):
+            del self._places[key]
+            return False
+        first = 0
+        for array in arrays:
+            array.ravel()[:] = np.frombuffer(data, array.dtype, array.size, first)
+            first += array.nbytes
+        return True
+
+    def keep(self, key: bytes, values: Iterable[NDArray]) -> None:
+        """Write a result, so that it outlives the process.
+
+        Parameters
+        ----------
+        key : from `key_of`.
+        values : arrays of numbers.
+        """
+        data = b"".join(np.ascontiguousarray(value).tobytes() for value in values)
+        with output_errors(self.path):
+            if self._file is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = self._locked()
+                self._file.truncate(0)
+                self._file.write(json.dumps(self._run).encode() + b"\n")
+            checksum = zlib.crc32(data)
+            begin = self._file.seek(0, 2) + _HEAD.size
+            self._file.write(_HEAD.pack(key, len(data), checksum) + data)
+            self._file.flush()
+            self._places[key] = begin, len(data), checksum
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+        is_over = kind is None or (issubclass(kind, HesimError) and not issubclass(kind, OutputError))
+        if is_over:
+            with output_errors(self.path):
+                self.path.unlink(missing_ok=True)
