@@ -96,7 +96,7 @@ class LastEvent:
     """Keeps the level of each pixel's last event."""
 
     STATE: tuple[str, ...] = (
-        *("_t_us", "_log", "_spread", "_level", "reference"),
+        *("_t_us", "_log", "_spread", "level", "reference"),
         *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
     )
 
@@ -106,7 +106,7 @@ class LastEvent:
         self._t_us = 0
         self._log: Float = None  # ln x of the last sample
         self._spread: Float = None  # s/x of the last sample
-        self._level: Float = None  # ln x with its noise, at the end of the last segment
+        self.level: Float = None  # ln x with its noise, at the end of the last segment
         self.reference: Float = None  # level of the last event
         self._photoreceptor = Photoreceptor(noise) if noise.photoreceptor else None
         self._band_noise: BandNoise | None = None
@@ -126,9 +126,9 @@ class LastEvent:
         dr.eval(log, spread)
         if self._log is None:
             start = self._photoreceptor.start(log, t_us) if self._photoreceptor else log
-            self._level = start + (spread * self._band_noise.start(t_us) if self._band_noise else 0.0)
-            self.reference = dr.copy(self._level)
-            dr.eval(self._level, self.reference)
+            self.level = start + (spread * self._band_noise.start(t_us) if self._band_noise else 0.0)
+            self.reference = dr.copy(self.level)
+            dr.eval(self.level, self.reference)
             if self._leak:
                 self._leak.start(t_us)
         else:
@@ -177,8 +177,8 @@ class LastEvent:
         crossed = dr.mulsign(dr.floor(dr.abs(distance) / theta), distance)  # thresholds, with the direction
         reference = dr.fma(crossed, theta, self.reference)
         dr.eval(level, reference, crossed)
-        before = self.reference, self._level
-        self.reference, self._level = reference, level
+        before = self.reference, self.level
+        self.reference, self.level = reference, level
         found = np.flatnonzero(crossed.numpy())
         if len(found) == 0:
             return no_events()
@@ -214,9 +214,9 @@ class LastEvent:
             due.append(self._defects.between(begin_us, end_us)[:2])
             origins.append(np.full(len(due[-1][0]), Origin.DEFECT, np.float64))
         due_us, due_pixel = (np.concatenate(values) for values in zip(*due, strict=True))
-        levels, thresholds = (self._level, level), self._noise.on_device.thresholds
+        levels, thresholds = (self.level, level), self._noise.on_device.thresholds
         self.reference, t_us, pixel, polarity = refractory.crossings(
             self.reference, levels, thresholds, begin_us, end_us, (due_us, due_pixel, np.concatenate(origins))
         )
-        self._level = level
+        self.level = level
         return _events(self._stamp(t_us), pixel, polarity, self._cols)

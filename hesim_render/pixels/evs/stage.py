@@ -104,8 +104,8 @@ class EvsStage:
     @property
     def level(self) -> Float:
         """Level of each asynchronous pixel at the last sample, ln x, with its noise."""
-        assert isinstance(self._mode, _LastEvent)
-        return self._mode._level
+        assert isinstance(self._mode, LastEvent)
+        return self._mode.level
 
     def compare_with(self, reference: Float) -> None:
         """Let the asynchronous pixels compare with other levels, ln x, from now on."""
