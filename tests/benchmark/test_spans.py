@@ -100,7 +100,7 @@ def test_a_renderer_knows_again_which_pixels_rest():
         still.flux.put(still.known, Flux(*rng.random((3, 1, int(still.known.sum())), np.float32)))
     other.restore(one.state())
     for role in ("any", "events"):
-        assert 50 < one.still(role).known.sum() and np.array_equal(one.still(role).known, other.still(role).known)
+        assert one.still(role).known.sum() > 50 and np.array_equal(one.still(role).known, other.still(role).known)
         for values, told in zip(one.still(role).flux.arrays, other.still(role).flux.arrays, strict=True):
             assert np.array_equal(values, told)
 
