@@ -24,6 +24,8 @@ from hesim_render.recording.frame import Frame
 
 #: A sharp image counts as that of the middle of an exposure if it is at most so far away, in parts of the exposure.
 _NEAR = 0.25
+#: Tasks whose results are in DN.
+IN_DN = ("deblur", "interpolate", "demosaic")
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,10 @@ class ClipTasks:
 
     def _predicted(self, task: str, item: int, shape: tuple[int, ...]) -> dict[str, NDArray]:
         """The user's result for an item, by the name of its method; empty where there is none."""
-        found = None if self._predictions is None else self._predictions.read(task, self._clip.name, item, shape)
+        if self._predictions is None:
+            return {}
+        full_scale = 2**self._clip.recording.mosaic.bit_depth - 1 if task in IN_DN else None
+        found = self._predictions.read(task, self._clip.name, item, shape, full_scale)
         return {} if found is None else {"prediction": found}
 
     def _truth(self, frame: Frame) -> tuple[float, NDArray] | None:
