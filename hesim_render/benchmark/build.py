@@ -163,7 +163,7 @@ def _plan_content(plan: Plan) -> dict[str, Any]:
     pools = plan.generator.given_files()
     return {
         "schema_version": SCHEMA,
-        "spec": spec.content,
+        "spec": spec.model_dump(mode="json"),
         "sensors": {str(number): content_hash(plan.sensor(clip).spec) for number, clip in sorted(first.items())},
         "scenes": {str(number): content_hash(plan.given_scene(clip).spec) for number, clip in sorted(given.items())},
         "parts": sorted(file_hash(path) for path in pools),
@@ -254,7 +254,7 @@ def _finish(plan: Plan, root: Path) -> None:
     manifest = {
         "schema_version": SCHEMA,
         "name": plan.spec.name,
-        "spec": plan.spec.content,
+        "spec": plan.spec.model_dump(mode="json"),
         "plan_sha256": hashlib.sha256((root / PLAN_FILE).read_bytes()).hexdigest(),
         "versions": contents[0]["versions"],
         "units": contents[0]["units"],

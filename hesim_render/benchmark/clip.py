@@ -12,7 +12,6 @@ from hesim_render.benchmark.colour_truth import COLOURS_FILE, frame_filters, wri
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.benchmark.sharp import SHARP_FILE, write_sharp
-from hesim_render.benchmark.spans import Spans
 from hesim_render.benchmark.statistics import figures
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.simulate import flux_source, simulate
@@ -75,15 +74,14 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     if is_complete(root, clip):
         content = json.loads((folder / CLIP_FILE).read_text(encoding="utf-8"))
         return Built(clip.name, 0.0, sum(entry["bytes"] for entry in content["files"].values()))
-    begin, spans = time.monotonic(), Spans(root, clip.name, plan.spec.span_s)
+    begin = time.monotonic()
     output = OutputFolder(folder, CLIP_FILE, overwrite=True)  # another worker may finish the same clip first
     try:
-        content = _fill(plan, clip, output.path, spans)
+        content = _fill(plan, clip, output.path)
         with output_errors(folder):
             text = json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
             (output.path / CLIP_FILE).write_text(text, encoding="utf-8")
         output.commit()
-        spans.remove()
     except BaseException:
         output.discard()
         raise
@@ -91,7 +89,7 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     return Built(clip.name, time.monotonic() - begin, size)
 
 
-def _fill(plan: Plan, clip: Clip, folder: Path, spans: Spans) -> dict[str, Any]:
+def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
     """Render a clip into a folder; returns its description."""
     spec, generated = plan.spec, plan.scene_files(clip)
     if generated is not None:
@@ -105,7 +103,6 @@ def _fill(plan: Plan, clip: Clip, folder: Path, spans: Spans) -> dict[str, Any]:
     # one renderer for both: what rests is rendered once
     quality = spec.quality if spec.samples is None else None
     renderer = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
-    spans.keep(renderer[0], RECORDING)
     recording = simulate(
         scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
         quality=quality, samples=spec.samples, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
@@ -115,7 +112,6 @@ def _fill(plan: Plan, clip: Clip, folder: Path, spans: Spans) -> dict[str, Any]:
     if spec.sharp is not None:
         with output_errors(folder):
             aps, _ = noise_models(sensor, level.clean, level.without)
-            spans.keep(renderer[0], SHARP_FILE)
             source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
             sharp = write_sharp(folder / SHARP_FILE, source, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
         if spec.sharp.colours and len(frame_filters(sensor)) > 1:

@@ -12,10 +12,11 @@ import numpy as np
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.simulate import change_driven_parts, flux_source
+from hesim_render.capture.simulate import flux_source
 from hesim_render.core.progress import in_words
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.forecast import forecast
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import Scene, load_scene
@@ -102,7 +103,7 @@ def _render_seconds(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> flo
     if spec.samples is not None:
         return 0.0  # most of the time of small clips is not that of rays
     flux, _ = flux_source(in_absolute_light(scene)[0], sensor, seed, spec.quality, None, False, None)
-    parts = change_driven_parts(flux)
+    parts = [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
     level = spec.noise[clip.noise]
     capture = Capture(flux, flux.sensor, *noise_models(sensor, level.clean, level.without), spec.duration_us, seed)
     pixel, exposures = capture.frame_exposures

@@ -153,7 +153,7 @@ def simulate(
         if level is not None:
             settings["light_level"] = level.as_dict()
         settings |= {"backend": backend.select().label, "camera": _camera_used(flux)}
-        rendering = change_driven_parts(flux)
+        rendering = _change_driven_parts(flux)
         wanted = rendering[0].quality if rendering else None
         labels = EVENTS in kinds
         plain = Capture(flux, flux.sensor, *noise, duration_us, seed, labels=labels and not rendering)
@@ -268,7 +268,7 @@ def flux_source(
     return flux, settings | {"mode": "exact", "samples": rays}
 
 
-def change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
+def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
     """The change-driven renderers of a source, one per waveform of its lights; none in the exact mode."""
     return [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
 

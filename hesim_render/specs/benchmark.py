@@ -219,9 +219,6 @@ class BenchmarkSpec(Strict):
         description="rays per pixel and slice, in place of quality: exact mode",
     )
     audit: float = Field(1.0, ge=0, le=1, description="share of the clips whose render is audited, drawn at random")
-    span_s: float | None = Field(
-        None, gt=0, le=3600, description="simulated time after which the render of a clip is kept, to go on from there"
-    )
     folder: Path = Field(Path(), exclude=True)
 
     @model_validator(mode="after")
@@ -237,8 +234,6 @@ class BenchmarkSpec(Strict):
                 raise ValueError(f"{key}: each name once; there are {', '.join(map(str, names))}")
         if self.samples is not None and self.sharp is not None:
             raise ValueError("samples: sharp images have an error that follows quality; leave one of the two out")
-        if self.samples is not None and self.span_s is not None:
-            raise ValueError("span_s: spans are kept of renders with a quality, not of the exact mode; drop samples")
         if any(limits[1] < limits[0] for limits in self.exposures_us):
             raise ValueError("exposures_us: a range is [smallest, largest]")
         if self.combinations > MOST_CLIPS:
@@ -250,11 +245,6 @@ class BenchmarkSpec(Strict):
     @property
     def duration_us(self) -> int:
         return round(self.duration_s * 1e6)
-
-    @property
-    def content(self) -> dict[str, Any]:
-        """All keys that decide the bytes of clips, as plain values."""
-        return self.model_dump(mode="json", exclude={"span_s"})
 
     @property
     def combinations(self) -> int:

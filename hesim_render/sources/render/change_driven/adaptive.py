@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,23 +64,6 @@ class AdaptiveRenderer:
                 Flux.zeros(1, count if may_rest else 0),
             )
         return self._kept[role]
-
-    def state(self) -> dict[str, NDArray]:
-        """The pixels that are known to be constant, of all roles so far, for `restore`."""
-        found: dict[str, NDArray] = {}
-        for role, still in self._kept.items():
-            known = still.known if still.span_us is not None else still.known[:0]
-            found |= {f"{role}.known": known, f"{role}.flux": np.stack(still.flux.at(known).arrays)}
-        return found
-
-    def restore(self, state: dict[str, NDArray]) -> None:
-        """Know the pixels again that `state` named."""
-        for role in get_args(Role):
-            known = state.get(f"{role}.known")
-            if known is not None and known.size:
-                still = self.still(role)
-                still.known[:] = known
-                still.flux.put(known, Flux(*state[f"{role}.flux"]))
 
     def bands(self, pixel: NDArray[np.uint32], role: Role) -> Iterator[Band]:
         """The listed pixels in bands of successive rows."""

@@ -28,38 +28,15 @@ class Blocks:
     """
 
     def __init__(self, renderer: AdaptiveRenderer, pixel: NDArray[np.uint32], first: Block) -> None:
-        self._renderer, self._pixel = renderer, pixel
+        self._renderer = renderer
         self.base = Flux.zeros(1, pixel.size)
         begin, end = (np.full(pixel.size, times[0]) for times in (first.begin_us, first.end_us))
         renderer.alone(pixel, begin, end, "events", self.base)
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
-        self._set_bands()
+        self._bands = list(renderer.bands(pixel[self.alive], "events"))
         self._time = float(first.begin_us[0]), float(first.end_us[0])
         self._last = self.base.at(self.alive)
-
-    def _set_bands(self) -> None:
-        self._bands = list(self._renderer.bands(self._pixel[self.alive], "events"))
-
-    def state(self) -> dict[str, NDArray]:
-        """All that `restored` needs."""
-        return {
-            "blocks.pixel": self._pixel, "blocks.alive": self.alive, "blocks.time": np.array(self._time),
-            "blocks.base": np.stack(self.base.arrays), "blocks.last": np.stack(self._last.arrays),
-        }  # fmt: skip
-
-    @classmethod
-    def restored(cls, renderer: AdaptiveRenderer, state: dict[str, NDArray]) -> Blocks | None:
-        """The list as it was when it gave its `state`; None if there was none."""
-        if "blocks.pixel" not in state:
-            return None
-        found = cls.__new__(cls)
-        found._renderer, found._pixel, found.alive = renderer, state["blocks.pixel"], state["blocks.alive"]
-        found.base, found._last = Flux(*state["blocks.base"]), Flux(*state["blocks.last"])
-        begin, end = state["blocks.time"].tolist()
-        found._time = begin, end
-        found._set_bands()
-        return found
 
     def take(self, block: Block) -> Flux:
         """Flux of the pixels that may change, [window, alive pixel]."""

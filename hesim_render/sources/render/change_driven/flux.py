@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import astuple, replace
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +26,6 @@ from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import Blocks
-from hesim_render.sources.render.change_driven.journal import Arrays, Journal, key_of
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import traced_again
@@ -93,8 +91,6 @@ class ChangeDrivenFlux:
         self._clock = MotionClock(self.view, tracer.camera, tracer.parts.groups, partial(least_depth_m, tracer))
         self.is_static = not self._tracer.parts.groups and self._tracer.camera is None
         self._index = self._renderer.index
-        self._work: Blocks | None = None
-        self._journal: Journal | None = None
 
     @property
     def progress(self) -> Callable[[int], None] | None:
@@ -144,17 +140,12 @@ class ChangeDrivenFlux:
         end = np.broadcast_to(np.asarray(end_us, dtype=np.float64), pixels.shape)
         if not np.all(end >= begin):
             raise RangeError("end_us - begin_us", float(np.min(end - begin)), "0 or more")
-        halves = np.zeros((2, pixels.size), np.float32)
+        flux = Flux.zeros(1, pixels.size)
         if not self._is_dark and pixels.size:
-            halves = self._answer((pixels, begin, end), end, partial(self._alone, pixels, begin, end))["halves"]
-        half_a, half_b = types.Float(halves[0]), types.Float(halves[1])
+            self._renderer.alone(pixels, begin, end, "any", flux)
+        half_a, half_b = types.Float(flux.half_a[0]), types.Float(flux.half_b[0])
         require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
         return half_a, half_b
-
-    def _alone(self, pixels: NDArray[np.uint32], begin: NDArray[np.float64], end: NDArray[np.float64]) -> Arrays:
-        flux = Flux.zeros(1, pixels.size)
-        self._renderer.alone(pixels, begin, end, "any", flux)
-        return {"halves": np.stack([flux.half_a[0], flux.half_b[0]])}
 
     # ---- for the forecast -------------------------------------------------------------------------
 
@@ -240,66 +231,20 @@ class ChangeDrivenFlux:
         """See `FluxSource.flux_of_blocks`."""
         types = jit()
         pixels = np.ascontiguousarray(pixel, dtype=np.uint32).ravel()
-        alive, base = np.arange(pixels.size), np.zeros((3, pixels.size), np.float32)
-        self._work = None
+        work: Blocks | None = None
         for block in blocks:
-            flux = np.zeros((3, int(np.count_nonzero(block.wanted)), pixels.size), np.float32)
-            if pixels.size and not self._is_dark:
-                question = pixels, block.begin_us, block.end_us, block.wanted
-                told = self._answer(question, block.end_us, partial(self._take, pixels, block))
-                alive, base = told.get("alive", alive), told.get("base", base)
-                flux = told["flux"]
-            for window in range(flux.shape[1]):
-                values = base.copy()
-                values[:, alive] = flux[:, window]
+            if pixels.size == 0 or self._is_dark:
+                flux = Flux.zeros(block.wanted.size, pixels.size)
+                alive = np.arange(pixels.size)
+                base = Flux.zeros(1, pixels.size)
+            else:
+                work = work or Blocks(self._renderer, pixels, block)
+                flux, alive, base = work.take(block), work.alive, work.base
+            for window in np.flatnonzero(block.wanted):
+                self.counts.values += pixels.size
+                values = [part[0].copy() for part in base.arrays]
+                for whole, part in zip(values, flux.arrays, strict=True):
+                    whole[alive] = part[window]
                 half_a, half_b = types.Float(values[0]), types.Float(values[1])
                 require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
                 yield Sample(half_a, half_b, values[2])
-
-    def _take(self, pixels: NDArray[np.uint32], block: Block) -> Arrays:
-        """Flux of the wanted windows of the next block; with the first block, that of the pixels at rest."""
-        found: Arrays = {}
-        if self._work is None:
-            self._work = Blocks(self._renderer, pixels, block)
-            found = {"alive": self._work.alive, "base": np.concatenate(self._work.base.arrays)}
-        flux = self._work.take(block)
-        self.counts.values += pixels.size * int(np.count_nonzero(block.wanted))
-        return {**found, "flux": np.stack([values[block.wanted] for values in flux.arrays])}
-
-    # ---- spans that are kept on disk --------------------------------------------------------------
-
-    def keep_in(self, folder: Path | None, span_us: int = 0) -> None:
-        """Keep all answers from now on in a folder, and give those that an earlier run kept there; see `Journal`.
-
-        The run must ask the same questions in the same order. Then all values, and the work that `counts` states, are
-        those of a run that was never interrupted.
-
-        Parameters
-        ----------
-        folder : of this source alone; None ends it, and what is not yet on disk is written.
-        span_us : simulated time after which a file is completed, µs.
-        """
-        if self._journal is not None:
-            self._journal.flush(self._state)
-        self._journal = None if folder is None else Journal(folder, span_us)
-
-    def _answer(self, question: tuple[NDArray, ...], end_us: NDArray[np.float64], make: Callable[[], Arrays]) -> Arrays:
-        """The answer to a question, from the journal if it has one."""
-        if self._journal is None:
-            return make()
-        key = key_of(question)
-        recalled = self._journal.recall(key)
-        if recalled is None:
-            answer = make()
-            work = np.array([*astuple(self.counts), self._tracer.rays_done])
-            self._journal.add(key, {**answer, "work": work}, float(end_us.max()), self._state)
-            return answer
-        *counts, self._tracer.rays_done = recalled.answer["work"].tolist()
-        self._renderer.counts = Counts(*counts)
-        if recalled.state is not None:
-            self._renderer.restore(recalled.state)
-            self._work = Blocks.restored(self._renderer, recalled.state)
-        return recalled.answer
-
-    def _state(self) -> Arrays:
-        return {**self._renderer.state(), **({} if self._work is None else self._work.state())}
