@@ -106,6 +106,7 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
         "| `clip.json` | numbers on the axes, figures, parts, error and audit, units, versions, hashes |",
         "| `recording/` | RAW frames with blur, events, their truth and labels |",
         "| `sharp.h5` | sharp flux and noise-free RAW at given times, if the plan asks for them |",
+        "| `colours.h5` | the same light through every filter at every pixel, if the plan asks for it |",
         "| `scene/` | the generated scene with its meshes and textures |", "",
     ]  # fmt: skip
     return "\n".join(lines)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hesim_render.benchmark.colour_truth import COLOURS_FILE, frame_filters, write_colours
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.benchmark.sharp import SHARP_FILE, write_sharp
@@ -113,6 +114,9 @@ def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
             aps, _ = noise_models(sensor, level.clean, level.without)
             source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
             sharp = write_sharp(folder / SHARP_FILE, source, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
+        if spec.sharp.colours and len(frame_filters(sensor)) > 1:
+            with output_errors(folder):
+                write_colours(folder / COLOURS_FILE, scene, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
     manifest = recording.manifest
     return {
         "schema_version": SCHEMA,

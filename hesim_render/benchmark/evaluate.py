@@ -40,7 +40,8 @@ def evaluate_benchmark(
     root : folder of the benchmark.
     split : whose clips; None takes all.
     tasks : names (`TASKS`); default all. A clip without what a task needs is left out of it.
-    predictions : folder of your own results, ``TASK/CLIP/000000.npy``, which are scored beside the baselines.
+    predictions : folder of your own results, ``TASK/CLIP/000000.npy`` or ``.png``, which are scored beside the
+        baselines.
     out : JSON file of the result; None writes none. It is replaced if it exists.
     progress : called with (done, total, what).
 

@@ -12,6 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from hesim_render.benchmark.clip import CLIP_FILE, RECORDING, SCENE
+from hesim_render.benchmark.colour_truth import COLOURS_FILE, ColourTruth
 from hesim_render.benchmark.generator import SCENE_FILE
 from hesim_render.benchmark.sharp import SHARP_FILE, SharpImages
 from hesim_render.core.errors import SpecError
@@ -111,6 +112,11 @@ class BenchmarkClip:
     def sharp(self) -> SharpImages | None:
         """Sharp images; None where the benchmark has none."""
         return SharpImages(inside(self.folder, SHARP_FILE)) if (self.folder / SHARP_FILE).is_file() else None
+
+    @cached_property
+    def colours(self) -> ColourTruth | None:
+        """Full-colour truth; None where the benchmark has none."""
+        return ColourTruth(inside(self.folder, COLOURS_FILE)) if (self.folder / COLOURS_FILE).is_file() else None
 
     @property
     def scene_file(self) -> Path | None:

@@ -9,8 +9,14 @@ from numpy.typing import NDArray
 
 from hesim_render.benchmark.folder import BenchmarkClip
 from hesim_render.benchmark.metrics import learned, learned_measures
+from hesim_render.core.units import S_PER_US
+from hesim_render.isp.balance import white_balance
+from hesim_render.isp.colour import colour_matrix
+from hesim_render.isp.demosaicing import demosaic
+from hesim_render.isp.levels import black_level
 from hesim_render.isp.pipeline import Pipeline, process
 from hesim_render.measure.pictures import delta_e, psnr, ssim
+from hesim_render.mosaic.colour_profile import Camera
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording.manifest import sensor_spec
 from hesim_render.specs.sensor import SensorSpec
@@ -111,12 +117,60 @@ class Development:
         span = 2**mosaic.bit_depth - 1 - black
         valid = self.layout.aps_mask
         found = {"raw_psnr_db": psnr((raw - black) / span, (truth - black) / span, valid=valid)}
-        picture, wanted = self.linear(raw), self.linear(truth)
+        return found | self._compared(self.linear(raw), self.linear(truth))
+
+    def full_dn(self, flux: NDArray, exposure_us: float) -> NDArray[np.float64]:
+        """What the sensor without noise would read of a flux, DN, not rounded; at most the white level.
+
+        Parameters
+        ----------
+        flux : any shape, e⁻/s.
+        exposure_us : exposure, µs.
+        """
+        mosaic = self._clip.recording.mosaic
+        read = mosaic.black_level_dn + mosaic.system_gain_dn_per_e * flux.astype(np.float64) * exposure_us * S_PER_US
+        return np.minimum(read, mosaic.white_level_dn)
+
+    def linear_of_channels(self, channels: NDArray) -> NDArray[np.float32]:
+        """Linear sRGB [row, col, 3] of every channel at every pixel [row, col, channel], DN: nothing to demosaic."""
+        camera = Camera.of(self._clip.recording.mosaic)
+        gains = np.array(camera.white_balance) / min(camera.white_balance)
+        lifted = (channels - camera.black_level_dn) / (camera.white_level_dn - camera.black_level_dn)
+        # clipped as `balance.white_balance` does it: where the channel of the smallest gain saturates
+        balanced = np.minimum(lifted * gains, 1).astype(np.float32)
+        return np.asarray(colour_matrix(balanced, camera.matrix), dtype=np.float32)
+
+    def demosaiced(self, raw: NDArray) -> NDArray[np.float64]:
+        """Every channel at every pixel, DN, by the package's own demosaicing of RAW [row, col], DN.
+
+        As in its pipeline, it works on the balanced mosaic.
+        """
+        camera = Camera.of(self._clip.recording.mosaic)
+        black, span = camera.black_level_dn, camera.white_level_dn - camera.black_level_dn
+        gains, tile = camera.white_balance, camera.tile_channel
+        lifted = black_level(raw, camera.black_level_dn, camera.white_level_dn)
+        channels = demosaic(white_balance(lifted, tile, gains), tile)
+        return channels.astype(np.float64) / (np.array(gains) / min(gains)) * span + black
+
+    def channel_scores(self, channels: NDArray, truth: NDArray) -> dict[str, float]:
+        """Measures of a demosaiced frame against the truth, as those of `scores`.
+
+        Parameters
+        ----------
+        channels, truth : [row, col, channel], DN.
+        """
+        mosaic = self._clip.recording.mosaic
+        black, span = mosaic.black_level_dn, mosaic.white_level_dn - mosaic.black_level_dn
+        found = {"channel_psnr_db": psnr((channels - black) / span, (truth - black) / span)}
+        return found | self._compared(self.linear_of_channels(channels), self.linear_of_channels(truth))
+
+    def _compared(self, picture: NDArray[np.float32], wanted: NDArray[np.float32]) -> dict[str, float]:
+        """Measures of a picture in linear sRGB against the wanted one."""
         bright = float(np.percentile(wanted, _PERCENTILE))
         gain = _WHITE / bright if bright > 0 else 1.0
         picture, wanted = (np.clip(image * gain, 0, 1) for image in (picture, wanted))
         a, b = encode_exactly(picture), encode_exactly(wanted)
-        found |= {"psnr_db": psnr(a, b), "delta_e": delta_e(picture, wanted)}
+        found = {"psnr_db": psnr(a, b), "delta_e": delta_e(picture, wanted)}
         if min(a.shape[:2]) >= 11:
             found["ssim"] = ssim(a, b)
         return found | {name: learned(name, a, b) for name in learned_measures()}

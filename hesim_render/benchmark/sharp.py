@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,20 @@ from hesim_render.sources.protocol import FluxSource
 from hesim_render.specs.benchmark import SharpSpec
 
 SHARP_FILE = "sharp.h5"
+
+
+def _row_offset_us(sensor: Sensor, spec: SharpSpec) -> NDArray[np.float64]:
+    aps = sensor.spec.aps
+    assert aps is not None
+    rolling = spec.shutter == "sensor" and aps.shutter == "rolling"
+    return np.arange(sensor.rows, dtype=np.float64) * (aps.line_time_us if rolling else 0.0)
+
+
+def windows(sensor: Sensor, spec: SharpSpec, duration_us: int) -> Iterator[tuple[float, NDArray[np.float64]]]:
+    """Middle of row 0's window and begin of each row's window, [row], of every sharp image, µs."""
+    offset = _row_offset_us(sensor, spec)
+    for middle in spec.middles_us(duration_us, float(offset[-1])):
+        yield middle, middle - spec.window_us / 2 + offset
 
 
 def write_sharp(
@@ -42,15 +57,13 @@ def write_sharp(
     """
     aps = sensor.spec.aps
     assert aps is not None
-    rolling = spec.shutter == "sensor" and aps.shutter == "rolling"
-    offset = np.arange(sensor.rows) * (aps.line_time_us if rolling else 0.0)
-    middles = spec.middles_us(duration_us, float(offset[-1]))
+    times = list(windows(sensor, spec, duration_us))
     types = jit()
     clean, _ = noise_models(sensor, clean=True)
     assert clean is not None
     pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
     row = pixel // sensor.cols
-    shape, exposure_s = (len(middles), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US
+    shape, exposure_s = (len(times), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US
     disk = Disk(path)
     file = h5py.File(disk, "w")
     try:
@@ -59,12 +72,12 @@ def write_sharp(
                 "flux": "e-/s of each pixel through its own filter, mean over its window", "window_us": spec.window_us,
                 "exposure_us": aps.exposure_us, "shutter": spec.shutter, "quality": quality,
             })  # fmt: skip
-            file["time_us"] = np.array(middles, dtype=np.float64)
-            file["row_offset_us"] = offset
+            file["time_us"] = np.array([middle for middle, _ in times], dtype=np.float64)
+            file["row_offset_us"] = _row_offset_us(sensor, spec)
             for name, kind in (("flux_e_per_s", "f4"), ("stderr_e_per_s", "f4"), ("raw_dn", "u2")):
                 file.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), compression=COMPRESSION)
-            for number, middle in enumerate(middles):
-                first = middle - spec.window_us / 2 + offset[row]
+            for number, (_, begin) in enumerate(times):
+                first = begin[row]
                 half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
                 a, b = np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
                 image = np.full((2, sensor.rows * sensor.cols), np.nan, np.float32)
@@ -84,7 +97,7 @@ def write_sharp(
         file.close()
         disk.close()
         raise
-    return len(middles)
+    return len(times)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Tasks of a clip with their baselines: deblurring, interpolation, denoising, fidelity, flow, intensity, high range."""
+"""Tasks of a clip with their baselines: deblurring, interpolation, denoising, events, flow, intensity, colour."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.benchmark.bilinear import bilinear
 from hesim_render.benchmark.double_integral import sharp_over_blurred
 from hesim_render.benchmark.event_filters import FILTERS
 from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged
@@ -23,6 +24,8 @@ from hesim_render.recording.frame import Frame
 
 #: A sharp image counts as that of the middle of an exposure if it is at most so far away, in parts of the exposure.
 _NEAR = 0.25
+#: Tasks whose results are in DN.
+IN_DN = ("deblur", "interpolate", "demosaic")
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,10 @@ class ClipTasks:
 
     def _predicted(self, task: str, item: int, shape: tuple[int, ...]) -> dict[str, NDArray]:
         """The user's result for an item, by the name of its method; empty where there is none."""
-        found = None if self._predictions is None else self._predictions.read(task, self._clip.name, item, shape)
+        if self._predictions is None:
+            return {}
+        full_scale = 2**self._clip.recording.mosaic.bit_depth - 1 if task in IN_DN else None
+        found = self._predictions.read(task, self._clip.name, item, shape, full_scale)
         return {} if found is None else {"prediction": found}
 
     def _truth(self, frame: Frame) -> tuple[float, NDArray] | None:
@@ -228,6 +234,27 @@ class ClipTasks:
             for name, flux in found.items():
                 yield Score(self._clip.name, "hdr", name, number, flux_scores(flux, truth, valid))
 
+    def demosaic(self) -> Iterator[Score]:
+        """Every channel at every pixel from the noise-free RAW of each sharp image, whose event pixels have no value.
+
+        The truth is the rendered light through each filter (`colours`).
+        """
+        sharp, colours, development = self._clip.sharp, self._clip.colours, self._development
+        if sharp is None or colours is None:
+            return
+        mosaic, aps = self._clip.recording.mosaic, development.sensor.aps
+        assert aps is not None
+        order = [colours.channels.index(name) for name in mosaic.channels]
+        for number in range(len(colours.time_us)):
+            raw = sharp.raw_dn(number).astype(np.float64)
+            exposure_us = float(self._clip.content["exposure_us"] or aps.exposure_us)
+            truth = development.full_dn(colours.flux_e_per_s(number)[..., order], exposure_us)
+            found = {"guided": development.demosaiced(raw), "bilinear": bilinear(raw, mosaic.tile_channel)}
+            found |= self._predicted("demosaic", number, truth.shape)
+            for name, channels in found.items():
+                values = development.channel_scores(channels, truth)
+                yield Score(self._clip.name, "demosaic", name, number, values)
+
 
 TASKS: dict[str, Callable[[ClipTasks], Iterator[Score]]] = {
     "deblur": ClipTasks.deblur,
@@ -237,4 +264,5 @@ TASKS: dict[str, Callable[[ClipTasks], Iterator[Score]]] = {
     "flow": ClipTasks.flow,
     "intensity": ClipTasks.intensity,
     "hdr": ClipTasks.hdr,
+    "demosaic": ClipTasks.demosaic,
 }

@@ -114,11 +114,13 @@ def evaluate(
     tasks: Annotated[
         str | None,
         typer.Option(
-            metavar="TASK,TASK…", help="deblur, interpolate, denoise, fidelity, flow, intensity, hdr; default all"
+            metavar="TASK,TASK…",
+            help="deblur, interpolate, denoise, fidelity, flow, intensity, hdr, demosaic; default all",
         ),
     ] = None,
     predictions: Annotated[
-        Path | None, typer.Option(help="folder of your own results, TASK/CLIP/000000.npy, scored beside the baselines")
+        Path | None,
+        typer.Option(help="folder of your own results, TASK/CLIP/000000.npy or .png, scored beside the baselines"),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="JSON file of all single values")] = None,
     overwrite: Overwrite = False,

@@ -150,6 +150,10 @@ class SharpSpec(Strict):
         "sensor", description="times are those of row 0, and rows follow as in a frame; or all rows at the same time"
     )
 
+    colours: bool = Field(
+        False, description="the same times through every filter at every pixel as well, rendered; for demosaicing"
+    )
+
     @model_validator(mode="after")
     def _check(self) -> SharpSpec:
         if (self.every_us is None) == (not self.times_us):

@@ -5,11 +5,13 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from benchmarks import small
 from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
 from hesim_render.benchmark.evaluate import summary, table
 from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import ClipTasks, Score
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.pixels.evs.events import Label
@@ -96,6 +98,41 @@ def test_results_of_a_user_are_scored_beside_the_baselines(built, tmp_path):
     assert scores["deblur"]["raw_psnr_db"] == scores["interpolate"]["raw_psnr_db"] == np.inf
     assert scores["denoise"]["noise_kept"] == 0 and scores["flow"]["epe_px"] == 0
     assert not signal.any() and scores["fidelity"]["count_error"] == 0  # these few pixels see no edge pass
+
+
+def png(path, image):
+    """A PNG of 8 or 16 bits by the encoder of Pillow, which is not that of the decoder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path)
+
+
+def test_pictures_hold_dn_or_parts_of_the_full_scale(tmp_path):
+    rng = np.random.default_rng(1)
+    wide, narrow = rng.integers(0, 4096, (5, 7)).astype(np.uint16), rng.integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    png(tmp_path / "deblur" / "a" / "000000.png", wide)
+    png(tmp_path / "demosaic" / "a" / "000003.png", narrow)
+    png(tmp_path / "flow" / "a" / "000000.png", narrow)
+    png(tmp_path / "deblur" / "a" / "000001.png", np.dstack([narrow, narrow[..., :1]]))
+    png(tmp_path / "deblur" / "a" / "000002.png", wide)
+    np.save(tmp_path / "deblur" / "a" / "000002.npy", wide)
+    (tmp_path / "deblur" / "a" / "000004.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(40))
+    given = Predictions(tmp_path, ["deblur", "demosaic", "flow"], ["a"])
+    assert np.array_equal(given.read("deblur", "a", 0, (5, 7), 4095), wide)
+    np.testing.assert_allclose(given.read("demosaic", "a", 3, (5, 7, 3), 1023), narrow / 255 * 1023)
+    assert given.read("deblur", "a", 9, (5, 7), 4095) is None
+    for task, item, shape, message in (
+        ("deblur", 1, (5, 7), "format rgba; expected grey"), ("deblur", 2, (5, 7), "beside it"),
+        ("deblur", 4, (5, 7), "PNG"),
+    ):  # fmt: skip
+        with pytest.raises(SpecError, match=message):
+            given.read(task, "a", item, shape, 4095)
+    with pytest.raises(SpecError, match="no unit"):
+        given.read("flow", "a", 0, (5, 7, 3))
+    again = Predictions(tmp_path, ["deblur", "demosaic", "flow"], ["a"])
+    with pytest.raises(SpecError, match=r"expected grey of 8 or 16 bits, \[7, 5\]"):
+        again.read("deblur", "a", 0, (7, 5), 4095)
+    with pytest.raises(SpecError, match=r"holds float64 \[5, 7\]; expected numbers \[5, 7, 3\]"):
+        again.read("deblur", "a", 0, (5, 7, 3), 4095)
 
 
 @pytest.mark.slow
