@@ -14,14 +14,20 @@ from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.benchmark.sharp import SHARP_FILE, write_sharp
 from hesim_render.benchmark.statistics import figures
 from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.simulate import flux_source, simulate
+from hesim_render.capture.simulate import flux_source, go_on, simulate
+from hesim_render.core.journal import Journal
 from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.recording.manifest import software_versions
+from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
 from hesim_render.sources.render.light_level import in_absolute_light
-from hesim_render.sources.scene import load_scene
+from hesim_render.sources.scene import Scene, load_scene
+from hesim_render.specs.files import content_hash
 
 CLIP_FILE, RECORDING, SCENE = "clip.json", "recording", "scene"
 SCHEMA = 1
+#: Time of a clip's build after which what is rendered is kept, for a build that goes on; most clips take less.
+_KEPT_AFTER_S = 60.0
 UNITS = {
     "t_us": "µs from the start of the clip; the end of an integration window",
     "raw": "DN",
@@ -77,7 +83,7 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     begin = time.monotonic()
     output = OutputFolder(folder, CLIP_FILE, overwrite=True)  # another worker may finish the same clip first
     try:
-        content = _fill(plan, clip, output.path)
+        content = _fill(plan, clip, output.path, folder)
         with output_errors(folder):
             text = json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
             (output.path / CLIP_FILE).write_text(text, encoding="utf-8")
@@ -89,8 +95,8 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     return Built(clip.name, time.monotonic() - begin, size)
 
 
-def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
-    """Render a clip into a folder; returns its description."""
+def _fill(plan: Plan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
+    """Render a clip into a folder, which will be `target`; returns its description."""
     spec, generated = plan.spec, plan.scene_files(clip)
     if generated is not None:
         with output_errors(folder):
@@ -103,20 +109,23 @@ def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
     # one renderer for both: what rests is rendered once
     quality = spec.quality if spec.samples is None else None
     renderer = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
-    recording = simulate(
-        scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
-        quality=quality, samples=spec.samples, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
-        out=folder / RECORDING, progress=False,
-    )  # fmt: skip
-    sharp = 0
-    if spec.sharp is not None:
-        with output_errors(folder):
-            aps, _ = noise_models(sensor, level.clean, level.without)
-            source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
-            sharp = write_sharp(folder / SHARP_FILE, source, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
-        if spec.sharp.colours and len(frame_filters(sensor)) > 1:
+    with _journal(plan, clip, target, scene, sensor) as journal:
+        go_on(renderer[0], journal)
+        recording = simulate(
+            scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
+            quality=quality, samples=spec.samples, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
+            out=folder / RECORDING, progress=False,
+        )  # fmt: skip
+        sharp = 0
+        if spec.sharp is not None:
             with output_errors(folder):
-                write_colours(folder / COLOURS_FILE, scene, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
+                aps, _ = noise_models(sensor, level.clean, level.without)
+                source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
+                asked = spec.sharp, spec.duration_us, seed, spec.quality
+                sharp = write_sharp(folder / SHARP_FILE, source, sensor, *asked)
+    if spec.sharp is not None and spec.sharp.colours and len(frame_filters(sensor)) > 1:
+        with output_errors(folder):
+            write_colours(folder / COLOURS_FILE, scene, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
     manifest = recording.manifest
     return {
         "schema_version": SCHEMA,
@@ -137,3 +146,10 @@ def _fill(plan: Plan, clip: Clip, folder: Path) -> dict[str, Any]:
             if path.is_file()
         },
     }
+
+
+def _journal(plan: Plan, clip: Clip, target: Path, scene: Scene, sensor: Sensor) -> Journal:
+    """What the renderer of a clip has traced, for a build that goes on within a long clip."""
+    hashes = {"scene_hash": content_hash(scene.spec), "sensor_hash": content_hash(sensor.spec)}
+    run = {"spec": plan.spec.model_dump(mode="json"), "clip": clip.as_dict(), **hashes, "software": software_versions()}
+    return Journal(target, run, overwrite=True, shared=True, after_s=_KEPT_AFTER_S)

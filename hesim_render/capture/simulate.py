@@ -196,8 +196,7 @@ def simulate(
             overwrite=overwrite,
         ) as writer, _journal(resume and renderer is None, out, writer, overwrite) as journal:  # fmt: skip
             if journal is not None:
-                for number, part in enumerate(_renderers(flux)):
-                    part.go_on(journal, number)
+                go_on(flux, journal)
             capture.record(writer, told)
             render: dict[str, Any] = {
                 "error_noise": {name: meter.as_dict(wanted) for name, meter in capture.errors.items()},
@@ -286,6 +285,12 @@ def _change_driven_parts(flux: Any) -> list[ChangeDrivenFlux]:
 def _renderers(flux: Any) -> tuple[Any, ...]:
     """The renderers of a source, one per waveform of its lights."""
     return getattr(flux, "sources", (flux,))
+
+
+def go_on(flux: Any, journal: Journal) -> None:
+    """Let the renderers of a source keep what they trace in a journal, and take from it what is there already."""
+    for number, part in enumerate(_renderers(flux)):
+        part.go_on(journal, number)
 
 
 def _journal(

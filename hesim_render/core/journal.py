@@ -11,6 +11,7 @@ import fcntl
 import hashlib
 import json
 import struct
+import time
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -57,6 +58,8 @@ class Journal:
     target : output of the run.
     run : plain values, by name, of all that the results depend on.
     overwrite : begin anew where the journal is that of another run.
+    shared : keep nothing where another process writes the journal, in place of an error.
+    after_s : keep nothing in the first seconds; a short run then leaves no file.
 
     Attributes
     ----------
@@ -69,8 +72,16 @@ class Journal:
         If the journal is that of another run and `overwrite` is False. The message names what differs.
     """
 
-    def __init__(self, target: str | Path, run: Mapping[str, Any], overwrite: bool = False) -> None:
-        self.path = journal_of(target)
+    def __init__(
+        self,
+        target: str | Path,
+        run: Mapping[str, Any],
+        overwrite: bool = False,
+        shared: bool = False,
+        after_s: float = 0.0,
+    ) -> None:
+        self.path, self._shared, self._begin_s = journal_of(target), shared, time.monotonic() + after_s
+        self._is_off = False
         self._run = json.loads(json.dumps({"format": _FORMAT, **run}, default=str))
         self._places: dict[bytes, tuple[int, int, int]] = {}
         self._file: BinaryIO | None = None
@@ -100,15 +111,21 @@ class Journal:
                 return
             end = self._read(file)
         self._file = self._locked()
-        self._file.truncate(end)
+        if self._file is not None:
+            self._file.truncate(end)
 
-    def _locked(self) -> BinaryIO:
-        """The file, which no other process may have open; the lock ends with the process."""
+    def _locked(self) -> BinaryIO | None:
+        """The file, which no other process may have open; the lock ends with the process. None where it is shared, and
+        another process has it.
+        """
         file = self.path.open("a+b")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.close()
+            if self._shared:
+                self._is_off = True
+                return None
             raise OutputError(f"{self.path}: another run is writing it") from None
         except OSError:  # a file system without locks
             pass
@@ -163,11 +180,15 @@ class Journal:
         key : from `key_of`.
         values : arrays of numbers.
         """
+        if self._is_off or time.monotonic() < self._begin_s:
+            return
         data = b"".join(np.ascontiguousarray(value).tobytes() for value in values)
         with output_errors(self.path):
             if self._file is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = self._locked()
+                if self._file is None:
+                    return
                 self._file.truncate(0)
                 self._file.write(json.dumps(self._run).encode() + b"\n")
             checksum = zlib.crc32(data)
@@ -184,6 +205,6 @@ class Journal:
             self._file.close()
             self._file = None
         is_over = kind is None or (issubclass(kind, HesimError) and not issubclass(kind, OutputError))
-        if is_over:
+        if is_over and not self._is_off:
             with output_errors(self.path):
                 self.path.unlink(missing_ok=True)

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.journal import Journal, key_of
+from hesim_render.sources.render.change_driven.aim import PairAims
+from hesim_render.sources.render.change_driven.windows import Windows
 
 
 @dataclass(frozen=True)
@@ -79,3 +81,9 @@ def remembered(
     else:
         trace()
         journal.keep(key, [values[part] for values in every])
+
+
+def told_of(windows: Windows, span_us: tuple[float, float] | None, aims: PairAims | None) -> tuple[object, ...]:
+    """What the flux of pairs depends on besides the pairs themselves."""
+    aimed = () if aims is None else (aims.first, aims.count, aims.group)
+    return windows.begin_us, windows.end_us, span_us, *aimed

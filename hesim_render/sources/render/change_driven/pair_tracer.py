@@ -15,7 +15,7 @@ from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims, in_blocks
-from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, remembered
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, remembered, told_of
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import depth_limit, mitsuba
@@ -126,7 +126,7 @@ class PairTracer(Tracer):
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
         for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims):
             lanes = [pixel[part], window[part].astype(np.uint32), lit[part].astype(np.uint32), times[part]]
-            inputs = "flux", *lanes, packets[part], stream, *_told_of(windows, span_us, aimed)
+            inputs = "flux", *lanes, packets[part], stream, *told_of(windows, span_us, aimed)
             trace = partial(self._trace_block, lanes, packets[part], moments, key, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * _PACKET)
@@ -176,7 +176,7 @@ class PairTracer(Tracer):
             part = slice(first, min(count, first + room))
             lanes = pixel[part], window[part].astype(np.uint32)
             aimed = None if aims is None else aims.part(part)
-            inputs = "pilot", *lanes, samples, footprint_px, stream, *_told_of(windows, span_us, aimed)
+            inputs = "pilot", *lanes, samples, footprint_px, stream, *told_of(windows, span_us, aimed)
             trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report((part.stop - first) * samples)
@@ -346,9 +346,3 @@ def _bits(kind: type[UInt32], condition: Mask, count: int) -> UInt32:
     import drjit as dr
 
     return dr.select(condition, kind(1), dr.zeros(kind, count))
-
-
-def _told_of(windows: Windows, span_us: tuple[float, float] | None, aims: PairAims | None) -> tuple[object, ...]:
-    """What the flux of pairs depends on besides the pairs themselves."""
-    aimed = () if aims is None else (aims.first, aims.count, aims.group)
-    return windows.begin_us, windows.end_us, span_us, *aimed
