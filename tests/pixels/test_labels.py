@@ -203,14 +203,15 @@ def test_events_lost_in_the_dead_time_are_noise_free_crossings_within_it():
     ("noise_dn", "dead_us", "most"),
     [
         (2.0, 1_000, 0.0),
-        *(pytest.param(*p, marks=pytest.mark.slow) for p in ((1.0, 1_000, 0.0), (2.0, 300, 0.0), (5.0, 1_000, 0.03))),
+        *(pytest.param(*p, marks=pytest.mark.slow) for p in ((1.0, 1_000, 0.0), (2.0, 300, 0.01), (5.0, 1_000, 0.03))),
     ],
 )
 def test_with_a_dead_time_signal_has_the_rate_of_the_run_without_noise_but_with_dead_time(noise_dn, dead_us, most):
     """As above, both polarities together. The run to compare with has the dead time and the pixels' own thresholds.
 
-    Noise of a tenth of the threshold and of a twentieth; and of a quarter. The latter lasts as long as the dead time,
-    and is in the reference at the release, so that pixels fire more often or less: docs/ground-truth.md states 3 %.
+    Noise of a tenth of the threshold and of a twentieth. Where the dead time is shorter than the noise lasts, or the
+    noise is a quarter of the threshold, noise is in the reference at the release, so that pixels fire more often or
+    less: docs/ground-truth.md states 1 % and 3 %.
     """
     noise = model(True, {**NOISY, "beta4": noise_dn}, evs__threshold_mismatch_std=0.05,
                   evs__refractory_period_us=dead_us)  # fmt: skip
@@ -223,7 +224,7 @@ def test_with_a_dead_time_signal_has_the_rate_of_the_run_without_noise_but_with_
     )
     assert expected > 20_000
     assert abs(labelled - expected) < max(np.sqrt(expected), most * expected)
-    assert found.counts()["lost_refractory"] > 100 and found.counts()["mismatch"] > 100
+    assert found.counts()["lost_refractory"] > 50 and found.counts()["mismatch"] > 100
 
 
 # ---- nominal and own thresholds --------------------------------------------------------------------------------------
@@ -311,7 +312,7 @@ def test_what_is_let_go_of_changes_no_label(monkeypatch):
         monkeypatch.setattr(partners, "_FEW", few)
         labeller = Labeller(noise, 9, 0, 10**9)
         stage = EvsStage(noise, 9, labels=labeller)
-        for t in TICKS:
+        for t in TICKS[:60]:
             stage.step(jit().Float(((np.exp(light(t)) - 1) / 2).astype(np.float32)), int(t))
         verdicts = labeller._partners._verdicts
         found.append((EventLabels.of([labeller.taken()]).label, verdicts._open.shape[1], verdicts._given.size))
