@@ -20,6 +20,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     Movable,
     as_spec_error,
     box_corners,
+    files_readable,
     make_mesh,
     spectrum_dict,
     transform,
@@ -112,6 +113,7 @@ class BuiltScene:
         return self.camera
 
 
+@files_readable()
 def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] | None = None) -> BuiltScene:
     """Load a scene for rendering.
 

@@ -47,7 +47,6 @@ def mitsuba() -> MitsubaModule:
     resolver: Any = getattr(mi, "file_resolver")()  # noqa: B009 - the stubs declare it as an object
     if str(resolver[0]) != str(_home(mi)):
         resolver.prepend(str(_home(mi)))
-    _have_threads()
     return mi
 
 
@@ -60,15 +59,23 @@ def _home(mi: MitsubaModule) -> Path:
     return Path(mi.__file__).resolve().parent
 
 
-def _have_threads() -> None:
-    """Make sure that Mitsuba has at least two threads; with one it would wait for ever.
+@contextmanager
+def files_readable() -> Iterator[None]:
+    """Give Mitsuba at least two threads while it reads files; with one it would wait for ever.
 
-    It reads and writes EXR files in tasks of its thread pool, and one of them waits for others.
+    It reads EXR files in tasks of its thread pool, and one of them waits for others.
     """
     import drjit as dr
 
-    if dr.thread_count() < _LEAST_THREADS:
-        dr.set_thread_count(_LEAST_THREADS)
+    before = dr.thread_count()
+    if before >= _LEAST_THREADS:
+        yield
+        return
+    dr.set_thread_count(_LEAST_THREADS)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 @contextmanager
