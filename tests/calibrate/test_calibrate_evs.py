@@ -196,6 +196,7 @@ def test_closed_form_of_the_mean_over_thresholds():
     np.testing.assert_allclose(probability_variance(u, m), (p * p) @ weight - (p @ weight) ** 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_differenced_from_tick_to_tick_gives_wider_errors(tmp_path):
     # One draw per tick, differenced: successive differences correlate by −1/2 and counts scatter more than binomially.
     rng = np.random.default_rng(4)
@@ -250,6 +251,7 @@ def test_the_sqrt_law_is_recognised(tmp_path):
     assert np.abs((value - [29.0, 6240.0, 0.25, 0.1]) / error).max() < 4.5
 
 
+@pytest.mark.slow
 def test_a_narrow_range_of_brightness_gives_no_numbers_for_what_it_cannot_tell(tmp_path):
     capture_sets.write_events(tmp_path / "set", ramp=False, brightest=20.0)
     calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "report.html")

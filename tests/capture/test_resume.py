@@ -74,6 +74,7 @@ def test_another_command_does_not_go_on(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
 def test_entries_are_told_apart_by_all_that_they_depend_on(exact, tmp_path):
     """The same pixels in other windows, and of another part of the light; each twice, the second time from the file."""

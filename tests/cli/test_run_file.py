@@ -113,6 +113,7 @@ def test_runs_of_videos_and_cubes(capsys, tmp_path):
     assert not (tmp_path / "w").exists()
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys):
     """The program is stopped while it develops: the second call renders nothing."""
     run = write(tmp_path)

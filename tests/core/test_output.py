@@ -247,6 +247,7 @@ def test_maps_that_another_calibration_names_are_kept(captures):
     assert names(captures).count("c_aps_maps-HASH.npz") == 2
 
 
+@pytest.mark.slow
 def test_a_report_takes_no_other_files_place(captures, monkeypatch):
     """All of it is found out before the work, which is not begun."""
     out, report = captures / "c.yaml", captures / "r.html"
@@ -318,6 +319,7 @@ def slow_run(folder, seconds, *arguments):
     return child
 
 
+@pytest.mark.slow
 def test_two_runs_into_one_calibration_lose_no_section(tmp_path):
     """One process holds the old content for two seconds before it replaces it; the other one writes meanwhile."""
     both_sets(tmp_path)
@@ -333,6 +335,7 @@ def test_two_runs_into_one_calibration_lose_no_section(tmp_path):
     assert found == ["aps.html", "c.yaml", "c_aps_maps-HASH.npz", "c_evs_maps-HASH.npz"]
 
 
+@pytest.mark.slow
 def test_a_run_that_waits_too_long_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "_PATIENCE_S", 0.3)
     both_sets(tmp_path)

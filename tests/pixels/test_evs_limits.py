@@ -316,6 +316,7 @@ def test_noisy_pixels_against_a_pixel_by_pixel_version():
     assert differing <= 1
 
 
+@pytest.mark.slow
 def test_leak_events_rest_the_pixel_too():
     """Poisson events behind a dead time: a renewal process of mean T + 1/r; mean and variance at z = 5.5.
 

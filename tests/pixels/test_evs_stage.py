@@ -227,6 +227,7 @@ def test_noiseless_ramp_gives_intervals_theta_over_slope():
     assert late.min() > -0.1 and late.max() < 1.1
 
 
+@pytest.mark.slow
 def test_ramp_does_not_depend_on_the_samples():
     noise = asynchronous(16).clean()
     log_of_t = [1.0 + 2e-5 * t for t in range(0, 64_001, 250)]
@@ -335,6 +336,7 @@ def test_numpy_version_of_last_event_agrees():
     assert period_us * 6 == pytest.approx(1250)
 
 
+@pytest.mark.slow
 def test_last_event_rate_does_not_follow_the_slices():
     """Static light sampled at 1, 2, 4 and 8 kHz: noise rates within 2 %.
 

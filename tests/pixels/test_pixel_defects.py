@@ -467,6 +467,7 @@ def test_two_levels_are_recovered(amplitude, share, correlation):
     assert np.median(found.width_dn) == pytest.approx(np.hypot(1.2, 12**-0.5), rel=0.02)
 
 
+@pytest.mark.slow
 def test_noise_of_one_level_is_not_taken_for_two():
     """Whatever its width. The gain that is asked for is 20; that of 3000 pixels stays below 16."""
     for width in (0.9, 1.2, 4.0):

@@ -354,6 +354,7 @@ def test_cameras_of_opencv(recorded, tmp_path):
     assert storage.getNode("distortion_model").string() == "none"
 
 
+@pytest.mark.slow
 def test_cameras_with_distortion_in_both_formats(tmp_path):
     def truth(model):
         scene = rendering.make_scene(light=rendering.FURNACE, camera={"origin_m": [0, 0, 1]}, objects=[
