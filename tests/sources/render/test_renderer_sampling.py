@@ -175,3 +175,18 @@ def test_wavelengths_follow_the_response_exactly():
         area = np.concatenate([[0], np.cumsum((values[1:] + values[:-1]) / 2 * np.diff(grid))])
         expected = np.interp(wavelengths, grid, area / area[-1])
         np.testing.assert_allclose(expected, (np.arange(4 * count) + 0.5) / (4 * count), atol=2e-5)
+
+
+def test_tables_of_wavelengths_make_one_kernel_wherever_they_lie_in_memory():
+    flat, types, kernels = Spectrum(np.array([400.0, 700.0]), np.ones(2)), jit(), set()
+    held = []
+    for k in range(12):
+        held.append(np.empty(16 * k + 1, np.uint32))  # other places for what follows
+        sampler = WavelengthSampler({"flat": flat})
+        u = dr.opaque(types.Float, 0.3, 64)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.eval(sampler.sample(dr.opaque(types.UInt32, 0, 64), u))
+            kernels.add(tuple(entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])))
+        held.append(sampler)
+    assert len(kernels) == 1
