@@ -63,6 +63,17 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_bytes(name, tmp_path, mon
     assert stop > 0 and live <= every - 2 * stop
 
 
+def test_filters_whose_glare_is_traced_at_the_same_pixels_are_told_apart(tmp_path):
+    """Of one run, whose journal holds the glare of one filter when that of the next one is traced."""
+    sensor = hr.load_sensor("reference-bayer", {"lens.veiling_glare": 0.3}).crop(16, 12)
+    given = {"duration_s": 0.02, "seed": 3, "samples": 16, "clean": True}
+    first, other = (
+        hr.simulate(hr.load_scene("colorchecker"), sensor, out=tmp_path / str(resume), resume=resume, **given)
+        for resume in (False, True)
+    )
+    np.testing.assert_array_equal(first.frames[0].electrons_mean, other.frames[0].electrons_mean)
+
+
 def test_another_command_does_not_go_on(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         record("exact static", tmp_path / "out", stop_after=1, monkeypatch=monkeypatch, overwrite=True, samples=8192)

@@ -85,7 +85,9 @@ class VeilingGlare:
                 return [dr.sum(radiance) / len(radiance) * light]
 
             (halves,) = self._tracer.trace(
-                np.arange(count, dtype=np.uint32), begin, end, choose, weigh, elsewhere=self._index
+                *(np.arange(count, dtype=np.uint32), begin, end, choose, weigh),
+                elsewhere=self._index,
+                name=f"glare of filter {number}",
             )
             found[number] = [np.array(half, np.float64).mean() for half in halves]
         return found

@@ -163,6 +163,7 @@ class PixelTracer(Tracer):
         wavelengths: Wavelengths,
         values: Values,
         elsewhere: NDArray[np.uint32] | None = None,
+        name: str = "",
     ) -> list[Halves]:
         """Averages over the rays of each listed pixel. The camera moves through the pixel's own interval.
 
@@ -174,6 +175,8 @@ class PixelTracer(Tracer):
         values : map radiance to the quantities to average.
         elsewhere : [n], numbers of pixels on the full sensor, with random numbers of their own, instead of those of the
             region; `pixel` then is their number in this list.
+        name : of these averages. The same pixels with other `wavelengths` or `values` need another name, by which the
+            journal tells them apart.
 
         Returns
         -------
@@ -203,7 +206,7 @@ class PixelTracer(Tracer):
         for first in range(0, pixel.size, room):
             part = slice(first, first + room)
             spread = None if times is None else [values[part] for values in times]
-            inputs = self._posed_us, elsewhere is None, pixel[part], full[pixel[part]], *(spread or ())
+            inputs = name, self._posed_us, elsewhere is None, pixel[part], full[pixel[part]], *(spread or ())
             trace = partial(self._block, pixel[part], full[pixel[part]], key, spread, wavelengths, values)
             parts.append(self._remembered(inputs, trace))
             self._report(pixel[part].size * self.samples)
