@@ -17,7 +17,7 @@ from hesim_render.benchmark.sharp import windows
 from hesim_render.capture.simulate import flux_source
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
-from hesim_render.core.hdf5 import COMPRESSION, Disk
+from hesim_render.core.hdf5 import COMPRESSION, new_file
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -65,29 +65,21 @@ def write_colours(
     names, times = frame_filters(sensor), list(windows(sensor, spec, duration_us))
     every = np.arange(sensor.rows * sensor.cols, dtype=np.uint32)
     shape = (len(times), sensor.rows, sensor.cols, len(names))
-    disk = Disk(path)
-    file = h5py.File(disk, "w")
-    try:
-        with disk.told():
-            file.attrs.update({"flux": "e-/s through each filter, mean over the window", "window_us": spec.window_us})
-            file["time_us"] = np.array([middle for middle, _ in times])
-            file["channel"] = names
-            for name in ("flux_e_per_s", "stderr_e_per_s"):
-                file.create_dataset(name, shape, "f4", chunks=(1, *shape[1:3], 1), compression=COMPRESSION)
-            for channel, name in enumerate(names):
-                seen, one = in_absolute_light(scene)[0], through_one_filter(sensor, name)
-                source, _ = flux_source(seen, one, seed + 1 + channel, quality, None, False, None)
-                for number, (_, begin) in enumerate(times):
-                    first = begin[every // sensor.cols]
-                    a, b = (np.array(half) for half in source.mean_flux(every, first, first + spec.window_us))
-                    file["flux_e_per_s"][number, ..., channel] = (0.5 * (a + b)).reshape(shape[1:3])
-                    file["stderr_e_per_s"][number, ..., channel] = (0.5 * np.abs(a - b)).reshape(shape[1:3])
-            file.close()
-            disk.close()
-    except BaseException:
-        file.close()
-        disk.close()
-        raise
+    with new_file(path) as file:
+        file.attrs.update({"flux": "e-/s through each filter, mean over the window", "window_us": spec.window_us})
+        file["time_us"] = np.array([middle for middle, _ in times])
+        file["channel"] = names
+        for name in ("flux_e_per_s", "stderr_e_per_s"):
+            file.create_dataset(name, shape, "f4", chunks=(1, *shape[1:3], 1), compression=COMPRESSION)
+        for channel, seen_by in enumerate(names):
+            seen, one = in_absolute_light(scene)[0], through_one_filter(sensor, seen_by)
+            source, _ = flux_source(seen, one, seed + 1 + channel, quality, None, False, None)
+            for number, (_, begin) in enumerate(times):
+                first = begin[every // sensor.cols]
+                a, b = (np.array(half) for half in source.mean_flux(every, first, first + spec.window_us))
+                for name, values in (("flux_e_per_s", 0.5 * (a + b)), ("stderr_e_per_s", 0.5 * np.abs(a - b))):
+                    file[name][number, ..., channel] = values.reshape(shape[1:3])
+                    file[name].flush()
     return len(times)
 
 

@@ -14,7 +14,7 @@ from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
-from hesim_render.core.hdf5 import COMPRESSION, Disk
+from hesim_render.core.hdf5 import COMPRESSION, new_file
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import FluxSource
@@ -64,39 +64,30 @@ def write_sharp(
     pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
     row = pixel // sensor.cols
     shape, exposure_s = (len(times), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US
-    disk = Disk(path)
-    file = h5py.File(disk, "w")
-    try:
-        with disk.told():
-            file.attrs.update({
-                "flux": "e-/s of each pixel through its own filter, mean over its window", "window_us": spec.window_us,
-                "exposure_us": aps.exposure_us, "shutter": spec.shutter, "quality": quality,
-            })  # fmt: skip
-            file["time_us"] = np.array([middle for middle, _ in times], dtype=np.float64)
-            file["row_offset_us"] = _row_offset_us(sensor, spec)
-            for name, kind in (("flux_e_per_s", "f4"), ("stderr_e_per_s", "f4"), ("raw_dn", "u2")):
-                file.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), compression=COMPRESSION)
-            for number, (_, begin) in enumerate(times):
-                first = begin[row]
-                half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
-                a, b = np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
-                image = np.full((2, sensor.rows * sensor.cols), np.nan, np.float32)
-                image[0, pixel], image[1, pixel] = 0.5 * (a + b), np.abs(a - b) * 0.5
-                electrons = np.nan_to_num(image[0], nan=0.0) * np.float32(exposure_s)
-                raw = clean.sample_dn(types.Float(electrons), aps.exposure_us, seed).numpy()
-                raw = np.where(sensor.layout.aps_mask, raw.reshape(shape[1:]), 0)
-                for name, values in (
-                    ("flux_e_per_s", image[0]), ("stderr_e_per_s", image[1]), ("raw_dn", raw.astype(np.uint16)),
-                ):  # fmt: skip
-                    stored = file[name]
-                    stored[number] = values.reshape(shape[1:])
-                    stored.flush()  # so that its chunks have their place now, see `truth_file`
-            file.close()
-            disk.close()
-    except BaseException:
-        file.close()
-        disk.close()
-        raise
+    with new_file(path) as file:
+        file.attrs.update({
+            "flux": "e-/s of each pixel through its own filter, mean over its window", "window_us": spec.window_us,
+            "exposure_us": aps.exposure_us, "shutter": spec.shutter, "quality": quality,
+        })  # fmt: skip
+        file["time_us"] = np.array([middle for middle, _ in times], dtype=np.float64)
+        file["row_offset_us"] = _row_offset_us(sensor, spec)
+        for name, kind in (("flux_e_per_s", "f4"), ("stderr_e_per_s", "f4"), ("raw_dn", "u2")):
+            file.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), compression=COMPRESSION)
+        for number, (_, begin) in enumerate(times):
+            first = begin[row]
+            half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
+            a, b = np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
+            image = np.full((2, sensor.rows * sensor.cols), np.nan, np.float32)
+            image[0, pixel], image[1, pixel] = 0.5 * (a + b), np.abs(a - b) * 0.5
+            electrons = np.nan_to_num(image[0], nan=0.0) * np.float32(exposure_s)
+            raw = clean.sample_dn(types.Float(electrons), aps.exposure_us, seed).numpy()
+            raw = np.where(sensor.layout.aps_mask, raw.reshape(shape[1:]), 0)
+            for name, values in (
+                ("flux_e_per_s", image[0]), ("stderr_e_per_s", image[1]), ("raw_dn", raw.astype(np.uint16)),
+            ):  # fmt: skip
+                stored = file[name]
+                stored[number] = values.reshape(shape[1:])
+                stored.flush()  # so that its chunks have their place now, see `truth_file`
     return len(times)
 
 

@@ -76,6 +76,26 @@ class Disk:
             raise self._error
 
 
+@contextlib.contextmanager
+def new_file(path: Path) -> Iterator[h5py.File]:
+    """A new file that is closed at the end of the with statement, on a full disk as well, whose error is raised then.
+
+    Bytes are the same each time if data sets that are written piece by piece are flushed after each piece: chunks get
+    their places when they are packed, which is else when HDF5 likes to.
+    """
+    disk = Disk(path)
+    file = h5py.File(disk, "w")
+    try:
+        with disk.told():
+            yield file
+            file.close()
+            disk.close()
+    except BaseException:
+        file.close()
+        disk.close()
+        raise
+
+
 def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui") -> Any:
     """A data set of numbers that is stored in this file itself; `kinds` are NumPy's letters of the kinds that it may
     hold.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, reading, require_memory
-from hesim_render.core.hdf5 import COMPRESSION, Disk, dataset_of
+from hesim_render.core.hdf5 import COMPRESSION, dataset_of, new_file
 from hesim_render.exchange.dsec import EventFileWriter, read_events
 from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, Label, LabelBlock, Lost
 
@@ -77,21 +77,12 @@ class LabelFileWriter:
 
     def close(self) -> None:
         """Write both files."""
-        disk = Disk(self._path)
-        file = h5py.File(disk, "w")
-        try:
-            with disk.told():
-                self._pack(file, "label", self._label, np.dtype([("label", "u1")]))
-                for column in ("in", *_COLUMNS):
-                    self._pack(file, f"lost/{column}", self._lost, _LOST)
-                file["label"].attrs.update({label.name.lower(): int(label) for label in Label})
-                file["lost/in"].attrs.update({place.name.lower(): int(place) for place in Lost})
-                file.close()
-                disk.close()
-        except BaseException:
-            file.close()
-            disk.close()
-            raise
+        with new_file(self._path) as file:
+            self._pack(file, "label", self._label, np.dtype([("label", "u1")]))
+            for column in ("in", *_COLUMNS):
+                self._pack(file, f"lost/{column}", self._lost, _LOST)
+            file["label"].attrs.update({label.name.lower(): int(label) for label in Label})
+            file["lost/in"].attrs.update({place.name.lower(): int(place) for place in Lost})
         self._clean.close()
         self._drop_parts()
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.guard import MOST_BYTES, reading, require_memory
-from hesim_render.core.hdf5 import COMPRESSION, Disk, dataset_of
+from hesim_render.core.hdf5 import COMPRESSION, dataset_of, new_file
 from hesim_render.recording.truth_kinds import EVENTS, truth_kinds
 
 if TYPE_CHECKING:
@@ -90,34 +90,25 @@ def write_truth(
     request : what is written.
     told : called with numbers of images done and of all.
     """
-    disk = Disk(path)
-    file = h5py.File(disk, "w")
-    try:
-        with disk.told():
-            file.attrs.update({"layout": _LAYOUT, "kinds": ",".join(request.geometry), "times": "µs", "lengths": "m"})
-            _write_constants(file, truth)
-            has_events = 0 not in truth.sensor.layout.evs_shape
-            groups = [("frames", "mosaic", list(request.frame_times_us))] if len(request.frame_times_us) else []
-            if has_events:
-                groups.append(("events", "events", list(request.event_times_us)))
-            total, done = sum(len(times) for _, _, times in groups), 0
-            for name, grid, times in groups:
-                rows = np.array([np.broadcast_to(t, truth.sensor.rows) for t in times])
-                file[f"{name}/row_time_us" if name == "frames" else f"{name}/time_us"] = (
-                    rows if name == "frames" else rows[:, 0]
-                )
-                for number in range(len(times)):
-                    _write_images(file[name], truth, grid, request.kinds, rows, number)
-                    done += 1
-                    if told is not None:
-                        told(done, total)
-            _write_series(file, truth, request)
-            file.close()
-            disk.close()
-    except BaseException:
-        file.close()
-        disk.close()
-        raise
+    with new_file(path) as file:
+        file.attrs.update({"layout": _LAYOUT, "kinds": ",".join(request.geometry), "times": "µs", "lengths": "m"})
+        _write_constants(file, truth)
+        has_events = 0 not in truth.sensor.layout.evs_shape
+        groups = [("frames", "mosaic", list(request.frame_times_us))] if len(request.frame_times_us) else []
+        if has_events:
+            groups.append(("events", "events", list(request.event_times_us)))
+        total, done = sum(len(times) for _, _, times in groups), 0
+        for name, grid, times in groups:
+            rows = np.array([np.broadcast_to(t, truth.sensor.rows) for t in times])
+            file[f"{name}/row_time_us" if name == "frames" else f"{name}/time_us"] = (
+                rows if name == "frames" else rows[:, 0]
+            )
+            for number in range(len(times)):
+                _write_images(file[name], truth, grid, request.kinds, rows, number)
+                done += 1
+                if told is not None:
+                    told(done, total)
+        _write_series(file, truth, request)
 
 
 def _write_constants(file: Any, truth: SceneTruth) -> None:
