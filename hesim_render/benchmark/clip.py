@@ -123,9 +123,9 @@ def _fill(plan: Plan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
                 source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
                 asked = spec.sharp, spec.duration_us, seed, spec.quality
                 sharp = write_sharp(folder / SHARP_FILE, source, sensor, *asked)
-    if spec.sharp is not None and spec.sharp.colours and len(frame_filters(sensor)) > 1:
-        with output_errors(folder):
-            write_colours(folder / COLOURS_FILE, scene, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
+        if spec.sharp is not None and spec.sharp.colours and len(frame_filters(sensor)) > 1:
+            with output_errors(folder):
+                write_colours(folder / COLOURS_FILE, scene, sensor, spec.sharp, spec.duration_us, seed, spec.quality)
     manifest = recording.manifest
     return {
         "schema_version": SCHEMA,

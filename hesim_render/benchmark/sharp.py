@@ -87,7 +87,7 @@ def write_sharp(
             ):  # fmt: skip
                 stored = file[name]
                 stored[number] = values.reshape(shape[1:])
-                stored.flush()  # so that its chunks have their place now, see `truth_file`
+                stored.flush()  # so that its chunks have their place now, see `new_file`
     return len(times)
 
 

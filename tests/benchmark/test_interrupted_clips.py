@@ -75,7 +75,7 @@ def test_a_clip_whose_build_was_killed_has_the_bytes_of_a_whole_one(name, tmp_pa
     for most in kills:
         assert build(plan, root, most) == most
         assert not clip_folder(root, plan.clips[0]).exists() and journal.stat().st_size > 0
-    # nothing is traced twice: kernels that were compiled before do not count as blocks
+    # no block is traced twice
     assert build(plan, root) == blocks - sum(kills)
     assert bytes_of(root, plan) == bytes_of(tmp_path / "whole", plan)
     assert not journal.exists()

@@ -50,3 +50,22 @@ def test_flux_of_twenty_against_the_reference(tmp_path):
 def test_runs_are_as_right_as_they_say(begin, tmp_path):
     """Values, events and the bounds of the audit; `benchmarks/random_scenes.py` does the same in parts."""
     assert not judge([judged_run(small_scene(seed, tmp_path)) for seed in range(begin, begin + 25)])
+
+
+def record(seed, off=0, missed=0, count_off=0, mean=0.0):
+    values = {"all": 100, "exact": 95, "off": count_off, "mean": mean + 0.01 * (-1) ** seed, "mean_square": 0.3}
+    counts = {"off": [off, 50, 0.02], "missed": [missed, 20, 0.03], "extra": [0, 20, 0.01]}
+    return {"seed": seed, "mode": "change-driven", **counts, "values": values}
+
+
+def test_what_does_not_hold_is_named():
+    good = [record(seed) for seed in range(25)]
+    assert not judge(good)
+    few = [record(seed, off=40) if seed < 5 else record(seed) for seed in range(25)]
+    assert [line.split(":")[0] for line in judge(few)] == ["off", "off"]  # five broken bounds, and too many in all
+    assert "missed: 25 of 500" in judge([record(seed, missed=1) for seed in range(25)])[0]
+    assert judge([record(seed, count_off=1) for seed in range(25)]) == [
+        "off by more than three wanted errors: 25 of 2375"
+    ]
+    assert "bias" in judge([record(seed, mean=0.02) for seed in range(25)])[0]
+    assert "mode exact" in judge([*good, {**record(99), "mode": "exact"}])[0]

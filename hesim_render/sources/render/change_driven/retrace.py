@@ -121,9 +121,8 @@ def traced_again(
         gain.rays(scatter / wanted_error), pilot.unshadowed / (np.float32(tuning.audit_ray_weight) * wanted_error)
     )
     rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
-    times = np.clip(np.ceil((gain.error(scatter, rays) / wanted_error) ** 2), 1, tuning.most_audit_times).astype(
-        np.int64
-    )
+    wanted_times = np.ceil((gain.error(scatter, rays) / wanted_error) ** 2)
+    times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)
     each, first = np.repeat(np.arange(pixel.size), times), np.cumsum(times) - times
     of = pixel[each], window[each], windows, rays[each], lit[each], Stream.AUDIT
     repeat = np.arange(each.size) - first[each]
