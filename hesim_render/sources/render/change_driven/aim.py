@@ -136,18 +136,18 @@ class LaneAims:
     is_aimed: Mask
 
     @classmethod
-    def of(cls, aims: PairAims, pair: NDArray[np.integer] | None, lane: UInt32, is_aimed: Mask) -> LaneAims:
+    def of(cls, aims: PairAims, pair: NDArray[np.integer], lane: UInt32, is_aimed: Mask) -> LaneAims:
         """Spread the objects of pairs over lanes.
 
         Parameters
         ----------
         aims : of all pairs.
-        pair : pair of each packet of lanes; None if `lane` is a pair.
+        pair : pair of each packet of lanes.
         lane : packet of each lane.
         is_aimed : True for the rays that are aimed.
         """
         types = jit()
-        first, count = (values if pair is None else values[pair] for values in (aims.first, aims.count))
+        first, count = aims.first[pair], aims.count[pair]
         group = table(types.UInt32, np.append(aims.group, np.zeros(2, np.uint32)))
         return cls(spread_out(types.UInt32, first, lane), spread_out(types.UInt32, count, lane), group, is_aimed)
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.journal import Journal, key_of
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -31,6 +33,29 @@ class PairFlux:
     def mean(self) -> NDArray[np.float32]:
         return np.float32(0.5) * (self.half_a + self.half_b)
 
+    def put(
+        self, part: slice | NDArray[np.int64], flux: Float, met: UInt32, packets: NDArray[np.int64], packet_rays: int
+    ) -> None:
+        """Put in the means over rays, the first half of which belong to half a.
+
+        Parameters
+        ----------
+        part : pairs that were traced.
+        flux, met : of each ray, one pair after the other; `met` is 1 where the ray came near a moving object.
+        packets, packet_rays : number of packets of each pair, and of rays in a packet.
+        """
+        import drjit as dr
+
+        # sums over half packets: a half of a pair is never smaller
+        sums = np.array(dr.block_sum(flux, packet_rays // 2))
+        bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, packet_rays))
+        starts = np.cumsum(packets) - packets
+        # a pair of one packet is half a then half b; longer ones have their first packets in half a
+        halves = np.add.reduceat(sums.astype(np.float64), np.stack([2 * starts, 2 * starts + packets], axis=1).ravel())
+        halves = halves.reshape(-1, 2) / (packets * (packet_rays / 2))[:, None]
+        self.half_a[part], self.half_b[part] = halves[:, 0], halves[:, 1]
+        self.met[part] = np.bitwise_or.reduceat(bits, starts)
+
 
 @dataclass(frozen=True)
 class PilotFlux:
@@ -52,6 +77,37 @@ class PilotFlux:
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
     met: NDArray[np.bool_]
+
+    def put(
+        self, part: slice, lit: Float, hidden: Float, unshadowed: Float, met: UInt32, samples: int, alike: int
+    ) -> None:
+        """Put in the statistics of pairs.
+
+        Parameters
+        ----------
+        part : pairs that were traced.
+        lit, hidden, unshadowed, met : of each ray, one pair after the other; `met` is 1 where the ray came near a
+            moving object.
+        samples : number of rays of each pair.
+        alike : number of successive rays that are of one kind. Scatter is that within each kind.
+        """
+        import drjit as dr
+
+        types = jit()
+        kind = dr.arange(types.UInt32, len(met)) // dr.opaque(types.UInt32, alike)
+        share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, alike / (alike - 1))
+        per_share = dr.opaque(types.Float, 1 / alike)
+        for values, name in ((lit, "lit"), (hidden, "hidden")):
+            mean = dr.block_sum(values, samples) * share
+            own = dr.block_sum(values, alike) * per_share
+            square = dr.square(values - dr.gather(types.Float, own, kind))
+            fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
+            # these rays are a sample of the scatter in the scene
+            scatter = dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
+            dr.eval(mean, scatter)
+            getattr(self, name)[part], getattr(self, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
+        self.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
+        self.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, met, samples))
 
 
 def remembered(

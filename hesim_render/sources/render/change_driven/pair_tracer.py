@@ -125,9 +125,9 @@ class PairTracer(Tracer):
         moments = self._moments(windows, span_us)
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
         for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims):
-            lanes = [pixel[part], window[part].astype(np.uint32), lit[part].astype(np.uint32), times[part]]
-            inputs = "flux", *lanes, packets[part], stream, *told_of(windows, span_us, aimed)
-            trace = partial(self._trace_block, lanes, packets[part], moments, key, aimed, out, part)
+            lanes = pixel[part], window[part].astype(np.uint32), times[part]
+            inputs = "flux", *lanes, lit[part], packets[part], stream, *told_of(windows, span_us, aimed)
+            trace = partial(self._trace_block, lanes, lit[part], packets[part], moments, key, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * _PACKET)
         # the lit estimate of a dark pixel may be negative; a flux is not
@@ -156,7 +156,7 @@ class PairTracer(Tracer):
         Parameters
         ----------
         pixel, window, windows, stream, span_us : see `trace`.
-        samples : rays per pair, a power of two.
+        samples : rays per pair, a power of two, at least `LEAST_SAMPLES`.
         footprint_px : width of the area in which the rays start, pixels.
         aims : small objects at which half of the rays of each pair are aimed; each pair has one or more.
 
@@ -174,7 +174,7 @@ class PairTracer(Tracer):
         room = max(1, self._block_rays // samples)
         for first in range(0, count, room):
             part = slice(first, min(count, first + room))
-            lanes = pixel[part], window[part].astype(np.uint32)
+            lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
             aimed = None if aims is None else aims.part(part)
             inputs = "pilot", *lanes, samples, footprint_px, stream, *told_of(windows, span_us, aimed)
             trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part)
@@ -215,6 +215,7 @@ class PairTracer(Tracer):
     def _trace_block(
         self,
         lanes: Sequence[NDArray[np.uint32]],
+        lit: NDArray[np.bool_],
         packets: NDArray[np.int64],
         moments: Moments,
         key: UInt64,
@@ -222,22 +223,73 @@ class PairTracer(Tracer):
         out: PairFlux,
         part: slice | NDArray[np.int64],
     ) -> None:
-        """Trace some pairs in packets of `_PACKET` rays."""
+        """Flux of some pairs, each with some packets of rays."""
+        import drjit as dr
+
+        types = jit()
+        rays = packets * _PACKET
+        footprint = dr.opaque(types.Float, 1.0)
+        if_lit, if_hidden, _, met = self._packets_of(lanes, packets, rays // 2, moments, key, footprint, aims)
+        packet = dr.arange(types.UInt32, len(met)) // _PACKET
+        takes_lit = spread_out(types.UInt32, np.repeat(lit.astype(np.uint32), packets), packet)
+        out.put(part, dr.select(takes_lit != 0, if_lit, if_hidden), met, packets, _PACKET)
+
+    def _pilot_block(
+        self,
+        lanes: Sequence[NDArray[np.uint32]],
+        moments: Moments,
+        key: UInt64,
+        samples: int,
+        footprint: Float,
+        aims: PairAims | None,
+        out: PilotFlux,
+        part: slice,
+    ) -> None:
+        """Statistics of some pairs, each with the same number of rays."""
+        packets = np.full(lanes[0].size, samples // _PACKET)
+        # all rays belong to the first half
+        found = self._packets_of(lanes, packets, packets * _PACKET, moments, key, footprint, aims)
+        # rays that are aimed are a kind of their own: their mean differs from that of the others
+        out.put(part, *found, samples, samples if aims is None else samples // 2)
+
+    def _packets_of(
+        self,
+        lanes: Sequence[NDArray[np.uint32]],
+        packets: NDArray[np.int64],
+        half_rays: NDArray[np.int64],
+        moments: Moments,
+        key: UInt64,
+        footprint: Float,
+        aims: PairAims | None,
+    ) -> tuple[Float, Float, Float, UInt32]:
+        """Trace pairs in packets of `_PACKET` rays.
+
+        The final render and the pilot pass share this kernel, which takes seconds to compile.
+
+        Parameters
+        ----------
+        lanes : pixel, window and repetition of each pair.
+        packets, half_rays : number of packets of each pair, and of rays in its first half.
+        moments, key, footprint, aims : see `trace` and `pilot`.
+
+        Returns
+        -------
+        The integrator's three fluxes of each ray, and 1 where it met the box of a moving object, else 0.
+        """
         import drjit as dr
 
         types = jit()
         used = int(packets.sum())
-        starts = np.cumsum(packets) - packets
         pair = np.repeat(np.arange(packets.size, dtype=np.uint32), packets)
+        starts = np.cumsum(packets) - packets
         within = (np.arange(used) - np.repeat(starts, packets)).astype(np.uint32)
-        half_rays = np.repeat((packets * (_PACKET // 2)).astype(np.uint32), packets)
 
         ray_index = dr.arange(types.UInt32, used * _PACKET)
         packet = ray_index // _PACKET
         sample = spread_out(types.UInt32, within, packet) * _PACKET + ray_index - packet * _PACKET
-        per_half = spread_out(types.UInt32, half_rays, packet)
+        tables = *lanes, half_rays.astype(np.uint32)
+        pixel, window, repeat, per_half = (spread_out(types.UInt32, values[pair], packet) for values in tables)
         half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
-        pixel, window, lit, repeat = (spread_out(types.UInt32, values[pair], packet) for values in lanes)
         within_half, aimed = sample - half * per_half, None
         if aims is not None:
             # rays of either kind have random numbers of their own, and are stratified among themselves
@@ -247,66 +299,11 @@ class PairTracer(Tracer):
             within_half = dr.select(is_aimed, within_half - per_half, within_half)
             half += dr.select(is_aimed, types.UInt32(2), 0)
         self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
-        if_lit, if_hidden, _, met = self._rays_of(pixel, window, moments, types.Float(1.0), aimed)
-        flux = dr.select(lit != 0, if_lit, if_hidden)
-        met = _bits(types.UInt32, met, used * _PACKET)
-        dr.eval(flux, met)
-        self._sampler.rest()
-        # sums over half packets: a half of a pair is never smaller
-        sums = np.array(dr.block_sum(flux, _PACKET // 2))
-        bits = np.array(dr.block_reduce(dr.ReduceOp.Or, met, _PACKET))
-        rays = packets * _PACKET
-        # a pair of one packet is half a then half b; longer ones have their first packets in half a
-        halves = np.add.reduceat(sums.astype(np.float64), np.stack([2 * starts, 2 * starts + packets], axis=1).ravel())
-        halves = halves.reshape(-1, 2) / (rays / 2)[:, None]
-        out.half_a[part], out.half_b[part] = halves[:, 0], halves[:, 1]
-        out.met[part] = np.bitwise_or.reduceat(bits, starts)
-
-    def _pilot_block(
-        self,
-        lanes: tuple[NDArray[np.uint32], NDArray[np.uint32]],
-        moments: Moments,
-        key: UInt64,
-        samples: int,
-        footprint: Float,
-        aims: PairAims | None,
-        out: PilotFlux,
-        part: slice,
-    ) -> None:
-        import drjit as dr
-
-        types = jit()
-        count = lanes[0].size * samples
-        rays = dr.opaque(types.UInt32, samples)
-        ray_index = dr.arange(types.UInt32, count)
-        lane = ray_index // rays
-        pixel, number = (spread_out(types.UInt32, values, lane) for values in lanes)
-        # rays that are aimed are a kind of their own: their mean differs from that of the others
-        kind, alike, half, aimed = lane, samples, types.UInt32(0), None
-        if aims is not None:
-            alike = samples // 2
-            kind = ray_index // dr.opaque(types.UInt32, alike)
-            half = 2 * (kind & 1)
-            aimed = LaneAims.of(aims, None, lane, half > 0)
-        per_kind = dr.opaque(types.UInt32, alike)
-        self._sampler.setup(key, pixel, half, ray_index - kind * per_kind, per_kind, MOST_SAMPLES // 2)
-        lit, hidden, unshadowed, met = self._rays_of(pixel, number, moments, footprint, aimed)
-        bits = _bits(types.UInt32, met, count)
+        lit, hidden, unshadowed, met = self._rays_of(pixel, window, moments, footprint, aimed)
+        bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * _PACKET))
         dr.eval(lit, hidden, unshadowed, bits)
         self._sampler.rest()
-        share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, alike / (alike - 1))
-        per_share = dr.opaque(types.Float, 1 / alike)
-        for values, name in ((lit, "lit"), (hidden, "hidden")):
-            mean = dr.block_sum(values, samples) * share
-            own = dr.block_sum(values, alike) * per_share
-            square = dr.square(values - dr.gather(types.Float, own, kind))
-            fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
-            # these rays are a sample of the scatter in the scene
-            scatter = dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
-            dr.eval(mean, scatter)
-            getattr(out, name)[part], getattr(out, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
-        out.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
-        out.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, bits, samples))
+        return lit, hidden, unshadowed, bits
 
     def _rays_of(
         self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | None
@@ -339,10 +336,3 @@ class PairTracer(Tracer):
         if weight is None:
             return lit, hidden, unshadowed, met
         return lit * weight, hidden * weight, unshadowed * weight, met
-
-
-def _bits(kind: type[UInt32], condition: Mask, count: int) -> UInt32:
-    """1 where a condition holds, one entry a lane even if it is a single one."""
-    import drjit as dr
-
-    return dr.select(condition, kind(1), dr.zeros(kind, count))
