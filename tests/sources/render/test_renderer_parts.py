@@ -7,7 +7,7 @@ from rendering import mitsuba_scene, mono, pair_tracer, traced
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import closed_form as parts
 from hesim_render.sources.render.transport import moving_scene as moving
-from hesim_render.sources.render.transport.closed_form import Part
+from hesim_render.sources.render.transport.closed_form import Part, surface_of
 
 COUNT = 100_000
 
@@ -84,7 +84,7 @@ def test_hits_and_surfaces_are_those_of_mitsuba(name):
     assert part._scene is None
     theirs = scene.ray_intersect(ray)
     hit, face = part.nearest(ray, False, everywhere)
-    ours = part.surface(hit, face, ray, mi.RayFlags.All, everywhere)
+    ours = surface_of([part], hit, face, ray, mi.RayFlags.All, everywhere)
 
     met, wanted = np.array(hit.is_valid()), np.array(theirs.is_valid())
     assert 0.05 < wanted.mean() < 0.9
@@ -170,7 +170,7 @@ def test_a_ray_leaves_the_face_it_starts_from():
         normal /= np.linalg.norm(normal)
         ray = mi.Ray3f(mi.Point3f((middle + size * normal[:, None]).astype(np.float32)), mi.Vector3f(-normal))
         hit, face = part.nearest(ray, False, mi.Bool(True))
-        si = part.surface(hit, face, ray, mi.RayFlags.All, mi.Bool(True))
+        si = surface_of([part], hit, face, ray, mi.RayFlags.All, mi.Bool(True))
         assert np.array(face).min() == 1
         turned = rng.normal(size=(3, COUNT))
         turned /= np.linalg.norm(turned, axis=0)

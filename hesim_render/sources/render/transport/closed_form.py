@@ -9,6 +9,7 @@ the reflection of all surfaces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -173,12 +174,13 @@ class Part:
     scene : Mitsuba scene with these shapes.
     apart : True if most rays pass far from the shapes. Mitsuba is then asked only about rays that meet a ball around
         them.
+    faces_before : number of faces of the parts before it, if faces of several parts are told apart.
     """
 
-    def __init__(self, mi: MitsubaModule, scene: MitsubaObject, apart: bool) -> None:
+    def __init__(self, mi: MitsubaModule, scene: MitsubaObject, apart: bool, faces_before: int = 0) -> None:
         import drjit as dr
 
-        self._mi = mi
+        self._mi, self._faces_before = mi, faces_before
         #: Centre and squared radius of each ball, and its shape.
         self._balls: list[tuple[Point3, Float, MitsubaObject]] = []
         #: For each face: rows of the map to u, v and height; number of its first triangle; its shape.
@@ -222,7 +224,7 @@ class Part:
         -------
         hit : `PreliminaryIntersection3f`, its t infinite where nothing is hit; on a face, with the position on the
             face.
-        face : UInt32, 1 to `face_count` for a face, and 0 for anything else.
+        face : UInt32, `faces_before` + 1 to + `face_count` for a face, and 0 for anything else.
         """
         import drjit as dr
 
@@ -241,7 +243,7 @@ class Part:
         for middle, square, shape in self._balls:
             t = to_ball(ray, middle, square)
             end = take(active & (t >= 0) & (t < end), t, shape)
-        for number, (rows, _, shape) in enumerate(self._faces, start=1):
+        for number, (rows, _, shape) in enumerate(self._faces, start=self._faces_before + 1):
             t, place, inside = to_face(ray, rows)
             closer = active & inside & (t >= 0) & (t < end)
             end, face = take(closer, t, shape), dr.select(closer, number, face)
@@ -261,30 +263,16 @@ class Part:
             blocked |= inside & (t >= 0) & (t < ray.maxt)
         return blocked & active
 
-    def surface(self, hit: Interaction, face: UInt32, ray: Ray, flags: MitsubaObject, active: Mask) -> Interaction:
-        """Surface at the hit points, `SurfaceInteraction3f` in the part's own frame; t is infinite where nothing was
-        hit.
-
-        Parameters
-        ----------
-        hit, face : results of `nearest` for `ray`.
-        ray : the rays.
-        flags : `RayFlags`, fields to compute. Faces always have all fields.
-        active : lanes in which a result is needed.
-        """
-        si = hit.compute_surface_interaction(ray, flags, active & (face == 0))
-        if self._faces:
-            self._describe_faces(si, ray, hit, face)
-        return si
-
-    def _describe_faces(self, si: Interaction, ray: Ray, hit: Interaction, face: UInt32) -> None:
-        """Fill in the surface data of lanes that hit a face."""
+    def describe_faces(self, si: Interaction, hit: Interaction, face: UInt32) -> None:
+        """Fill in normals, axes, texture coordinates and triangles of lanes that hit a face of this part."""
         import drjit as dr
 
         u, v = hit.prim_uv
         second = u + v > 1
         n, shading, s, dp_du, dp_dv = si.n, si.sh_frame.n, si.sh_frame.s, si.dp_du, si.dp_dv
-        for number, ((_, triangle, _), told) in enumerate(zip(self._faces, self._surfaces, strict=True), start=1):
+        for number, ((_, triangle, _), told) in enumerate(
+            zip(self._faces, self._surfaces, strict=True), start=self._faces_before + 1
+        ):
             here = face == number
 
             def chosen(name: str, told: dict[str, list[Any]] = told) -> DeviceArray:
@@ -296,16 +284,40 @@ class Part:
             origin, along_u, along_v = chosen("uv")
             si.uv = dr.select(here, dr.fma(along_u, u, dr.fma(along_v, v, origin)), si.uv)
             si.prim_index = dr.select(here, dr.select(second, triangle + 1, triangle), si.prim_index)
-        here = face != 0
         si.n, si.sh_frame.n, si.sh_frame.s, si.dp_du, si.dp_dv = n, shading, s, dp_du, dp_dv
-        si.sh_frame.t = dr.select(here, dr.cross(shading, s), si.sh_frame.t)
-        si.t, si.p = dr.select(here, hit.t, si.t), dr.select(here, ray(hit.t), si.p)
-        si.shape = dr.select(here, hit.shape, si.shape)
-        si.wi = dr.select(here, si.sh_frame.to_local(-ray.d), si.wi)
 
     def _near(self, ray: Ray) -> Mask:
         """True where a ray meets the ball around all shapes, if there is one."""
         return self._mi.Bool(True) if self._around is None else meets_ball(ray, ray.maxt, self._around)
+
+
+def surface_of(
+    parts: Sequence[Part], hit: Interaction, face: UInt32, ray: Ray, flags: MitsubaObject, active: Mask
+) -> Interaction:
+    """Surface at the hit points, `SurfaceInteraction3f` in the frame of the part that was hit; t is infinite where
+    nothing was hit.
+
+    Parameters
+    ----------
+    parts : all that may have been hit.
+    hit, face : results of `Part.nearest` of that part.
+    ray : the rays in its frame.
+    flags : `RayFlags`, fields to compute. Faces always have all fields.
+    active : lanes in which a result is needed.
+    """
+    import drjit as dr
+
+    si = hit.compute_surface_interaction(ray, flags, active & (face == 0))
+    if not any(part.face_count for part in parts):
+        return si
+    for part in parts:
+        part.describe_faces(si, hit, face)
+    here = face != 0
+    si.sh_frame.t = dr.select(here, dr.cross(si.sh_frame.n, si.sh_frame.s), si.sh_frame.t)
+    si.t, si.p = dr.select(here, hit.t, si.t), dr.select(here, ray(hit.t), si.p)
+    si.shape = dr.select(here, hit.shape, si.shape)
+    si.wi = dr.select(here, si.sh_frame.to_local(-ray.d), si.wi)
+    return si
 
 
 def _on_device(mi: MitsubaModule, values: NDArray[np.float64]) -> list[Any]:

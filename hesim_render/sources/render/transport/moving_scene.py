@@ -33,7 +33,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.builder import BuiltScene
 from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.transport.closed_form import Part
+from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
 
@@ -168,15 +168,12 @@ class MovingScene:
         boxes = [light.get_shape().bbox() for light in lights if light.get_shape() is not None]
         self.lamp_boxes = np.array([[box.min, box.max] for box in boxes], dtype=np.float64).reshape(-1, 2, 3)
         self._resting = Part(mi, self.static, apart=False)
-        self.groups = [
-            Group(
-                name,
-                Part(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False), apart=True),
-                built.trajectories[name],
-                np.concatenate([part.corners for part in built.groups[name]]),
-            )
-            for name, shapes in parts.items()
-        ]
+        self.groups, faces = [], self._resting.face_count
+        for name, shapes in parts.items():
+            part = Part(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False), apart=True, faces_before=faces)
+            corners = np.concatenate([part.corners for part in built.groups[name]])
+            self.groups.append(Group(name, part, built.trajectories[name], corners))
+            faces += part.face_count
         self._sort_groups()
 
     def _sort_groups(self) -> None:
@@ -184,6 +181,7 @@ class MovingScene:
         simple = [number for number, group in enumerate(self.groups) if group.part.form is not None]
         together = simple if len(simple) > _FEW else []
         self._single = [number for number in range(len(self.groups)) if number not in together]
+        self._described = [self._resting, *(self.groups[number].part for number in self._single)]
         self._fleet = None
         if self.groups:
             self._tracks = Tracks([group.trajectory for group in self.groups])
@@ -207,38 +205,35 @@ class MovingScene:
         mi = self.mi
         flags = mi.RayFlags.All if flags is None else flags
         hit, face = self._resting.nearest(ray, coherent, active)
-        rest = self._resting.surface(hit, face, ray, flags, active)
         if not self.groups:
-            return Surface(mi, rest, None, mi.Bool(False))
+            return Surface(mi, surface_of([self._resting], hit, face, ray, flags, active), None, mi.Bool(False))
         pose = DevicePose.none(mi.Vector3f)
 
-        def take(closer: Mask, found: Interaction, own: DevicePose, state: LoopState) -> LoopState:
-            rest, *columns, shift = state
-            columns = [dr.select(closer, a, b) for a, b in zip(own.columns, columns, strict=True)]
-            return dr.select(closer, found, rest), *columns, dr.select(closer, own.shift, shift)
+        def take(closer: Mask, found: Interaction, number: UInt32, own: DevicePose, state: LoopState) -> LoopState:
+            columns = (dr.select(closer, a, b) for a, b in zip((*own.columns, own.shift), state[2:], strict=True))
+            return dr.select(closer, found, state[0]), dr.select(closer, number, state[1]), *columns
 
         def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             local.maxt = dr.minimum(local.maxt, state[0].t)
-            hit, face = group.part.nearest(local, coherent, near)
-            closer = near & hit.is_valid()
-            return take(closer, group.part.surface(hit, face, local, flags, closer), own, state)
+            found, number = group.part.nearest(local, coherent, near)
+            return take(near & found.is_valid(), found, number, own, state)
 
-        resting = rest.t
-        state: LoopState = rest, *pose.columns, pose.shift
-        state, met = self._visit_groups(ray, moment, active, resting, state, visit)
+        state: LoopState = hit, face, *pose.columns, pose.shift
+        state, met = self._visit_groups(ray, moment, active, hit.t, state, visit)
         if self._fleet is not None:
             fleet = self._fleet
-            hit, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
+            found, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
             met |= near
 
-            def describe(*state: Any) -> LoopState:
-                own = fleet.pose(number, moment)
-                found = hit.compute_surface_interaction(_at_rest(ray, own), flags, hit.is_valid())
-                return take(hit.is_valid(), found, own, state)
+            def pose_of(*state: Any) -> LoopState:
+                return take(found.is_valid(), found, mi.UInt32(0), fleet.pose(number, moment), state)
 
-            state = dr.if_stmt(state, hit.is_valid(), describe, lambda *state: state, label="moving surface")
-        rest, *columns, shift = state
-        return Surface(mi, rest, DevicePose(tuple(columns), shift), met)
+            state = dr.if_stmt(state, found.is_valid(), pose_of, lambda *state: state, label="moving surface")
+        # surfaces are described once, for all parts: a description of each would be most of the kernel
+        hit, face, *columns, shift = state
+        pose = DevicePose(tuple(columns), shift)
+        rest = surface_of(self._described, hit, face, _at_rest(ray, pose), flags, active)
+        return Surface(mi, rest, pose, met)
 
     def distance(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Float, Mask]:
         """Distance to the nearest surface of all parts, m, infinite where there is none; and True where a box was
