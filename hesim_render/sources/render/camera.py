@@ -21,6 +21,7 @@ from hesim_render.sensor.lens import pixel_centres_mm
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.projection import Projection
 from hesim_render.sources.render.scene.mitsuba_camera import MitsubaCamera
+from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import CameraSpec, SceneSpec, Vector
 
@@ -257,6 +258,8 @@ def _image_distance_mm(sensor: Sensor, horizontal_fov_deg: float) -> float:
 def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera | None = None) -> View:
     """Place the camera of a scene: its pose at rest, and the sensor with focal length, f-number and focus resolved.
 
+    A track that holds one pose is part of the pose at rest; one that moves the camera is not, see `camera_trajectory`.
+
     With a `camera` section: `fit` as in `CameraSpec`, otherwise the stated origin and target; the focus defaults to the
     distance between them. `horizontal_fov_deg` spans the width of the read-out region as if it were centred on the
     axis, and the camera is turned so that the centre of the region looks at the target. With a focal length, a region
@@ -280,6 +283,15 @@ def place_camera(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera
     SpecError
         If the camera cannot be placed as asked.
     """
+    placed = _placed(scene, sensor, mitsuba_sensor)
+    track = trajectories(scene).get("camera")
+    if track is None or track.moves:
+        return placed
+    return replace(placed, camera_to_world=track.matrix(0.0) @ placed.camera_to_world)
+
+
+def _placed(scene: SceneSpec, sensor: Sensor, mitsuba_sensor: MitsubaCamera | None) -> View:
+    """The camera without its track."""
     camera = scene.camera
     if camera is None:
         return _from_mitsuba(scene, sensor, mitsuba_sensor)

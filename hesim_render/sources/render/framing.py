@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import HesimWarning
 from hesim_render.core.units import MM_PER_M
 from hesim_render.sources.render.camera import View
-from hesim_render.sources.render.scene.parents import trajectories
+from hesim_render.sources.render.scene.parents import camera_trajectory, trajectories
 from hesim_render.specs.scene import SceneSpec
 from hesim_render.targets.points import placement, surface_points
 
@@ -50,7 +50,7 @@ class Framing:
 
 def posed_view(spec: SceneSpec, view: View, t_us: float) -> View:
     """The view at a time, with the motion of the camera."""
-    camera = trajectories(spec).get("camera")
+    camera = camera_trajectory(spec)
     return view if camera is None else replace(view, camera_to_world=camera.matrix(t_us) @ view.camera_to_world)
 
 

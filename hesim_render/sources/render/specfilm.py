@@ -18,7 +18,7 @@ from hesim_render.sources.render.exact import used_responses
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import spectrum_dict, transform, using_variant
-from hesim_render.sources.render.scene.parents import trajectories
+from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.scene import Scene
 
 #: Effects that Mitsuba's cameras have, or that are factors on their pictures.
@@ -97,7 +97,7 @@ def perspective_dict(
 
 def camera_at(scene: Scene, view: View, t_us: float) -> NDArray[np.float64]:
     """Camera-to-world matrix of a (moving) camera at one time."""
-    camera = trajectories(scene.spec).get("camera")
+    camera = camera_trajectory(scene.spec)
     return view.camera_to_world if camera is None else camera.matrix(t_us) @ view.camera_to_world
 
 

@@ -7,7 +7,11 @@ from rendering import D65_1000_LUX, FURNACE, flux_image, make_scene, mono
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.camera import look_at, place_camera
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.framing import posed_view
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.specfilm import camera_at
 from hesim_render.sources.scene import Scene
 
 
@@ -167,6 +171,22 @@ def test_a_camera_track_is_held_outside_its_keyframes():
     again = np.array(source.mean_flux(pixels, 9500, 9600)[0])
     np.testing.assert_array_equal(later, again)
     assert not np.array_equal(before.ravel(), later)
+
+
+@pytest.mark.parametrize("mode", ["exact", "change-driven"])
+def test_a_camera_track_that_holds_one_pose_puts_the_camera_there(mode):
+    # the edge at x = 0 leaves the middle of the picture by as much as the camera goes to +x
+    shift_m = 10 / (32 / np.tan(np.radians(10)) / 0.5)
+    keys = [{"t_us": t, "translation_m": (shift_m, 0, 0)} for t in (0, 1000)]
+    scene = edge_scene(motion=[{"object": "camera", "keyframes": keys}])
+    sensor = mono(64, 4)
+    source = ChangeDrivenFlux(scene, sensor, 0.5) if mode == "change-driven" else RenderedFlux(scene, sensor, 16)
+    a, b = source.mean_flux(np.arange(64 * 4, dtype=np.uint32), 0, 1000)
+    share = (np.array(a) + np.array(b)).reshape(4, 64)
+    share /= share[:, -1:]
+    np.testing.assert_allclose(share, np.broadcast_to(np.arange(64) >= 22, (4, 64)), atol=0.02)
+    assert posed_view(scene.spec, source.view, 500).camera_to_world[0, 3] == pytest.approx(shift_m)
+    assert camera_at(scene, source.view, 500)[0, 3] == pytest.approx(shift_m)
 
 
 def test_mitsuba_camera_is_followed():

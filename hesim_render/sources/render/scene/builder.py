@@ -83,12 +83,15 @@ class BuiltScene:
 
     def pose(self, t_us: float) -> None:
         """Move every moving object to its pose at `t_us`, and give it its shape of that time."""
+        self.place(t_us, {name: track.matrix(t_us) for name, track in self.trajectories.items()})
+
+    def place(self, t_us: float, poses: Mapping[str, NDArray[np.float64]]) -> None:
+        """As `pose`, where the poses of `trajectories` at that time are known."""
         for name in dict.fromkeys((*self.trajectories, *self.deformations)):
-            matrix = self.trajectories[name].matrix(t_us) if name in self.trajectories else np.eye(4)
             for shape in self.groups[name]:
                 if name in self.deformations:
                     shape.deform(self.deformations[name].at(t_us))
-                shape.set_pose(matrix)
+                shape.set_pose(poses.get(name, np.eye(4)))
         if self.moves:
             self.parameters.update()
 
