@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, Mask, UInt32, UInt64
+from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
@@ -24,6 +24,7 @@ from hesim_render.sources.render.transport.matt import MattIntegrator
 from hesim_render.sources.render.transport.motion_bounds import stays_in
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.paths import PathIntegrator
+from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.spectral.waveform import Waveform
@@ -264,7 +265,7 @@ class PairTracer(Tracer):
     ) -> tuple[Float, Float, Float, UInt32]:
         """Trace pairs in packets of `_PACKET` rays.
 
-        The final render and the pilot pass share this kernel, which takes seconds to compile.
+        The final render and the pilot pass share the kernel of the integrator, which takes seconds to compile.
 
         Parameters
         ----------
@@ -299,16 +300,23 @@ class PairTracer(Tracer):
             within_half = dr.select(is_aimed, within_half - per_half, within_half)
             half += dr.select(is_aimed, types.UInt32(2), 0)
         self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
-        lit, hidden, unshadowed, met = self._rays_of(pixel, window, moments, footprint, aimed)
+        primary, now, which, weight = self._rays_of(pixel, window, moments, footprint, aimed)
+        # a kernel of its own for the rays, so that one kernel traces them however they were aimed; it costs no time
+        self._sampler.evaluate()
+        dr.eval(primary.o, primary.d, now.instant_us, now.window, now.bin, which, weight)
+        lit, hidden, unshadowed, met = self._integrator.flux(self._sampler, primary, now, which)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * _PACKET))
         dr.eval(lit, hidden, unshadowed, bits)
         self._sampler.rest()
+        if weight is not None:
+            lit, hidden, unshadowed = lit * weight, hidden * weight, unshadowed * weight
+            dr.eval(lit, hidden, unshadowed)
         return lit, hidden, unshadowed, bits
 
     def _rays_of(
         self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | None
-    ) -> tuple[Float, Float, Float, Mask]:
-        """The integrator's `flux` of one ray per lane, weighted, with the scale of the optical axis."""
+    ) -> tuple[Ray, Moment, UInt32, Float | None]:
+        """One ray per lane: the ray in world space, its time, the filter of its pixel, and its weight if it has one."""
         import drjit as dr
 
         mi, types = self.built.mi, jit()
@@ -332,7 +340,4 @@ class PairTracer(Tracer):
         tile_col = col - col // self._tile_cols * self._tile_cols
         which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        lit, hidden, unshadowed, met = self._integrator.flux(sampler, primary, now, which)
-        if weight is None:
-            return lit, hidden, unshadowed, met
-        return lit * weight, hidden * weight, unshadowed * weight, met
+        return primary, now, which, weight

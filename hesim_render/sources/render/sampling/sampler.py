@@ -150,6 +150,10 @@ def sampler_class(variant: str) -> type[MitsubaObject]:
             self._bits = max(0, ((most or samples_per_half) - 1).bit_length())
             self._mask = samples_per_half - 1 if most else (1 << self._bits) - 1
 
+        def evaluate(self) -> None:
+            """Evaluate the state between two draws, so that the next draws belong to another kernel."""
+            dr.eval(self.keys, self.sample, self._mask)
+
         def _draw(self) -> tuple[UInt32, list[UInt32]]:
             """Index of the next point, and the random bits that shift its coordinates."""
             self.dimension = self.dimension + 1
