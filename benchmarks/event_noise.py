@@ -1,7 +1,7 @@
 """Rates of noise events of asynchronous pixels with a dead time: makes the tables of hesim_render/specs.
 
     python benchmarks/event_noise.py > hesim_render/specs/event_noise_table.py      (half an hour on 2 cores)
-    python benchmarks/event_noise.py after_reset > hesim_render/specs/noise_after_reset_table.py      (8 minutes)
+    python benchmarks/event_noise.py after_reset > hesim_render/specs/noise_after_reset_table.py      (9 minutes)
 
 A pixel of unit noise with thresholds a and b compares with the level at the end of its last dead time. The noise is
 white noise through two equal poles that are -3 dB at 1/period together, exact at 16 nodes a period and linear between
@@ -36,7 +36,7 @@ SPAN, SPAN_NO_DEAD_TIME = (1000, 3000), (100, 1000)
 #: periods, the first of which are of more pixels.
 AFTER_LOWER, AFTER_PIXELS = (1.0, 2.0, 3.0, 3.75, 4.5, 5.25), (512, 1024, 2048, 4096, 8192, 16384)
 AFTER_DIFFERENCE = (0.0, 0.1, 0.25, 0.5, 0.8, 1.8, 3.6, 5.0, 7.5)
-AFTER_DEAD_PERIODS = (0.01, 0.03, 0.1, 0.3, 1.0)
+AFTER_DEAD_PERIODS = (0.01, 0.03, 0.055, 0.1, 0.3, 1.0)
 AGE, EARLY_AGES, MORE_PIXELS = (0, 1, 3, 10, 30, 100, 300, 1000), 5, 8
 #: Smallest threshold: larger differences of low thresholds are cut to it.
 LEAST = 0.4
@@ -129,7 +129,7 @@ def main_after_reset() -> None:
     print("#: Lower threshold, and difference of both, over σ; dead time times the bandwidth of the noise.")
     print(f"LOWER = {AFTER_LOWER}\nDIFFERENCE = {AFTER_DIFFERENCE}\nDEAD_PERIODS = {AFTER_DEAD_PERIODS}")
     print(f"#: Periods since the reset, begins of the spans; the last one ends with the 3000th.\nAGE = {AGE}")
-    print(f"#: Events over those of the last span at a difference of at most {DIFFERENCE[-1]}, [lower threshold, ")
+    print(f"#: Events over those of the last span at a difference of at most {DIFFERENCE[-1]}, [lower threshold,")
     print("#: difference, dead time, age].\nAFTER_RESET = (")
     for lower, pixels in zip(AFTER_LOWER, AFTER_PIXELS, strict=True):
         print("    (")

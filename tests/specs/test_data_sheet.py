@@ -65,14 +65,21 @@ def test_rates_of_noise_events_between_the_entries_of_the_table(on, off, dead_pe
     assert float(events_per_period(on, off, dead_periods)) == pytest.approx(simulated, rel=0.06)
 
 
-def test_leak_makes_noise_events_more_frequent():
+@pytest.mark.parametrize(
+    ("thresholds", "dead_periods", "pixels", "times", "within"),
+    # dead times between two entries and at one; the second thresholds differ by more than the first table has
+    [((3.4, 4.2), 0.075, 1500, 1.2, 0.07), ((8.0, 3.0), 0.1, 1000, 3.0, 0.1)],
+)
+def test_leak_makes_noise_events_more_frequent(thresholds, dead_periods, pixels, times, within):
     """A leak event resets its pixel to a random level, with which noise events are more frequent for a while."""
-    thresholds, dead_periods, leak_periods = (3.4, 4.2), 0.1, 0.03
-    simulated = reset_pixel_rates(*thresholds, dead_periods, 5, 1500, 400, leak_periods=leak_periods)
+    leak_periods = 0.03
+    simulated = reset_pixel_rates(*thresholds, dead_periods, 5, pixels, 400, leak_periods=leak_periods)
     alone, leaking = (float(events_per_period(*thresholds, dead_periods, rate)) for rate in (0.0, leak_periods))
-    assert leaking > 1.5 * alone
-    # 6000 events: standard error below 2 %
-    assert leaking == pytest.approx(simulated, rel=0.07)
+    assert leaking > times * alone
+    # 3600 events or more: standard error below 3 %; interpolation adds 5 %
+    assert leaking == pytest.approx(simulated, rel=within)
+    of_both = noise_rates_hz(thresholds, 0.0, 1.0, 20.0, dead_periods / 20, 20 * leak_periods)
+    assert sum(of_both) == pytest.approx(20 * leaking)
     # without a dead time leak events reset nothing
     assert events_per_period(*thresholds, 0.0, leak_periods) == events_per_period(*thresholds, 0.0)
 
