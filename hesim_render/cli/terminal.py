@@ -7,7 +7,6 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hesim_render.core.errors import RangeError
@@ -75,15 +74,12 @@ def complain(*lines: str) -> None:
 
 def summary(recording: Recording) -> str:
     """Content and place of a recording, in a few lines."""
+    from hesim_render.recording.outline import scene_name
+
     manifest = recording.manifest
     counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
-    video = manifest["settings"].get("video")
-    scene = Path(video["source"]).name if video else (manifest.get("scene") or {}).get("name", "no scene file")
-    if "cube" in manifest["settings"]:
-        scene = manifest["settings"]["cube"]["file"]
-    lines = [
-        f"{scene} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s, seed {manifest['seed']}"
-    ]
+    seen = f"{scene_name(recording)} seen by {manifest['sensor']['name']}, {recording.duration_us / 1e6:g} s"
+    lines = [seen if "imported" in manifest["settings"] else f"{seen}, seed {manifest['seed']}"]
     if any(any(row) for row in recording.mosaic.tile_aps):
         size, bits = f"{roi['width_px']}x{roi['height_px']} px", f"{recording.mosaic.bit_depth} bit"
         none = " (no frame's last row is fully exposed in this time)" if counts["frames"] == 0 else ""

@@ -82,7 +82,7 @@ class _Pixel:
         assert self.spec.photoreceptor_cutoff_hz is not None
         dead_s = (self.noise.refractory_period_us or 0) * S_PER_US
         bandwidth_hz = share * self.spec.photoreceptor_cutoff_hz
-        on, off = noise_rates_hz(self.thresholds, self.mismatch, math.sqrt(variance), bandwidth_hz, dead_s)
+        on, off = noise_rates_hz(self.thresholds, self.mismatch, math.sqrt(variance), bandwidth_hz, dead_s, leak_hz)
         return on + leak_hz, off
 
     def shot_limit(self, lux: NDArray[np.float64]) -> NDArray[np.float64]:

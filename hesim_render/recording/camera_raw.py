@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
 
 #: Suffixes of files that are read so; DNG and TIFF only where they are packed.
-CAMERA_SUFFIXES = (".arw", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw")
+CAMERA_SUFFIXES = (
+    *(".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".erf", ".iiq", ".kdc", ".mef", ".mos"),
+    *(".mrw", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".rwl", ".srw"),
+)
 #: Letters of the colour codes of DNG, as LibRaw names them.
 _LETTERS = "RGBCMYW"
 #: Black levels further apart are told, DN.

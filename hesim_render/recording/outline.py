@@ -40,9 +40,16 @@ def parameters(recording: Recording) -> list[tuple[str, str]]:
 
 
 def scene_name(recording: Recording) -> str:
-    """Name of the scene, or of the video."""
-    video = recording.manifest["settings"].get("video")
-    return Path(video["source"]).name if video else (recording.manifest.get("scene") or {}).get("name", "no scene file")
+    """Name of the scene, or of the file that stands for it: a video, a cube, or the first one of a capture."""
+    settings, scene = recording.manifest["settings"], recording.manifest.get("scene")
+    if "video" in settings:
+        return Path(settings["video"]["source"]).name
+    if "cube" in settings:
+        return str(settings["cube"]["file"])
+    if "imported" in settings:
+        given = settings["imported"]
+        return str(given.get("events") or next(iter(given.get("frames") or ()), "no file"))
+    return str((scene or {}).get("name", "no scene file"))
 
 
 def text_summary(recording: Recording) -> str:

@@ -6,8 +6,14 @@ that instant. How often the noise then crosses a threshold has no closed form. L
 of a pixel that always compares with the mean; it is ten to fifty times lower at thresholds of four σ, because the level
 of comparison itself wanders with the noise. The tables have the rates of such pixels by simulation
 (``benchmarks/event_noise.py``), as events per period 1/f, of the mean and the difference of both thresholds over σ and
-of the dead time. Between entries log(rate) is linear in the square of the mean threshold, in the difference and in the
-log of the dead time.
+of the dead time. Between entries log(rate) is a cubic spline of the square of the mean threshold, of the difference and
+of the log of the dead time. Where one threshold is far above the other, a second table goes on.
+
+An event of the leak resets a pixel with a dead time to the level of that instant, which is random. For a while after it
+noise events are more (or less) frequent. With n(s) their rate at the time s after such a reset, which the second table
+has, their mean rate is that over the time since the last leak event, which is exponentially distributed::
+
+    r ∫ exp(−r s) n(s) ds
 
 A pixel without a dead time moves its level of comparison by exactly a threshold with each event. Its rate falls for as
 long as one looks; the table has the mean of the 100th to the 1000th period.
@@ -16,7 +22,8 @@ long as one looks; the table has the mean of the 100th to the 1000th period.
 from __future__ import annotations
 
 import math
-from functools import cache
+from functools import cache, lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +31,7 @@ from scipy import optimize
 from scipy.interpolate import RegularGridInterpolator
 
 from hesim_render.core.errors import RangeError
+from hesim_render.specs import noise_after_reset_table as after_reset
 from hesim_render.specs.event_noise_table import DEAD_PERIODS, DIFFERENCE, EVENTS, EVENTS_NO_DEAD_TIME, MEAN
 
 #: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
@@ -38,36 +46,78 @@ _WEIGHTS = np.exp(-0.5 * _DEVIATES**2) / np.sum(np.exp(-0.5 * _DEVIATES**2))
 
 
 @cache
-def _table(has_dead_time: bool) -> RegularGridInterpolator:
+def _table(has_dead_time: bool, method: Literal["linear", "cubic"]) -> RegularGridInterpolator:
     axes: tuple[NDArray[np.float64], ...] = np.square(MEAN), np.asarray(DIFFERENCE)
     axes += (np.log(DEAD_PERIODS),) if has_dead_time else ()
     values = np.log(EVENTS if has_dead_time else EVENTS_NO_DEAD_TIME)
-    return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=None)
+    return RegularGridInterpolator(axes, values, method, bounds_error=False, fill_value=None)
 
 
-def events_per_period(on_sigma: ArrayLike, off_sigma: ArrayLike, dead_periods: float) -> NDArray[np.float64]:
-    """ON and OFF events together of a pixel, per period 1/f of the noise bandwidth.
+@lru_cache(maxsize=64)
+def _after_reset(dead_periods: float) -> RegularGridInterpolator:
+    """Logarithm of the second table, [age], at a dead time: linear in its logarithm."""
+    nodes, values = np.log(after_reset.DEAD_PERIODS), np.log(after_reset.AFTER_RESET)
+    place = math.log(min(max(dead_periods, after_reset.DEAD_PERIODS[0]), after_reset.DEAD_PERIODS[-1]))
+    k = min(int(np.searchsorted(nodes, place, side="right")) - 1, len(nodes) - 2)
+    part = (place - nodes[k]) / (nodes[k + 1] - nodes[k])
+    axes = np.square(after_reset.LOWER), np.sqrt(after_reset.DIFFERENCE)
+    return RegularGridInterpolator(axes, (1 - part) * values[:, :, k] + part * values[:, :, k + 1], "cubic")
+
+
+def _over_late(
+    lower: NDArray[np.float64], difference: NDArray[np.float64], dead_periods: float, leak_periods: float
+) -> NDArray[np.float64]:
+    """Noise events over those of the first table, which has no leak and ends at a difference of thresholds."""
+    where = [
+        np.clip(lower, after_reset.LOWER[0], after_reset.LOWER[-1]) ** 2,
+        np.sqrt(np.minimum(difference, after_reset.DIFFERENCE[-1])),
+    ]
+    rates = np.exp(_after_reset(dead_periods)(np.stack(where, axis=-1)))
+    # share of the time with the last leak event longer ago than each age
+    older = np.append(np.exp(-leak_periods * np.asarray(after_reset.AGE)), 0.0)
+    return rates @ (older[:-1] - older[1:])
+
+
+def events_per_period(
+    on_sigma: ArrayLike, off_sigma: ArrayLike, dead_periods: float, leak_periods: float = 0.0
+) -> NDArray[np.float64]:
+    """ON and OFF noise events together of a pixel, per period 1/f of the noise bandwidth.
 
     Parameters
     ----------
     on_sigma, off_sigma : θ₊/σ and θ₋/σ, any shapes that go together.
     dead_periods : dead time times f; 0 for none.
+    leak_periods : rate of leak events over f. It matters to pixels with a dead time only.
 
     Returns
     -------
-    Events per period. Means of both thresholds above 5.5 σ are extrapolated.
+    Events per period, without those of the leak. Means of both thresholds above 5.5 σ are extrapolated.
     """
     on, off = np.broadcast_arrays(np.asarray(on_sigma, np.float64), np.asarray(off_sigma, np.float64))
-    mean, difference = (on + off) / 2, np.abs(on - off)
-    where = [np.maximum(mean, MEAN[0]) ** 2, np.minimum(difference, DIFFERENCE[-1])]
-    if dead_periods > 0:
-        dead = min(max(dead_periods, DEAD_PERIODS[0]), DEAD_PERIODS[-1])
-        where.append(np.full(on.shape, math.log(dead)))
-    return np.exp(_table(dead_periods > 0)(np.stack(where, axis=-1))).reshape(on.shape)
+    lower, difference = np.minimum(on, off), np.abs(on - off)
+    limited = np.minimum(difference, DIFFERENCE[-1])
+    if dead_periods <= 0:
+        where = np.stack([np.maximum((on + off) / 2, MEAN[0]) ** 2, limited], axis=-1)
+        return np.exp(_table(False, "linear")(where)).reshape(on.shape)
+    dead = np.full(on.shape, math.log(min(max(dead_periods, DEAD_PERIODS[0]), DEAD_PERIODS[-1])))
+    mean = lower + limited / 2
+
+    def at(squared: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([squared, limited, dead], axis=-1)
+
+    log = _table(True, "cubic")(at(np.clip(mean, MEAN[0], MEAN[-1]) ** 2))
+    line, last = _table(True, "linear"), MEAN[-1] ** 2
+    log += line(at(np.maximum(mean**2, last))) - line(at(np.full(on.shape, last)))
+    return (np.exp(log) * _over_late(lower, difference, dead_periods, leak_periods)).reshape(on.shape)
 
 
 def noise_rates_hz(
-    thresholds: tuple[float, float], mismatch: float, sigma: float, bandwidth_hz: float, dead_s: float
+    thresholds: tuple[float, float],
+    mismatch: float,
+    sigma: float,
+    bandwidth_hz: float,
+    dead_s: float,
+    leak_hz: float = 0.0,
 ) -> tuple[float, float]:
     """Rates of ON and of OFF noise events of a pixel, mean over pixels, in steady light.
 
@@ -81,6 +131,7 @@ def noise_rates_hz(
     sigma : standard deviation of ln x, time average.
     bandwidth_hz : −3 dB frequency of the noise, Hz.
     dead_s : dead time after an event, s; 0 for none.
+    leak_hz : rate of leak events, Hz, which are no part of the result.
 
     Returns
     -------
@@ -92,7 +143,7 @@ def noise_rates_hz(
     spread = np.maximum(1 + mismatch * deviates, LEAST_THRESHOLD_REL)
     on, off = np.meshgrid(thresholds[0] * spread / sigma, thresholds[1] * spread / sigma)
     dead_periods = dead_s * bandwidth_hz
-    rates = bandwidth_hz * events_per_period(on, off, dead_periods) * np.outer(weights, weights)
+    rates = bandwidth_hz * events_per_period(on, off, dead_periods, leak_hz / bandwidth_hz) * np.outer(weights, weights)
     beyond = _beyond((on + off) / 2, dead_periods)
     share = np.clip((off + beyond) / (on + off + 2 * beyond), 0.0, 1.0)
     return float(np.sum(rates * share)), float(np.sum(rates * (1 - share)))
@@ -114,14 +165,19 @@ _BEYOND = ((0.01, 0.03, 0.1, 0.3, 1.0), (0.12, 0.33, 0.7, 1.17, 1.52), (0.0, 0.0
 
 
 def noise_sigma(
-    rate_hz: float, thresholds: tuple[float, float], mismatch: float, bandwidth_hz: float, dead_s: float
+    rate_hz: float,
+    thresholds: tuple[float, float],
+    mismatch: float,
+    bandwidth_hz: float,
+    dead_s: float,
+    leak_hz: float = 0.0,
 ) -> float:
     """Standard deviation of ln x that gives a rate of noise events, ON and OFF together; inverse of `noise_rates_hz`.
 
     Parameters
     ----------
-    rate_hz : events of a pixel, mean over pixels, Hz.
-    thresholds, mismatch, bandwidth_hz, dead_s : as for `noise_rates_hz`.
+    rate_hz : noise events of a pixel, mean over pixels, Hz.
+    thresholds, mismatch, bandwidth_hz, dead_s, leak_hz : as for `noise_rates_hz`.
 
     Raises
     ------
@@ -132,12 +188,12 @@ def noise_sigma(
 
     def excess(log_sigma: float) -> float:
         sigma = math.exp(log_sigma)
-        found = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s))
+        found = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s, leak_hz))
         return math.log(max(found, 1e-300) / rate_hz)
 
     lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / MEAN[0])
     if excess(highest) < 0:
-        most = sum(noise_rates_hz(thresholds, mismatch, math.exp(highest), bandwidth_hz, dead_s))
+        most = sum(noise_rates_hz(thresholds, mismatch, math.exp(highest), bandwidth_hz, dead_s, leak_hz))
         raise RangeError(
             "rate of noise events", f"{rate_hz:g} Hz", f"at most {most:.3g} Hz with a noise bandwidth of "
             f"{bandwidth_hz:g} Hz; a larger bandwidth gives more"

@@ -281,7 +281,9 @@ def _noise(figures: Figures, bandwidth_hz: float, photoreceptor: Mapping[str, fl
             assert figures.dark_lux is not None
             corner_hz = photoreceptor["cutoff_hz"] * max(lux, figures.dark_lux) / photoreceptor["signal_dn"]
             share = min(corner_hz / bandwidth_hz, 1.0)
-        sigma = noise_sigma(rate_hz, figures.thresholds, figures.mismatch, share * bandwidth_hz, dead_s)
+        sigma = noise_sigma(
+            rate_hz, figures.thresholds, figures.mismatch, share * bandwidth_hz, dead_s, figures.leak_hz
+        )
         return sigma**2 / share
 
     variances = [variance(lux, rate_hz) for lux, rate_hz in figures.noise]

@@ -15,6 +15,7 @@ from hesim_render.core.errors import HesimWarning, SpecError
 from hesim_render.recording.dng import write_dng
 from hesim_render.recording.imports import import_recording
 from hesim_render.recording.noise_profile import noise_profile
+from hesim_render.recording.outline import scene_name
 from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
 
 NOISE = 51041
@@ -130,9 +131,11 @@ def test_files_of_cameras_are_read_through_rawpy(tmp_path):
         import_recording(
             tmp_path / "u", hr.load_sensor("reference-bayer").crop(128, 64), frames=[tmp_path / "camera.dng"]
         )
-    (tmp_path / "x.nef").write_bytes(b"no picture of any camera")
-    with pytest.raises(SpecError, match=r"x\.nef: cannot be read .*camera"):
-        import_recording(tmp_path / "v", sensor, frames=[tmp_path / "x.nef"])
+    assert scene_name(made) == "camera.dng"
+    for name in ("x.nef", "x.kdc"):
+        (tmp_path / name).write_bytes(b"no picture of any camera")
+        with pytest.raises(SpecError, match=rf"{name}: cannot be read .*camera"):
+            import_recording(tmp_path / "v", sensor, frames=[tmp_path / name])
     assert not any((tmp_path / name).exists() for name in "suv")
 
 

@@ -19,8 +19,10 @@ SHEET = "evs.data_sheet."
 BARE = IMX636[: IMX636.index("sources:")]
 
 
-def reset_pixel_rates(on, off, dead_periods, seed, pixels=400, periods=700, first=100, nodes=16):
-    """Events per period of noisy pixels with a dead time, by simulation in NumPy from the law of the noise alone."""
+def reset_pixel_rates(on, off, dead_periods, seed, pixels=400, periods=700, first=100, nodes=16, leak_periods=0.0):
+    """Events per period of noisy pixels with a dead time, by simulation in NumPy from the law of the noise alone. Leak
+    events, which are not counted, begin a dead time as well.
+    """
     rng = np.random.default_rng(seed)
     pole = 2 * np.pi / np.sqrt(np.sqrt(2) - 1)
     lag = pole / nodes
@@ -44,6 +46,9 @@ def reset_pixel_rates(on, off, dead_periods, seed, pixels=400, periods=700, firs
             again = fired & (ready <= 1)
             level[again] = (u + (w - u) * ready)[again]
             fired = again & ((w - level >= on) | (w - level <= -off))
+        if leak_periods:
+            leaks = (ready <= 1) & (rng.random(pixels) < leak_periods / nodes)
+            ready[leaks] = 1 + dead_periods * nodes
         ready -= 1
         state = after
     return events / (pixels * (periods - first))
@@ -58,6 +63,25 @@ def test_rates_of_noise_events_between_the_entries_of_the_table(on, off, dead_pe
     simulated = reset_pixel_rates(on, off, dead_periods, seed=5)
     # at least 60,000 events, over-dispersed by less than 4: standard error below 1 %; interpolation may add 4 %
     assert float(events_per_period(on, off, dead_periods)) == pytest.approx(simulated, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "dead_periods", "pixels", "times", "within"),
+    # dead times between two entries and at one; the second thresholds differ by more than the first table has
+    [((3.4, 4.2), 0.075, 1500, 1.2, 0.07), ((8.0, 3.0), 0.1, 1000, 3.0, 0.1)],
+)
+def test_leak_makes_noise_events_more_frequent(thresholds, dead_periods, pixels, times, within):
+    """A leak event resets its pixel to a random level, with which noise events are more frequent for a while."""
+    leak_periods = 0.03
+    simulated = reset_pixel_rates(*thresholds, dead_periods, 5, pixels, 400, leak_periods=leak_periods)
+    alone, leaking = (float(events_per_period(*thresholds, dead_periods, rate)) for rate in (0.0, leak_periods))
+    assert leaking > times * alone
+    # 3600 events or more: standard error below 3 %; interpolation adds 5 %
+    assert leaking == pytest.approx(simulated, rel=within)
+    of_both = noise_rates_hz(thresholds, 0.0, 1.0, 20.0, dead_periods / 20, 20 * leak_periods)
+    assert sum(of_both) == pytest.approx(20 * leaking)
+    # without a dead time leak events reset nothing
+    assert events_per_period(*thresholds, 0.0, leak_periods) == events_per_period(*thresholds, 0.0)
 
 
 def test_the_table_meets_the_published_relation_of_noise_and_rate():
@@ -145,7 +169,7 @@ def test_the_coefficients_have_the_figures_of_the_sheet():
     corner_hz = evs.photoreceptor.cutoff_hz * 5 / evs.photoreceptor.signal_dn
     share = corner_hz / 60
     assert 0.9 < share < 1
-    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6)
+    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6, 0.1)
     assert variance[5.0] * share == pytest.approx(noise**2, rel=1e-4)
     assert evs.photoreceptor.filters_noise and evs.photoreceptor_cutoff_hz == 60
     assert evs.photoreceptor.min_cutoff_hz == pytest.approx(corner_hz * 0.08 / 5)
@@ -166,7 +190,7 @@ def test_two_background_rates_tell_the_dark_current(tmp_path):
     theta, spread = (math.log(1.25),) * 2, read_sensor("imx636").evs.threshold_mismatch_std
     for lux, rate_hz in ((50.0, 0.5), (2.0, 4.0)):
         sigma = math.sqrt(beta.beta3**2 * lux + beta.beta4**2) / (lux + beta.beta2)
-        assert sum(noise_rates_hz(theta, spread, sigma, 150.0, 500e-6)) == pytest.approx(rate_hz - 0.1, rel=1e-3)
+        assert sum(noise_rates_hz(theta, spread, sigma, 150.0, 500e-6, 0.1)) == pytest.approx(rate_hz - 0.1, rel=1e-3)
     assert beta.beta4**2 == pytest.approx(beta.beta3**2 * beta.beta2)
 
 
@@ -241,7 +265,7 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
         sigma = math.sqrt((beta.beta3**2 * level.lux + beta.beta4**2) * share) / (level.lux + beta.beta2)
         on, off = noise_rates_hz(
             (evs.contrast_threshold_on, evs.contrast_threshold_off), evs.threshold_mismatch_std, sigma,
-            share * evs.photoreceptor_cutoff_hz, evs.refractory_period_us * 1e-6,
+            share * evs.photoreceptor_cutoff_hz, evs.refractory_period_us * 1e-6, sheet.leak_hz,
         )  # fmt: skip
         assert on + off + sheet.leak_hz == pytest.approx(level.rate_hz, rel=1e-3)
     # the step that crosses the threshold after the stated time, solved and not by the inverse formula

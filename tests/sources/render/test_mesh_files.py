@@ -116,6 +116,10 @@ def test_meshes_without_a_surface_are_one_line(tmp_path):
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n"
     )
+    (tmp_path / "quad.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n"
+    )
     (tmp_path / "far.gltf").write_text(
         json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": "../far.bin", "byteLength": 4}]})
     )
@@ -124,6 +128,7 @@ def test_meshes_without_a_surface_are_one_line(tmp_path):
         "damaged.glb": "damaged.glb: cannot be read as a mesh",
         "line.stl": "line.stl: objects.thing.mesh: the mesh has no extent, so there is nothing to see",
         "point.ply": "point.ply: objects.thing.mesh: the mesh has no extent, so there is nothing to see",
+        "quad.ply": "quad.ply: objects.thing.mesh: has no triangles alone: export triangles (Triangulated Mesh in",
         "far.gltf": "'../far.bin' lies outside of the scene's folder",
         "scene.yaml": "a mesh must be one of OBJ, PLY, STL, GLB, GLTF, not scene.yaml",
     }

@@ -22,6 +22,8 @@ from hesim_render.spectral.transfer import decode
 from hesim_render.targets.piece import Picture
 
 _OF_MITSUBA, _OF_TRIMESH = ("obj", "ply"), ("stl", "glb", "gltf")
+#: What Mitsuba says of PLY files with larger faces, binary ones and those of text.
+_NO_TRIANGLES = ("is this a triangle mesh", "trailing tokens after end of PLY file")
 #: Textures of glTF materials that are not rendered, by trimesh's name.
 _UNUSED = {
     "metallicRoughnessTexture": "metallic and roughness texture",
@@ -68,8 +70,14 @@ def mesh_shapes(
         raise SpecError(f"no such mesh file: {path}", key=key)
     kind = path.suffix.lower().lstrip(".")
     if kind in _OF_MITSUBA:
-        with as_spec_error(path, key):
-            shape = mi.load_dict({"type": kind, "filename": str(path)})
+        try:
+            with as_spec_error(path, key):
+                shape = mi.load_dict({"type": kind, "filename": str(path)})
+        except SpecError as error:
+            if not any(said in str(error) for said in _NO_TRIANGLES):
+                raise
+            told = "has no triangles alone: export triangles (Triangulated Mesh in Blender), or a GLB file"
+            raise SpecError(told, file=path, key=key) from None
         box = shape.bbox()
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         fit = placement @ _fit(item, low, high, int(shape.face_count()), path, key)
