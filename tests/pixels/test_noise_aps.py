@@ -361,7 +361,7 @@ def test_clean_is_exact(law, form):
 @pytest.mark.parametrize(
     "term",
     [
-        pytest.param(term, marks=() if term in ("read", "prnu") else pytest.mark.slow)
+        pytest.param(term, marks=() if term == "read" else pytest.mark.slow)
         for term in APS_TERMS
         if term != "crosstalk"  # that one acts on the flux
     ],

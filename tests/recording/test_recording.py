@@ -275,7 +275,7 @@ def run(code, *arguments):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("limit", [20_000, 120_000, 300_000])
+@pytest.mark.parametrize("limit", [*(pytest.param(n, marks=pytest.mark.slow) for n in (20_000, 300_000)), 120_000])
 def test_a_full_disk_is_one_clear_error(limit, tmp_path):
     """A limit on file size stands in for it: writes fail in the kernel, at a frame, the truth or the events."""
     code = """
@@ -298,7 +298,7 @@ else:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("limit", [20_000, 250_000, 900_000])
+@pytest.mark.parametrize("limit", [*(pytest.param(n, marks=pytest.mark.slow) for n in (20_000, 900_000)), 250_000])
 def test_a_disk_that_is_full_of_events_is_one_clear_error(limit, tmp_path):
     """HDF5 by itself cannot close such a file: it ends in messages of its own, and in a crash."""
     code = """

@@ -81,12 +81,21 @@ def lamps(count):
     }
 
 
+LIGHTS = {"sky": {"sky": SKY}, "lamp and sky": {"lamp": LAMP, "sky": SKY}, "3 lamps": lamps(3), "12 lamps": lamps(12)}
+#: Longest path in segments, and first segment with roulette.
+DEPTHS = ((2, 16), (4, 16), (12, 16), (12, 3))
+FAST = (("lamp and sky", (12, 3)), ("12 lamps", (2, 16)))
+
+
 @pytest.mark.parametrize(
-    ("depth", "roulette"),
-    [(2, 16), pytest.param(4, 16, marks=pytest.mark.slow), pytest.param(12, 16, marks=pytest.mark.slow), (12, 3)],
+    ("light", "depth", "roulette"),
+    [
+        pytest.param(LIGHTS[name], *depths, id=f"{name}-{depths[0]}-{depths[1]}", marks=marks)
+        for name in LIGHTS
+        for depths in DEPTHS
+        for marks in [() if (name, depths) in FAST else pytest.mark.slow]
+    ],
 )
-@pytest.mark.parametrize("light", [pytest.param({"sky": SKY}, marks=pytest.mark.slow), {"lamp": LAMP, "sky": SKY},
-                                   pytest.param(lamps(3), marks=pytest.mark.slow), lamps(12)])  # fmt: skip
 def test_paths_are_those_of_mitsuba(light, depth, roulette, draws_of_mitsuba):
     """However long they are, and whatever their last segment may run into: the same rays to the same value.
 

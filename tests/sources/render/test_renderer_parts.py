@@ -73,7 +73,10 @@ BOXES = {
 }
 
 
-@pytest.mark.parametrize("name", BOXES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in ("flipped", "box", "corners of their own") else n for n in BOXES],
+)
 def test_hits_and_surfaces_are_those_of_mitsuba(name):
     import drjit as dr
 

@@ -49,12 +49,14 @@ ALIKE = (
     "siemens-star",
     "step-wedge",
 )
+#: Motions over textures as in `fan` and `facade-drive`.
+MOVING_ALIKE = ("falling-objects", "hand-held", "pendulum", "robot-arm")
 #: Darkness, and streets at night and by day.
 OTHER_LIGHT = ("dark", "traffic-light", "facade-drive")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ALIKE else n for n in list_names("scenes")]
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in ALIKE + MOVING_ALIKE else n for n in list_names("scenes")]
 )
 def test_every_shipped_scene_renders(name):
     scene = hr.load_scene(name)
