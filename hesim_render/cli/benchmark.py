@@ -30,6 +30,10 @@ def build(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="dask.distributed scheduler, in place of --workers")
     ] = None,
+    span: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="several workers render longer clips in spans of this length; 0: never"),
+    ] = 1.0,
     estimate: Annotated[bool, typer.Option(help="estimate time and size before the start")] = True,
     yes: Yes = False,
     set_: Annotated[
@@ -57,7 +61,7 @@ def build(
         return
     with told.progress(content.name) as progress:
         built = build_benchmark(
-            content, out, workers=workers, scheduler=scheduler, estimate=estimate,
+            content, out, workers=workers, scheduler=scheduler, span_s=span, estimate=estimate,
             on_estimate=lambda expected: _estimated(told, expected, progress, workers, yes or scheduler is not None),
             progress=progress,
         )  # fmt: skip
