@@ -21,7 +21,7 @@ from hesim_render.benchmark.build import UnfinishedError
 from hesim_render.benchmark.clip import build_clip, clip_folder, render_span
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan
-from hesim_render.benchmark.spans import journals_in, spans_of
+from hesim_render.benchmark.spans import journals_in, spans_folder, spans_of
 from hesim_render.benchmark.units import Unit, Waiting
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.benchmark.worker import attempt
@@ -261,8 +261,14 @@ def test_two_workers_with_spans_and_a_kill_in_one_leave_the_same_bytes(whole, tm
         return begin(self, clips, told, spans)
 
     monkeypatch.setattr(LocalWorkers, "run", run)
-    check(build_benchmark(small(**LONG), root, workers=2, span_s=SPAN_S, estimate=False), whole)
+    built = build_benchmark(small(**LONG), root, workers=2, span_s=SPAN_S, estimate=False)
+    check(built, whole)
     assert killed
+    # what a worker that was thought dead has left after its clip was done
+    left = spans_folder(next(built.clips()).folder)
+    left.mkdir()
+    (left / "x").write_text("")
+    check(build_benchmark(small(**LONG), root, estimate=False), whole)
 
 
 @pytest.mark.slow
