@@ -1,14 +1,16 @@
 """Cost of the clips of a benchmark: where their time goes, what the framework adds, what a second worker brings.
 
-Three parts, each with generated scenes of the default ranges::
+Four parts, each with generated scenes of the default ranges::
 
     python benchmarks/clips.py parts [--clips 4] [--roi 256x192] [--sensor gen2] [--duration 0.05]
     python benchmarks/clips.py overhead [the same options]
     python benchmarks/clips.py workers [the same options]
+    python benchmarks/clips.py spans --clips 1 --duration 0.4 [the same options]
 
 `parts` prints processor seconds of each step of a clip, with the materials of its scene. `overhead` builds the clips
 with one worker of one thread, and prints what that took beyond the time inside the clips. `workers` builds the same
-clips with one and with two workers of one thread each. Both need an idle machine and clips of more than some seconds.
+clips with one and with two workers of one thread each. `spans` does so with spans of a quarter of each clip for the two
+workers. All three need an idle machine and clips of more than some seconds.
 """
 
 import argparse
@@ -22,6 +24,7 @@ from hesim_render.benchmark.build import build_benchmark, opened
 from hesim_render.benchmark.clip import build_clip
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.spans import spans_of
 from hesim_render.benchmark.worker import order_of
 from hesim_render.capture import simulate as simulate_module
 from hesim_render.capture.loop import Capture
@@ -96,13 +99,13 @@ def parts(spec, folder):
     print(f"{3600 * len(plan.clips) / total['all']:.0f} clips per hour of one core")
 
 
-def run(spec, folder, count):
-    """Clips by `count` workers of one thread: when they began, the time of each answer, and that inside its clip."""
+def run(spec, folder, count, spans=()):
+    """Clips by `count` workers of one thread: when they began, the time of each answer, and that inside its unit."""
     plan = Plan(spec)
     opened(plan, folder)
     answers, begin = [], time.monotonic()
     failed = LocalWorkers(order_of(spec, folder), count, threads=1).run(
-        plan.clips, lambda answer: answers.append((time.monotonic(), answer.get("seconds", 0.0)))
+        plan.clips, lambda answer: answers.append((time.monotonic(), answer.get("seconds", 0.0))), spans
     )
     assert not failed, failed
     return begin, answers
@@ -132,9 +135,21 @@ def workers(spec, folder):
     print(f"two are {times[1] / times[2]:.2f} times as fast as one")
 
 
+def spans(spec, folder):
+    times = {}
+    for count, parts in ((1, ()), (2, spans_of(spec.duration_us, -(-spec.duration_us // 4)))):
+        begin, answers = run(spec, folder / str(count), count, parts)
+        times[count] = max(end for end, _ in answers) - begin
+        inside = ", ".join(f"{seconds:.1f}" for _, seconds in answers)
+        print(
+            f"{count} workers, {len(parts)} spans: {times[count]:.1f} s with their start; units: {inside} s", flush=True
+        )
+    print(f"two are {times[1] / times[2]:.2f} times as fast as one")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["parts", "overhead", "workers"])
+    parser.add_argument("what", choices=["parts", "overhead", "workers", "spans"])
     parser.add_argument("--clips", type=int, default=4)
     parser.add_argument("--roi", default="256x192")
     parser.add_argument("--sensor", default="gen2")
@@ -143,7 +158,9 @@ def main():
     parser.add_argument("--audit", type=float, default=1.0)
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        {"parts": parts, "overhead": overhead, "workers": workers}[given.what](spec_of(given), Path(folder))
+        {"parts": parts, "overhead": overhead, "workers": workers, "spans": spans}[given.what](
+            spec_of(given), Path(folder)
+        )
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from hesim_render.benchmark.forecast import BuildEstimate, estimate_build
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import Plan, shared_parts
+from hesim_render.benchmark.spans import SPAN_S, Span, discard_spans, spans_of
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.core.output import check_target, output_errors, replacing
@@ -38,6 +39,7 @@ def build_benchmark(
     *,
     workers: int = 0,
     scheduler: str | None = None,
+    span_s: float = SPAN_S,
     estimate: bool = True,
     on_estimate: Callable[[BuildEstimate], None] | None = None,
     progress: Progress | None = None,
@@ -50,6 +52,8 @@ def build_benchmark(
     out : folder of the benchmark. Each clip appears in it whole or not at all.
     workers : number of processes; 0 builds in this process. The bytes do not depend on it.
     scheduler : address of a dask.distributed scheduler, in place of `workers`.
+    span_s : where there are several workers, the light of longer clips is rendered by them side by side in equal spans,
+        none of which is longer, s; 0: one worker for each clip. The bytes do not depend on it.
     estimate : estimate time and size before the start, which takes some seconds for each sensor.
     on_estimate : called with the estimate.
     progress : called with (done, total, what).
@@ -65,12 +69,14 @@ def build_benchmark(
     OutputError
         If `out` holds something else, or cannot be written (the finished clips stay).
     RangeError
-        If `workers` is negative, or the scheduler does not answer.
+        If `workers` or `span_s` is negative, or the scheduler does not answer.
     UnfinishedError
         If clips could not be built.
     """
     if workers < 0:
         raise RangeError("workers", workers, "0 or more")
+    if not 0 <= span_s < float("inf"):
+        raise RangeError("span_s", span_s, "a length of time, s; or 0 for whole clips")
     spec = spec if isinstance(spec, BenchmarkSpec) else read_benchmark(spec)
     plan = Plan(spec)
     plan.check()
@@ -80,16 +86,22 @@ def build_benchmark(
         expected = estimate_build(plan, missing) if estimate and missing else None
         if expected is not None and on_estimate is not None:
             on_estimate(expected)
-        begin, done = time.monotonic(), {"clips": len(plan.clips) - len(missing), "seconds": 0.0, "bytes": 0}
+        begin, done = time.monotonic(), {"clips": float(len(plan.clips) - len(missing)), "seconds": 0.0, "bytes": 0}
+        is_shared = client is not None or workers > 1
+        spans = spans_of(spec.duration_us, max(1, round(span_s * 1e6)) if span_s else 0) if is_shared else ()
+        left = {clip.name: 1.0 for clip in missing}
 
         def told(answer: dict[str, Any]) -> None:
-            done["clips"] += 1
+            name = answer["name"]
+            part = left[name] if "error" in answer else 1 / (len(spans) + 1)
+            left[name] -= part
+            done["clips"] += part
             done["seconds"] += answer.get("seconds", 0.0)
             done["bytes"] += answer.get("bytes", 0)
             if progress is not None:
                 progress(done["clips"], len(plan.clips), "clips")
 
-        failed = _run(missing, order_of(spec, root), workers, client, told) if missing else {}
+        failed = _run(missing, spans, order_of(spec, root), workers, client, told) if missing else {}
     _report(root, expected, len(missing), time.monotonic() - begin, done, workers, scheduler)
     if failed:
         lines = [f"{name}: {reason}" for name, reason in sorted(failed.items())]
@@ -136,14 +148,19 @@ def last_run(root: Path) -> str:
 
 
 def _run(
-    clips: list[Clip], order: str, workers: int, client: Any, told: Callable[[dict[str, Any]], None]
+    clips: list[Clip],
+    spans: tuple[Span, ...],
+    order: str,
+    workers: int,
+    client: Any,
+    told: Callable[[dict[str, Any]], None],
 ) -> dict[str, str]:
     if client is not None:
         from hesim_render.benchmark.cluster import run_on_cluster
 
-        return run_on_cluster(client, order, clips, told)
+        return run_on_cluster(client, order, clips, told, spans)
     if workers:
-        return LocalWorkers(order, workers).run(clips, told)
+        return LocalWorkers(order, workers).run(clips, told, spans)
     failed: dict[str, str] = {}
     for clip in clips:
         answer = attempt(order, clip.as_dict())
@@ -246,6 +263,8 @@ def _finish(plan: Plan, root: Path) -> None:
     SpecError
         If splits share a part.
     """
+    for clip in plan.clips:  # a worker that was thought dead may have left a span after its clip was done
+        discard_spans(clip_folder(root, clip))
     contents = [read_clip(clip_folder(root, clip)) for clip in plan.clips]
     leaks = shared_parts({content["name"]: (content["split"], set(content["parts"])) for content in contents})
     if leaks:

@@ -11,8 +11,18 @@ from typing import Any
 from hesim_render.benchmark.colour_truth import COLOURS_FILE, frame_filters, write_colours
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import Clip, Plan
-from hesim_render.benchmark.sharp import SHARP_FILE, write_sharp
+from hesim_render.benchmark.sharp import SHARP_FILE, sharp_flux, windows, write_sharp
+from hesim_render.benchmark.spans import (
+    Span,
+    discard_spans,
+    is_rendered,
+    journals_in,
+    note_rendered,
+    scratch,
+    span_journal,
+)
 from hesim_render.benchmark.statistics import figures
+from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.simulate import flux_source, go_on, simulate
 from hesim_render.core.journal import Journal
@@ -20,6 +30,7 @@ from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.recording.manifest import software_versions
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
+from hesim_render.sources.protocol import FluxSource
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import Scene, load_scene
 from hesim_render.specs.files import content_hash
@@ -45,7 +56,7 @@ class Built:
     Parameters
     ----------
     name : of the clip.
-    seconds, bytes : time and size; the time is that of an earlier run, 0, where the clip was there already.
+    seconds, bytes : time and size of this unit of work; 0 s where the clip was there already, 0 bytes for a span.
     """
 
     name: str
@@ -91,36 +102,92 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     except BaseException:
         output.discard()
         raise
+    discard_spans(folder)
     size = sum(entry["bytes"] for entry in content["files"].values())
     return Built(clip.name, time.monotonic() - begin, size)
 
 
+def render_span(plan: Plan, clip: Clip, span: Span, root: Path) -> Built:
+    """Render the light of a span of a clip into a journal that `build_clip` reads, unless that has been done.
+
+    Parameters
+    ----------
+    plan, clip, root : see `build_clip`.
+    span : one of `spans_of`.
+
+    Raises
+    ------
+    HesimError
+        If it cannot be rendered or written.
+    """
+    begin, folder, spec = time.monotonic(), clip_folder(root, clip), plan.spec
+    if is_complete(root, clip):
+        return Built(clip.name, 0.0, 0)
+    with scratch(folder) as place:
+        scene, _ = _scene(plan, clip, place)
+        sensor, level = plan.sensor(clip), spec.noise[clip.noise]
+        with span_journal(folder, span, _run_of(plan, clip, scene, sensor)) as journal:
+            if is_rendered(journal, span):
+                return Built(clip.name, 0.0, 0)
+            flux, _ = renderer = _renderer(plan, clip, scene, sensor)
+            if not flux.is_static:  # the light of a static scene is one render, of which there are no spans
+                go_on(flux, journal)
+                last = span[1] if span[1] < spec.duration_us else float("inf")
+                noise = noise_models(sensor, level.clean, level.without)
+                Capture(flux, flux.sensor, *noise, spec.duration_us, spec.seeds[clip.seed]).render(span[0], last)
+                if spec.sharp is not None:
+                    source = _sharp_source(plan, clip, renderer, sensor)
+                    for middle, first in windows(sensor, spec.sharp, spec.duration_us):
+                        if span[0] <= middle < last:
+                            sharp_flux(source, sensor, spec.sharp, first)
+            note_rendered(journal, span)
+    return Built(clip.name, time.monotonic() - begin, 0)
+
+
+def _scene(plan: Plan, clip: Clip, folder: Path) -> tuple[Scene, tuple[str, ...]]:
+    """The scene of a clip and its parts; a generated one is written into a folder."""
+    generated = plan.scene_files(clip)
+    if generated is None:
+        return plan.given_scene(clip), plan.given_parts(clip)
+    with output_errors(folder):
+        return load_scene(generated.write(folder / SCENE)), generated.parts
+
+
+def _renderer(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> tuple[Any, dict[str, Any]]:
+    """The renderer of a clip and its settings."""
+    spec = plan.spec
+    quality = spec.quality if spec.samples is None else None
+    seed = spec.seeds[clip.seed]
+    return flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
+
+
+def _sharp_source(plan: Plan, clip: Clip, renderer: tuple[Any, dict[str, Any]], sensor: Sensor) -> FluxSource:
+    """The light of the sharp images: with the crosstalk that the frames of the clip have."""
+    level = plan.spec.noise[clip.noise]
+    aps, _ = noise_models(sensor, level.clean, level.without)
+    return with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
+
+
 def _fill(plan: Plan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
     """Render a clip into a folder, which will be `target`; returns its description."""
-    spec, generated = plan.spec, plan.scene_files(clip)
-    if generated is not None:
-        with output_errors(folder):
-            scene = load_scene(generated.write(folder / SCENE))
-        parts = generated.parts
-    else:
-        scene, parts = plan.given_scene(clip), plan.given_parts(clip)
+    spec = plan.spec
+    scene, parts = _scene(plan, clip, folder)
     sensor, level = plan.sensor(clip), spec.noise[clip.noise]
     seed = spec.seeds[clip.seed]
     # one renderer for both: what rests is rendered once
-    quality = spec.quality if spec.samples is None else None
-    renderer = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
+    renderer = _renderer(plan, clip, scene, sensor)
     with _journal(plan, clip, target, scene, sensor) as journal:
         go_on(renderer[0], journal)
         recording = simulate(
             scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
-            quality=quality, samples=spec.samples, truth=spec.truth, audit=plan.is_audited(clip), renderer=renderer,
+            quality=spec.quality if spec.samples is None else None, samples=spec.samples, truth=spec.truth,
+            audit=plan.is_audited(clip), renderer=renderer,
             out=folder / RECORDING, progress=False,
         )  # fmt: skip
         sharp = 0
         if spec.sharp is not None:
             with output_errors(folder):
-                aps, _ = noise_models(sensor, level.clean, level.without)
-                source = with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
+                source = _sharp_source(plan, clip, renderer, sensor)
                 asked = spec.sharp, spec.duration_us, seed, spec.quality
                 sharp = write_sharp(folder / SHARP_FILE, source, sensor, *asked)
         if spec.sharp is not None and spec.sharp.colours and len(frame_filters(sensor)) > 1:
@@ -149,7 +216,17 @@ def _fill(plan: Plan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
 
 
 def _journal(plan: Plan, clip: Clip, target: Path, scene: Scene, sensor: Sensor) -> Journal:
-    """What the renderer of a clip has traced, for a build that goes on within a long clip."""
+    """What the renderer of a clip has traced, here and in spans, for a build that goes on within a long clip."""
+    run, others = _run_of(plan, clip, scene, sensor), journals_in(target)
+    return Journal(target, run, overwrite=True, shared=True, after_s=_KEPT_AFTER_S, others=others)
+
+
+def _run_of(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> dict[str, Any]:
+    """All that the light of a clip depends on."""
     hashes = {"scene_hash": content_hash(scene.spec), "sensor_hash": content_hash(sensor.spec)}
-    run = {"spec": plan.spec.model_dump(mode="json"), "clip": clip.as_dict(), **hashes, "software": software_versions()}
-    return Journal(target, run, overwrite=True, shared=True, after_s=_KEPT_AFTER_S)
+    return {
+        "spec": plan.spec.model_dump(mode="json"),
+        "clip": clip.as_dict(),
+        **hashes,
+        "software": software_versions(),
+    }

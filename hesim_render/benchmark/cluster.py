@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from hesim_render.benchmark.plan import Clip
+from hesim_render.benchmark.spans import Span
+from hesim_render.benchmark.units import Unit
 from hesim_render.benchmark.worker import attempt
 from hesim_render.core.errors import BackendError, OutputError, RangeError
 
@@ -34,7 +36,7 @@ def connected(address: str) -> Any:
 
 
 def run_on_cluster(
-    client: Any, order: str, clips: Sequence[Clip], told: Callable[[dict[str, Any]], None]
+    client: Any, order: str, clips: Sequence[Clip], told: Callable[[dict[str, Any]], None], spans: Sequence[Span] = ()
 ) -> dict[str, str]:
     """Build clips on a cluster, whose workers see the folder of the benchmark under the same path.
 
@@ -44,6 +46,7 @@ def run_on_cluster(
     order : from `order_of`.
     clips : what is built.
     told : called with each answer (`attempt`).
+    spans : of every clip; the clip comes after all of them.
 
     Returns
     -------
@@ -67,8 +70,12 @@ def run_on_cluster(
     futures = {}
     for clip in clips:
         # the key is of this call: a result of an earlier build must not stand for this one
-        future = client.submit(attempt, order, clip.as_dict(), pure=False, retries=0)
-        futures[future.key] = (future, clip)
+        parts: list[Any] = []
+        for span in (*spans, None):
+            given = (list(parts),) if span is None and spans else ()
+            future = client.submit(attempt, order, Unit(clip, span).as_dict(), *given, pure=False, retries=0)
+            futures[future.key] = (future, clip)
+            parts.append(future)
     for future in distributed.as_completed([future for future, _ in futures.values()], loop=client.loop):
         clip = futures[future.key][1]
         try:
@@ -84,9 +91,10 @@ def run_on_cluster(
             answer = {"name": clip.name, "error": "its workers died again and again (dask: KilledWorker)"}
         else:
             raise failure
-        told(answer)
+        if clip.name not in failed:
+            told(answer)
         if "error" in answer:
-            failed[clip.name] = answer["error"]
+            failed.setdefault(clip.name, answer["error"])
             if answer.get("fatal"):
                 raise OutputError(answer["error"])
         futures.pop(future.key)

@@ -1,4 +1,4 @@
-"""Worker processes on this machine: they take clips one by one, and a dead one is replaced."""
+"""Worker processes on this machine: they take units of work one by one, and a dead one is replaced."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ import os
 import selectors
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import IO, Any
 
 from hesim_render.benchmark.plan import Clip
+from hesim_render.benchmark.spans import Span
+from hesim_render.benchmark.units import Unit, Waiting
 from hesim_render.core.errors import BackendError, OutputError
 
-#: A clip at which a worker dies so many times is given up.
+#: A unit of work at which a worker dies so many times is given up, and so is its clip.
 MOST_DEATHS = 3
 _GRACE_S = 2.0
 #: How a worker process is started.
 COMMAND = (sys.executable, "-c", "from hesim_render.benchmark.worker import main; main()")
-#: Called with the answer for each clip as it comes.
+#: Called with the answer for each unit of work as it comes.
 Told = Callable[[dict[str, Any]], None]
 
 
 @dataclass
 class _Worker:
     process: subprocess.Popen[str]
-    clip: Clip | None = None
+    unit: Unit | None = None
     is_ready: bool = False
 
     @property
@@ -75,13 +76,14 @@ class LocalWorkers:
         self._waits.register(worker.answers, selectors.EVENT_READ, worker)
         return worker
 
-    def run(self, clips: Sequence[Clip], told: Told) -> dict[str, str]:
+    def run(self, clips: Sequence[Clip], told: Told, spans: Sequence[Span] = ()) -> dict[str, str]:
         """Build clips.
 
         Parameters
         ----------
         clips : in the order in which they are begun.
         told : called with each answer of a worker (`attempt`).
+        spans : of every clip, whose light is rendered span by span before the clip is built.
 
         Returns
         -------
@@ -94,7 +96,13 @@ class LocalWorkers:
         BackendError
             If workers cannot start.
         """
-        waiting, deaths, failed = deque(clips), dict.fromkeys((clip.name for clip in clips), 0), {}
+        waiting, deaths, failed = Waiting(clips, spans), dict[Unit, int](), dict[str, str]()
+
+        def fail(unit: Unit, answer: dict[str, Any]) -> None:
+            failed.setdefault(answer["name"], answer["error"])
+            waiting.drop(unit.clip)
+            told(answer)
+
         try:
             for _ in range(min(self._count, len(waiting))):
                 self._start()
@@ -103,41 +111,51 @@ class LocalWorkers:
                     worker: _Worker = key.data
                     line = worker.answers.readline()
                     if not line:
-                        clip, status = worker.clip, self._remove(worker)
+                        unit, status = worker.unit, self._remove(worker)
                         if not worker.is_ready:
                             raise BackendError(f"a worker of the benchmark could not start (status {status})")
-                        if clip is not None:
-                            deaths[clip.name] += 1
-                            if deaths[clip.name] >= MOST_DEATHS:
-                                failed[clip.name] = f"its worker died {MOST_DEATHS} times (last: {_cause(status)})"
-                                told({"name": clip.name, "error": failed[clip.name]})
+                        if unit is not None:
+                            deaths[unit] = deaths.get(unit, 0) + 1
+                            if unit.clip.name in failed:
+                                pass
+                            elif deaths[unit] >= MOST_DEATHS:
+                                error = f"its worker died {MOST_DEATHS} times (last: {_cause(status)})"
+                                error = error if unit.span is None else f"{unit}: {error}"
+                                fail(unit, {"name": unit.clip.name, "error": error})
                             else:
-                                waiting.append(clip)
+                                waiting.again(unit)
                         if waiting:
                             self._start()
+                        self._give_all(waiting)
                         continue
                     answer = json.loads(line)
                     if "ready" in answer:
                         worker.is_ready = True
                     else:
-                        worker.clip = None
-                        told(answer)
-                        if "error" in answer:
-                            failed[answer["name"]] = answer["error"]
+                        assert worker.unit is not None
+                        unit, worker.unit = worker.unit, None
+                        waiting.done(unit)
+                        if "error" not in answer:
+                            told(answer)
+                        else:
+                            fail(unit, answer)
                             if answer.get("fatal"):
                                 raise OutputError(answer["error"])
-                    self._give(worker, waiting)
+                    self._give_all(waiting)
         finally:
             self._end()
         return failed
 
-    def _give(self, worker: _Worker, waiting: deque[Clip]) -> None:
-        """The next clip for a worker; without one, the worker ends."""
-        if not waiting:
-            self._remove(worker)
-            return
-        worker.clip = waiting.popleft()
-        worker.send(json.dumps(worker.clip.as_dict()))
+    def _give_all(self, waiting: Waiting) -> None:
+        """The next unit for each worker that has none. Where nothing waits, the worker ends; where all that waits has
+        to, so does the worker.
+        """
+        for worker in [worker for worker in self._workers if worker.is_ready and worker.unit is None]:
+            worker.unit = waiting.take()
+            if worker.unit is not None:
+                worker.send(json.dumps(worker.unit.as_dict()))
+            elif not waiting:
+                self._remove(worker)
 
     def _remove(self, worker: _Worker) -> int:
         self._waits.unregister(worker.answers)

@@ -37,6 +37,26 @@ def windows(sensor: Sensor, spec: SharpSpec, duration_us: int) -> Iterator[tuple
         yield middle, middle - spec.window_us / 2 + offset
 
 
+def _frame_pixels(sensor: Sensor) -> NDArray[np.uint32]:
+    return np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
+
+
+def sharp_flux(
+    source: FluxSource, sensor: Sensor, spec: SharpSpec, begin_us: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Both halves of the flux of a sharp image, [frame pixel], e⁻/s.
+
+    Parameters
+    ----------
+    source, sensor, spec : see `write_sharp`.
+    begin_us : begin of each row's window, [row], from `windows`.
+    """
+    pixel = _frame_pixels(sensor)
+    first = begin_us[pixel // sensor.cols]
+    half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
+    return np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
+
+
 def write_sharp(
     path: Path, source: FluxSource, sensor: Sensor, spec: SharpSpec, duration_us: int, seed: int, quality: float
 ) -> int:
@@ -61,8 +81,7 @@ def write_sharp(
     types = jit()
     clean, _ = noise_models(sensor, clean=True)
     assert clean is not None
-    pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
-    row = pixel // sensor.cols
+    pixel = _frame_pixels(sensor)
     shape, exposure_s = (len(times), sensor.rows, sensor.cols), aps.exposure_us * S_PER_US
     with new_file(path) as file:
         file.attrs.update({
@@ -74,9 +93,7 @@ def write_sharp(
         for name, kind in (("flux_e_per_s", "f4"), ("stderr_e_per_s", "f4"), ("raw_dn", "u2")):
             file.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), compression=COMPRESSION)
         for number, (_, begin) in enumerate(times):
-            first = begin[row]
-            half_a, half_b = source.mean_flux(pixel, first, first + spec.window_us)
-            a, b = np.array(half_a, dtype=np.float32), np.array(half_b, dtype=np.float32)
+            a, b = sharp_flux(source, sensor, spec, begin)
             image = np.full((2, sensor.rows * sensor.cols), np.nan, np.float32)
             image[0, pixel], image[1, pixel] = 0.5 * (a + b), np.abs(a - b) * 0.5
             electrons = np.nan_to_num(image[0], nan=0.0) * np.float32(exposure_s)

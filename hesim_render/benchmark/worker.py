@@ -1,4 +1,4 @@
-"""A worker process: takes clips from its standard input, one line each, and answers with one line each.
+"""A worker process: takes units of work from its standard input, one line each, and answers with one line each.
 
 A worker of dask calls `attempt`. Errors travel as text, because exceptions with several arguments cannot be pickled.
 """
@@ -12,13 +12,15 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from hesim_render import __version__
-from hesim_render.benchmark.clip import build_clip
+from hesim_render.benchmark.clip import build_clip, render_span
 from hesim_render.benchmark.devices import claim_device
-from hesim_render.benchmark.plan import Clip, Plan
+from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.units import Unit
 from hesim_render.core.errors import HesimError, OutputError
 from hesim_render.core.output import discard_unfinished
 from hesim_render.specs.benchmark import BenchmarkSpec
@@ -46,27 +48,36 @@ def _claimed() -> str | None:
     return claim_device()
 
 
-def attempt(order: str, clip: dict[str, Any]) -> dict[str, Any]:
-    """Build a clip and tell what became of it.
+def attempt(order: str, unit: dict[str, Any], spans: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+    """Build a clip, or render a span of one, and tell what became of it.
 
     Parameters
     ----------
     order : from `order_of`.
-    clip : fields of a `Clip`.
+    unit : fields of a `Unit`.
+    spans : answers for the spans of the clip; one that failed is the answer for the clip as well.
 
     Returns
     -------
-    ``name``, and ``seconds`` and ``bytes``, or ``error`` and ``fatal`` (True where other clips would fail as well).
+    ``name`` of the clip, and ``seconds`` and ``bytes``, or ``error`` and ``fatal`` (True where other clips would fail
+    as well).
     """
+    failed = [answer for answer in spans if "error" in answer]
+    if failed:
+        return dict(failed[0])
     with _one_at_a_time:
         _claimed()
-        name = str(clip["name"])
+        name = str(unit["name"])
         try:
             plan, root, version = _opened(order)
             if version != __version__:
                 text = f"this worker has hesim_render {__version__}, and the build was started by {version}"
                 return {"name": name, "error": text, "fatal": True}
-            built = build_clip(plan, Clip(**clip), root)
+            work = Unit.of(unit)
+            if work.span is None:
+                built = build_clip(plan, work.clip, root)
+            else:
+                built = render_span(plan, work.clip, work.span, root)
         except HesimError as error:
             return {"name": name, "error": str(error), "fatal": isinstance(error, OutputError)}
         except Exception as error:  # a fault of ours in one clip must not end the build of the others
@@ -81,7 +92,7 @@ def _stop(*_: object) -> None:
 
 
 def main() -> None:
-    """Serve clips until the standard input ends."""
+    """Do units of work until the standard input ends."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print is no answer
     signal.signal(signal.SIGTERM, _stop)

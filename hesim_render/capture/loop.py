@@ -208,6 +208,34 @@ class Capture:
                 progress(piece.end_us, self._duration_us, "simulated µs")
             piece = next(pieces, None)
 
+    def render(self, begin_us: float, end_us: float) -> None:
+        """Ask the source for what `run` asks it for between two times, by the same calls; nothing is captured.
+
+        The first frame and the first window are asked for as well, because a renderer finds in them what rests. With a
+        journal (`hesim_render.core.journal`) it answers these calls of a later run from there.
+
+        Parameters
+        ----------
+        begin_us, end_us : the times, µs; a frame lies where its exposure begins.
+        """
+        for piece in self._pieces():
+            exposure = piece.frame.exposure
+            if exposure is self._exposures[0] or begin_us <= exposure.start_us < end_us:
+                for _ in self._expose(piece):
+                    pass
+        if self._stage is not None:
+            blocks = self._blocks_of_span(begin_us, end_us)
+            for _ in self._event_source.flux_of_blocks(self._evs_pixel, blocks):
+                pass
+
+    def _blocks_of_span(self, begin_us: float, end_us: float) -> Iterator[Block]:
+        """The first window of the run, and the blocks that begin between two times."""
+        for number, block in enumerate(self.event_blocks()):
+            if number == 0:
+                yield Block(block.begin_us[:1], block.end_us[:1], block.wanted[:1])
+            if begin_us <= block.end_us[0] < end_us and (number > 0 or block.wanted.size > 1):
+                yield block
+
     def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
         """Run the capture, and write frames, events and the truth of the event pixels as they come.
 

@@ -30,6 +30,10 @@ def build(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="dask.distributed scheduler, in place of --workers")
     ] = None,
+    span: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", help="several workers render longer clips in spans of this length; 0: never"),
+    ] = 1.0,
     estimate: Annotated[bool, typer.Option(help="estimate time and size before the start")] = True,
     yes: Yes = False,
     set_: Annotated[
@@ -57,7 +61,7 @@ def build(
         return
     with told.progress(content.name) as progress:
         built = build_benchmark(
-            content, out, workers=workers, scheduler=scheduler, estimate=estimate,
+            content, out, workers=workers, scheduler=scheduler, span_s=span, estimate=estimate,
             on_estimate=lambda expected: _estimated(told, expected, progress, workers, yes or scheduler is not None),
             progress=progress,
         )  # fmt: skip
@@ -140,6 +144,9 @@ def evaluate(
         )  # fmt: skip
     lines = [f"{result['clips']} clips of {result['benchmark']}, split {result['split']}"]
     lines += [table(result["summary"]) or "no clip has what these tasks need", *([] if out is None else [f"in {out}"])]
+    for name in listed(tasks):
+        if name not in result["summary"]:
+            complain(f"{name}: no clip of this split has what it needs")
     for name in result["unused"]:
         complain(f"{name}: belongs to no item that was scored")
     facts = {name: result[name] for name in ("benchmark", "split", "clips", "summary", "unused")}

@@ -13,7 +13,7 @@ import json
 import struct
 import time
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -49,6 +49,18 @@ def journal_of(target: str | Path) -> Path:
     return place.with_name(f".{short_name(place)}.unfinished")
 
 
+def _entries(path: Path, file: BinaryIO) -> Iterator[tuple[bytes, tuple[Path, int, int, int]]]:
+    """Keys and places of all whole entries from here on; one that another process is writing ends the list."""
+    size = path.stat().st_size
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        key, length, checksum = _HEAD.unpack(head)
+        begin = file.tell()
+        if begin + length > size:
+            return
+        file.seek(begin + length)
+        yield key, (path, begin, length, checksum)
+
+
 class Journal:
     """Results that a run has calculated, in a file. In a with statement it is closed at the end, and removed if the run
     has succeeded, or has failed for a reason that would end it again.
@@ -60,11 +72,14 @@ class Journal:
     overwrite : begin anew where the journal is that of another run.
     shared : keep nothing where another process writes the journal, in place of an error.
     after_s : keep nothing in the first seconds; a short run then leaves no file.
+    others : journals of parts of the same run, which are only read; another process may be writing them. Those that
+        are missing, or of another run, count as empty.
+    stays : leave the file after success, for a journal that is among the `others` of another one.
 
     Attributes
     ----------
     path : the file, from `journal_of`. It appears with the first result.
-    found : number of results of an earlier run.
+    found : number of results of an earlier run, those of `others` included.
 
     Raises
     ------
@@ -79,12 +94,20 @@ class Journal:
         overwrite: bool = False,
         shared: bool = False,
         after_s: float = 0.0,
+        others: Iterable[Path] = (),
+        stays: bool = False,
     ) -> None:
         self.path, self._shared, self._begin_s = journal_of(target), shared, time.monotonic() + after_s
-        self._is_off = False
+        self._is_off, self._stays = False, stays
         self._run = json.loads(json.dumps({"format": _FORMAT, **run}, default=str))
-        self._places: dict[bytes, tuple[int, int, int]] = {}
+        #: File, first byte, length and checksum of each result.
+        self._places: dict[bytes, tuple[Path, int, int, int]] = {}
         self._file: BinaryIO | None = None
+        #: The one of the others that is open.
+        self._other: tuple[Path, BinaryIO] | None = None
+        for other in others:
+            if other != self.path:
+                self._places.update(self._results_in(other))
         with output_errors(self.path):
             self._open(target, overwrite)
         self.found = len(self._places)
@@ -109,7 +132,9 @@ class Journal:
                     )
                 self.path.unlink()
                 return
-            end = self._read(file)
+            end = file.tell()
+            for key, place in _entries(self.path, file):
+                self._places[key], end = place, place[1] + place[2]
         self._file = self._locked()
         if self._file is not None:
             self._file.truncate(end)
@@ -131,18 +156,32 @@ class Journal:
             pass
         return file
 
-    def _read(self, file: BinaryIO) -> int:
-        """Find the places of all whole entries; returns their end."""
-        size, end = self.path.stat().st_size, file.tell()
-        while len(head := file.read(_HEAD.size)) == _HEAD.size:
-            key, length, checksum = _HEAD.unpack(head)
-            begin, end_of_entry = file.tell(), file.tell() + length
-            if end_of_entry > size:
-                break
-            file.seek(end_of_entry)
-            self._places[key] = begin, length, checksum
-            end = end_of_entry
-        return end
+    def _results_in(self, path: Path) -> dict[bytes, tuple[Path, int, int, int]]:
+        """Places of the results in another journal of this run."""
+        try:
+            with path.open("rb") as file:
+                if json.loads(file.readline(_LONGEST_LINE)) == self._run:
+                    return dict(_entries(path, file))
+        except (OSError, ValueError):
+            pass
+        return {}
+
+    def _reader(self, path: Path) -> BinaryIO | None:
+        """A file of results, open; None if it is gone. One of the others is open at a time."""
+        if path == self.path:
+            return self._file
+        if self._other is None or self._other[0] != path:
+            self._close_other()
+            try:
+                self._other = path, path.open("rb")
+            except FileNotFoundError:  # the clip that it belongs to was finished elsewhere
+                return None
+        return self._other[1]
+
+    def _close_other(self) -> None:
+        if self._other is not None:
+            self._other[1].close()
+            self._other = None
 
     def recall(self, key: bytes, into: Iterable[NDArray]) -> bool:
         """Fill arrays with a known result.
@@ -156,12 +195,15 @@ class Journal:
         -------
         False where there is none; the arrays are as before.
         """
-        if key not in self._places or self._file is None:
+        if key not in self._places:
             return False
-        begin, length, checksum = self._places[key]
-        with output_errors(self.path):
-            self._file.seek(begin)
-            data = self._file.read(length)
+        path, begin, length, checksum = self._places[key]
+        with output_errors(path):
+            file = self._reader(path)
+            if file is None:
+                return False
+            file.seek(begin)
+            data = file.read(length)
         arrays = list(into)
         if zlib.crc32(data) != checksum or len(data) != sum(array.nbytes for array in arrays):
             del self._places[key]
@@ -195,15 +237,18 @@ class Journal:
             begin = self._file.seek(0, 2) + _HEAD.size
             self._file.write(_HEAD.pack(key, len(data), checksum) + data)
             self._file.flush()
-            self._places[key] = begin, len(data), checksum
+            self._places[key] = self.path, begin, len(data), checksum
 
     def __enter__(self) -> Journal:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._close_other()
         if self._file is not None:
             self._file.close()
             self._file = None
+        if kind is None and self._stays:
+            return
         is_over = kind is None or (issubclass(kind, HesimError) and not issubclass(kind, OutputError))
         if is_over and not self._is_off:
             with output_errors(self.path):

@@ -125,10 +125,10 @@ def test_a_killed_worker_leaves_the_same_bytes(built, tmp_path):
     workers = []
     begin = LocalWorkers.run
 
-    def run(self, clips, told):
+    def run(self, *given):
         workers.append(self)
         threading.Thread(target=kill, daemon=True).start()
-        return begin(self, clips, told)
+        return begin(self, *given)
 
     killed = []
 

@@ -203,7 +203,9 @@ def test_the_double_integral_gains_on_renders_and_noise_takes_it(tmp_path):
         scores = {score.method: score.values["raw_psnr_db"] for score in ClipTasks(clip).deblur()}
         gains[clip.content["noise"]] = scores["double-integral"] - scores["blurred"]
     print(gains)
-    assert gains["clean"] > 3 and gains["clean"] > gains["standard"] > gains["noisy"], gains
+    # docs/benchmarks.md states 11.1, 6.0 and 4.9 dB
+    assert gains["clean"] > 8 and gains["clean"] > gains["standard"] + 3 and gains["noisy"] > 2, gains
+    assert gains["standard"] > gains["noisy"] + 0.5, gains
 
 
 NOISY = {"evs.leak_rate_hz": 50.0}

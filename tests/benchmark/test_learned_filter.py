@@ -85,9 +85,9 @@ def test_a_filter_learns_and_says_what_it_lacks(monkeypatch):
 
 @pytest.mark.slow
 def test_calibrated_noise_helps_on_a_sensor_of_other_physics():
-    """Seeds are fixed. With two clips of 0.2 s the areas were 0.69 and 0.76; half of that gain is asked for."""
+    """Seeds are fixed. The areas of this repetition were 0.804 and 0.848; half of that gain is asked for."""
     pytest.importorskip("torch")
     script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "learned_denoising.py"))
-    networks, _ = script["run"](2, 0.2, 20.0, 1)
-    print(networks)
-    assert networks["calibrated noise"][0][0] > networks["uniform noise"][0][0] + 0.03
+    (uniform, calibrated), *_ = script["run"]("davis346", 50.0, 8, 0.2, 1)
+    print(uniform, calibrated)
+    assert calibrated[0] > uniform[0] + 0.022

@@ -32,6 +32,10 @@ def test_a_benchmark_is_built_verified_evaluated_and_exported(spec, tmp_path, ca
     status, text, _ = call(capsys, "benchmark", "evaluate", out, "--out", tmp_path / "s.json", "--tasks", "deblur")
     assert status == 0 and "double-integral" in text and json.loads((tmp_path / "s.json").read_text())["clips"] == 1
     assert "--overwrite" in fails(capsys, "benchmark", "evaluate", out, "--out", tmp_path / "s.json")
+    # a task that was asked for and cannot be scored is named; among all tasks it is left out
+    status, text, err = call(capsys, "benchmark", "evaluate", out, "--tasks", "hdr,deblur")
+    assert status == 0 and "double-integral" in text and err.endswith("hdr: no clip of this split has what it needs\n")
+    assert "hdr" not in call(capsys, "benchmark", "evaluate", out)[2]
     status, text, _ = call(capsys, "benchmark", "export", out, "--layout", "highrev", "--out", tmp_path / "x")
     assert status == 0 and text.startswith("1 pictures in")
     next(out.glob("clips/*/sharp.h5")).unlink()

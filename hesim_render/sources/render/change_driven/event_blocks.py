@@ -53,6 +53,9 @@ class Blocks:
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us)
             what = renderer.plan(pilot, band, is_knot=True)
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
+            if first is None:
+                # by itself, so that the other windows are traced by the calls of a run that comes from the block before
+                first = renderer.render(band, windows, numbers[:1], what.first())[0]
             flux, _ = renderer.render(band, windows, numbers, what, first=first)
             for values in flux.arrays[:2]:
                 fill_in(values, what.rendered, centre)

@@ -70,6 +70,10 @@ class Plan:
     error: NDArray[np.float32]
     aims: Aims | None = None
 
+    def first(self) -> Plan:
+        """The plan of the first window alone."""
+        return Plan(self.rendered[:1], self.rays[:1], self.lit[:1], self.error[:1], self.aims)
+
 
 def plan(
     pilot: Pilot, sites: Sites, unit: NoiseUnit, quality: float, gain: Gain, tuning: Tuning, is_knot: bool
