@@ -271,7 +271,7 @@ GOOD_EVENTS = {"plain": {"mismatch": 0.0}, "mismatch": {}, "wide mismatch": {"mi
 @pytest.mark.parametrize(
     "keys",
     [
-        pytest.param(keys, id=name, marks=pytest.mark.slow if name in ("leak", "asymmetry", "mismatch") else ())
+        pytest.param(keys, id=name, marks=pytest.mark.slow if name != "plain" else ())
         for name, keys in GOOD_EVENTS.items()
     ],
 )

@@ -193,6 +193,7 @@ def _texts(figure):
     return [(t.get_text(), t.get_window_extent(canvas)) for t in texts]
 
 
+@pytest.mark.slow
 def test_no_text_of_a_drawing_lies_on_another_or_beyond_its_edge(again, tmp_path, monkeypatch):
     capture_sets.write_events(tmp_path / "set", size=32, trials=2000, brightest=300.0, c=0.001)
     calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")  # dark pixels on a logarithmic axis

@@ -33,7 +33,7 @@ def rendered(capsys, tmp_path, sensor, *names):
     return manifest["settings"]
 
 
-@pytest.mark.parametrize("sensor", ["eiger", "davis346"])
+@pytest.mark.parametrize("sensor", ["eiger", pytest.param("davis346", marks=pytest.mark.slow)])
 def test_all_effects_together_are_rendered(capsys, tmp_path, sensor):
     settings = rendered(capsys, tmp_path, sensor, *EFFECTS)
     assert settings["mode"] == "exact" and "lens.diffraction" in settings["exact_because"]

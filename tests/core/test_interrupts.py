@@ -60,7 +60,7 @@ def _interrupt(child, number=signal.SIGINT):
     return child.returncode, out, err, time.monotonic() - begin
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_native_code_that_never_returns_is_ended_and_cleaned_up_after(number, tmp_path):
     child = _start(sys.executable, "-c", _NEVER, str(tmp_path / "o"))
     assert child.stdout.readline() == "there\n" and len(list(tmp_path.iterdir())) == 1

@@ -272,7 +272,7 @@ BEST = {
 }
 
 
-@pytest.mark.parametrize("lux", [20, 100])
+@pytest.mark.parametrize("lux", [20, pytest.param(100, marks=pytest.mark.slow)])
 def test_noise_reduction_beats_hand_set_filters(lux):
     data = pytest.importorskip("skimage.data")
     against_clean, against_true = gained(data.astronaut()[40:296, 100:356], lux, BEST)

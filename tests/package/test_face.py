@@ -45,7 +45,13 @@ def test_descriptions_are_short_and_say_what_is_what():
         assert len(repr(thing)) < 200
 
 
-@pytest.mark.parametrize("call", ["hr.load_sensor('reference-bayer')", "colour.delta_e_2000([[1, 1, 1]], [[1, 1, 0]])"])
+@pytest.mark.parametrize(
+    "call",
+    [
+        "hr.load_sensor('reference-bayer')",
+        pytest.param("colour.delta_e_2000([[1, 1, 1]], [[1, 1, 0]])", marks=pytest.mark.slow),
+    ],
+)
 def test_numpy_prints_as_before(call):
     """colour-science sets NumPy's print options for the whole process when it is imported."""
     code = (

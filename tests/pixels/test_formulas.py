@@ -178,6 +178,7 @@ print(json.dumps({"found": [f.tolist() for f in found], "loaded": loaded}))
 """
 
 
+@pytest.mark.slow
 def test_calibration_fits_the_formulas_where_drjit_and_mitsuba_cannot_be_imported(tmp_path):
     """The formulas of both kinds of pixel, and both fits, run there; no sampler is loaded."""
     capture_sets.write_events(tmp_path / "set", size=64, trials=20000)

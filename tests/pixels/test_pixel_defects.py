@@ -136,7 +136,7 @@ def test_shares_and_rates_are_the_files():
     assert not np.array_equal(other, whole.evs.defects.stuck)
 
 
-@pytest.mark.parametrize("reference", ("previous_sample", "last_event"))
+@pytest.mark.parametrize("reference", (pytest.param("previous_sample", marks=pytest.mark.slow), "last_event"))
 def test_hot_and_flickering_pixels_fire_as_their_closed_forms(reference):
     """Mean and variance of counts over pixels, and no event elsewhere; 4 scores: false alarm 1e-4.
 

@@ -153,7 +153,7 @@ def furnace(integrator, depth=None):
     return mitsuba_scene({**CLOSED, **({"integrator": integrator} if integrator else {})}, depth=depth)
 
 
-@pytest.mark.parametrize("plugin", ["path", "volpath", "volpathmis"])
+@pytest.mark.parametrize("plugin", ["path", "volpath", pytest.param("volpathmis", marks=pytest.mark.slow)])
 def test_max_depth_of_the_scene_file_changes_the_scenes_own_integrator(plugin):
     # at rr_depth 1 with all walls at 0.8 roulette ends a fifth of all paths: they are noisier, none is lost
     sensor, own = mono(COLS, ROWS), {"type": plugin, "max_depth": 2, "rr_depth": 9}
@@ -221,7 +221,7 @@ def slab(integrator, sigma=0.7, **medium):
     return {"sky": SKY, "slab": layer, **({"integrator": {"type": integrator}} if integrator else {})}
 
 
-@pytest.mark.parametrize("integrator", ["volpath", "volpathmis"])
+@pytest.mark.parametrize("integrator", [pytest.param("volpath", marks=pytest.mark.slow), "volpathmis"])
 def test_light_through_a_medium_follows_beers_law(integrator):
     sensor = mono(COLS, ROWS)
     flux = exact_flux(mitsuba_scene(slab(integrator), depth=None), sensor, 4096).mean()
@@ -368,7 +368,9 @@ def test_a_bitmap_that_was_handed_over_is_still_there_the_second_time():
     np.testing.assert_array_equal(exact_flux(scene, mono(COLS, ROWS), 16), first)
 
 
-@pytest.mark.parametrize("many", [False, True], ids=["faces in closed form", "searched by Mitsuba"])
+@pytest.mark.parametrize(
+    "many", [pytest.param(False, marks=pytest.mark.slow), True], ids=["faces in closed form", "searched by Mitsuba"]
+)
 def test_vertex_colours_move_with_their_mesh(many, tmp_path):
     """A sheet whose colour runs from 0.05 to 0.95 along it, turned by 90° and shifted."""
     steps = 9 if many else 2
@@ -425,8 +427,15 @@ def mitsubas_own(shapes, spp=64):
 @pytest.mark.parametrize(
     ("settings", "film", "more"),
     [
-        ({"principal_point_offset_x": 0.3, "principal_point_offset_y": -0.2}, {}, {}),
-        ({}, {"crop_offset_x": 32, "crop_offset_y": 4, "crop_width": 32, "crop_height": 24}, {}),
+        pytest.param(
+            {"principal_point_offset_x": 0.3, "principal_point_offset_y": -0.2}, {}, {}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {},
+            {"crop_offset_x": 32, "crop_offset_y": 4, "crop_width": 32, "crop_height": 24},
+            {},
+            marks=pytest.mark.slow,
+        ),
         (
             {"principal_point_offset_x": -0.1},
             {"crop_offset_x": 8, "crop_offset_y": 20, "crop_width": 32, "crop_height": 24},

@@ -49,6 +49,7 @@ def test_cube_follows_motion():
     np.testing.assert_array_equal(early, whole)
 
 
+@pytest.mark.slow
 def test_cube_of_a_window_is_the_mean_of_the_motion_in_it():
     """A card that moves by 1.6 of the 25 mm pixels within the window, in front of nothing: its share of each pixel,
     averaged over the window, times ρE/π.

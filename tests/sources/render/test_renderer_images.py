@@ -100,7 +100,7 @@ def test_it_takes_fewer_rays(monkeypatch):
 @pytest.mark.parametrize(
     "bsdf",
     [
-        GREY,
+        pytest.param(GREY, marks=pytest.mark.slow),  # as in `test_matt`
         {"type": "plastic", "diffuse_reflectance": {"type": "uniform", "value": 0.4}},
         {"type": "roughplastic", "diffuse_reflectance": {"type": "uniform", "value": 0.4}, "alpha": 0.2},
         pytest.param({"type": "twosided", "nested": GREY}, marks=pytest.mark.slow),

@@ -64,7 +64,7 @@ def test_polygon_below_the_horizon_does_not_count():
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in ("uniform", "point") else ()) for kind in LIGHTS]
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind != "area" else ()) for kind in LIGHTS]
 )
 def test_a_card_at_the_plane_point_is_lit_as_asked(kind):
     # a 1 mm card there: L = ρ E / π at any wavelength

@@ -60,7 +60,7 @@ def middle_times(begin, end, count=20_000):
     return begin + (np.arange(count) + 0.5) / count * (end - begin)
 
 
-@pytest.mark.parametrize("move", ["plate", "camera"])
+@pytest.mark.parametrize("move", [pytest.param("plate", marks=pytest.mark.slow), "camera"])
 def test_edge_that_moves_across_pixels(move):
     """Its mean coverage is known; 12 windows of one row, in each of which one or two pixels are partly covered."""
     scene, sensor = plate(move), mono(8, 6)
