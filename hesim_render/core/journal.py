@@ -144,6 +144,24 @@ class Journal:
             end = end_of_entry
         return end
 
+    def read(self, key: bytes) -> bytes | None:
+        """The bytes of a known result, None where there is none.
+
+        Parameters
+        ----------
+        key : from `key_of`.
+        """
+        if key not in self._places or self._file is None:
+            return None
+        begin, length, checksum = self._places[key]
+        with output_errors(self.path):
+            self._file.seek(begin)
+            data = self._file.read(length)
+        if zlib.crc32(data) != checksum:
+            del self._places[key]
+            return None
+        return data
+
     def recall(self, key: bytes, into: Iterable[NDArray]) -> bool:
         """Fill arrays with a known result.
 
@@ -156,14 +174,10 @@ class Journal:
         -------
         False where there is none; the arrays are as before.
         """
-        if key not in self._places or self._file is None:
+        data, arrays = self.read(key), list(into)
+        if data is None:
             return False
-        begin, length, checksum = self._places[key]
-        with output_errors(self.path):
-            self._file.seek(begin)
-            data = self._file.read(length)
-        arrays = list(into)
-        if zlib.crc32(data) != checksum or len(data) != sum(array.nbytes for array in arrays):
+        if len(data) != sum(array.nbytes for array in arrays):
             del self._places[key]
             return False
         first = 0
