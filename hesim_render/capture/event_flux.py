@@ -11,6 +11,8 @@ from hesim_render.core.device_types import Float
 class EventFlux:
     """Truth of the event pixels: mean flux over all samples, with both halves kept apart."""
 
+    STATE = ("_half_a", "_half_b", "samples")
+
     def __init__(self, count: int) -> None:
         self._half_a, self._half_b = np.zeros(count), np.zeros(count)
         self.samples = 0

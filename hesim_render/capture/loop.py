@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from heapq import heappop, heappush
-from itertools import pairwise, tee
+from collections.abc import Callable, Iterator
+from itertools import islice, tee
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.capture.event_flux import EventFlux
+from hesim_render.capture.open_frames import OpenFrame, Piece, pieces_of
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.progress import Progress
@@ -26,8 +25,11 @@ from hesim_render.mosaic.schedule import (
     exposures,
     sample_of_blocks,
     tick_blocks,
+    wanted_windows,
+    without_first,
 )
 from hesim_render.pixels.aps.model import ApsNoise
+from hesim_render.pixels.arrays import restore, saved
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
@@ -39,24 +41,6 @@ from hesim_render.sources.still import StillFlux
 
 if TYPE_CHECKING:
     from hesim_render.recording.writer import RecordingWriter
-
-
-@dataclass
-class _OpenFrame:
-    """A frame during its exposure: both halves of its electrons, per frame pixel; None before the first piece."""
-
-    exposure: Exposure
-    half_a: Float = None
-    half_b: Float = None
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """Part of an exposure during which the source is in one state."""
-
-    frame: _OpenFrame
-    begin_us: float
-    end_us: float
 
 
 class Capture:
@@ -112,6 +96,11 @@ class Capture:
         self._stage = EvsStage(evs, seed, labels=self.labeller) if evs is not None else None
         if self._stage is not None and pixels is not None:
             self._stage.resume(pixels)
+        self._known_us = self._stage.t_us if self._stage is not None else None
+        #: Event samples taken, pieces exposed, and frames in exposure, by their index.
+        self._samples = self._exposed = 0
+        self._open: dict[int, OpenFrame] = {}
+        self._t_us = begin_us
         self._pixel_state: dict[str, Any] = {}
         self._event_flux = EventFlux(self._evs_pixel.size)
         self.errors = {"frames": ErrorMeter(), "events": ErrorMeter()}
@@ -138,7 +127,7 @@ class Capture:
         """Blocks of windows for which the source is asked for the flux of event pixels."""
         if self._stage is None:
             return
-        spec, known_us = self._stage.noise.spec, self._stage.t_us
+        spec, known_us = self._stage.noise.spec, self._known_us
         if spec.reference == "previous_sample" or known_us is None:
             yield from self._blocks_between(self._begin_us, self._duration_us)
             return
@@ -177,6 +166,45 @@ class Capture:
         """Number of events that the sensor's read-out has lost so far."""
         return self._stage.dropped if self._stage is not None else 0
 
+    @property
+    def frame_mask(self) -> NDArray[np.bool_]:
+        """Which pixels give frame values, [row, col]."""
+        return self._sensor.layout.aps_mask
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Time that has been simulated, and end of the run, µs."""
+        return self._t_us, self._duration_us
+
+    def state(self) -> dict[str, Any]:
+        """State between two items that `run` yields: plain values, NumPy arrays. Not of labels and errors of a render.
+
+        Unlike `pixel_state`, it belongs to the same run, and holds frames in exposure.
+        """
+        return {
+            "samples": self._samples,
+            "exposed": self._exposed,
+            "t_us": self._t_us,
+            "open": {str(index): saved(frame) for index, frame in self._open.items()},
+            "stage": None if self._stage is None else self._stage.state(),
+            "flux": saved(self._event_flux),
+        }
+
+    def go_on(self, state: dict[str, Any]) -> None:
+        """Let `run` yield what comes after a `state` of the same run. The source is asked for nothing before it.
+
+        Parameters
+        ----------
+        state : from `state`.
+        """
+        self._samples, self._exposed, self._t_us = state["samples"], state["exposed"], state["t_us"]
+        self._open = {e.index: OpenFrame(e) for e in self._exposures if str(e.index) in state["open"]}
+        for index, frame in self._open.items():
+            restore(frame, state["open"][str(index)])
+        if self._stage is not None:
+            self._stage.resume(state["stage"])
+        restore(self._event_flux, state["flux"])
+
     def run(self, progress: Progress | None = None) -> Iterator[Frame | NDArray]:
         """Run the capture.
 
@@ -188,11 +216,11 @@ class Capture:
         ------
         Frames, and blocks of events (structured arrays of `EVENT_DTYPE`); each kind in order of time.
         """
-        pieces = self._pieces()
+        pieces = islice(pieces_of(self._exposures, self._frame_source, self._open), self._exposed, None)
         piece = next(pieces, None)
-        blocks, asked = tee(self.event_blocks())
+        blocks, asked = tee(without_first(self.event_blocks(), self._samples))
         samples = self._event_source.flux_of_blocks(self._evs_pixel, asked)
-        for begin_us, end_us in _wanted(blocks):
+        for begin_us, end_us in wanted_windows(blocks):
             # expose whatever ends before a window first: a source may drop its data of the past
             while piece is not None and piece.end_us <= begin_us:
                 yield from self._expose(piece)
@@ -218,7 +246,7 @@ class Capture:
         ----------
         begin_us, end_us : the times, µs; a frame lies where its exposure begins.
         """
-        for piece in self._pieces():
+        for piece in pieces_of(self._exposures, self._frame_source, self._open):
             exposure = piece.frame.exposure
             if exposure is self._exposures[0] or begin_us <= exposure.start_us < end_us:
                 for _ in self._expose(piece):
@@ -236,12 +264,18 @@ class Capture:
             if begin_us <= block.end_us[0] < end_us and (number > 0 or block.wanted.size > 1):
                 yield block
 
-    def record(self, writer: RecordingWriter, progress: Progress | None = None) -> None:
+    def record(
+        self,
+        writer: RecordingWriter,
+        progress: Progress | None = None,
+        keep: Callable[[Frame | NDArray], None] | None = None,
+    ) -> None:
         """Run the capture, and write frames, events and the truth of the event pixels as they come.
 
         Parameters
         ----------
         writer, progress : takes frames and events; called with (done, total, what).
+        keep : called with each frame and block of events as well; it may ask for the `state`.
         """
         for item in self.run(progress):
             if isinstance(item, np.ndarray):
@@ -250,6 +284,8 @@ class Capture:
                     writer.add_event_labels(self.labeller.taken())
             else:
                 writer.add_frame(item)
+            if keep is not None:
+                keep(item)
         if self._stage is not None:
             writer.set_event_truth(self.event_flux.mean_e_per_s(), self.event_flux.stderr_e_per_s())
             writer.set_events_dropped(self.events_dropped)
@@ -264,34 +300,24 @@ class Capture:
         else:
             self._event_flux.add(sample.half_a, sample.half_b)
         events = self._step(sample.half_a, sample.half_b, t_us)
+        self._samples, self._t_us = self._samples + 1, min(t_us, self._duration_us)
         return events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
 
-    def _pieces(self) -> Iterator[_Piece]:
-        """Exposures, cut where the source changes its state, in order of their ends."""
-        waiting: list[tuple[float, int, _Piece]] = []
-        for exposure in self._exposures:
-            # no piece of this exposure ends before the exposure begins
-            while waiting and waiting[0][0] <= exposure.start_us:
-                yield heappop(waiting)[2]
-            frame = _OpenFrame(exposure)
-            edges = self._frame_source.slice_edges_us(exposure.start_us, exposure.end_us)
-            for begin, end in pairwise([float(exposure.start_us), *edges, exposure.end_us]):
-                heappush(waiting, (end, exposure.index, _Piece(frame, begin, end)))
-        while waiting:
-            yield heappop(waiting)[2]
-
-    def _expose(self, piece: _Piece) -> Iterator[Frame]:
+    def _expose(self, piece: Piece) -> Iterator[Frame]:
         """Add to each row the part of its exposure that lies in a piece. Yield the frame after its last piece."""
         frame = piece.frame
         if frame.half_a is None:
             import drjit as dr
 
             frame.half_a, frame.half_b = (dr.zeros(jit().Float, self._aps_pixel.size) for _ in range(2))
+            self._open[frame.exposure.index] = frame
         self._add(frame, piece.begin_us, piece.end_us)
+        self._exposed += 1
         if piece.end_us >= frame.exposure.end_us:
+            del self._open[frame.exposure.index]
             yield self._read_out(frame)
 
-    def _add(self, frame: _OpenFrame, begin_us: float, end_us: float) -> None:
+    def _add(self, frame: OpenFrame, begin_us: float, end_us: float) -> None:
         import drjit as dr
 
         starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
@@ -321,7 +347,7 @@ class Capture:
         )
         return self._stage.step((half_a + half_b) * (0.5 * seconds), t_us)
 
-    def _read_out(self, frame: _OpenFrame) -> Frame:
+    def _read_out(self, frame: OpenFrame) -> Frame:
         """Draw the noise of a frame once, then put all values back on the mosaic."""
         import drjit as dr
 
@@ -355,10 +381,3 @@ class Capture:
             line_time_us=exposure.line_time_us,
             index=exposure.index,
         )
-
-
-def _wanted(blocks: Iterable[Block]) -> Iterator[tuple[float, float]]:
-    """Begin and end of every wanted window, in order of time."""
-    for block in blocks:
-        ends = np.rint(block.end_us[block.wanted])
-        yield from zip(block.begin_us[block.wanted].tolist(), ends.tolist(), strict=True)

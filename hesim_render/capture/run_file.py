@@ -254,7 +254,7 @@ def _recorded(
         )  # fmt: skip
     elif spec.video is not None:
         source = spec.video.beside(spec.video.file, shipped=False)
-        made = simulate_video(source, asked.sensor, **limits, **common, **asked.options)
+        made = simulate_video(source, asked.sensor, resume=True, **limits, **common, **asked.options)
     else:
         assert spec.cube is not None
         source = spec.cube.beside(spec.cube.file, shipped=False)

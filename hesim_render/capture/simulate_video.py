@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from hesim_render.capture.kept_run import KeptRun
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core import backend
 from hesim_render.core.errors import RangeError, SpecError, TooLongError
+from hesim_render.core.journal import Journal, journal_of
 from hesim_render.core.progress import Progress, ProgressReport, in_words, shown
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.description import Mosaic, describe
@@ -22,6 +26,7 @@ from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.video import VideoFlux, VideoOptions
+from hesim_render.sources.video.digest import stamp_of
 from hesim_render.sources.video.flux import Source
 from hesim_render.spectral import spectrum as spectra
 
@@ -30,6 +35,9 @@ _SLACK_US = 1.0
 #: Processor seconds for a pixel of a picture, of an event sample and of a frame that is read out and stored; seconds
 #: for each of these besides its pixels, and in all. From `benchmarks/video.py`, for one core of an AVX-512 server.
 _PER_PIXEL_S, _PER_ITEM_S, _IN_ALL_S = np.array([8e-9, 17e-9, 60e-9]), np.array([1e-3, 1e-3, 2e-2]), 4.0
+
+#: Estimated time of a run above which it is kept for another one to go on from, and time between its states, s.
+_LONG_S, _PART_S = 20.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,7 @@ def simulate_video(
     progress: Progress | Literal[False] | None = None,
     max_minutes: float | None = None,
     on_estimate: Callable[[VideoEstimate], None] | None = None,
+    resume: bool = False,
     **options: Any,
 ) -> Recording:
     """Simulate a sensor in front of a video: RAW frames, events, and their noise-free truth.
@@ -97,6 +106,8 @@ def simulate_video(
     sensor : from `load_sensor` (crop it for a region of interest).
     duration_s : simulated time from the video's first picture, s; default: the whole video.
     seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as for `simulate`.
+    resume : keep the frames and events of a run of more than about 20 s in a file beside `out`, until the recording is
+        complete. The same call goes on from what an interrupted one has left there, and gives the same bytes.
     options : options of `sources.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
         tags, ``mode``, ``white_lux`` or ``white_e_per_s`` with ``white_filter``, ``fit``, ``lens_shading``, …
 
@@ -128,7 +139,8 @@ def simulate_video(
     TooLongError
         If the run would take longer than `max_minutes`.
     OutputError
-        If `out` exists or cannot be written. No partial output is left.
+        If `out` exists or cannot be written, or, with `resume`, if another run was interrupted there. No partial
+        output is left.
     """
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
@@ -155,24 +167,48 @@ def simulate_video(
             "backend": backend.select().label,
         }
         capture = Capture(flux, sensor, aps, evs, duration_us, seed)
-        with RecordingWriter(
-            out,
-            sensor,
-            seed=seed,
-            duration_us=duration_us,
-            settings=settings,
-            overwrite=overwrite,
-            mosaic=_mosaic(sensor, flux.options),
-        ) as writer:
+        with (
+            RecordingWriter(
+                out,
+                sensor,
+                seed=seed,
+                duration_us=duration_us,
+                settings=settings,
+                overwrite=overwrite,
+                mosaic=_mosaic(sensor, flux.options),
+            ) as writer,
+            _journal(resume, source, flux, expected, out, writer, overwrite) as journal,
+        ):
             with shown(progress, f"{Path(name).name} → {sensor.name}") as told:
                 if isinstance(told, ProgressReport):
                     told.expect(expected.seconds)
                 flux.start_digest()
-                capture.record(writer, told)
+                kept = None if journal is None else KeptRun(capture, journal, _PART_S)
+                if kept is not None:
+                    kept.go_on(writer, told)
+                capture.record(writer, told, None if kept is None else kept.keep)
             writer.add_settings({"video": flux.describe()})
             return writer.finish()
     finally:
         flux.close()
+
+
+def _journal(
+    is_kept: bool,
+    source: Source,
+    flux: VideoFlux,
+    expected: VideoEstimate,
+    out: str | Path | None,
+    writer: RecordingWriter,
+    overwrite: bool,
+) -> AbstractContextManager[Journal | None]:
+    """The journal of a long run, or of any that was interrupted; nothing where none is kept."""
+    if not is_kept or out is None or (expected.seconds < _LONG_S and not journal_of(out).is_file()):
+        return nullcontext()
+    made_by = writer.run["software"] | {"av": version("av")}
+    return Journal(
+        out, {**writer.run, "software": made_by, "video": flux.settings(), "input": stamp_of(source)}, overwrite
+    )
 
 
 def _duration_us(duration_s: float | None, flux: VideoFlux, name: str) -> int:

@@ -91,7 +91,7 @@ def video(
             interpolation=interpolation, motion_factor=motion_factor, transfer=transfer, gamma=gamma,
             primaries=primaries, matrix=matrix, range=range_, bit_depth=bit_depth, mode=mode, others=others,
             camera=None if camera is None else load_camera(camera), illuminant=illuminant, white_lux=white_lux,
-            white_e_per_s=white_e_per_s, white_filter=white_filter, fit=fit, lens_shading=lens_shading,
+            white_e_per_s=white_e_per_s, white_filter=white_filter, fit=fit, lens_shading=lens_shading, resume=True,
         )  # fmt: skip
     notes = recording.manifest["settings"]["video"]["notes"]
     tell_recording(told, recording, "".join(f"\nnote: {text}" for text in notes))

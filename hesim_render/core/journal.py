@@ -183,6 +183,27 @@ class Journal:
             self._other[1].close()
             self._other = None
 
+    def read(self, key: bytes) -> bytes | None:
+        """The bytes of a known result, None where there is none.
+
+        Parameters
+        ----------
+        key : from `key_of`.
+        """
+        if key not in self._places:
+            return None
+        path, begin, length, checksum = self._places[key]
+        with output_errors(path):
+            file = self._reader(path)
+            if file is None:
+                return None
+            file.seek(begin)
+            data = file.read(length)
+        if zlib.crc32(data) != checksum:
+            del self._places[key]
+            return None
+        return data
+
     def recall(self, key: bytes, into: Iterable[NDArray]) -> bool:
         """Fill arrays with a known result.
 
@@ -195,17 +216,10 @@ class Journal:
         -------
         False where there is none; the arrays are as before.
         """
-        if key not in self._places:
+        data, arrays = self.read(key), list(into)
+        if data is None:
             return False
-        path, begin, length, checksum = self._places[key]
-        with output_errors(path):
-            file = self._reader(path)
-            if file is None:
-                return False
-            file.seek(begin)
-            data = file.read(length)
-        arrays = list(into)
-        if zlib.crc32(data) != checksum or len(data) != sum(array.nbytes for array in arrays):
+        if len(data) != sum(array.nbytes for array in arrays):
             del self._places[key]
             return False
         first = 0

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,3 +220,23 @@ def sample_of_blocks(
     # a source adds a single window where a run begins, and these stretches are not runs
     found = [block for block in found if block.wanted.size > 1]
     return BlockSample(found, _STRETCHES * stretch_us / (end_us - begin_us))
+
+
+def without_first(blocks: Iterable[Block], count: int) -> Iterator[Block]:
+    """Blocks whose first wanted windows, so many of all, are not wanted."""
+    for block in blocks:
+        places = np.flatnonzero(block.wanted)
+        if count:
+            wanted = block.wanted.copy()
+            wanted[places[:count]] = False
+            block = replace(block, wanted=wanted)
+        count -= min(count, places.size)
+        if block.wanted.any() or not places.size:
+            yield block
+
+
+def wanted_windows(blocks: Iterable[Block]) -> Iterator[tuple[float, float]]:
+    """Begin and end of every wanted window, in order of time."""
+    for block in blocks:
+        ends = np.rint(block.end_us[block.wanted])
+        yield from zip(block.begin_us[block.wanted].tolist(), ends.tolist(), strict=True)

@@ -99,8 +99,7 @@ def prepare(name, folder):
         np.save(folder / "v.npy", np.full((4, 16, 16), 128, np.uint8))
 
 
-def start(folder, arguments, step=None, side="before", exchange=True):
-    how = ["-m", "hesim_render.cli"]
+def start(folder, arguments, step=None, side="before", exchange=True, how=("-m", "hesim_render.cli")):
     if step is not None:
         how = [HERE / "killed.py", step, side, "yes" if exchange else "no"]
     return subprocess.Popen(
@@ -252,6 +251,50 @@ def test_a_killed_run_goes_on(command, number, tmp_path):
     for _ in range(2):
         child = start(tmp_path, given)
         while child.poll() is None and not (journal.is_file() and journal.stat().st_size > before + 50_000):
+            time.sleep(0.01)
+        child.send_signal(number)
+        _, err = child.communicate(timeout=60)
+        assert child.returncode in (130, -number) and "Traceback" not in err, err
+        assert not out.exists() and journal.stat().st_size > before
+        before = journal.stat().st_size
+    kept = journal.read_bytes()
+    refused = start(tmp_path, [*run, "--seed", "8", "--out", out])
+    assert "an interrupted run, which would go on there, had another seed" in refused.communicate(timeout=60)[1]
+    assert refused.returncode == 2 and journal.read_bytes() == kept
+    finish(tmp_path, given)
+    assert files_in(out) == files_in(tmp_path / "whole") and not journal.exists()
+    for path in files_in(out):
+        assert (out / path).read_bytes() == (tmp_path / "whole" / path).read_bytes(), path
+
+
+#: A run of a video is kept from its begin, and in short parts.
+SHORT_PARTS = (
+    "import hesim_render.capture.simulate_video as video; video._LONG_S, video._PART_S = 0.0, 0.1; "
+    "from hesim_render.cli import main; main()"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("command", ["video", "run"])
+def test_a_killed_video_goes_on(command, number, tmp_path):
+    """Ended twice, it ends with the bytes of one that ran through without a journal."""
+    pictures = np.random.default_rng(1).integers(0, 256, (300, 48, 64, 1), np.uint8).repeat(4, 1).repeat(4, 2)
+    np.save(tmp_path / "v.npy", pictures.repeat(3, 3))
+    run = ["video", "v.npy", "--fps", "100", "--transfer", "srgb", "--primaries", "bt709", "--sensor", "gen2"]
+    run += ["--roi", "192x128"]
+    (tmp_path / "r.yaml").write_text(
+        "schema_version: 1\nname: r\nvideo: {file: v.npy, options: {fps: 100, transfer: srgb, primaries: bt709}}\n"
+        "sensor: gen2\nroi: 192x128\n"
+    )
+    given = [*run, "--out", "out"] if command == "video" else ["run", "r.yaml", "--out", "r"]
+    finish(tmp_path, [*run, "--out", "whole"])
+    out = tmp_path / ("r/recording" if command == "run" else "out")
+    journal = out.parent / f".{out.name}.unfinished"
+    before = 0
+    for _ in range(2):
+        child = start(tmp_path, given, how=("-c", SHORT_PARTS))
+        while child.poll() is None and not (journal.is_file() and journal.stat().st_size > before + 500_000):
             time.sleep(0.01)
         child.send_signal(number)
         _, err = child.communicate(timeout=60)

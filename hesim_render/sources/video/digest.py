@@ -6,7 +6,13 @@ import hashlib
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.journal import key_of
 
 
 class Digest:
@@ -75,3 +81,19 @@ class Hashed(ABC):
     def _stop_digest(self) -> None:
         if self._digest is not None:
             self._digest.stop()
+
+
+def stamp_of(source: str | Path | NDArray) -> str:
+    """What tells an input from another one, or from itself before a change, without reading it: names, sizes and times
+    of change of its files; of an array in memory the hash.
+
+    Parameters
+    ----------
+    source : file, folder or array.
+    """
+    if isinstance(source, np.ndarray):
+        return key_of(source).hex()
+    path = Path(source).resolve()
+    files = sorted(entry for entry in path.iterdir() if entry.is_file()) if path.is_dir() else [path]
+    states = [(file.name, file.stat()) for file in files]
+    return key_of(str(path), *((name, state.st_size, state.st_mtime_ns) for name, state in states)).hex()

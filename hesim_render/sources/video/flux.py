@@ -285,9 +285,12 @@ class VideoFlux(WindowByWindow):
 
     def describe(self) -> dict[str, Any]:
         """The manifest's entry for the video: input and hash, colours, scale, times, interpolation."""
+        return {**self._reader.describe(), **self.settings()}
+
+    def settings(self) -> dict[str, Any]:
+        """The part of `describe` that does not wait for the hash of the input."""
         options = self.options
         return {
-            **self._reader.describe(),
             "colour": self.tags.as_dict(),
             "mode": options.mode,
             "others": options.others if options.mode == "matrix" else None,
