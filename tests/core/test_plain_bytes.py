@@ -46,7 +46,9 @@ def test_types_of_arrays_are_those_of_the_backend():
     )
 
 
-@pytest.mark.parametrize("value", [object(), [1], {1, 2}, np.array([object()])], ids=["an object", "a list", "a set", "objects"])
+@pytest.mark.parametrize(
+    "value", [object(), [1], {1, 2}, np.array([object()])], ids=["an object", "a list", "a set", "objects"]
+)
 def test_other_values_are_refused(value):
     with pytest.raises(TypeError):
         to_bytes(value)
