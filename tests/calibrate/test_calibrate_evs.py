@@ -152,6 +152,7 @@ def test_mismatch_is_recovered_and_part_of_the_fit(mismatched):
     assert np.corrcoef(pixel, true[good])[0, 1] > 0.9
 
 
+@pytest.mark.slow
 def test_mismatch_from_the_static_counts_alone(tmp_path):
     capture_sets.write_events(tmp_path / "set", size=128, trials=20000, mismatch=0.05)
     calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")

@@ -441,6 +441,7 @@ def test_overrides_have_the_last_word_and_the_path_is_relative_to_the_file(sessi
     assert hr.load_sensor(tmp_path / "mine.yaml").spec.model_dump(mode="json")["noise"]["sha256"] != first["sha256"]
 
 
+@pytest.mark.slow
 def test_without_a_measured_threshold_the_files_own_is_kept(tmp_path):
     sensor = hr.load_sensor("eiger", BUSY).crop(64, 64)
     folder = write_captures(sensor, tmp_path / "c", frames=8, ticks=4000)

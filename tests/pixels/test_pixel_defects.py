@@ -511,6 +511,7 @@ def frames_session(tmp_path_factory):
     return given, folder / "c.yaml", folder / "c"
 
 
+@pytest.mark.slow
 def test_telegraph_pixels_of_frames_are_found(frames_session):
     """All whose variance is above the limit that the docs state, and no good one: chance 1e-6 and less each."""
     given, file, _ = frames_session

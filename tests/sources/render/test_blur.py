@@ -124,6 +124,7 @@ def test_a_lopsided_kernel_is_seen_as_it_was_measured():
     assert a.sum() == pytest.approx(plain.sum(), rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_skirts_of_a_measured_psf_change_with_what_moves_far_away():
     """A lamp 12 px away: 3 % of its light lies in a ring of the kernel, which few of a pixel's rays meet."""
     y, x = np.mgrid[-15:16, -15:16]

@@ -138,6 +138,7 @@ def test_matt_plate_under_an_area_light():
     assert abs(many.flux.mean() / truth[16:32].mean() - 1) < 1e-5
 
 
+@pytest.mark.slow
 def test_twice_as_many_instants_change_nothing():
     scene, sensor = vibration(), hr.load_sensor("reference-bayer").crop(40, 32)
     reference = WindowReference(scene, sensor)

@@ -49,8 +49,8 @@ ALIKE = (
     "siemens-star",
     "step-wedge",
 )
-#: Motions over textures as in `fan` and `facade-drive`.
-MOVING_ALIKE = ("falling-objects", "hand-held", "pendulum", "robot-arm")
+#: Motions of textured solids, as in `glass-and-metal` and `traffic-light`.
+MOVING_ALIKE = ("facade-drive", "falling-objects", "fan", "hand-held", "pendulum", "robot-arm")
 #: Darkness, and streets at night and by day.
 OTHER_LIGHT = ("dark", "traffic-light", "facade-drive")
 
