@@ -69,6 +69,7 @@ def test_native_code_that_never_returns_is_ended_and_cleaned_up_after(number, tm
     assert seconds < 2.0 and list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_interrupt_inside_of_a_finaliser_ends_the_run_without_a_traceback(tmp_path):
     """Python cannot raise there: it would print the exception and go on."""
     lost = """

@@ -131,6 +131,7 @@ def test_noise_of_a_calibration(calibration, tmp_path):
         FrameNoise.of_calibration(broken, 1000)
 
 
+@pytest.mark.slow
 def test_a_calibrated_sensors_maps_come_from_its_calibration(calibration, tmp_path):
     """They are not in the recording: without them rows are estimated, with them they are subtracted."""
     sensor = hr.load_sensor("eiger", {"noise": str(calibration)}).crop(64, 64, 40, 80)

@@ -289,6 +289,7 @@ def test_wrong_keys_are_told(key, value, text):
 # ---- frame pixels --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_telegraph_noise_has_its_variance_and_autocovariance():
     """Values of noiseless pixels: two levels, mean 0, a² p (1 − p), exp(−Δt/τ); 4 scores: false alarm 1e-4."""
     given = sensor(
@@ -354,6 +355,7 @@ def events_session(tmp_path_factory):
     return given, folder / "c.yaml"
 
 
+@pytest.mark.slow
 def test_defects_of_events_are_found_and_named(events_session):
     given, file = events_session
     true, maps, section = given.evs.defects, read_maps(file, "evs"), read_calibration(file)["evs"]
@@ -379,6 +381,7 @@ def test_defects_of_events_are_found_and_named(events_session):
     assert maps["defect_off_per_trial"].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_a_calibrated_sensor_misbehaves_alike(events_session):
     given, file = events_session
     true = given.evs.defects
@@ -475,6 +478,7 @@ def test_noise_of_one_level_is_not_taken_for_two():
         assert found.gain.max() < 16 and not found.is_telegraph.any()
 
 
+@pytest.mark.slow
 def test_variances_of_good_pixels_are_not_looked_at():
     """1e6 pixels of Gaussian noise and of dark current that varies: 1 is expected, 8 or more have a chance of 1e-5."""
     rng, frames, side = np.random.default_rng(8), 32, 1000

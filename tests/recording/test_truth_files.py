@@ -91,6 +91,7 @@ def test_a_loaded_recording_knows_its_scene(recorded):
         loaded.truth_with(hr.load_scene("flat-field"))
 
 
+@pytest.mark.slow
 def test_a_recording_in_memory_saves_the_truth_that_was_asked_for(recorded, tmp_path):
     kept = simulate(moving_scene(), sensor(), duration_s=0.06, samples=2, truth=["all"])
     assert kept.stored_truth is None
@@ -399,6 +400,7 @@ def test_exports_that_cannot_be_made_leave_nothing(recorded, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
+@pytest.mark.slow
 def test_files_are_the_same_if_somebody_holds_on_to_their_data_sets(recorded, tmp_path, monkeypatch):
     """A profiler that samples the stack does. HDF5 places a chunk when the last reference to its data set goes."""
     held, plain = [], h5py.Group.__getitem__

@@ -138,6 +138,7 @@ EVERY = {
 }
 
 
+@pytest.mark.slow
 def test_each_effect_is_switched_off_by_its_name_and_told_in_the_manifest():
     from hesim_render.specs.lens import LENS_TERMS
 

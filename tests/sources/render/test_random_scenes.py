@@ -36,7 +36,7 @@ def test_scenes_are_functions_of_their_seed(tmp_path):
 
 
 def test_flux_against_the_reference(tmp_path):
-    assert_right([check_exposure(random_scene(seed, tmp_path, 12, 8), 12) for seed in FAST])
+    assert_right([check_exposure(random_scene(seed, tmp_path, 12, 8), 8) for seed in FAST])
 
 
 @pytest.mark.slow
