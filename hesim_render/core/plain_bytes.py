@@ -67,11 +67,16 @@ def _outline(value: Any, arrays: list[NDArray]) -> Any:
 
 def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
     """The value of an outline, and the end of its data."""
+    import drjit as dr
+
     if not isinstance(outline, dict):
         return outline, begin
     ((kind, given),) = outline.items()
     if kind == "type":
-        return getattr(jit(), given), begin
+        found = getattr(jit(), given, None)
+        if not dr.is_array_v(found):  # the bytes may name anything
+            raise TypeError(f"no type of Dr.Jit arrays: {given!r}")
+        return found, begin
     if kind == "array":
         descr, shape, is_scalar = given
         dtype = np.dtype(descr if isinstance(descr, str) else [tuple(field) for field in descr])

@@ -223,7 +223,7 @@ def sample_of_blocks(
 
 
 def without_first(blocks: Iterable[Block], count: int) -> Iterator[Block]:
-    """Blocks whose first wanted windows, so many of all, are not wanted."""
+    """Blocks that want all but the first `count` windows; one of which nothing is wanted any more is left out."""
     for block in blocks:
         places = np.flatnonzero(block.wanted)
         if count:

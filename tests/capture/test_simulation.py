@@ -1,11 +1,14 @@
 """The main job from end to end: scene to recording."""
 
+import gc
+
 import numpy as np
 import pytest
 from scipy import constants, stats
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError
+from hesim_render.sources.render.scene.builder import BuiltScene
 
 
 def run(scene, sensor, size, **options):
@@ -111,3 +114,25 @@ def test_exposures_times_and_settings_are_recorded():
 def test_arguments_out_of_range(options):
     with pytest.raises(RangeError):
         run("dark", "gen2", (16, 16), **options)
+
+
+@pytest.mark.parametrize(
+    ("scene", "how"),
+    [("rotating-star", {}), ("led-grid", {}), ("camera-sweep", {"exact": True}), ("pendulum", {"truth": ["flow"]})],
+    ids=["default", "flicker", "exact", "truth"],
+)
+def test_a_run_leaves_no_surfaces_behind(scene, how):
+    """Each kernel lists the surfaces of all scenes that are alive: runs would become slower, one after another."""
+    mono = hr.load_sensor("reference-mono").crop(8, 6)
+
+    def alive():
+        return sum(isinstance(value, BuiltScene) for value in gc.get_objects())
+
+    gc.collect()
+    before = alive()
+    gc.disable()
+    try:
+        hr.simulate(hr.load_scene(scene), mono, duration_s=0.003, max_minutes=None, **how)
+        assert alive() == before
+    finally:
+        gc.enable()

@@ -52,3 +52,9 @@ def test_types_of_arrays_are_those_of_the_backend():
 def test_other_values_are_refused(value):
     with pytest.raises(TypeError):
         to_bytes(value)
+
+
+@pytest.mark.parametrize("name", ["__loader__", "__class__", "Nothing"])
+def test_bytes_name_no_other_type_than_those_of_arrays(name):
+    with pytest.raises(TypeError, match=name):
+        from_bytes(to_bytes(type(name, (), {})))

@@ -17,7 +17,7 @@ from hesim_render.sources.render.scene.deformation import Deformation
 from hesim_render.sources.render.scene.mitsuba_version import box_corners, spectrum_dict
 from hesim_render.sources.render.scene.parents import camera_trajectory, trajectories
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.specfilm import perspective_dict
+from hesim_render.sources.render.specfilm import camera_at, perspective_dict
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
 
@@ -66,8 +66,7 @@ class FrozenPixels:
         self.view = place_camera(scene.spec, sensor, self._built.mitsuba_sensor())
         sensor = self.view.sensor
         self.is_dark = self._built.is_dark
-        self._track = camera_trajectory(scene.spec)
-        self.is_static = not self._built.moves and self._track is None
+        self.is_static = not self._built.moves and camera_trajectory(scene.spec) is None
         self._filter = sensor.layout.filter_index.ravel()
         self._full_index = sensor.layout.full_index.ravel()
         scale = scene.spec.mitsuba.radiance_scale if scene.spec.mitsuba is not None else 1.0
@@ -112,7 +111,7 @@ class FrozenPixels:
         found = np.zeros((count, pixels.size))
         # the poses of all instants at once: one by one, they would take longer than the rays
         poses = {name: track.matrix(times) for name, track in self._built.trajectories.items()}
-        cameras = np.broadcast_to(self._cameras_at(times) @ MITSUBA_AXES, (*times.shape, 4, 4))
+        cameras = np.broadcast_to(camera_at(self._scene, self.view, times) @ MITSUBA_AXES, (*times.shape, 4, 4))
         for repeat, instant in np.ndindex(times.shape):
             if not self.is_static:
                 now = repeat, instant
@@ -129,11 +128,6 @@ class FrozenPixels:
                 )
                 found[repeat, place] += weight[repeat, instant] * float(np.array(image).ravel()[0])
         return found / work.instants * self._factor[pixels]
-
-    def _cameras_at(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Camera-to-world matrices, [..., 4, 4] for times [...], or one [4, 4] if the camera rests."""
-        to_world = self.view.camera_to_world
-        return to_world if self._track is None else self._track.matrix(t_us) @ to_world
 
     def _instants(
         self, span_us: tuple[float, float], rng: np.random.Generator, shape: tuple[int, int]
@@ -171,7 +165,7 @@ class FrozenPixels:
         knots = [t_us for each in moving for t_us in each.knots_us]
         inside = [float(t) for t in knots if begin_us < t < end_us]
         times = np.unique(np.concatenate([times, inside]))
-        cameras = np.broadcast_to(self._cameras_at(times), (times.size, 4, 4))
+        cameras = np.broadcast_to(camera_at(self._scene, self.view, times), (times.size, 4, 4))
         still = [self._built.corners] if np.ptp(cameras, axis=0).any() else []
         places = [np.broadcast_to(corners, (times.size, *corners.shape)) for corners in still]
         for name in dict.fromkeys((*self._built.trajectories, *self._built.deformations)):

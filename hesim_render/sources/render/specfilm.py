@@ -7,7 +7,7 @@ from math import atan, degrees
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import RangeError, SpecError
@@ -95,8 +95,8 @@ def perspective_dict(
     }
 
 
-def camera_at(scene: Scene, view: View, t_us: float) -> NDArray[np.float64]:
-    """Camera-to-world matrix of a (moving) camera at one time."""
+def camera_at(scene: Scene, view: View, t_us: ArrayLike) -> NDArray[np.float64]:
+    """Camera-to-world matrices at times [...], µs: [..., 4, 4], or a single one [4, 4] if the camera rests."""
     camera = camera_trajectory(scene.spec)
     return view.camera_to_world if camera is None else camera.matrix(t_us) @ view.camera_to_world
 

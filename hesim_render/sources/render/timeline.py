@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.method_cache import method_cache
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.scene.deformation import Deformation
 from hesim_render.sources.render.scene.trajectory import Trajectory
@@ -59,7 +59,7 @@ class Timeline:
         self._moving: list[Trajectory | Deformation] = [*self._trajectories.values(), *self._deformations.values()]
         self._scene_corners = scene_corners
         self._max_motion_px, self._min_slice_us = max_motion_px, min_slice_us
-        self._edges_between = lru_cache(maxsize=4096)(self._measure)
+        self._edges_between = method_cache(self._measure, maxsize=4096)
 
     def _knots(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """All keyframe times from the last at or before `begin_us` to the first at or after `end_us`."""

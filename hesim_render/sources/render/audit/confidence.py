@@ -9,6 +9,8 @@ reached 1/α are therefore excluded with confidence 1 − α, at whatever time a
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,9 +22,9 @@ _PARTS = np.concatenate([[0.5], np.full(8, 0.5 / 8)])
 _STEP = 1e-3
 
 
-def _log_capital(gain: NDArray[np.float64]) -> float:
-    """Logarithm of the portfolio's final capital, from the gain of a stake of 1 on each draw (above -1 each)."""
-    each = np.log1p(_STAKES[:, None] * gain[None]).sum(axis=1)
+def _log_capital(gain: NDArray[np.float64], count: NDArray[np.int64]) -> float:
+    """Logarithm of the portfolio's final capital, from the gain of a stake of 1 on a draw (above -1), so often each."""
+    each = np.log1p(_STAKES[:, None] * gain[None]) @ count
     return float(np.logaddexp.reduce(each + np.log(_PARTS)))
 
 
@@ -38,7 +40,9 @@ def upper_bound(values: NDArray[np.float64], confidence: float) -> float:
     -------
     The bound, in [0, 1].
     """
-    return _least(lambda m: m - values, confidence, values.size)
+    # most draws are alike: each value is looked at once
+    distinct, count = np.unique(values, return_counts=True)
+    return _least(lambda m: m - distinct, confidence, count)
 
 
 def lower_bound(values: NDArray[np.float64], confidence: float) -> float:
@@ -62,21 +66,21 @@ def ratio_upper_bound(part: NDArray[np.float64], whole: NDArray[np.float64], mos
     -------
     The bound, in [0, 1].
     """
-    return _least(lambda r: (r * whole - part) / most, confidence, part.size)
+    pairs, count = np.unique(part + 1j * whole, return_counts=True)
+    return _least(lambda r: (r * pairs.imag - pairs.real) / most, confidence, count)
 
 
-def _least(gain: object, confidence: float, count: int) -> float:
+def _least(gain: Callable[[float], NDArray[np.float64]], confidence: float, count: NDArray[np.int64]) -> float:
     """Smallest parameter up to 1 from which on all values are excluded, to a relative step of `_STEP`."""
-    assert callable(gain)
-    if count == 0:
+    if count.size == 0:
         return 1.0
     wanted = -np.log1p(-confidence)
     low, high = 0.0, 1.0
-    if _log_capital(gain(high)) < wanted:
+    if _log_capital(gain(high), count) < wanted:
         return 1.0
     while high - low > _STEP * high:  # the capital grows with the parameter
         middle = np.sqrt(max(low, 1e-9) * high) if low else max(high / 2, 1e-9)
-        if _log_capital(gain(middle)) >= wanted:
+        if _log_capital(gain(middle), count) >= wanted:
             high = middle
         elif middle <= 1e-9:
             return middle

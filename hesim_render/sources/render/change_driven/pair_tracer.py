@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
+from hesim_render.core.method_cache import method_cache
 from hesim_render.core.rng import Stream, stream_key
 from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
@@ -77,7 +78,7 @@ class PairTracer(Tracer):
             depth, roulette = (depth_limit(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
         self._aim = Aim(self.parts, self.rays)
-        self._boxes = lru_cache(maxsize=8)(self._boxes_in)
+        self._boxes = method_cache(self._boxes_in, maxsize=8)
         layout = self.sensor.layout
         tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
         self._filter_tile = types.UInt32(tile.ravel())
@@ -301,7 +302,8 @@ class PairTracer(Tracer):
             half += dr.select(is_aimed, types.UInt32(2), 0)
         self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
         primary, now, which, weight = self._rays_of(pixel, window, moments, footprint, aimed)
-        # a kernel of its own for the rays, so that one kernel traces them however they were aimed; it costs no time
+        # A kernel of its own makes the rays, so that one kernel traces them however they were aimed. Rays that pass
+        # through memory cost no time that could be measured.
         self._sampler.evaluate()
         dr.eval(primary.o, primary.d, now.instant_us, now.window, now.bin, which, weight)
         lit, hidden, unshadowed, met = self._integrator.flux(self._sampler, primary, now, which)

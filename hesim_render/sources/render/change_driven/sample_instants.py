@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.method_cache import method_cache
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import BLOCK_INTERVALS, CELL_US
 from hesim_render.sources.render.camera import View
@@ -65,7 +65,7 @@ class MotionClock:
         self._turned = self._stretch**2
         if view.projection.distortion is not None:
             _, self._stretch, self._turned = view.projection.distortion.steepest
-        self._speed_of = lru_cache(maxsize=1024)(self._per_metre)
+        self._speed_of = method_cache(self._per_metre, maxsize=1024)
 
     def instants_us(self, begin_us: float, end_us: float) -> NDArray[np.int64]:
         """Instants from `begin_us` to `end_us`, both included, in whole µs; multiples of `CELL_US` are among them."""

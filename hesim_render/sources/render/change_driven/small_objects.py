@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from hesim_render.core.method_cache import method_cache
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.change_driven.tuning import Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -102,7 +102,7 @@ class Zoom:
         self._view, self._camera, self._groups = view, camera, groups
         self._is_matt, self._tuning = is_matt, tuning
         # bands of rows ask for the same windows one after another, and so does the audit
-        self._outlines = lru_cache(maxsize=64)(self._outlines_in)
+        self._outlines = method_cache(self._outlines_in, maxsize=64)
         geometry = view.sensor.spec.geometry
         left, right, top, bottom = (edge / (geometry.pitch_um * 1e-3) for edge in view.followed_mm)
         middle = np.array([geometry.cols / 2, geometry.rows / 2])

@@ -61,9 +61,9 @@ def _home(mi: MitsubaModule) -> Path:
 
 @contextmanager
 def files_readable() -> Iterator[None]:
-    """Give Mitsuba at least two threads while it reads files; with one it would wait for ever.
+    """Give Mitsuba at least two threads while it reads or writes files; with one it would wait for ever.
 
-    It reads EXR files in tasks of its thread pool, and one of them waits for others.
+    It reads and writes EXR files in tasks of its thread pool, and one of them waits for others.
     """
     import drjit as dr
 

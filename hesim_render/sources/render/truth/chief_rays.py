@@ -7,7 +7,6 @@ them at every instant. Directions and positions are computed in float64 from the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Ray, UInt32
+from hesim_render.core.method_cache import method_cache
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
@@ -95,7 +95,7 @@ class ChiefRays:
         self.parts = MovingScene(self.built, geometry_only=True)
         self.names = Names.of(self._mi, self.built, self.parts)
         self._rays = RayFactory(self.view)
-        self._boxes = lru_cache(maxsize=8)(self._boxes_in)
+        self._boxes = method_cache(self._boxes_in, maxsize=8)
 
     @property
     def tracks(self) -> list[Trajectory]:
