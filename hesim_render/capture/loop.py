@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import islice, tee
+from itertools import tee
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.capture.error_meter import ErrorMeter
 from hesim_render.capture.event_flux import EventFlux
-from hesim_render.capture.open_frames import OpenFrame, Piece, pieces_of
-from hesim_render.core.backend import jit
+from hesim_render.capture.open_frames import OpenFrames, frame_pixels
 from hesim_render.core.device_types import Float
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
@@ -75,43 +74,40 @@ class Capture:
         pixels: dict[str, Any] | None = None,
         labels: bool = False,
     ) -> None:
-        self._sensor, self._aps, self._seed = sensor, aps, seed
+        self._sensor, self._seed = sensor, seed
         self._begin_us, self._duration_us = begin_us, duration_us
         layout = sensor.layout
         # frame pixels and event pixels share one source, unless crosstalk is switched off for one of the two
         sources = {n.crosstalk: with_crosstalk(flux, layout.shape, n.crosstalk) for n in (aps, evs) if n is not None}
-        self._frame_source, self._event_source = (
+        frame_source, self._event_source = (
             sources[noise.crosstalk] if noise is not None else next(iter(sources.values()), flux)
             for noise in (aps, evs)
         )
-        none = np.empty(0, np.uint32)
-        self._aps_pixel = np.flatnonzero(layout.aps_mask).astype(np.uint32) if aps is not None else none
-        self._aps_row = self._aps_pixel // layout.cols
-        self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else none
+        self._aps_pixel = frame_pixels(sensor, aps)
+        self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else np.empty(0, np.uint32)
         every = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
         self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
         if flux.is_static:
-            self._frame_source, self._event_source = self._still_sources()
+            frame_source, self._event_source = self._still(frame_source)
+        self._frames = OpenFrames(sensor, aps, self._exposures, frame_source, seed)
         self.labeller = Labeller(evs, seed, begin_us, duration_us) if labels and evs is not None else None
         self._stage = EvsStage(evs, seed, labels=self.labeller) if evs is not None else None
         if self._stage is not None and pixels is not None:
             self._stage.resume(pixels)
         self._known_us = self._stage.t_us if self._stage is not None else None
-        #: Event samples taken, pieces exposed, and frames in exposure, by their index.
-        self._samples = self._exposed = 0
-        self._open: dict[int, OpenFrame] = {}
-        self._t_us = begin_us
+        #: Number of event samples taken, and time that has been simulated, µs.
+        self._samples, self._t_us = 0, begin_us
         self._pixel_state: dict[str, Any] = {}
         self._event_flux = EventFlux(self._evs_pixel.size)
-        self.errors = {"frames": ErrorMeter(), "events": ErrorMeter()}
+        self.errors = {"frames": self._frames.errors, "events": ErrorMeter()}
 
-    def _still_sources(self) -> tuple[FluxSource, FluxSource]:
-        """Both sources of a static scene, each rendered once for all the pixels that it is asked for."""
+    def _still(self, frame_source: FluxSource) -> tuple[FluxSource, FluxSource]:
+        """Sources of frames and of events of a static scene: each pixel that is asked for is rendered once."""
         frame_pixel = self._aps_pixel if self._exposures else self._aps_pixel[:0]
-        if self._frame_source is self._event_source:
-            still = StillFlux(self._frame_source, np.concatenate([frame_pixel, self._evs_pixel]))
+        if frame_source is self._event_source:
+            still = StillFlux(frame_source, np.concatenate([frame_pixel, self._evs_pixel]))
             return still, still
-        return StillFlux(self._frame_source, frame_pixel), StillFlux(self._event_source, self._evs_pixel)
+        return StillFlux(frame_source, frame_pixel), StillFlux(self._event_source, self._evs_pixel)
 
     @property
     def event_pixels(self) -> NDArray[np.uint32]:
@@ -183,9 +179,8 @@ class Capture:
         """
         return {
             "samples": self._samples,
-            "exposed": self._exposed,
             "t_us": self._t_us,
-            "open": {str(index): saved(frame) for index, frame in self._open.items()},
+            "frames": self._frames.state(),
             "stage": None if self._stage is None else self._stage.state(),
             "flux": saved(self._event_flux),
         }
@@ -197,10 +192,8 @@ class Capture:
         ----------
         state : from `state`.
         """
-        self._samples, self._exposed, self._t_us = state["samples"], state["exposed"], state["t_us"]
-        self._open = {e.index: OpenFrame(e) for e in self._exposures if str(e.index) in state["open"]}
-        for index, frame in self._open.items():
-            restore(frame, state["open"][str(index)])
+        self._samples, self._t_us = state["samples"], state["t_us"]
+        self._frames.go_on(state["frames"])
         if self._stage is not None:
             self._stage.resume(state["stage"])
         restore(self._event_flux, state["flux"])
@@ -216,14 +209,14 @@ class Capture:
         ------
         Frames, and blocks of events (structured arrays of `EVENT_DTYPE`); each kind in order of time.
         """
-        pieces = islice(pieces_of(self._exposures, self._frame_source, self._open), self._exposed, None)
+        pieces = self._frames.pieces()
         piece = next(pieces, None)
         blocks, asked = tee(without_first(self.event_blocks(), self._samples))
         samples = self._event_source.flux_of_blocks(self._evs_pixel, asked)
         for begin_us, end_us in wanted_windows(blocks):
             # expose whatever ends before a window first: a source may drop its data of the past
             while piece is not None and piece.end_us <= begin_us:
-                yield from self._expose(piece)
+                yield from self._frames.expose(piece)
                 piece = next(pieces, None)
             yield self._compare(next(samples), int(end_us))
             if progress is not None:
@@ -231,7 +224,7 @@ class Capture:
         if self._stage is not None:
             self._pixel_state = self._pixel_state or self._stage.state()
         while piece is not None:
-            yield from self._expose(piece)
+            yield from self._frames.expose(piece)
             if progress is not None and self._stage is None:
                 progress(piece.end_us, self._duration_us, "simulated µs")
             piece = next(pieces, None)
@@ -246,10 +239,10 @@ class Capture:
         ----------
         begin_us, end_us : the times, µs; a frame lies where its exposure begins.
         """
-        for piece in pieces_of(self._exposures, self._frame_source, self._open):
+        for piece in self._frames.pieces():
             exposure = piece.frame.exposure
             if exposure is self._exposures[0] or begin_us <= exposure.start_us < end_us:
-                for _ in self._expose(piece):
+                for _ in self._frames.expose(piece):
                     pass
         if self._stage is not None:
             blocks = self._blocks_of_span(begin_us, end_us)
@@ -303,39 +296,6 @@ class Capture:
         self._samples, self._t_us = self._samples + 1, min(t_us, self._duration_us)
         return events[(events["t_us"] > self._begin_us) & (events["t_us"] <= self._duration_us)]
 
-    def _expose(self, piece: Piece) -> Iterator[Frame]:
-        """Add to each row the part of its exposure that lies in a piece. Yield the frame after its last piece."""
-        frame = piece.frame
-        if frame.half_a is None:
-            import drjit as dr
-
-            frame.half_a, frame.half_b = (dr.zeros(jit().Float, self._aps_pixel.size) for _ in range(2))
-            self._open[frame.exposure.index] = frame
-        self._add(frame, piece.begin_us, piece.end_us)
-        self._exposed += 1
-        if piece.end_us >= frame.exposure.end_us:
-            del self._open[frame.exposure.index]
-            yield self._read_out(frame)
-
-    def _add(self, frame: OpenFrame, begin_us: float, end_us: float) -> None:
-        import drjit as dr
-
-        starts = frame.exposure.row_begin_us(np.arange(self._sensor.rows))
-        first = np.maximum(starts, begin_us)
-        last = np.minimum(starts + frame.exposure.exposure_us, end_us)
-        where = np.flatnonzero((last > first)[self._aps_row])
-        if where.size == 0:
-            return
-        rows = self._aps_row[where]
-        half_a, half_b = self._frame_source.mean_flux(self._aps_pixel[where], first[rows], last[rows])
-        types = jit()
-        seconds = types.Float(((last - first)[rows] * S_PER_US).astype(np.float32))
-        index = types.UInt32(where.astype(np.uint32))
-        for total, half in ((frame.half_a, half_a), (frame.half_b, half_b)):
-            # every index occurs once, so this is no race and the sum's order is that of time
-            dr.scatter(total, dr.gather(types.Float, total, index) + half * seconds, index)
-        dr.eval(frame.half_a, frame.half_b)
-
     def _step(self, half_a: Float, half_b: Float, t_us: int) -> NDArray:
         assert self._stage is not None
         seconds = self._stage.noise.spec.window_us * S_PER_US
@@ -346,38 +306,3 @@ class Capture:
             lambda electrons, which: noise.noise_equivalent_e(electrons, noise.layout.evs_position.ravel()[which]),
         )
         return self._stage.step((half_a + half_b) * (0.5 * seconds), t_us)
-
-    def _read_out(self, frame: OpenFrame) -> Frame:
-        """Draw the noise of a frame once, then put all values back on the mosaic."""
-        import drjit as dr
-
-        assert self._aps is not None
-        types = jit()
-        layout = self._sensor.layout
-        exposure = frame.exposure
-        count = layout.rows * layout.cols
-        index = types.UInt32(self._aps_pixel)
-        noise = self._sensor.aps
-        self.errors["frames"].add(
-            frame.half_a, frame.half_b, lambda signal, _: noise.noise_equivalent_e(signal, exposure.exposure_us)
-        )
-        mean = 0.5 * (frame.half_a + frame.half_b)
-        signal = dr.zeros(types.Float, count)
-        dr.scatter(signal, mean, index)
-        raw = self._aps.sample_dn(signal, exposure.exposure_us, self._seed, exposure.index).numpy()
-        electrons = np.full(count, np.nan, dtype=np.float32)
-        stderr = np.full(count, np.nan, dtype=np.float32)
-        electrons[self._aps_pixel] = np.array(mean)
-        stderr[self._aps_pixel] = np.array(dr.abs(frame.half_a - frame.half_b) * 0.5)
-        valid = layout.aps_mask
-        return Frame(
-            raw=np.where(valid, raw.reshape(layout.shape), 0).astype(np.uint16),
-            valid=valid,
-            electrons_mean=electrons.reshape(layout.shape),
-            electrons_stderr=stderr.reshape(layout.shape),
-            t_us=exposure.t_us,
-            exposure_start_us=exposure.start_us,
-            exposure_us=exposure.exposure_us,
-            line_time_us=exposure.line_time_us,
-            index=exposure.index,
-        )
