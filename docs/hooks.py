@@ -125,9 +125,7 @@ def bibliography() -> str:
 
 def commands() -> str:
     """What `--help` says of every command, as Markdown."""
-    import typer
-
-    from hesim_render.cli.commands import app
+    from hesim_render.cli.commands import program
 
     def section(name: str, command: Any) -> list[str]:
         context = command.context_class(
@@ -138,8 +136,7 @@ def commands() -> str:
             lines += section(f"{name} {below}", child)
         return lines
 
-    whole = typer.main.get_command(app)
-    visible = ((name, command) for name, command in whole.commands.items() if not command.hidden)
+    visible = ((name, command) for name, command in program().commands.items() if not command.hidden)
     return "\n".join(line for name, command in visible for line in section(name, command))
 
 

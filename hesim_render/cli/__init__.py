@@ -60,11 +60,11 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
     try:
         import typer
 
-        from hesim_render.cli.commands import app
+        from hesim_render.cli.commands import program
 
         # typer carries its own copy of click in newer versions; this is the base of its usage errors in all
         usage_error = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
-        status = app(args=given or ["--help"], standalone_mode=False)
+        status = program()(args=given or ["--help"], standalone_mode=False)
         return status if isinstance(status, int) else 0
     except KeyboardInterrupt:
         return ExitStatus.INTERRUPTED

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from functools import cache
+from typing import Annotated, Any
 
 import typer
 
@@ -55,3 +56,9 @@ for _command in (
 
 app.add_typer(sensor.app, name="sensor")
 app.add_typer(benchmark.app, name="benchmark")
+
+
+@cache
+def program() -> Any:
+    """All commands as one that can be called; building it takes longer than reading a command line."""
+    return typer.main.get_command(app)
