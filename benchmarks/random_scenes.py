@@ -4,10 +4,12 @@ Scenes by seed, none of which chose any constant, are simulated with their audit
 Mitsuba's own integrators. That takes about a minute of one core a scene. One line of JSON a scene is appended to the
 file, and a scene that is in it already is not run.
 
-    python benchmarks/random_scenes.py run --seeds 2000:2500 --out random_scenes.jsonl
-    python benchmarks/random_scenes.py judge random_scenes.jsonl
+    python benchmarks/random_scenes.py run --seeds 2000:2500
+    python benchmarks/random_scenes.py judge
 
-Run it in several processes with seeds of their own. `judge` prints counts and bounds, and what does not hold.
+The file is `results/random_scenes.jsonl`, unless `--out` or an argument names another one; each line names the commit
+that was run. Run it in several processes with seeds and files of their own. `judge` prints counts and bounds, and what
+does not hold.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 
 from random_checks import judge, judged_run
 from random_scenes import small_scene
+
+RESULTS = Path(__file__).parent / "results" / "random_scenes.jsonl"
 
 
 def run(seeds: range, out: Path) -> None:
@@ -80,8 +84,8 @@ if __name__ == "__main__":
     commands = parser.add_subparsers(dest="command", required=True)
     one = commands.add_parser("run")
     one.add_argument("--seeds", default="2000:2500", help="first:last, without the last")
-    one.add_argument("--out", type=Path, default=Path("random_scenes.jsonl"))
-    commands.add_parser("judge").add_argument("file", type=Path)
+    one.add_argument("--out", type=Path, default=RESULTS)
+    commands.add_parser("judge").add_argument("file", type=Path, nargs="?", default=RESULTS)
     given = parser.parse_args()
     if given.command == "judge":
         sys.exit(report(given.file))
