@@ -360,7 +360,6 @@ def test_parse_roi():
         parse_roi("512x384x2")
 
 
-@pytest.mark.slow
 def test_interrupt_exits_130_and_leaves_nothing(tmp_path):
     out = tmp_path / "o"
     command = [sys.executable, "-m", "hesim_render.cli", "simulate", "rotating-star", "--sensor", "gen2", "--roi"]
@@ -403,7 +402,6 @@ def test_the_main_job_end_to_end(capsys, tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_lab_calibrate_and_simulate_end_to_end(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     status, out, err = call(

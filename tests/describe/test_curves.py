@@ -28,11 +28,15 @@ SLOW = {
 #: Without noise, and without the queue of the read-out, in which events of all pixels at once would wait.
 NO_QUEUE = ("leak", "shot", "dark_current", "readout_limit")
 #: Shipped sensors whose event pixels are written as a data sheet, and the latencies that the sheets state.
-SHEETS = [name for name in list_names("sensors") if (evs := read_sensor(name).evs) is not None and evs.data_sheet]
+SHEETS = {
+    name: evs.data_sheet
+    for name in list_names("sensors")
+    if (evs := read_sensor(name).evs) is not None and evs.data_sheet
+}
 LATENCIES = [
     (name, speed.lux, speed.latency_us)
-    for name in SHEETS
-    for speed in read_sensor(name).evs.data_sheet.speed
+    for name, sheet in SHEETS.items()
+    for speed in sheet.speed
     if speed.latency_us is not None
 ]
 

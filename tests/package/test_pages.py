@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 import run_page
-import typer
 from ruamel.yaml import YAML
 from source_trees import source_tree
 
 import hesim_render as hr
-from hesim_render.cli.commands import app
+from hesim_render.cli.commands import program
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -35,7 +34,7 @@ def commands_of(text):
 
 def parsed(words):
     """Parse a command line as the program does, without running it: the command's name."""
-    command, context = typer.main.get_command(app), None
+    command, context = program(), None
     while hasattr(command, "commands") and words and words[0] in command.commands:
         context = command.context_class(command, parent=context, info_name="hesim-render")
         command, words = command.commands[words[0]], words[1:]

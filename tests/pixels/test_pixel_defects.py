@@ -289,7 +289,6 @@ def test_wrong_keys_are_told(key, value, text):
 # ---- frame pixels --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_telegraph_noise_has_its_variance_and_autocovariance():
     """Values of noiseless pixels: two levels, mean 0, a² p (1 − p), exp(−Δt/τ); 4 scores: false alarm 1e-4."""
     given = sensor(
@@ -355,7 +354,6 @@ def events_session(tmp_path_factory):
     return given, folder / "c.yaml"
 
 
-@pytest.mark.slow
 def test_defects_of_events_are_found_and_named(events_session):
     given, file = events_session
     true, maps, section = given.evs.defects, read_maps(file, "evs"), read_calibration(file)["evs"]
@@ -381,7 +379,6 @@ def test_defects_of_events_are_found_and_named(events_session):
     assert maps["defect_off_per_trial"].max() < 2e-3
 
 
-@pytest.mark.slow
 def test_a_calibrated_sensor_misbehaves_alike(events_session):
     given, file = events_session
     true = given.evs.defects

@@ -400,7 +400,6 @@ def test_exports_that_cannot_be_made_leave_nothing(recorded, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
-@pytest.mark.slow
 def test_files_are_the_same_if_somebody_holds_on_to_their_data_sets(recorded, tmp_path, monkeypatch):
     """A profiler that samples the stack does. HDF5 places a chunk when the last reference to its data set goes."""
     held, plain = [], h5py.Group.__getitem__

@@ -18,13 +18,14 @@ _BANDS = np.arange(400.0, 701.0, 10.0)
 
 def surfaces(folder):
     """Pictures and materials on objects, an environment map, and a track with a parent."""
-    from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+    from hesim_render.sources.render.scene.mitsuba_version import files_readable, mitsuba
 
     rng = np.random.default_rng(6)
     Image.fromarray(rng.integers(0, 255, (8, 8, 3), dtype=np.uint8)).save(folder / "t.png")
     np.save(folder / "cube.npy", rng.random((4, 6, 5), dtype=np.float32))
     mi = mitsuba()
-    mi.Bitmap(rng.random((4, 8, 3), dtype=np.float32)).write(str(folder / "sky.exr"))
+    with files_readable():
+        mi.Bitmap(rng.random((4, 8, 3), dtype=np.float32)).write(str(folder / "sky.exr"))
     (folder / "curve.csv").write_text("360,0.4\n830,0.5\n")
     (folder / "s.yaml").write_text(
         "schema_version: 1\nname: x\ndescription: d\nobjects:\n"

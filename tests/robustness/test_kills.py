@@ -230,6 +230,33 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
     trial.end()
 
 
+def ended_twice(tmp_path, command, run, given, number, more_bytes, how=("-m", "hesim_render.cli")):
+    """Ended twice by a signal, a command goes on, and ends with the bytes of one that ran through (`whole`).
+
+    Each time it is ended when its journal has grown by `more_bytes`. `run` is the command without its target.
+    """
+    out = tmp_path / ("r/recording" if command == "run" else "out")
+    journal = out.parent / f".{out.name}.unfinished"
+    before = 0
+    for _ in range(2):
+        child = start(tmp_path, given, how=how)
+        while child.poll() is None and not (journal.is_file() and journal.stat().st_size > before + more_bytes):
+            time.sleep(0.01)
+        child.send_signal(number)
+        _, err = child.communicate(timeout=60)
+        assert child.returncode in (130, -number) and "Traceback" not in err, err
+        assert not out.exists() and journal.stat().st_size > before
+        before = journal.stat().st_size
+    kept = journal.read_bytes()
+    refused = start(tmp_path, [*run, "--seed", "8", "--out", out])
+    assert "an interrupted run, which would go on there, had another seed" in refused.communicate(timeout=60)[1]
+    assert refused.returncode == 2 and journal.read_bytes() == kept
+    finish(tmp_path, given)
+    assert files_in(out) == files_in(tmp_path / "whole") and not journal.exists()
+    for path in files_in(out):
+        assert (out / path).read_bytes() == (tmp_path / "whole" / path).read_bytes(), path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 @pytest.mark.parametrize("command", ["simulate", "rerun", "run"])
@@ -245,26 +272,7 @@ def test_a_killed_run_goes_on(command, number, tmp_path):
         "schema_version: 1\nname: r\nscene: rotating-star\nsensor: gen2\nroi: 96x64\nduration_s: 0.02\n"
     )
     finish(tmp_path, [*run, "--out", "whole"])
-    out = tmp_path / ("r/recording" if command == "run" else "out")
-    journal = out.parent / f".{out.name}.unfinished"
-    before = 0
-    for _ in range(2):
-        child = start(tmp_path, given)
-        while child.poll() is None and not (journal.is_file() and journal.stat().st_size > before + 50_000):
-            time.sleep(0.01)
-        child.send_signal(number)
-        _, err = child.communicate(timeout=60)
-        assert child.returncode in (130, -number) and "Traceback" not in err, err
-        assert not out.exists() and journal.stat().st_size > before
-        before = journal.stat().st_size
-    kept = journal.read_bytes()
-    refused = start(tmp_path, [*run, "--seed", "8", "--out", out])
-    assert "an interrupted run, which would go on there, had another seed" in refused.communicate(timeout=60)[1]
-    assert refused.returncode == 2 and journal.read_bytes() == kept
-    finish(tmp_path, given)
-    assert files_in(out) == files_in(tmp_path / "whole") and not journal.exists()
-    for path in files_in(out):
-        assert (out / path).read_bytes() == (tmp_path / "whole" / path).read_bytes(), path
+    ended_twice(tmp_path, command, run, given, number, 50_000)
 
 
 #: A run of a video is kept from its begin, and in short parts.
@@ -289,26 +297,7 @@ def test_a_killed_video_goes_on(command, number, tmp_path):
     )
     given = [*run, "--out", "out"] if command == "video" else ["run", "r.yaml", "--out", "r"]
     finish(tmp_path, [*run, "--out", "whole"])
-    out = tmp_path / ("r/recording" if command == "run" else "out")
-    journal = out.parent / f".{out.name}.unfinished"
-    before = 0
-    for _ in range(2):
-        child = start(tmp_path, given, how=("-c", SHORT_PARTS))
-        while child.poll() is None and not (journal.is_file() and journal.stat().st_size > before + 500_000):
-            time.sleep(0.01)
-        child.send_signal(number)
-        _, err = child.communicate(timeout=60)
-        assert child.returncode in (130, -number) and "Traceback" not in err, err
-        assert not out.exists() and journal.stat().st_size > before
-        before = journal.stat().st_size
-    kept = journal.read_bytes()
-    refused = start(tmp_path, [*run, "--seed", "8", "--out", out])
-    assert "an interrupted run, which would go on there, had another seed" in refused.communicate(timeout=60)[1]
-    assert refused.returncode == 2 and journal.read_bytes() == kept
-    finish(tmp_path, given)
-    assert files_in(out) == files_in(tmp_path / "whole") and not journal.exists()
-    for path in files_in(out):
-        assert (out / path).read_bytes() == (tmp_path / "whole" / path).read_bytes(), path
+    ended_twice(tmp_path, command, run, given, number, 500_000, how=("-c", SHORT_PARTS))
 
 
 @pytest.mark.slow

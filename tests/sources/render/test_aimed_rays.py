@@ -134,7 +134,6 @@ def test_pairs_without_small_objects_keep_their_bits():
     assert np.mean(together.half_a[~plain] != alone.half_a[~plain]) > 0.5
 
 
-@pytest.mark.slow
 def test_an_audit_of_the_same_pair_twice_gives_the_same_value():
     source, aims = source_and_aims()
     crossed = np.flatnonzero(aims.count.reshape(2, -1).min(axis=0))

@@ -8,7 +8,7 @@ from rendering import flux_image, mono
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.scene.mitsuba_version import files_readable, mitsuba
 
 ROWS, COLS = 64, 128
 THETA = np.linspace(0, np.pi, ROWS)[:, None]
@@ -17,7 +17,8 @@ AROUND = 2 * np.pi * np.arange(COLS)[None] / COLS
 
 def write_map(folder, values):
     picture = np.repeat(np.broadcast_to(values, (ROWS, COLS))[..., None], 3, axis=2).astype(np.float32)
-    mitsuba().Bitmap(picture).write(str(folder / "map.exr"))
+    with files_readable():
+        mitsuba().Bitmap(picture).write(str(folder / "map.exr"))
 
 
 def flux(folder, light, tilt_deg=0.0, samples=1 << 14):

@@ -138,7 +138,6 @@ EVERY = {
 }
 
 
-@pytest.mark.slow
 def test_each_effect_is_switched_off_by_its_name_and_told_in_the_manifest():
     from hesim_render.specs.lens import LENS_TERMS
 
