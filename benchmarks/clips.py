@@ -4,17 +4,21 @@ Four parts, each with generated scenes of the default ranges::
 
     python benchmarks/clips.py parts [--clips 4] [--roi 256x192] [--sensor gen2] [--duration 0.05]
     python benchmarks/clips.py overhead [the same options]
-    python benchmarks/clips.py workers [the same options]
+    python benchmarks/clips.py workers [--equal] [the same options]
     python benchmarks/clips.py spans --clips 1 --duration 0.4 [the same options]
 
 `parts` prints processor seconds of each step of a clip, with the materials of its scene. `overhead` builds the clips
 with one worker of one thread, and prints what that took beyond the time inside the clips. `workers` builds the same
-clips with one and with two workers of one thread each. `spans` does so with spans of a quarter of each clip for the two
-workers. All three need an idle machine and clips of more than some seconds.
+clips with one and with two workers of one thread each, when their kernels are compiled. Scenes differ by a factor of
+ten in their time, so that with few clips the last one keeps a worker waiting: `--equal` gives all clips one scene.
+`spans` cuts each clip into four spans for the two workers. All but `parts` need an idle machine and clips of more than
+some seconds.
 """
 
 import argparse
 import contextlib
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -49,7 +53,9 @@ STEPS = (
 def spec_of(given):
     keys = {
         "schema_version": 1, "name": "cost", "description": "Default ranges.", "duration_s": given.duration,
-        "scenes": {"count": given.clips, "objects": [2, 4]}, "sensors": [{"sensor": given.sensor, "roi": given.roi}],
+        "scenes": {"count": 1 if given.equal else given.clips, "objects": [2, 4]},
+        "seeds": list(range(7, 7 + given.clips)) if given.equal else [7],
+        "sensors": [{"sensor": given.sensor, "roi": given.roi}],
         "sharp": {"every_us": round(given.duration * 1e6 / 5), "window_us": 200},
         "truth": ["flow", "depth", "events"], "quality": given.quality, "audit": given.audit,
     }  # fmt: skip
@@ -127,12 +133,29 @@ def overhead(spec, folder):
 
 
 def workers(spec, folder):
-    times = {}
+    times, inside = {}, {}
+    run(spec, folder / "first", 2)  # compiles the kernels, which stay on the disk of a machine
     for count in (1, 2):
         begin, answers = run(spec, folder / str(count), count)
         times[count] = max(end for end, _ in answers) - begin
-        print(f"{count} workers of one thread: {times[count]:.1f} s with their start", flush=True)
-    print(f"two are {times[1] / times[2]:.2f} times as fast as one")
+        inside[count] = sum(seconds for _, seconds in answers)
+        each = ", ".join(f"{seconds:.1f}" for _, seconds in answers)
+        print(f"{count} workers of one thread: {times[count]:.1f} s with their start; clips: {each} s", flush=True)
+    slower, idle = inside[2] / inside[1], 1 - inside[2] / (2 * times[2])
+    print(
+        f"two are {times[1] / times[2]:.2f} times as fast as one; they began or waited for {100 * idle:.0f} % of that"
+    )
+    print(f"clips take {slower:.2f} times as long beside each other, plain loops {plain_loops(2) / plain_loops(1):.2f}")
+
+
+#: Arithmetic that needs little memory, for some seconds: what the processors themselves give to a second process.
+LOOP = "import time; t = time.perf_counter(); sum(i * i for i in range(40_000_000)); print(time.perf_counter() - t)"
+
+
+def plain_loops(count):
+    """Mean time of equal loops in as many processes at once, s."""
+    loops = [subprocess.Popen([sys.executable, "-c", LOOP], stdout=subprocess.PIPE, text=True) for _ in range(count)]
+    return sum(float(loop.communicate()[0]) for loop in loops) / count
 
 
 def spans(spec, folder):
@@ -151,6 +174,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["parts", "overhead", "workers", "spans"])
     parser.add_argument("--clips", type=int, default=4)
+    parser.add_argument("--equal", action="store_true", help="one scene with as many seeds, so that clips take as long")
     parser.add_argument("--roi", default="256x192")
     parser.add_argument("--sensor", default="gen2")
     parser.add_argument("--duration", type=float, default=0.05)
