@@ -149,9 +149,10 @@ def test_a_look_at_a_full_sensor_takes_less_than_three_seconds():
     """Processor time of all threads, the better of two runs; importing and the backend come before."""
     sensor = hr.load_sensor("eiger")
     look(hr.load_scene("dark"), hr.load_sensor("davis346"))
-    taken = []
     for name in ("colorchecker", "camera-sweep"):
-        start = time.process_time()
-        look(hr.load_scene(name), sensor)
-        taken.append(time.process_time() - start)
-    assert max(taken) < 3
+        taken = []
+        for _ in range(2):
+            start = time.process_time()
+            look(hr.load_scene(name), sensor)
+            taken.append(time.process_time() - start)
+        assert min(taken) < 3
