@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
-from random_checks import MOST_OFF, QUALITY, check_exposure, judge, judged_run
+from random_checks import MOST_OFF, QUALITY, check_exposure, count_events, judge, judged_run
 from random_scenes import random_scene, small_scene
 from scipy import stats
+
+import hesim_render as hr
 
 FAST, SLOW = range(1000, 1020), range(2000, 2500)
 
@@ -45,6 +47,20 @@ def test_flux_against_the_reference(part, tmp_path):
 def test_runs_are_as_right_as_they_say(begin, tmp_path):
     """Values, events and the bounds of the audit; `benchmarks/random_scenes.py` does the same in parts."""
     assert not judge([judged_run(small_scene(seed, tmp_path)) for seed in range(begin, begin + 25)])
+
+
+def test_an_event_within_the_error_of_the_comparison_is_not_counted():
+    """One pixel rises: by less than its threshold in truth, by slightly more in the run."""
+    sensor = hr.load_sensor("gen2").crop(16, 16)
+    theta = float(np.broadcast_to(sensor.evs.threshold_on_map, sensor.layout.evs_shape).flat[0])
+    begin, chosen = 1e6, np.array([0])
+    own, truth = np.array([[begin], [begin * np.exp(1.03 * theta)]]), np.full((2, 1), begin)
+    near = np.array([[begin], [begin * np.exp(0.98 * theta)]])
+    for reference, error, extra in ((truth, 1.0, 1), (near, 1.0, 1), (near, 0.01 * theta * begin, 0)):
+        counted = count_events(sensor, chosen, own, reference, np.full((2, 1), error))
+        assert (counted.found.sum(), counted.true.sum(), counted.extra.sum()) == (1, 0, extra)
+        swapped = count_events(sensor, chosen, reference, own, np.full((2, 1), error))
+        assert (swapped.found.sum(), swapped.true.sum(), swapped.missed.sum()) == (0, 1, extra)
 
 
 def record(seed, off=0, missed=0, count_off=0, mean=0.0):
