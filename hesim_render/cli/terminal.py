@@ -120,7 +120,7 @@ def _reached(render: dict[str, Any] | None) -> list[str]:
             f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of the noise, "
             f"with 99 % confidence at most {_percent(part['off_at_most'])}"
         )
-        if part.get("true_events"):
+        if part.get("true_events") or part.get("found_events"):
             line += (
                 f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
                 f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"

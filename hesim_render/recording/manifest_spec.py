@@ -41,6 +41,7 @@ class _AuditedPart(_Open):
     off: float
     off_at_most: float
     true_events: int | None = None
+    found_events: int | None = None
     missed: float | None = None
     missed_at_most: float | None = None
     extra: float | None = None
@@ -49,8 +50,8 @@ class _AuditedPart(_Open):
     @model_validator(mode="after")
     def _check(self) -> _AuditedPart:
         shares = (self.missed, self.missed_at_most, self.extra, self.extra_at_most)
-        if self.true_events and any(share is None for share in shares):
-            raise ValueError("true_events: needs missed, extra and their _at_most beside it")
+        if (self.true_events or self.found_events) and any(share is None for share in shares):
+            raise ValueError("true_events, found_events: need missed, extra and their _at_most beside them")
         return self
 
 

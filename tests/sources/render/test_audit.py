@@ -143,6 +143,18 @@ def test_estimates_are_the_shares_themselves(monkeypatch):
     assert found["deviation_noise"]["largest"] >= (1 - 1 / 1.6) / UNIT * 0.999
 
 
+def test_events_of_a_run_that_has_none_in_truth_are_too_many():
+    """One pixel of a still scene flashes: few values are off, but every event is wrong."""
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    run = truth.copy()
+    run[TICKS // 2, 0] *= 1.5
+    found = audited(run, truth, 1)
+    assert found["events"]["true_events"] == 0 < found["events"]["found_events"]
+    assert found["events"]["extra"] == found["events"]["extra_at_most"] == 1
+    assert found["verdict"] == "not met"
+    assert audited(truth, truth, 1)["verdict"] == "met"  # nothing moves, and nothing is found
+
+
 @pytest.mark.slow  # a run of the command line tells it, too
 def test_verdict_and_the_quality_that_would_do():
     truth = np.full((TICKS, ROWS * COLS), 1e5)
