@@ -91,14 +91,14 @@ def summary(recording: Recording) -> str:
         )
     if counts.get("events_dropped"):
         lines.append(f"  {counts['events_dropped']} more events were lost in the sensor's read-out")
-    lines += _reached(manifest["settings"].get("render"))
+    lines += render_lines(manifest["settings"].get("render"))
     if recording.path is not None:
         pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
         lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
     return "\n".join(map(printable, lines))
 
 
-def _reached(render: dict[str, Any] | None) -> list[str]:
+def render_lines(render: dict[str, Any] | None) -> list[str]:
     """Lines about the error that a render has reached."""
     if render is None:
         return []
