@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hesim_render.capture.loop import Capture
+from hesim_render.core.distinct import distinct_pixels
 from hesim_render.sources.render.change_driven.forecast import Estimate
 
 #: Exposures whose slices are counted; pixels that are rendered to find the speed, at most.
@@ -35,7 +36,7 @@ def estimate_exact(flux: Any, capture: Capture, samples: int) -> Estimate:
     frame_pixel, exposures = capture.frame_exposures
     events = capture.event_pixels.size
     if parts[0].is_static:
-        values = float(np.union1d(frame_pixel if exposures else frame_pixel[:0], capture.event_pixels).size)
+        values = float(distinct_pixels(frame_pixel if exposures else frame_pixel[:0], capture.event_pixels).size)
     else:
         values = events * capture.sample_of_event_blocks().windows
         if exposures:
@@ -58,7 +59,7 @@ def _rays_per_second(part: Any, capture: Capture, samples: int) -> float:
     """Speed of a small picture; a first one compiles the kernels, which the run needs as well."""
     import drjit as dr
 
-    every = np.union1d(capture.frame_exposures[0], capture.event_pixels)
+    every = distinct_pixels(capture.frame_exposures[0], capture.event_pixels)
     count = min(every.size, max(1, _PIXELS // max(1, samples // 16)))
     pixel = every[np.linspace(0, every.size - 1, count).astype(int)]
     begin, end = np.zeros(count), np.full(count, 1.0)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Halves
+from hesim_render.core.distinct import distinct_pixels
 from hesim_render.sources.protocol import FluxSource
 from hesim_render.sources.window_by_window import WindowByWindow
 
@@ -32,8 +33,8 @@ class Kept:
 
         types = jit()
         self._reach(int(pixel.max()) + 1 if pixel.size else 0)
-        fresh = np.unique(pixel[~self._known[pixel]])
-        if fresh.size:
+        if not self._known[pixel].all():
+            fresh = distinct_pixels(pixel[~self._known[pixel]])
             where = types.UInt32(fresh)
             for source, kept in zip(self._sources, self._kept, strict=True):
                 for whole, half in zip(kept, source.mean_flux(fresh, 0.0, 1.0), strict=True):
@@ -71,7 +72,7 @@ class StillFlux(WindowByWindow):
     is_static = True
 
     def __init__(self, source: FluxSource, pixel: NDArray[np.uint32]) -> None:
-        self._kept, self._pixel = Kept([source]), np.unique(pixel)
+        self._kept, self._pixel = Kept([source]), pixel
         self._is_rendered = False
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sensor.lens import relative_illumination_at
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
@@ -56,14 +57,14 @@ class VeilingGlare:
         pose_us : time at which moving objects stand.
         """
         types = jit()
-        spans, which = np.unique(np.stack([begin_us, end_us]), axis=1, return_inverse=True)
+        spans, which = distinct_columns(np.stack([begin_us, end_us]))
         group = np.arange(spans.shape[1]) * min(_GROUPS, spans.shape[1]) // spans.shape[1]
         key = spans.tobytes() + np.float64(pose_us).tobytes()
         if self._known is None or self._known[0] != key:
             self._known = key, [self._means(spans[:, group == number]) for number in range(int(group[-1]) + 1)]
         means = np.stack(self._known[1])
         filter_of = self._tracer.sensor.layout.filter_index.ravel()[pixel]
-        found = means[group[which.ravel()], filter_of]
+        found = means[group[which], filter_of]
         half_a, half_b = (types.Float(np.ascontiguousarray(values, np.float32)) for values in found.T)
         return half_a, half_b
 

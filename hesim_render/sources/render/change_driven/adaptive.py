@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
@@ -149,8 +150,8 @@ class AdaptiveRenderer:
         known = still.known[pixel]
         out.put(known, still.flux.at(pixel[known]))
         waiting = np.flatnonzero(~known)
-        span, number = np.unique(np.stack([begin[waiting], end[waiting]]), axis=1, return_inverse=True)
-        windows, number = Windows(span[0], span[1]), number.ravel()
+        span, number = distinct_columns(np.stack([begin[waiting], end[waiting]]))
+        windows = Windows(span[0], span[1])
         # neighbours use the window of their own row; a row with several windows is rendered once for each
         turn = turns(pixel[waiting] // self._sensor.cols, number)
         for k in range(int(turn.max(initial=-1)) + 1):

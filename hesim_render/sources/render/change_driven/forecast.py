@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.distinct import distinct_pixels
 from hesim_render.mosaic.schedule import BlockSample, Exposure
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
@@ -74,7 +75,9 @@ def forecast(
             patch = _patches(event_pixel, source, rng)
             each = [source.foretell(patch, block.begin_us, block.end_us, "events") for block in chosen]
             rays += float(np.mean(each)) * event_pixel.size * blocks.count
-        pixel = np.union1d(frame_pixel if exposures else frame_pixel[:0], event_pixel if is_static else event_pixel[:0])
+        pixel = distinct_pixels(
+            frame_pixel if exposures else frame_pixel[:0], event_pixel if is_static else event_pixel[:0]
+        )
         if pixel.size:
             patch = _patches(pixel, source, rng)
             begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))

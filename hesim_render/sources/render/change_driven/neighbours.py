@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.distinct import distinct_columns
+
 #: Largest distance of a neighbour from its listed pixel, pixels.
 REACH = 3
 
@@ -106,12 +108,12 @@ class Sites:
 
 def turns(row: NDArray[np.integer], window: NDArray[np.integer]) -> NDArray[np.int64]:
     """For each pair: the number of other windows of its row that come first, [n]."""
-    pairs, inverse = np.unique(np.stack([row.astype(np.int64), window.astype(np.int64)]), axis=1, return_inverse=True)
+    pairs, place = distinct_columns(np.stack([row.astype(np.int64), window.astype(np.int64)]))
     if pairs.shape[1] == 0:
         return np.empty(0, np.int64)
     starts = np.flatnonzero(np.diff(pairs[0], prepend=pairs[0][0] - 1))
     rank = np.arange(pairs.shape[1]) - np.repeat(starts, np.diff(starts, append=pairs.shape[1]))
-    return rank[inverse.ravel()]
+    return rank[place]
 
 
 def of_own_row(sites: Sites, window: NDArray[np.integer], cols: int) -> NDArray[np.int64]:

@@ -8,6 +8,7 @@ from dataclasses import astuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims, PairAims
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
@@ -108,8 +109,8 @@ def traced_again(
     """
     pairs, place = np.unique(np.stack([index.astype(np.float64), begin_us, end_us]), axis=1, return_inverse=True)
     pixel = pairs[0].astype(np.uint32)
-    span, window = np.unique(pairs[1:], axis=1, return_inverse=True)
-    windows, window = Windows(span[0], span[1]), window.ravel()
+    span, window = distinct_columns(pairs[1:])
+    windows = Windows(span[0], span[1])
     aims = _aims(zoom, pixel, tracer.sensor.spec.geometry.cols, windows, window)
     pilot = _pilot(tracer, pixel, windows, window, tuning.audit_pilot_rays, aims)
     lit = (pilot.lit_scatter <= pilot.hidden_scatter) & (2 * pilot.lit >= pilot.unshadowed)
