@@ -1,0 +1,86 @@
+"""Runs of the hidden scenes against many rays for every pair of a pixel and a tick."""
+
+from functools import cache
+
+import hidden_scenes
+import numpy as np
+import pytest
+from rendering import pair_tracer
+
+import hesim_render as hr
+from hesim_render.mosaic.schedule import tick_blocks
+from hesim_render.sources.render.audit.compare import compare_ticks
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.windows import Windows
+
+TICKS, TICK_US, WINDOW_US, COLS, ROWS, QUALITY = 18, 1250, 1000, 40, 30, 0.5
+
+#: Share of events that may be missed, or be too many, at quality 0.5.
+MOST_MISSED, MOST_EXTRA = 0.02, 0.01
+#: Rays of the truth. Uniform ones, as it has them, meet a spark once in a thousand.
+RAYS = dict.fromkeys(hidden_scenes.SCENES, 1024) | {"400 sparks": 4096}
+
+
+def sensor():
+    changes = {
+        "evs.tick_us": TICK_US,
+        "evs.window_us": WINDOW_US,
+        "evs.coefficients": [{"beta1": 1e-3, "beta2": 5e-3, "beta3": 3.1e-5, "beta4": 2.116e-4, "beta5": 0.0}],
+        "evs.shot_law": "linear",
+        "evs.contrast_threshold_on": 0.2,
+        "evs.contrast_threshold_off": 0.2,
+    }
+    return hr.load_sensor("reference-mono", changes).crop(COLS, ROWS)
+
+
+@cache
+def truth(name, rays):
+    """Flux of every pair, [tick, pixel], and the source that says what its noise is worth."""
+    tracer = pair_tracer(hidden_scenes.SCENES[name](), sensor(), 4711)
+    pixel = np.tile(tracer.sensor.layout.full_index.ravel(), TICKS)
+    window = np.repeat(np.arange(TICKS), COLS * ROWS)
+    ends = TICK_US * np.arange(1.0, TICKS + 1)
+    count = pixel.size
+    # of both estimates, half of the rays each: neither is chosen
+    halves = [
+        tracer.trace(
+            pixel, window, Windows(ends - WINDOW_US, ends), np.full(count, rays), np.full(count, lit), repeat=lit
+        ).mean
+        for lit in (False, True)
+    ]
+    return np.mean(halves, axis=0, dtype=np.float64).reshape(TICKS, -1)
+
+
+def shares(name, seed, rays):
+    """What a run has wrong, by the truth; and what its manifest says of that."""
+    shape = sensor()
+    rec = hr.simulate(
+        hidden_scenes.SCENES[name](), shape, duration_s=TICKS * TICK_US * 1e-6, seed=seed, clean=True, quality=QUALITY
+    )
+    wanted, seen = truth(name, rays), flux_of(name, seed)
+    pixels = np.arange(COLS * ROWS)
+    run, reference = (shape.evs.log_signal(flux, pixels) for flux in (seen[:2].mean(axis=0), wanted))
+    error = shape.evs.log_signal(seen[:2].mean(axis=0) + seen[2], pixels) - run
+    theta = np.full(pixels.size, 0.2)
+    counted = compare_ticks(run, reference, error, (theta, theta), np.ones(TICKS, np.bool_))
+    total = {field: float(values.sum()) for field, values in vars(counted).items()}
+    assert rec.events.size == pytest.approx(total["found"], abs=0.02 * total["found"] + 1)
+    return total, rec.manifest["settings"]["render"]["audit"]
+
+
+@cache
+def flux_of(name, seed):
+    """Both halves of what the default mode gives and the error that it states, [3, tick, pixel]."""
+    source = ChangeDrivenFlux(hidden_scenes.SCENES[name](), sensor(), QUALITY, seed=seed)
+    pixels = source.sensor.layout.evs_pixel.ravel()
+    blocks = tick_blocks(source.sensor.spec.evs, 0, TICKS * TICK_US)
+    samples = [(np.array(one.half_a), np.array(one.half_b), one.error) for one in source.flux_of_blocks(pixels, blocks)]
+    return np.array(samples, np.float64).swapaxes(0, 1)
+
+
+def judge(name, seed):
+    """Counts by the truth, what the manifest says of events, and the shares of events missed and extra."""
+    total, audit = shares(name, seed, RAYS[name])
+    told = audit["events"]
+    missed, extra = total["missed"] / max(1, total["true"]), total["extra"] / max(1, total["found"])
+    return total, told, missed, extra
