@@ -14,8 +14,6 @@ that was run.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -23,6 +21,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 import hidden_scenes
+import records
 from hidden_checks import MOST_EXTRA, MOST_MISSED, flux_of, judge
 
 RESULTS = Path(__file__).parent / "results" / "hidden_scenes.jsonl"
@@ -30,17 +29,11 @@ RESULTS = Path(__file__).parent / "results" / "hidden_scenes.jsonl"
 
 def run(scenes: list[str], seeds: range, out: Path) -> None:
     """Append a record for each scene and seed that has none."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+    commit = records.commit()
     import drjit as dr
 
     dr.set_thread_count(1)
-    done = {(one["scene"], one["seed"]) for one in _read(out)}
+    done = {(one["scene"], one["seed"]) for one in records.read(out)}
     for name in scenes:
         for seed in seeds:
             if (name, seed) in done:
@@ -53,28 +46,23 @@ def run(scenes: list[str], seeds: range, out: Path) -> None:
                 "missed": [missed, told["missed_at_most"]], "extra": [extra, told["extra_at_most"]],
                 "commit": commit, "cpu_s": round(time.process_time() - start, 1),
             }  # fmt: skip
-            with out.open("a") as file:
-                file.write(json.dumps(record) + "\n")
+            records.append(out, record)
             print(*record.values(), flush=True)
 
 
-def _read(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
 def report(path: Path) -> int:
-    """Print what each scene has wrong. Returns 1 if a limit is not met, or if 5 % of its runs break their bound."""
+    """Print what each scene has wrong. Returns 1 if a limit is not met, or if over 5 % of its runs break a bound."""
     failed = False
     for name in hidden_scenes.SCENES:
-        records = [one for one in _read(path) if one["scene"] == name]
-        if not records:
+        runs = [one for one in records.read(path) if one["scene"] == name]
+        if not runs:
             continue
-        missed, extra = ([one[which] for one in records] for which in ("missed", "extra"))
+        missed, extra = ([one[which] for one in runs] for which in ("missed", "extra"))
         broken = sum(a[0] > a[1] or b[0] > b[1] for a, b in zip(missed, extra, strict=True))
         most = max(share for share, _ in missed), max(share for share, _ in extra)
-        failed |= most[0] > MOST_MISSED or most[1] > MOST_EXTRA or broken > max(1, 0.05 * len(records))
+        failed |= most[0] > MOST_MISSED or most[1] > MOST_EXTRA or broken > max(1, 0.05 * len(runs))
         print(
-            f"{name}: {len(records)} runs, {sum(one['true'] for one in records):.0f} true events; at most"
+            f"{name}: {len(runs)} runs, {sum(one['true'] for one in runs):.0f} true events; at most"
             f" {100 * most[0]:.2f} % missed and {100 * most[1]:.2f} % extra; {broken} runs have more wrong than told"
         )
     print("something does not hold" if failed else "all holds")

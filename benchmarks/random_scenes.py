@@ -15,8 +15,6 @@ does not hold.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -24,6 +22,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
+import records
 from random_checks import judge, judged_run
 from random_scenes import small_scene
 
@@ -32,17 +31,11 @@ RESULTS = Path(__file__).parent / "results" / "random_scenes.jsonl"
 
 def run(seeds: range, out: Path) -> None:
     """Append a record for each seed that has none."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+    commit = records.commit()
     import drjit as dr
 
     dr.set_thread_count(1)
-    done = {one["seed"] for one in _read(out)} if out.exists() else set()
+    done = {one["seed"] for one in records.read(out)}
     for seed in seeds:
         if seed in done:
             continue
@@ -50,31 +43,26 @@ def run(seeds: range, out: Path) -> None:
         with tempfile.TemporaryDirectory() as folder:
             record = judged_run(small_scene(seed, Path(folder)))
         record |= {"commit": commit, "cpu_s": round(time.process_time() - start, 1)}
-        with out.open("a") as file:
-            file.write(json.dumps(record) + "\n")
+        records.append(out, record)
         print(seed, record["verdict"], record["off"], record["missed"], record["extra"], record["cpu_s"], flush=True)
-
-
-def _read(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def report(path: Path) -> int:
     """Print counts beside their bounds. Returns 1 if something does not hold."""
-    records = _read(path)
-    verdicts = [one["verdict"] for one in records]
-    print(f"{len(records)} scenes; verdicts:", {name: verdicts.count(name) for name in sorted(set(verdicts))})
+    runs = records.read(path)
+    verdicts = [one["verdict"] for one in runs]
+    print(f"{len(runs)} scenes; verdicts:", {name: verdicts.count(name) for name in sorted(set(verdicts))})
     for name in ("off", "missed", "extra"):
-        rows = [one[name] for one in records]
+        rows = [one[name] for one in runs]
         count, total = sum(row[0] for row in rows), sum(row[1] for row in rows)
         allowed = sum(row[1] * row[2] for row in rows)
         share, bound = (value / max(total, 1) for value in (count, allowed))
         print(f"{name}: {count:.0f} of {total:.0f} ({share:.4f}); the bounds allow {bound:.4f}")
-    exact = sum(one["values"]["exact"] for one in records)
-    mean = sum(one["values"]["mean"] * one["values"]["exact"] for one in records) / max(exact, 1)
+    exact = sum(one["values"]["exact"] for one in runs)
+    mean = sum(one["values"]["mean"] * one["values"]["exact"] for one in runs) / max(exact, 1)
     print(f"mean deviation {mean:.4f} noise units; off by more than three wanted errors:"
-          f" {sum(one['values']['off'] for one in records)} of {exact}")  # fmt: skip
-    wrong = judge(records)
+          f" {sum(one['values']['off'] for one in runs)} of {exact}")  # fmt: skip
+    wrong = judge(runs)
     print("\n".join(wrong) or "all holds")
     return 1 if wrong else 0
 

@@ -120,7 +120,7 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
         chosen[: pixels // 2] = rng.choice(busy, pixels // 2)
     own, stated, unit = flux[part, chosen], error[part, chosen], np.maximum(unit[part, chosen], 1e-9)
     found = reference.flux(seen.windows[part], seen.pixels[chosen], 0.2 * QUALITY * unit, seed=random.seed)
-    counted = count_events(reference.sensor, chosen, own, found.flux, np.hypot(stated, found.stderr))
+    counted = count_events(reference.sensor, chosen, own, found.flux, stated, found.stderr)
     deviation, exact = (own - found.flux) / unit, found.stderr <= 1.5 * 0.2 * QUALITY * unit
     square = (deviation**2 / ((stated**2 + found.stderr**2) / unit**2 + QUALITY**2))[exact]
     off = np.abs(deviation) > 3 * QUALITY
@@ -139,14 +139,13 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def count_events(sensor, chosen, own, reference, error) -> Counted:
+def count_events(sensor, chosen, own, reference, stated, reference_error) -> Counted:
     """Events of some pixels by their own flux and by the reference, both [window, pixel].
 
-    `error` is that of the comparison: a matt scene can be more exact than its reference, whose error then decides
-    what is sure.
+    What is sure depends on both standard errors, because a matt scene can be more exact than its reference.
     """
     noise = sensor.evs
-    levels = [noise.log_signal(values, chosen) for values in (own, reference, own + error)]
+    levels = [noise.log_signal(values, chosen) for values in (own, reference, own + np.hypot(stated, reference_error))]
     shape = noise.layout.evs_shape
     maps = (noise.threshold_on_map, noise.threshold_off_map)
     thresholds = tuple(np.broadcast_to(theta, shape).ravel()[chosen].astype(np.float64) for theta in maps)

@@ -56,10 +56,16 @@ def test_an_event_within_the_error_of_the_comparison_is_not_counted():
     begin, chosen = 1e6, np.array([0])
     own, truth = np.array([[begin], [begin * np.exp(1.03 * theta)]]), np.full((2, 1), begin)
     near = np.array([[begin], [begin * np.exp(0.98 * theta)]])
-    for reference, error, extra in ((truth, 1.0, 1), (near, 1.0, 1), (near, 0.01 * theta * begin, 0)):
-        counted = count_events(sensor, chosen, own, reference, np.full((2, 1), error))
+    exact, rough = np.full((2, 1), 1.0), np.full((2, 1), 0.01 * theta * begin)
+    for reference, errors, extra in (
+        (truth, (exact, exact), 1),
+        (near, (exact, exact), 1),
+        (near, (rough, exact), 0),
+        (near, (exact, rough), 0),
+    ):
+        counted = count_events(sensor, chosen, own, reference, *errors)
         assert (counted.found.sum(), counted.true.sum(), counted.extra.sum()) == (1, 0, extra)
-        swapped = count_events(sensor, chosen, reference, own, np.full((2, 1), error))
+        swapped = count_events(sensor, chosen, reference, own, *errors)
         assert (swapped.found.sum(), swapped.true.sum(), swapped.missed.sum()) == (0, 1, extra)
 
 
