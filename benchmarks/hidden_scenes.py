@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"
 
 import hidden_scenes
 import records
-from hidden_checks import MOST_EXTRA, MOST_MISSED, flux_of, judge
+from hidden_checks import MOST_EXTRA, MOST_MISSED, judge, run_of
 
 RESULTS = Path(__file__).parent / "results" / "hidden_scenes.jsonl"
 
@@ -40,7 +40,7 @@ def run(scenes: list[str], seeds: range, out: Path) -> None:
                 continue
             start = time.process_time()
             total, told, missed, extra = judge(name, seed)
-            flux_of.cache_clear()
+            run_of.cache_clear()
             record = {
                 "scene": name, "seed": seed, "true": total["true"], "found": total["found"],
                 "missed": [missed, told["missed_at_most"]], "extra": [extra, told["extra_at_most"]],

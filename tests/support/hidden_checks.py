@@ -1,6 +1,7 @@
 """Runs of the hidden scenes against many rays for every pair of a pixel and a tick."""
 
 from functools import cache
+from unittest import mock
 
 import hidden_scenes
 import numpy as np
@@ -8,7 +9,6 @@ import pytest
 from rendering import pair_tracer
 
 import hesim_render as hr
-from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.render.audit.compare import compare_ticks
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -51,13 +51,36 @@ def truth(name, rays):
     return np.mean(halves, axis=0, dtype=np.float64).reshape(TICKS, -1)
 
 
+@cache
+def run_of(name, seed):
+    """A recording in the default mode, and the flux that it was made of: both halves and the stated error, [3, tick,
+    pixel].
+    """
+    samples, given = [], ChangeDrivenFlux.flux_of_blocks
+
+    def noted(self, pixel, blocks):
+        np.testing.assert_array_equal(pixel, self.sensor.layout.evs_pixel.ravel())
+        for one in given(self, pixel, blocks):
+            samples.append((np.array(one.half_a), np.array(one.half_b), one.error))
+            yield one
+
+    with mock.patch.object(ChangeDrivenFlux, "flux_of_blocks", noted):
+        rec = hr.simulate(
+            hidden_scenes.SCENES[name](),
+            sensor(),
+            duration_s=TICKS * TICK_US * 1e-6,
+            seed=seed,
+            clean=True,
+            quality=QUALITY,
+        )
+    assert len(samples) == TICKS
+    return rec, np.array(samples, np.float64).swapaxes(0, 1)
+
+
 def shares(name, seed, rays):
     """What a run has wrong, by the truth; and what its manifest says of that."""
-    shape = sensor()
-    rec = hr.simulate(
-        hidden_scenes.SCENES[name](), shape, duration_s=TICKS * TICK_US * 1e-6, seed=seed, clean=True, quality=QUALITY
-    )
-    wanted, seen = truth(name, rays), flux_of(name, seed)
+    shape, wanted = sensor(), truth(name, rays)
+    rec, seen = run_of(name, seed)
     pixels = np.arange(COLS * ROWS)
     run, reference = (shape.evs.log_signal(flux, pixels) for flux in (seen[:2].mean(axis=0), wanted))
     error = shape.evs.log_signal(seen[:2].mean(axis=0) + seen[2], pixels) - run
@@ -66,16 +89,6 @@ def shares(name, seed, rays):
     total = {field: float(values.sum()) for field, values in vars(counted).items()}
     assert rec.events.size == pytest.approx(total["found"], abs=0.02 * total["found"] + 1)
     return total, rec.manifest["settings"]["render"]["audit"]
-
-
-@cache
-def flux_of(name, seed):
-    """Both halves of what the default mode gives and the error that it states, [3, tick, pixel]."""
-    source = ChangeDrivenFlux(hidden_scenes.SCENES[name](), sensor(), QUALITY, seed=seed)
-    pixels = source.sensor.layout.evs_pixel.ravel()
-    blocks = tick_blocks(source.sensor.spec.evs, 0, TICKS * TICK_US)
-    samples = [(np.array(one.half_a), np.array(one.half_b), one.error) for one in source.flux_of_blocks(pixels, blocks)]
-    return np.array(samples, np.float64).swapaxes(0, 1)
 
 
 def judge(name, seed):

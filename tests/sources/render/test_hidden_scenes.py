@@ -17,8 +17,8 @@ from hidden_checks import (
     TICK_US,
     TICKS,
     WINDOW_US,
-    flux_of,
     judge,
+    run_of,
     sensor,
     truth,
 )  # fmt: skip
@@ -64,11 +64,9 @@ def test_the_stated_error_of_event_samples_is_the_true_one(seed):
     A bin of the quantiles is 4.7 % wide. A value's error is known from two halves only, which widens the tail.
     """
     shape, wanted = sensor(), truth("fan", 1024)
-    rec = hr.simulate(
-        hidden_scenes.fan(), shape, duration_s=TICKS * TICK_US * 1e-6, seed=seed, clean=True, quality=QUALITY
-    )
+    rec, samples = run_of("fan", seed)
     told = rec.manifest["settings"]["render"]["error_noise"]["events"]
-    seen = flux_of("fan", seed)[:2].mean(axis=0)
+    seen = samples[:2].mean(axis=0)
     window_s, position = WINDOW_US * 1e-6, shape.evs.layout.evs_position.ravel()
     unit = np.stack([shape.evs.noise_equivalent_e(flux * window_s, position) for flux in seen]) / window_s
     off = np.abs(seen - wanted) / unit
