@@ -14,8 +14,6 @@ from hidden_checks import (
     MOST_MISSED,
     QUALITY,
     ROWS,
-    TICK_US,
-    TICKS,
     WINDOW_US,
     judge,
     run_of,

@@ -22,7 +22,6 @@ from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import depth_limit, mitsuba
 from hesim_render.sources.render.tracer import BLOCK_RAYS, Tracer
 from hesim_render.sources.render.transport.matt import MattIntegrator
-from hesim_render.sources.render.transport.motion_bounds import stays_in
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.paths import PathIntegrator
 from hesim_render.sources.render.transport.swept_boxes import Moment
@@ -78,7 +77,7 @@ class PairTracer(Tracer):
             depth, roulette = (depth_limit(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
         self._aim = Aim(self.parts, self.rays)
-        self._boxes = method_cache(self._boxes_in, maxsize=8)
+        self._boxes = method_cache(self.parts.box_rows_in, maxsize=8)
         layout = self.sensor.layout
         tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
         self._filter_tile = types.UInt32(tile.ravel())
@@ -204,15 +203,9 @@ class PairTracer(Tracer):
         """Windows on the device, with the boxes that contain each object during each window, or during all of
         `span_us`.
         """
-        groups = self.parts.groups
-        tracks = [group.trajectory for group in groups] + ([self.camera] if self.camera else [])
+        tracks = [group.trajectory for group in self.parts.groups] + ([self.camera] if self.camera else [])
         # where nothing moves, any instant will do
-        return Moments.of(windows, span_us, tracks, len(groups), self._boxes, self._light if tracks else None)
-
-    def _boxes_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
-        """Boxes that contain each group during some intervals, [interval, group, 2, 3], m."""
-        found = [stays_in(group.corners, group.trajectory, spans_us) for group in self.parts.groups]
-        return np.stack(found, axis=1) if found else np.empty((len(spans_us), 0, 2, 3))
+        return Moments.of(windows, span_us, tracks, self._boxes, self._light if tracks else None)
 
     def _trace_block(
         self,

@@ -13,7 +13,7 @@ from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.tables import table
 from hesim_render.sources.render.change_driven.light_times import LightTimes
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows
+from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.spectral.waveform import Waveform
 
 #: Largest number of intervals for which one call finds the boxes of moving objects.
@@ -52,7 +52,7 @@ class Moments:
     length_us : Float [window], length of each, µs.
     times, boxes : tables as in `Moment`.
     bins : UInt32 [window], number of the boxes of each window.
-    tracks, groups : numbers of tracks and of moving groups.
+    tracks, rows : number of tracks, and of rows of boxes in a bin.
     light : distribution of the instants in each window; None where it is even.
     """
 
@@ -61,7 +61,7 @@ class Moments:
     boxes: Float
     bins: UInt32
     tracks: int
-    groups: int
+    rows: int
     light: LightTimes | None = None
 
     def at(self, window: UInt32, share: Float) -> Moment:
@@ -73,7 +73,7 @@ class Moments:
         else:
             instant = self.light.instant_us(window, share)
         where = dr.gather(type(self.bins), self.bins, window)
-        return Moment(instant, self.times, self.tracks, window, self.boxes, self.groups, where)
+        return Moment(instant, self.times, self.tracks, window, self.boxes, self.rows, where)
 
     @classmethod
     def of(
@@ -81,8 +81,7 @@ class Moments:
         windows: Windows,
         span_us: tuple[float, float] | None,
         tracks: Sequence[Trajectory],
-        groups: int,
-        boxes_of: Callable[[tuple[tuple[float, float], ...]], NDArray[np.float64]],
+        boxes_of: Callable[[tuple[tuple[float, float], ...]], NDArray[np.float32]],
         waveform: Waveform | None = None,
     ) -> Moments:
         """Put windows on the device.
@@ -92,8 +91,7 @@ class Moments:
         windows : the windows.
         span_us : interval for which boxes hold, µs; None: for each window, or for a few windows close in time.
         tracks : tracks of everything that moves, those of groups first.
-        groups : number of groups.
-        boxes_of : maps intervals, µs, to boxes that contain each group, [interval, group, 2, 3], m.
+        boxes_of : maps intervals, µs, to the boxes of moving objects, see `MovingScene.box_rows_in`.
         waveform : power of the light, None if it is steady.
 
         Returns
@@ -116,12 +114,12 @@ class Moments:
             for values in (
                 windows.end_us - windows.begin_us,
                 np.stack(times, axis=1) if times else np.empty(0),
-                box_rows(boxes) if groups else np.empty(0),
+                boxes,
             )
         )
         numbers = types.UInt32(np.append(bins, bins[-1:]))
         light = None if waveform is None else LightTimes.of(waveform, windows.begin_us, windows.end_us)
-        moments = cls(lengths, local, sides, numbers, len(tracks), groups, light)
+        moments = cls(lengths, local, sides, numbers, len(tracks), boxes.shape[1], light)
         dr.make_opaque(moments.length_us, moments.times, moments.boxes, moments.bins)
         return moments
 

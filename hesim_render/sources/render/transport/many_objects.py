@@ -1,15 +1,19 @@
-"""Many moving objects of simple form, tested one after another in a loop over tables.
+"""Many moving objects of simple form, tested in loops over tables.
 
 The kernel does not depend on the number of objects. Objects consist of the forms of `closed_form`: balls, boxes,
 rectangles. Each is tested in its own frame at the ray's own time, if the ray meets the box that contains the object
-during the window.
+during the window. Objects that are near each other in a window form a bunch, and a ray that misses the box of a bunch
+asks for none of its members. Bunches save time only: where two surfaces are equally far, the object of the lower
+number counts, so that the order of the tests does not matter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.core.device_types import (
     Float,
@@ -31,6 +35,10 @@ from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of
 
 #: Number of entries in a row of the table of balls and of the table of faces.
 _BALL, _FACE = 8, 16
+#: Number of objects in a bunch. Of 80 to 400 objects in one picture, 4 to 12 are within a tenth of the fastest.
+_BUNCH = 8
+#: Bits of a place along each axis, by which objects are sorted.
+_PLACE_BITS = 10
 
 
 class Fleet:
@@ -42,12 +50,15 @@ class Fleet:
     forms : faces and balls of each group.
     numbers : number of each group among all groups of the scene.
     tracks : tracks of all groups of the scene.
+    groups : number of all groups, which have rows of boxes before those of the fleet.
     """
 
-    def __init__(self, mi: MitsubaModule, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks) -> None:
+    def __init__(
+        self, mi: MitsubaModule, forms: Sequence[SimpleForm], numbers: Sequence[int], tracks: Tracks, groups: int
+    ) -> None:
         import drjit as dr
 
-        self._mi, self._tracks = mi, tracks
+        self._mi, self._tracks, self._numbers = mi, tracks, np.array(numbers, np.int64)
         heads: list[list[float]] = []
         balls: list[Sequence[float]] = []
         faces: list[Sequence[float]] = []
@@ -62,8 +73,30 @@ class Fleet:
         self._heads = mi.UInt32(np.array(heads, np.uint32).ravel())
         self._balls = table(mi.Float, np.array([*balls, [0.0] * _BALL], np.float32))
         self._faces = table(mi.Float, np.array([*faces, [0.0] * _FACE], np.float32))
-        self._count = mi.UInt32(len(forms))
-        dr.make_opaque(self._heads, self._balls, self._faces, self._count)
+        count = len(forms)
+        bunches = -(-count // _BUNCH)
+        self._first, self._end, self._bunches = (mi.UInt32(n) for n in (groups, groups + count, bunches))
+        dr.make_opaque(self._heads, self._balls, self._faces, self._first, self._end, self._bunches)
+
+    def rows(self, boxes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Rows of `Moment.boxes` of the fleet.
+
+        Parameters
+        ----------
+        boxes : [interval, group, 8], the rows of all groups of the scene.
+
+        Returns
+        -------
+        [interval, object + bunch, 8]. In each interval, objects are sorted by their place; the number beside the low
+        corner is that of the object in the fleet. Then the boxes around each `_BUNCH` successive objects.
+        """
+        own = boxes[:, self._numbers]
+        order = np.argsort(_along_a_curve(own[..., :3] + own[..., 4:7]), axis=1, kind="stable")
+        own = np.take_along_axis(own, order[..., None], axis=1)
+        own[..., 3] = order
+        starts = np.arange(0, own.shape[1], _BUNCH)
+        low, high = np.minimum.reduceat(own, starts, axis=1), np.maximum.reduceat(own, starts, axis=1)
+        return np.concatenate([own, np.concatenate([low[..., :4], high[..., 4:]], axis=-1)], axis=1)
 
     def nearest(self, ray: Ray, moment: Moment, length: Float, active: Mask) -> tuple[Interaction, UInt32, Mask]:
         """Intersect rays with all groups: the nearest surface within a distance.
@@ -86,45 +119,27 @@ class Fleet:
         mi = self._mi
         inverse = inverse_of(ray.d)
 
-        def visit(k: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32, met: Mask) -> LoopState:
-            number, first_ball, last_ball, _ = dr.gather(mi.Array4u, self._heads, 2 * k)
-            near = active & meets_box(ray, inverse, length, moment.box(number))
-            met |= near
+        def visit(near: Mask, number: UInt32, k: UInt32, state: LoopState) -> LoopState:
+            local, (balls, faces) = self._at_rest(ray, number, moment), self._parts(k)
 
-            def look(t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
-                local = self._at_rest(ray, number, moment)
-                first_face, last_face, _, _ = dr.gather(mi.Array4u, self._heads, 2 * k + 1)
+            def try_ball(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
+                x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
+                own = to_ball(local, mi.Point3f(x, y, z), square)
+                closer = near & (own >= 0) & _before(own, number, t, group)
+                t, which, ball = dr.select(closer, own, t), dr.select(closer, j, which), ball | closer
+                return j + 1, t, place, which, ball, dr.select(closer, number, group)
 
-                def try_ball(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
-                    x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
-                    own = to_ball(local, mi.Point3f(x, y, z), square)
-                    closer = near & (own >= 0) & (own < t)
-                    t, which, ball = dr.select(closer, own, t), dr.select(closer, j, which), ball | closer
-                    return j + 1, t, place, which, ball, dr.select(closer, number, group)
+            def try_face(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
+                own, spot, inside = to_face(local, self._rows(j))
+                closer = near & inside & (own >= 0) & _before(own, number, t, group)
+                t, which, place = dr.select(closer, own, t), dr.select(closer, j, which), dr.select(closer, spot, place)
+                return j + 1, t, place, which, ball & ~closer, dr.select(closer, number, group)
 
-                def try_face(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
-                    own, spot, inside = to_face(local, self._rows(j))
-                    closer = near & inside & (own >= 0) & (own < t)
-                    t, which, place = (
-                        dr.select(closer, own, t),
-                        dr.select(closer, j, which),
-                        dr.select(closer, spot, place),
-                    )
-                    return j + 1, t, place, which, ball & ~closer, dr.select(closer, number, group)
+            _, *found = dr.while_loop((balls[0], *state), lambda j, *_: j < balls[1], try_ball, label="balls")
+            return tuple(dr.while_loop((faces[0], *found), lambda j, *_: j < faces[1], try_face, label="faces")[1:])
 
-                state = first_ball, t, place, which, ball, group
-                _, *found = dr.while_loop(state, lambda j, *_: j < last_ball, try_ball, label="balls")
-                state = first_face, *found
-                return tuple(dr.while_loop(state, lambda j, *_: j < last_face, try_face, label="faces")[1:])
-
-            found = dr.if_stmt((t, place, which, ball, group), near, look, lambda *state: state, label="moving group")
-            return k + 1, *found, met
-
-        nothing = mi.UInt32(0), mi.Float(length), mi.Point2f(0.0), mi.UInt32(0), mi.Bool(False), mi.UInt32(0)
-        state = (*nothing, mi.Bool(False))
-        _, t, place, which, ball, group, met = dr.while_loop(
-            state, lambda k, *_: k < self._count, visit, label="moving groups"
-        )
+        nothing = mi.Float(length), mi.Point2f(0.0), mi.UInt32(0), mi.Bool(False), mi.UInt32(0)
+        (t, place, which, ball, group), met = self._visit(ray, inverse, length, moment, active, nothing, visit)
         return self._hit(t, t < length, place, which, ball), group, met
 
     def blocks(self, ray: Ray, moment: Moment, active: Mask) -> tuple[Mask, Mask]:
@@ -134,35 +149,85 @@ class Fleet:
         mi = self._mi
         inverse = inverse_of(ray.d)
 
-        def visit(k: UInt32, blocked: Mask, met: Mask) -> LoopState:
-            number, first_ball, last_ball, _ = dr.gather(mi.Array4u, self._heads, 2 * k)
-            near = active & meets_box(ray, inverse, ray.maxt, moment.box(number))
-            met |= near
+        def visit(near: Mask, number: UInt32, k: UInt32, state: LoopState) -> LoopState:
+            local, (balls, faces) = self._at_rest(ray, number, moment), self._parts(k)
+            near = near & ~state[0]
 
-            def look(blocked: Mask) -> tuple[Mask]:
-                local = self._at_rest(ray, number, moment)
-                first_face, last_face, _, _ = dr.gather(mi.Array4u, self._heads, 2 * k + 1)
+            def try_ball(j: UInt32, blocked: Mask) -> LoopState:
+                x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
+                t = to_ball(local, mi.Point3f(x, y, z), square)
+                return j + 1, blocked | (near & (t >= 0) & (t < ray.maxt))
 
-                def try_ball(j: UInt32, blocked: Mask) -> tuple[UInt32, Mask]:
-                    x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
-                    t = to_ball(local, mi.Point3f(x, y, z), square)
-                    return j + 1, blocked | (near & (t >= 0) & (t < ray.maxt))
+            def try_face(j: UInt32, blocked: Mask) -> LoopState:
+                t, _, inside = to_face(local, self._rows(j))
+                return j + 1, blocked | (near & inside & (t >= 0) & (t < ray.maxt))
 
-                def try_face(j: UInt32, blocked: Mask) -> tuple[UInt32, Mask]:
-                    t, _, inside = to_face(local, self._rows(j))
-                    return j + 1, blocked | (near & inside & (t >= 0) & (t < ray.maxt))
+            _, *found = dr.while_loop((balls[0], *state), lambda j, *_: j < balls[1], try_ball, label="balls")
+            return tuple(dr.while_loop((faces[0], *found), lambda j, *_: j < faces[1], try_face, label="faces")[1:])
 
-                state = first_ball, blocked
-                _, blocked = dr.while_loop(state, lambda j, _: j < last_ball, try_ball, label="balls")
-                state = first_face, blocked
-                return (dr.while_loop(state, lambda j, _: j < last_face, try_face, label="faces")[1],)
-
-            (blocked,) = dr.if_stmt((blocked,), near & ~blocked, look, lambda blocked: (blocked,), label="moving group")
-            return k + 1, blocked, met
-
-        state = mi.UInt32(0), mi.Bool(False), mi.Bool(False)
-        _, blocked, met = dr.while_loop(state, lambda k, *_: k < self._count, visit, label="moving groups")
+        (blocked,), met = self._visit(ray, inverse, ray.maxt, moment, active, (mi.Bool(False),), visit)
         return blocked, met
+
+    def _visit(
+        self,
+        ray: Ray,
+        inverse: Vector3,
+        length: Float,
+        moment: Moment,
+        active: Mask,
+        state: LoopState,
+        visit: Callable[[Mask, UInt32, UInt32, LoopState], LoopState],
+    ) -> tuple[LoopState, Mask]:
+        """Call `visit` to update a state for each object whose box a ray meets.
+
+        Parameters
+        ----------
+        inverse, length : see `meets_box`.
+        state : initial values.
+        visit : takes the lanes that met the box, the number of the group in the scene and in the fleet, and the state;
+            returns the new state.
+
+        Returns
+        -------
+        state, met : the final state; and Bool, True where any box was met.
+        """
+        import drjit as dr
+
+        mi = self._mi
+
+        def bunch(number: UInt32, *state: Any) -> LoopState:
+            inside = active & meets_box(ray, inverse, length, moment.box(self._end + number))
+            first = self._first + number * _BUNCH
+            end = dr.minimum(first + _BUNCH, self._end)
+
+            def members(*state: Any) -> LoopState:
+                return tuple(dr.while_loop((first, *state), lambda row, *_: row < end, member, label="members")[1:])
+
+            def member(row: UInt32, *state: Any) -> LoopState:
+                *before, met = state
+                box, mark = moment.box_and_mark(row)
+                near = inside & meets_box(ray, inverse, length, box)
+
+                def look(*state: Any) -> LoopState:
+                    k = mi.UInt32(mark)
+                    return visit(near, dr.gather(mi.UInt32, self._heads, 8 * k), k, state)
+
+                found = dr.if_stmt(tuple(before), near, look, lambda *state: state, label="moving group")
+                return row + 1, *found, met | near
+
+            return number + 1, *dr.if_stmt(tuple(state), inside, members, lambda *state: state, label="bunch")
+
+        begin = mi.UInt32(0), *state, mi.Bool(False)
+        _, *end, met = dr.while_loop(begin, lambda number, *_: number < self._bunches, bunch, label="moving groups")
+        return tuple(end), met
+
+    def _parts(self, k: UInt32) -> tuple[tuple[UInt32, UInt32], tuple[UInt32, UInt32]]:
+        """First and last, exclusive, of the balls and of the faces of a group of the fleet."""
+        import drjit as dr
+
+        _, first_ball, last_ball, _ = dr.gather(self._mi.Array4u, self._heads, 2 * k)
+        first_face, last_face, _, _ = dr.gather(self._mi.Array4u, self._heads, 2 * k + 1)
+        return (first_ball, last_ball), (first_face, last_face)
 
     def pose(self, group: UInt32, moment: Moment) -> DevicePose:
         """Pose of the group whose number each lane holds."""
@@ -212,3 +277,17 @@ def _number(mi: MitsubaModule, shape: MitsubaObject) -> int:
 
     number: UInt32 = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(number[0])
+
+
+def _before(t: Float, group: UInt32, other_t: Float, other_group: UInt32) -> Mask:
+    """Whether a hit counts before another one: it is nearer, or equally far and of a group with a lower number."""
+    return (t < other_t) | ((t == other_t) & (group < other_group))
+
+
+def _along_a_curve(places: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Position of places [..., n, 3] along a Z-order curve through their bounding box, [..., n]."""
+    low, high = places.min(axis=-2, keepdims=True), places.max(axis=-2, keepdims=True)
+    share = (places - low) / np.maximum((high - low).max(axis=-1, keepdims=True), 1e-30)
+    cell = (share * ((1 << _PLACE_BITS) - 1)).astype(np.int64)
+    bits = (cell[..., None] >> np.arange(_PLACE_BITS)) & 1
+    return np.sum(bits << (3 * np.arange(_PLACE_BITS) + np.arange(3)[:, None]), axis=(-1, -2))

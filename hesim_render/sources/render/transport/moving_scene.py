@@ -35,7 +35,8 @@ from hesim_render.sources.render.scene.tracks import DevicePose, Tracks
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
-from hesim_render.sources.render.transport.swept_boxes import Moment, inverse_of, meets_box
+from hesim_render.sources.render.transport.motion_bounds import stays_in
+from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
 #: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
 _FEW = 3
@@ -187,7 +188,7 @@ class MovingScene:
             self._tracks = Tracks([group.trajectory for group in self.groups])
         if together:
             forms = [form for k in together if (form := self.groups[k].part.form) is not None]
-            self._fleet = Fleet(self.mi, forms, together, self._tracks)
+            self._fleet = Fleet(self.mi, forms, together, self._tracks, len(self.groups))
 
     def intersect(self, ray: Ray, moment: Moment, coherent: Mask, active: Mask, flags: MitsubaObject = None) -> Surface:
         """The nearest surface of all parts.
@@ -252,6 +253,15 @@ class MovingScene:
             hit, _, near = self._fleet.nearest(ray, moment, dr.minimum(ray.maxt, nearest), active)
             nearest, met = dr.select(hit.is_valid(), hit.t, nearest), met | near
         return nearest, met
+
+    def box_rows_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float32]:
+        """Boxes that contain each group during some intervals, and what the fleet adds: rows of `Moment.boxes`,
+        [interval, row, 8].
+        """
+        if not self.groups:
+            return np.empty((len(spans_us), 0, 8), np.float32)
+        rows = box_rows(np.stack([stays_in(one.corners, one.trajectory, spans_us) for one in self.groups], axis=1))
+        return rows if self._fleet is None else np.concatenate([rows, self._fleet.rows(rows)], axis=1)
 
     def pose(self, group: UInt32, moment: Moment) -> DevicePose:
         """Pose of the group whose number each lane holds."""

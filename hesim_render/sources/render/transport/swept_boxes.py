@@ -20,8 +20,8 @@ class Moment:
     times : Float table, `tracks` entries per window: local time of each track at the begin of the window, µs.
     tracks : number of tracks.
     window : UInt32, window of each ray.
-    boxes : Float table, 8 entries per group: low and high corner of its box, each padded by one unused number.
-    groups : number of groups in a bin.
+    boxes : Float table, rows of `box_rows`: those of all groups, and what `Fleet.rows` adds.
+    rows : number of rows in a bin.
     bin : UInt32, number of the set of boxes that holds for the ray's window.
     """
 
@@ -30,7 +30,7 @@ class Moment:
     tracks: int
     window: UInt32
     boxes: Float
-    groups: int
+    rows: int
     bin: UInt32
 
     def local_us(self, track: UInt32) -> Float:
@@ -40,18 +40,25 @@ class Moment:
         kind = type(self.window)
         return dr.gather(type(self.times), self.times, self.window * self.tracks + kind(track)) + self.instant_us
 
-    def box(self, group: UInt32) -> tuple[Vector3, Vector3]:
-        """Low and high corner of a group's box, 3-vectors, m."""
+    def box(self, row: UInt32) -> tuple[Vector3, Vector3]:
+        """Low and high corner of the box in a row, 3-vectors, m."""
+        return self.box_and_mark(row)[0]
+
+    def box_and_mark(self, row: UInt32) -> tuple[tuple[Vector3, Vector3], Float]:
+        """The box in a row, and the number that is stored beside its low corner."""
         import drjit as dr
         import mitsuba as mi
 
-        place = 2 * (self.bin * self.groups + type(self.bin)(group))
+        place = 2 * (self.bin * self.rows + type(self.bin)(row))
         low, high = (dr.gather(mi.Vector4f, self.boxes, place + k) for k in (0, 1))
-        return mi.Vector3f(low.x, low.y, low.z), mi.Vector3f(high.x, high.y, high.z)
+        return (mi.Vector3f(low.x, low.y, low.z), mi.Vector3f(high.x, high.y, high.z)), low.w
 
 
 def box_rows(boxes: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Boxes [..., 2, 3] as rows of `Moment.boxes`, [..., 8]; slightly widened, so that rounding does not cut a rim."""
+    """Boxes [..., 2, 3] as rows of `Moment.boxes`, [..., 8]: the low and the high corner, each padded by one number.
+
+    The boxes are slightly widened, so that rounding does not cut a rim.
+    """
     low, high = boxes[..., 0, :], boxes[..., 1, :]
     margin = 1e-4 * np.linalg.norm(high - low, axis=-1, keepdims=True)
     nothing = np.zeros((*low.shape[:-1], 1))

@@ -24,7 +24,6 @@ from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.parents import camera_trajectory
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.tracer import BLOCK_RAYS
-from hesim_render.sources.render.transport.motion_bounds import stays_in
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.sources.render.truth.names import Names
@@ -95,7 +94,7 @@ class ChiefRays:
         self.parts = MovingScene(self.built, geometry_only=True)
         self.names = Names.of(self._mi, self.built, self.parts)
         self._rays = RayFactory(self.view)
-        self._boxes = method_cache(self._boxes_in, maxsize=8)
+        self._boxes = method_cache(self.parts.box_rows_in, maxsize=8)
 
     @property
     def tracks(self) -> list[Trajectory]:
@@ -108,16 +107,12 @@ class ChiefRays:
             return np.broadcast_to(self.view.camera_to_world, (*np.shape(t_us), 4, 4))
         return self.camera.matrix(t_us) @ self.view.camera_to_world
 
-    def _boxes_in(self, spans_us: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
-        found = [stays_in(group.corners, group.trajectory, spans_us) for group in self.parts.groups]
-        return np.stack(found, axis=1) if found else np.empty((len(spans_us), 0, 2, 3))
-
     def _moment(self, t_us: NDArray[np.float64]) -> tuple[Moments, NDArray[np.float32]]:
         """All times as shares of one window."""
         span = float(t_us.min()), float(t_us.max())
         windows = Windows(np.array(span[:1]), np.array(span[1:]))
         tracks = self.tracks + ([self.camera] if self.camera else [])
-        moments = Moments.of(windows, span, tracks, len(self.parts.groups), self._boxes)
+        moments = Moments.of(windows, span, tracks, self._boxes)
         share = (t_us - span[0]) / max(span[1] - span[0], 1e-300)
         return moments, share.astype(np.float32)
 
