@@ -73,8 +73,8 @@ class Fleet:
         self._heads = mi.UInt32(np.array(heads, np.uint32).ravel())
         self._balls = table(mi.Float, np.array([*balls, [0.0] * _BALL], np.float32))
         self._faces = table(mi.Float, np.array([*faces, [0.0] * _FACE], np.float32))
-        count = len(forms)
-        bunches = -(-count // _BUNCH)
+        self._bunch, count = _BUNCH, len(forms)
+        bunches = -(-count // self._bunch)
         self._first, self._end, self._bunches = (mi.UInt32(n) for n in (groups, groups + count, bunches))
         dr.make_opaque(self._heads, self._balls, self._faces, self._first, self._end, self._bunches)
 
@@ -88,13 +88,13 @@ class Fleet:
         Returns
         -------
         [interval, object + bunch, 8]. In each interval, objects are sorted by their place; the number beside the low
-        corner is that of the object in the fleet. Then the boxes around each `_BUNCH` successive objects.
+        corner is that of the object in the fleet. Then the boxes around each bunch.
         """
         own = boxes[:, self._numbers]
         order = np.argsort(_along_a_curve(own[..., :3] + own[..., 4:7]), axis=1, kind="stable")
         own = np.take_along_axis(own, order[..., None], axis=1)
         own[..., 3] = order
-        starts = np.arange(0, own.shape[1], _BUNCH)
+        starts = np.arange(0, own.shape[1], self._bunch)
         low, high = np.minimum.reduceat(own, starts, axis=1), np.maximum.reduceat(own, starts, axis=1)
         return np.concatenate([own, np.concatenate([low[..., :4], high[..., 4:]], axis=-1)], axis=1)
 
@@ -197,8 +197,8 @@ class Fleet:
 
         def bunch(number: UInt32, *state: Any) -> LoopState:
             inside = active & meets_box(ray, inverse, length, moment.box(self._end + number))
-            first = self._first + number * _BUNCH
-            end = dr.minimum(first + _BUNCH, self._end)
+            first = self._first + number * self._bunch
+            end = dr.minimum(first + self._bunch, self._end)
 
             def members(*state: Any) -> LoopState:
                 return tuple(dr.while_loop((first, *state), lambda row, *_: row < end, member, label="members")[1:])
