@@ -17,6 +17,8 @@ TICKS, TICK_US, WINDOW_US, COLS, ROWS, QUALITY = 18, 1250, 1000, 40, 30, 0.5
 
 #: Share of events that may be missed, or be too many, at quality 0.5.
 MOST_MISSED, MOST_EXTRA = 0.02, 0.01
+#: Share of the runs of a scene that may have more wrong than that, or than their audits say.
+MOST_RUNS = 0.05
 #: Rays of the truth. Uniform ones, as it has them, meet a spark once in a thousand.
 RAYS = dict.fromkeys(hidden_scenes.SCENES, 1024) | {"400 sparks": 4096}
 
@@ -84,9 +86,12 @@ def shares(name, seed, rays):
     pixels = np.arange(COLS * ROWS)
     run, reference = (shape.evs.log_signal(flux, pixels) for flux in (seen[:2].mean(axis=0), wanted))
     error = shape.evs.log_signal(seen[:2].mean(axis=0) + seen[2], pixels) - run
-    theta = np.full(pixels.size, 0.2)
-    counted = compare_ticks(run, reference, error, (theta, theta), np.ones(TICKS, np.bool_))
+    rest = error, (np.full(pixels.size, 0.2),) * 2, np.ones(TICKS, np.bool_)
+    counted = compare_ticks(run, reference, *rest)
     total = {field: float(values.sum()) for field, values in vars(counted).items()}
+    # what errors as large as half the difference of both halves would cause on their own
+    alone = compare_ticks(shape.evs.log_signal(wanted + 0.5 * (seen[0] - seen[1]), pixels), reference, *rest)
+    total["flips_by_error"] = float(sum(values.sum() for values in (alone.missed, alone.extra, alone.flips)))
     assert rec.events.size == pytest.approx(total["found"], abs=0.02 * total["found"] + 1)
     return total, rec.manifest["settings"]["render"]["audit"]
 
@@ -97,3 +102,39 @@ def judge(name, seed):
     told = audit["events"]
     missed, extra = total["missed"] / max(1, total["true"]), total["extra"] / max(1, total["found"])
     return total, told, missed, extra
+
+
+def not_held(runs):
+    """What the runs of a scene say that does not hold, as lines; empty if all holds.
+
+    Parameters
+    ----------
+    runs : for each ``true`` and ``found`` events, and of ``missed`` and ``extra`` the share and the audit's bound.
+    """
+    wrong, few = [], max(1, MOST_RUNS * len(runs))
+    broken = sum(any(one[kind][0] > one[kind][1] for kind in ("missed", "extra")) for one in runs)
+    if broken > few:
+        wrong.append(f"{broken} of {len(runs)} runs have more wrong than their audits say")
+    for kind, of, most in (("missed", "true", MOST_MISSED), ("extra", "found", MOST_EXTRA)):
+        share = pooled(runs, kind, of)
+        above = sum(one[kind][0] > most for one in runs)
+        if share > most:
+            wrong.append(f"{100 * share:.2f} % {kind}")
+        if above > few:
+            wrong.append(f"{above} of {len(runs)} runs have more than {100 * most:.0f} % {kind}")
+    return wrong
+
+
+def pooled(runs, kind, of):
+    """Share of the events of all runs together that are missed, or extra."""
+    return sum(one[kind][0] * one[of] for one in runs) / max(1, sum(one[of] for one in runs))
+
+
+def record_of(name, seed):
+    """One run, as `not_held` takes it."""
+    total, told, missed, extra = judge(name, seed)
+    return {
+        "true": total["true"], "found": total["found"],
+        "missed": [missed, told["missed_at_most"]], "extra": [extra, told["extra_at_most"]],
+        "flips": [total["flips"], total["flips_by_error"]],
+    }  # fmt: skip

@@ -16,6 +16,8 @@ from hidden_checks import (
     ROWS,
     WINDOW_US,
     judge,
+    not_held,
+    record_of,
     run_of,
     sensor,
     truth,
@@ -45,13 +47,40 @@ def test_nothing_goes_by_unseen(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", hidden_scenes.SCENES)
 def test_in_95_of_100_seeds_no_more_is_wrong_than_the_audit_says(name):
-    """Ten seeds a scene, of which none may fail: a bound of 99 % fails one of ten by a chance of 10 %, twice 0.4 %."""
-    wrong = 0
-    for seed in range(10):
-        total, told, missed, extra = judge(name, seed)
-        assert missed <= MOST_MISSED and extra <= MOST_EXTRA, (seed, total)
-        wrong += missed > told["missed_at_most"] or extra > told["extra_at_most"]
-    assert wrong <= 1
+    """Ten seeds a scene: a bound of 99 % fails one of ten by a chance of 10 %, twice 0.4 %.
+
+    `benchmarks/hidden_scenes.py` has a hundred.
+    """
+    assert not not_held([record_of(name, seed) for seed in range(10)])
+
+
+@pytest.mark.slow
+def test_flips_are_those_that_the_stated_error_causes():
+    """Events near the threshold: those of 24 runs together within 20 %, their own spread is 4 %.
+
+    The truth has an error as well, a quarter of that of the runs.
+    """
+    scenes = ("fan", "vibration", "crossing", "glint", "thin rod", "fast ball")
+    flips, expected = np.sum([record_of(name, seed)["flips"] for name in scenes for seed in range(4)], axis=0)
+    assert flips > 500
+    assert flips == pytest.approx(expected, rel=0.2)
+
+
+def made(missed=0.0, extra=0.0, told=0.03):
+    return {"true": 1000.0, "found": 1000.0, "missed": [missed, told], "extra": [extra, told]}
+
+
+def test_what_does_not_hold_is_named():
+    good = [made(0.01, 0.005) for _ in range(95)]
+    assert not not_held(good)
+    assert not not_held([*good, *(made(0.025, 0.015) for _ in range(5))])  # five of a hundred may have more
+    assert not_held([*good, *(made(0.025) for _ in range(6))]) == ["6 of 101 runs have more than 2 % missed"]
+    assert not_held([*good, *(made(0, 0.015) for _ in range(6))]) == ["6 of 101 runs have more than 1 % extra"]
+    assert not_held([*good, *(made(0.01, told=0.009) for _ in range(6))]) == [
+        "6 of 101 runs have more wrong than their audits say"
+    ]
+    # few runs with much wrong
+    assert not_held([*good, *(made(0.9, 0.9, 1.0) for _ in range(3))]) == ["3.72 % missed", "3.24 % extra"]
 
 
 @pytest.mark.slow
