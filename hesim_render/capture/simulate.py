@@ -30,7 +30,7 @@ from hesim_render.sources.render.change_driven.forecast import Estimate, forecas
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.framing import warn_if_unseen
 from hesim_render.sources.render.light_level import in_absolute_light
-from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
+from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.lens import LENS_TERMS

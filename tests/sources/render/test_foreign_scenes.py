@@ -25,7 +25,7 @@ from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.specfilm import reference_flux
-from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
+from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.motion import TrackSpec
 

@@ -11,7 +11,7 @@ import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render import RenderedFlux
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.transport.moving_scene import NeedsExactMode
+from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 
 CAMERA = {"origin_m": [0, 0, 1]}
 SUN = {"type": "directional", "illuminance_lux": 1000, "direction": [0, 0, -1]}

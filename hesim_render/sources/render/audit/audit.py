@@ -18,6 +18,7 @@ from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.sources.protocol import AuditableFlux
 from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.confidence import lower_bound, ratio_upper_bound, upper_bound
+from hesim_render.sources.render.audit.tally import Tally
 from hesim_render.sources.render.audit.units import NotedFlux, Units
 
 #: Confidence of each stated bound.
@@ -38,48 +39,6 @@ _REFERENCE = 0.5
 _LEAST_BATCH, _MOST_BATCH = 256, 16384
 #: Upper limit for the rays of an audit: a part of the run's own rays, or a fixed number if that is more.
 _PART, _RAYS = 0.25, 30_000_000
-
-
-class _Tally:
-    """Results of the units, arrays [unit] in the random order in which units are examined.
-
-    Parameters
-    ----------
-    units : number of units.
-
-    Attributes
-    ----------
-    off : share of values off by more than the tolerance, times the weight of the unit.
-    expected : the share that the stated error of the run alone would put there, times the weight.
-    events : counts from `compare`. `by_error` : counts after the stated error is added to the reference.
-    eventful : length of the first part in which all units with events in the run were examined.
-    looked_at : length of the first part in which all units were examined.
-    """
-
-    def __init__(self, units: int) -> None:
-        self.off, self.expected, self.by_error = (np.zeros(units) for _ in range(3))
-        self.events = Counted(*(np.zeros(units) for _ in range(5)))
-        self.has_event = np.zeros(units, np.bool_)
-        self.eventful = self.looked_at = 0
-        self._deviations: list[tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]] = []
-
-    def note(self, place: NDArray[np.int64], deviation: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
-        """Note absolute deviations of some units, [window, unit], in units of noise, with the weight of each unit."""
-        each = np.broadcast_to(place, deviation.shape), deviation, np.broadcast_to(weight, deviation.shape)
-        self._deviations.append(tuple(values.ravel() for values in each))  # type: ignore[arg-type]
-
-    def deviations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Deviations and weights of all examined units, in increasing order of deviation."""
-        place, deviation, weight = (np.concatenate(values) for values in zip(*self._deviations, strict=True))
-        among = np.flatnonzero(place < self.looked_at)
-        order = among[np.argsort(deviation[among])]
-        return deviation[order], weight[order]
-
-    def rate(self, values: NDArray[np.float64]) -> float:
-        """Mean over units of a quantity that is 0 in units without events."""
-        rare = values[: self.eventful][self.has_event[: self.eventful]].sum() / max(1, self.eventful)
-        other = values[: self.looked_at][~self.has_event[: self.looked_at]].sum() / max(1, self.looked_at)
-        return float(rare + other)
 
 
 class Audit:
@@ -127,7 +86,7 @@ class Audit:
         part, the other units are examined as well, because any of them may have a value that is off or a missed event.
         """
         begin, batches = self._source.rays_traced, self._batches(noted)
-        tally, result, seen = _Tally(sum(units.pixel.size for units in noted)), dict[str, Any](), 0
+        tally, result, seen = Tally(sum(units.pixel.size for units in noted)), dict[str, Any](), 0
         if events:
             for batch in batches:
                 seen += 1
@@ -166,7 +125,7 @@ class Audit:
             first, size = first + chosen.size, min(2 * size, _MOST_BATCH)
         return found
 
-    def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: _Tally, which: str) -> None:
+    def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: Tally, which: str) -> None:
         """Render the reference of some units of a batch and count the results.
 
         Parameters
@@ -192,7 +151,7 @@ class Audit:
             tally.looked_at += count
 
     def _count(
-        self, units: Units, place: NDArray[np.int64], still: NDArray[np.bool_], which: str, tally: _Tally
+        self, units: Units, place: NDArray[np.int64], still: NDArray[np.bool_], which: str, tally: Tally
     ) -> None:
         events, core, tolerance = which != "frames", units.core, TOLERANCE * self._quality
         reference, difference = self._reference(units, still, which)
@@ -273,7 +232,7 @@ class Audit:
             return compare_ticks(*arguments)
         return compare_crossings(*arguments, _MOST_EVENTS["last_event"])
 
-    def _bounds(self, tally: _Tally, events: bool) -> dict[str, Any]:
+    def _bounds(self, tally: Tally, events: bool) -> dict[str, Any]:
         off, most = tally.off[: tally.looked_at], 1 / _STILL_PART if events else 1.0
         deviation, weight = tally.deviations()
         cumulated = np.cumsum(weight)
@@ -292,7 +251,7 @@ class Audit:
         }
         return found | self._event_bounds(tally) if events else found
 
-    def _event_bounds(self, tally: _Tally) -> dict[str, Any]:
+    def _event_bounds(self, tally: Tally) -> dict[str, Any]:
         """Bounds of missed and extra events. Units in which nothing can move have neither."""
         assert self._noise is not None
         most, counted = float(_MOST_EVENTS[self._noise.spec.reference]), tally.events

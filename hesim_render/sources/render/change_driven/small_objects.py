@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.method_cache import method_cache
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.change_driven.tuning import Tuning
@@ -201,10 +202,10 @@ class Zoom:
         # rows of a rolling shutter have different windows; rounded outwards, many of them share one look
         step = np.maximum((end - begin) / _PARTS, 1.0)
         times = np.stack([np.floor(begin / step) * step, np.ceil(end / step) * step])
-        looks, which = np.unique(times, axis=1, return_inverse=True)
+        looks, which = distinct_columns(times)
         found: list[Look] = []
         for look, (low, high) in enumerate(looks.T):
-            mine = np.flatnonzero(which.ravel() == look)
+            mine = np.flatnonzero(which == look)
             places = np.full(shape, -1)
             places[row[mine] - top, col[mine] - left] = mine
             for outlines, rays, is_small in self._outlines(float(low), float(high)):

@@ -36,14 +36,11 @@ from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.motion_bounds import stays_in
+from hesim_render.sources.render.transport.needs_exact import NeedsExactMode, require_paths
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
 #: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
 _FEW = 3
-
-
-class NeedsExactMode(SpecError):
-    """The scene needs the exact mode: paths between resting and rigidly moving surfaces do not describe it."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +125,7 @@ class MovingScene:
             )
         mi = built.mi
         if not geometry_only:
-            _require_paths(built)
+            require_paths(built)
         self.mi = mi
         moving = {
             shape: group
@@ -317,17 +314,6 @@ class MovingScene:
         return state, met
 
 
-def _require_paths(built: BuiltScene) -> None:
-    """Refuse scenes that paths between surfaces do not describe."""
-    if built.exact_because is not None:
-        raise NeedsExactMode(built.exact_because)
-    if not path_traced(built):
-        name = built.integrator.class_name()
-        raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
-    if built.integrator.hide_emitters:
-        raise NeedsExactMode("the integrator hides lights that are seen directly")
-
-
 def _at_rest(ray: Ray, pose: DevicePose) -> Ray:
     """Transform a ray into the rest frame of a posed object."""
     local = type(ray)(ray)
@@ -346,8 +332,3 @@ def spare_even_skies(mi: MitsubaModule, emitters: Sequence[MitsubaObject]) -> No
             parameters = mi.traverse(emitter)
             parameters["sampling_weight"] = 0.0
             parameters.update()
-
-
-def path_traced(built: BuiltScene) -> bool:
-    """True if Mitsuba's path tracer renders the scene; its paths run between surfaces only."""
-    return built.integrator.class_name() == "PathIntegrator"
