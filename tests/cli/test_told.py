@@ -85,6 +85,18 @@ def test_the_rays_of_an_exact_run_are_near_their_estimate(capsys, tmp_path, monk
     assert json.loads(out)["estimate"]["rays"] == pytest.approx(max(t.rays_done for t in tracers) - own, rel=0.3)
 
 
+@pytest.mark.parametrize("duration", ["0.005", pytest.param("0.06", marks=pytest.mark.slow)])
+def test_the_rays_of_a_run_are_near_their_estimate(duration, capsys, tmp_path):
+    """A fifth of the rays of a short run are those of its first window. GEN2 has few event pixels in the region."""
+    for sensor, region in (("eiger", "96x64"), ("gen2", "160x128")):
+        given = ["rotating-star", "--sensor", sensor, "--roi", region, "--duration", duration]
+        out = tmp_path / sensor
+        status, told, _ = call(capsys, "simulate", *given, "--out", out, "--json")
+        assert status == 0
+        render = json.loads((out / "recording.json").read_text())["settings"]["render"]
+        assert json.loads(told)["estimate"]["rays"] == pytest.approx(render["rays"] + render["pilot_rays"], rel=0.12)
+
+
 def test_a_long_exact_run_has_to_be_wanted(capsys, tmp_path):
     status, out, line = call(
         capsys, "simulate", "rotating-star", "--sensor", "gen2", "--duration", "300", "--samples", "1024", "--roi",

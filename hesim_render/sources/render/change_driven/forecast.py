@@ -74,7 +74,9 @@ def forecast(
             chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, _BLOCKS).astype(int))]
             patch = _patches(event_pixel, source, rng)
             each = [source.foretell(patch, block.begin_us, block.end_us, "events") for block in chosen]
-            rays += float(np.mean(each)) * event_pixel.size * blocks.count
+            # the first window of a run belongs to no block before it, and all pixels are rendered in it
+            first = source.foretell(patch, chosen[0].begin_us[:1], chosen[0].end_us[:1], "events")
+            rays += (first + float(np.mean(each)) * blocks.count) * event_pixel.size
         pixel = distinct_pixels(
             frame_pixel if exposures else frame_pixel[:0], event_pixel if is_static else event_pixel[:0]
         )
