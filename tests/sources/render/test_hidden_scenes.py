@@ -48,11 +48,15 @@ def test_nothing_goes_by_unseen(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", hidden_scenes.SCENES)
 def test_in_95_of_100_seeds_no_more_is_wrong_than_the_audit_says(name):
-    """Ten seeds a scene: a bound of 99 % fails one of ten by a chance of 10 %, twice 0.4 %.
+    """Ten seeds a scene: a bound of 99 % fails one of ten by a chance of 10 %, twice 0.4 %. No run may have more wrong
+    than a run should.
 
-    `benchmarks/hidden_scenes.py` has a hundred.
+    `benchmarks/hidden_scenes.py` has a hundred seeds. One of them has more, and says so.
     """
-    assert not not_held([record_of(name, seed) for seed in range(10)])
+    runs = [record_of(name, seed) for seed in range(10)]
+    assert not not_held(runs)
+    for one in runs:
+        assert one["missed"][0] <= MOST_MISSED and one["extra"][0] <= MOST_EXTRA
 
 
 @pytest.mark.slow
@@ -65,21 +69,25 @@ def test_flips_are_those_that_the_stated_error_causes():
     assert found == pytest.approx(expected, rel=0.1)
 
 
-def made(missed=0.0, extra=0.0, told=0.03):
-    return {"true": 1000.0, "found": 1000.0, "missed": [missed, told], "extra": [extra, told]}
+def made(missed=0.0, extra=0.0, told=0.03, **verdict):
+    return {"true": 1000.0, "found": 1000.0, "missed": [missed, told], "extra": [extra, told], **verdict}
 
 
 def test_what_does_not_hold_is_named():
     good = [made(0.01, 0.005) for _ in range(95)]
     assert not not_held(good)
-    assert not not_held([*good, *(made(0.025, 0.015) for _ in range(5))])  # five of a hundred may have more
-    assert not_held([*good, *(made(0.025) for _ in range(6))]) == ["6 of 101 runs have more than 2 % missed"]
-    assert not_held([*good, *(made(0, 0.015) for _ in range(6))]) == ["6 of 101 runs have more than 1 % extra"]
+    assert not not_held([*good, made(0.025, 0.015, verdict="not met")])
+    for verdict in ({}, {"verdict": "met"}, {"verdict": "not shown"}):
+        assert not_held([*good, made(0.025, **verdict)]) == ["1 of 96 runs have more than 2 % missed and do not say so"]
+        assert not_held([*good, made(0, 0.015, **verdict)]) == [
+            "1 of 96 runs have more than 1 % extra and do not say so"
+        ]
     assert not_held([*good, *(made(0.01, told=0.009) for _ in range(6))]) == [
         "6 of 101 runs have more wrong than their audits say"
     ]
     # few runs with much wrong
-    assert not_held([*good, *(made(0.9, 0.9, 1.0) for _ in range(3))]) == ["3.72 % missed", "3.24 % extra"]
+    many = [made(0.9, 0.9, 1.0, verdict="not met") for _ in range(3)]
+    assert not_held([*good, *many]) == ["3.72 % missed", "3.24 % extra"]
 
 
 @pytest.mark.slow
