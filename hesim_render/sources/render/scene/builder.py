@@ -22,6 +22,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     box_corners,
     files_readable,
     make_mesh,
+    settle_normals,
     spectrum_dict,
     transform,
 )
@@ -30,6 +31,7 @@ from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.surfaces import area_emitter, is_matt, paint_of, radiance_of, surface_of
 from hesim_render.sources.render.scene.trajectory import Trajectory
+from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
@@ -154,6 +156,9 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
             scene = mi.load_dict({"type": "scene", **content}, optimize=False)
         integrator = path_tracer(mi, spec.depth)
     parameters = mi.traverse(scene)
+    if spec.mitsuba is None:
+        without = {name for item in spec.objects for name in _without_normals(item, spec, groups)}
+        settle_normals(parameters, without.__contains__)
     tracks = {name: track for name, track in trajectories(spec).items() if name != "camera"}
     movable: dict[str, list[Movable]] = {}
     shapes = {shape.id(): shape for shape in scene.shapes()}
@@ -229,6 +234,13 @@ def _describe(
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
     return content, groups, paints if all_matt and not has_map else None, deformations
+
+
+def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, list[str]]) -> list[str]:
+    """Ids of an object's shapes that Mitsuba reads from a file without normals of its vertices."""
+    path = spec.folder / str(item.mesh)
+    is_read = item.shape == "mesh" and path.suffix.lower().lstrip(".") in MESH_FILES
+    return groups[item.name] if is_read and not brings_normals(path) else []
 
 
 def _target_pieces(spec: SceneSpec) -> list[Piece]:

@@ -20,6 +20,7 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.interrupts import interrupts_held
 from hesim_render.sources.render.scene.files import check_xml, require_state_inside
+from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals, ordered_normals
 from hesim_render.spectral.spectrum import Spectrum
 
 _LEAST_THREADS = 2
@@ -152,9 +153,47 @@ def load_scene(
         parser.transform_all(config, state)
         mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> element puts its own folder first
         review(state)
-        return parser.instantiate(config, state)
+        needs_normals = _without_normals(state)
+        scene = parser.instantiate(config, state)
     finally:
         mi.set_file_resolver(resolver)
+    settle_normals(mi.traverse(scene), needs_normals)
+    return scene
+
+
+def _without_normals(state: Any) -> Callable[[str], bool]:
+    """Tell of a shape's name in a parsed scene whether it is a mesh from files without normals.
+
+    Raises
+    ------
+    SpecError
+        If a 'merge' has meshes of both kinds, whose vertices cannot be told apart afterwards.
+    """
+    files = {}
+    for number, node in enumerate(state.nodes):
+        own = node.props
+        if own.plugin_name() in MESH_FILES and not own.get("face_normals", False):
+            path = Path(_opened(own["filename"]))
+            # Mitsuba says what is wrong with a file that is not there
+            files[number] = path.is_file() and not brings_normals(path, own.get("shape_index", 0))
+    merged = set()
+    for node in state.nodes:
+        if node.props.plugin_name() == "merge":
+            merged |= {files[number] for number in _children(node) if number in files}
+    if len(merged) == 2:
+        raise SpecError("shape 'merge': some of its meshes have normals of their vertices and others do not; take the "
+                        "meshes out of 'merge'")  # fmt: skip
+    named = {node.props.id(): files.get(number, False) for number, node in enumerate(state.nodes)
+             if node.props.plugin_name() != "merge"}  # fmt: skip
+    return lambda name: named.get(name, merged == {True})
+
+
+def _children(node: Any) -> list[int]:
+    """Numbers of the nodes that a node of a parsed scene refers to."""
+    import mitsuba as mi
+
+    resolved = mi.Properties.Type.ResolvedReference
+    return [node.props[key].index() for key in node.props if node.props.type(key) == resolved]
 
 
 def _opened(name: str) -> str:
@@ -266,12 +305,11 @@ class Movable:
         self._parameters = parameters
         self.prefix = prefix
         self._to_world: NDArray[np.float64] | None = None
+        self._normals: NDArray[np.float64] | None = None
         self.is_mesh = f"{prefix}.vertex_positions" in parameters
         if self.is_mesh:
             self._vertices = np.array(parameters[f"{prefix}.vertex_positions"], dtype=np.float64).reshape(-1, 3)
-            normals = f"{prefix}.vertex_normals"
-            has_normals = normals in parameters and len(parameters[normals]) == self._vertices.size
-            self._normals = np.array(parameters[normals], dtype=np.float64).reshape(-1, 3) if has_normals else None
+            self._normals = vertex_normals(parameters, prefix)
             self.corners = box_corners(self._vertices.min(axis=0), self._vertices.max(axis=0))
         else:
             matrix = np.array(parameters[f"{prefix}.to_world"].matrix, dtype=np.float64)
@@ -286,7 +324,9 @@ class Movable:
     def deform(self, vertices_m: NDArray[np.float64]) -> None:
         """Give a mesh another shape, [vertex, 3] as at its initial placement; takes effect at the next `set_pose`."""
         self._vertices = vertices_m
-        self._normals = None  # Mitsuba computes those of the new shape
+        if self._normals is not None:
+            faces = np.array(self._parameters[f"{self.prefix}.faces"]).reshape(-1, 3)
+            self._normals = ordered_normals(vertices_m, faces).astype(np.float64)
 
     def set_pose(self, pose: NDArray[np.float64]) -> None:
         """Set the shape to `pose` (4×4, rigid) times its initial placement; takes effect at ``parameters.update()``."""
@@ -300,8 +340,36 @@ class Movable:
         positions = self._vertices @ rotation.T + shift
         self._parameters[f"{self.prefix}.vertex_positions"] = positions.astype(np.float32).ravel()
         if self._normals is not None:
+            # with positions alone, Mitsuba would compute normals of its own
             turned = self._normals @ rotation.T
             self._parameters[f"{self.prefix}.vertex_normals"] = turned.astype(np.float32).ravel()
+
+
+def vertex_normals(parameters: MitsubaObject, prefix: str) -> NDArray[np.float64] | None:
+    """Normals of a mesh's vertices, [vertex, 3]; None if its faces are flat."""
+    key = f"{prefix}.vertex_normals"
+    if key not in parameters or len(parameters[key]) != len(parameters[f"{prefix}.vertex_positions"]):
+        return None
+    return np.array(parameters[key], dtype=np.float64).reshape(-1, 3)
+
+
+def settle_normals(parameters: MitsubaObject, needs_normals: Callable[[str], bool]) -> None:
+    """Give meshes the normals that their vertices determine, in place of Mitsuba's, whose last bits are by chance.
+
+    Parameters
+    ----------
+    parameters : ``mitsuba.traverse(scene)``.
+    needs_normals : True for the name of a mesh whose file has no normals (`brings_normals`).
+    """
+    ending, changed = ".vertex_normals", False
+    for prefix in [key.removesuffix(ending) for key in parameters.keys() if key.endswith(ending)]:
+        # a mesh of a group has the names of its owners before its own
+        if vertex_normals(parameters, prefix) is not None and needs_normals(prefix.rpartition(".")[2]):
+            vertices, faces = (np.array(parameters[f"{prefix}.{key}"]) for key in ("vertex_positions", "faces"))
+            normals = ordered_normals(vertices.reshape(-1, 3), faces.reshape(-1, 3))
+            parameters[f"{prefix}{ending}"], changed = normals.ravel(), True
+    if changed:
+        parameters.update()
 
 
 def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
