@@ -117,6 +117,14 @@ def test_any_number_of_workers_leaves_the_same_bytes(built, tmp_path, workers):
     assert digest_of(again) == digest_of(built) and verify_benchmark(again.root) == []
 
 
+def await_builder(root):
+    """Number of a process that builds a clip, as soon as there is one: its unfinished folder names it."""
+    while True:
+        for path in (root / "clips").glob(".*.partial"):
+            return int(path.name.removesuffix(".partial").rpartition("-")[2])
+        time.sleep(0.05)
+
+
 @pytest.mark.slow
 def test_a_killed_worker_leaves_the_same_bytes(built, tmp_path):
     """Two processes, one of which is killed while it renders; what is there is not built again."""
@@ -133,10 +141,7 @@ def test_a_killed_worker_leaves_the_same_bytes(built, tmp_path):
     killed = []
 
     def kill():
-        while not any((root / "clips").glob(".*.partial")):  # a clip is being built
-            time.sleep(0.05)
-        folder = next((root / "clips").glob(".*.partial")).name
-        pid = int(folder.removesuffix(".partial").rpartition("-")[2])
+        pid = await_builder(root)
         assert pid in workers[0].pids
         os.kill(pid, signal.SIGKILL)
         killed.append(pid)
@@ -364,10 +369,7 @@ def test_two_workers_of_dask_and_a_kill_leave_the_same_bytes(built, tmp_path):
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
 
         def kill():
-            while not any((root / "clips").glob(".*.partial")):
-                time.sleep(0.05)
-            name = next((root / "clips").glob(".*.partial")).name
-            os.kill(int(name.removesuffix(".partial").rpartition("-")[2]), signal.SIGKILL)
+            os.kill(await_builder(root), signal.SIGKILL)
 
         threading.Thread(target=kill, daemon=True).start()
         again = build_benchmark(small(), root, scheduler=cluster.scheduler_address, estimate=False)

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -360,25 +359,42 @@ def test_parse_roi():
         parse_roi("512x384x2")
 
 
-def test_interrupt_exits_130_and_leaves_nothing(tmp_path):
-    out = tmp_path / "o"
-    command = [sys.executable, "-m", "hesim_render.cli", "simulate", "rotating-star", "--sensor", "gen2", "--roi"]
-    for number in (signal.SIGINT, signal.SIGTERM):
-        child = subprocess.Popen(
-            [*command, "512x384", "--duration", "5", "--yes", "--out", out],
-            stderr=subprocess.PIPE,
-            text=True,
-            # a test run in the background of a shell ignores SIGINT, and its children would too
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-        )
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.glob(".o.*.partial")) and time.monotonic() < deadline and child.poll() is None:
-            time.sleep(0.05)
-        os.kill(child.pid, number)
-        _, err = child.communicate(timeout=60)
-        assert child.returncode == 130, err
-        assert "interrupted" in err and "Traceback" not in err
-        assert list(tmp_path.iterdir()) == []
+#: A run that says when it is about to keep its first result, or has kept it, and stays there until it is ended.
+HELD = """
+import sys, time
+from hesim_render.core.journal import Journal
+keep, when = Journal.keep, sys.argv[1]
+def held(*given):
+    if when == "after":
+        keep(*given)
+    print("held", flush=True)
+    time.sleep(600)
+Journal.keep = held
+from hesim_render.cli import main
+main(sys.argv[2:])
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "when", "left"),
+    [(signal.SIGINT, "before", []), (signal.SIGTERM, "before", []), (signal.SIGINT, "after", [".o.unfinished"])],
+)
+def test_interrupt_exits_130_and_leaves_what_was_kept_or_nothing(number, when, left, tmp_path):
+    child = subprocess.Popen(
+        [sys.executable, "-c", HELD, when, "simulate", "rotating-star", "--sensor", "gen2", "--roi", "64x48",
+         "--duration", "0.02", "--yes", "--out", tmp_path / "o"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # a test run in the background of a shell ignores SIGINT, and its children would too
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    while (line := child.stdout.readline()) and line != "held\n":
+        pass
+    assert line and any(path.name.endswith(".partial") for path in tmp_path.iterdir())
+    os.kill(child.pid, number)
+    _, err = child.communicate(timeout=60)
+    assert child.returncode == 130, err
+    assert "interrupted" in err and "Traceback" not in err
+    assert [path.name for path in tmp_path.iterdir()] == left
 
 
 def test_the_main_job_end_to_end(capsys, tmp_path):

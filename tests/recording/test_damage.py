@@ -220,14 +220,14 @@ def bomb(file, name, shape, dtype="<f4"):
 
 def test_truth_that_inflates_without_end_is_refused_by_its_header(folder):
     bomb(folder / "truth" / "000000.npz", "electrons_mean", (1 << 17, 1 << 15))
-    begin = time.monotonic()
+    begin = time.process_time()
     refused(lambda: Recording.load(folder).frames[0], r"no array 'electrons_stderr'")
     refused(
         lambda: read_arrays(folder / "truth" / "000000.npz", shapes={"electrons_mean": (32, 32)}),
         "expected \\(32, 32\\)",
     )
     refused(lambda: read_arrays(folder / "truth" / "000000.npz"), "GB of memory")
-    assert time.monotonic() - begin < 5  # inflated it would take a minute
+    assert time.process_time() - begin < 5  # inflated it would take a minute
 
 
 def test_headers_of_arrays_are_short_and_say_what_is_there(tmp_path):
@@ -364,9 +364,9 @@ def test_events_must_be_as_many_as_the_manifest_says(folder):
 )  # fmt: skip
 def test_yaml_that_means_more_than_it_says(tmp_path, text):
     (tmp_path / "s.yaml").write_text(text)
-    begin = time.monotonic()
+    begin = time.process_time()
     refused(lambda: load_yaml(tmp_path / "s.yaml"), r"s\.yaml")
-    assert time.monotonic() - begin < 5
+    assert time.process_time() - begin < 5
     (tmp_path / "s.yaml").write_text("a: &a {b: 1}\nc: *a\nd: {<<: *a, e: 2*3}\n")
     assert load_yaml(tmp_path / "s.yaml")["c"]["b"] == 1
 

@@ -60,8 +60,20 @@ def uneven_ball(seed=4, subdivisions=4):
 def mitsuba_scene(path, **keys):
     own = {"index": {"shape_index": 1}, "none": {}}["index" if path.suffix == ".serialized" else "none"]
     thing = {"type": path.suffix[1:], "filename": str(path), "bsdf": {"type": "diffuse"}, **own, **keys}
-    motion = [{"object": "thing", "keyframes": [{"t_us": TIMES_US[0]}, {
-        "t_us": TIMES_US[1], "rotation_axis": [1, 2, -2], "rotation_deg": 40.0, "translation_m": [0.2, -0.1, 0.3]}]}]
+    motion = [
+        {
+            "object": "thing",
+            "keyframes": [
+                {"t_us": TIMES_US[0]},
+                {
+                    "t_us": TIMES_US[1],
+                    "rotation_axis": [1, 2, -2],
+                    "rotation_deg": 40.0,
+                    "translation_m": [0.2, -0.1, 0.3],
+                },
+            ],
+        }
+    ]
     return make_scene(mitsuba={"inline": {"thing": thing, "sun": {"type": "constant"}}},
                       camera={"origin_m": [0, 0, 4], "horizontal_fov_deg": 30}, motion=motion)  # fmt: skip
 
@@ -72,7 +84,8 @@ def own_scene(path):
 
 
 def normals_of(built):
-    (key,) = (key for key in built.parameters.keys() if key.endswith(".vertex_normals"))
+    names = list(built.parameters.keys())
+    (key,) = (name for name in names if name.endswith(".vertex_normals"))
     return np.array(built.parameters[key]).reshape(-1, 3)
 
 
@@ -105,8 +118,8 @@ def test_normals_are_mitsubas_to_rounding(tmp_path):
 
 
 def test_weights_are_the_angles_at_the_vertex():
-    """Around the tip of a corner cut from a cuboid all angles are right, so all three faces weigh the same there, however
-    large they are; at the far corners the sheet's own angles count.
+    """At the tip of a corner of a cuboid all angles are right, so all three faces weigh the same, however large they
+    are; at the far corners the angles of the two faces count.
     """
     vertices = np.array([[0, 0, 0], [3.0, 0, 0], [0, 0.2, 0], [0, 0, 1.7]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2]])

@@ -362,7 +362,8 @@ def settle_normals(parameters: MitsubaObject, needs_normals: Callable[[str], boo
     needs_normals : True for the name of a mesh whose file has no normals (`brings_normals`).
     """
     ending, changed = ".vertex_normals", False
-    for prefix in [key.removesuffix(ending) for key in parameters.keys() if key.endswith(ending)]:
+    names = list(parameters.keys())  # iteration over the parameters themselves gives pairs
+    for prefix in [name.removesuffix(ending) for name in names if name.endswith(ending)]:
         # a mesh of a group has the names of its owners before its own
         if vertex_normals(parameters, prefix) is not None and needs_normals(prefix.rpartition(".")[2]):
             vertices, faces = (np.array(parameters[f"{prefix}.{key}"]) for key in ("vertex_positions", "faces"))
