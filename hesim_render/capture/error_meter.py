@@ -12,18 +12,24 @@ from hesim_render.core.device_types import Float, UInt32
 
 #: Number of values sampled per picture, and bins per decade of the histogram after its first bin.
 _VALUES, _BINS, _FIRST, _DECADES = 1 << 15, 50, 1e-5, 10
+#: Lower ends of the bins.
+_LOWER = np.concatenate([[0.0], _FIRST * 10 ** (np.arange(_BINS * _DECADES + 1) / _BINS)])
 
 
 class ErrorMeter:
-    """Measures the error of the values of a run.
+    """Measures the error of the values of a run, over the sensor's noise.
 
     Half the difference of a value's two halves has the variance of the value's own error and, with many rays, its
     distribution. In large pictures a sample of the values is used, the same in every picture.
+
+    Attributes
+    ----------
+    values : number of values so far.
     """
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS * _DECADES + 2, np.int64)
-        self._square, self._values = 0.0, 0
+        self._square, self.values = 0.0, 0
         self._where: tuple[NDArray[np.int64], UInt32] | None = None
 
     def add(
@@ -57,7 +63,7 @@ class ErrorMeter:
             np.clip(bins, 0, self._counts.size - 1).astype(np.int64), minlength=self._counts.size
         )
         self._square += float(np.sum(error * error))
-        self._values += error.size
+        self.values += error.size
 
     def as_dict(self, wanted: float | None = None) -> dict[str, float] | None:
         """Statistics for the manifest, in units of noise; None without values.
@@ -66,14 +72,20 @@ class ErrorMeter:
         ----------
         wanted : error that was asked for, in units of noise.
         """
-        if not self._values:
+        if not self.values:
             return None
-        lower = np.concatenate([[0.0], _FIRST * 10 ** (np.arange(self._counts.size - 1) / _BINS)])
-        cumulated = np.cumsum(self._counts)
-        found = {"rms": float(np.sqrt(self._square / self._values))}
-        for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
-            # centre of the bin, which is 4.7 % wide
-            found[name] = float(lower[np.searchsorted(cumulated, part * cumulated[-1])] * 10 ** (0.5 / _BINS))
+        found = {"rms": float(np.sqrt(self._square / self.values))}
+        found |= {name: self.quantile(part) for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
         if wanted is not None:
-            found["share_above_wanted"] = float(self._counts[lower >= wanted * (1 - 1e-9)].sum() / self._values)
+            found["share_above_wanted"] = self.share_from(wanted)
         return found
+
+    def quantile(self, part: float) -> float:
+        """Error that a part of the values does not exceed, to 5 %."""
+        cumulated = np.cumsum(self._counts)
+        # centre of the bin, which is 4.7 % wide
+        return float(_LOWER[np.searchsorted(cumulated, part * cumulated[-1])] * 10 ** (0.5 / _BINS))
+
+    def share_from(self, limit: float) -> float:
+        """Share of the values with an error of `limit` or more; the limit is rounded up to the begin of a bin."""
+        return float(self._counts[limit * (1 - 1e-9) <= _LOWER].sum() / self.values)

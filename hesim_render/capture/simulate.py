@@ -12,6 +12,7 @@ import numpy as np
 from hesim_render.capture.exact_estimate import estimate_exact
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import TERMS, noise_models
+from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
 from hesim_render.core.journal import Journal
@@ -203,6 +204,8 @@ def simulate(
             }
             if rendering:
                 render |= _work_done(rendering)
+            else:
+                render["audit"] = stated_verdict(capture.errors, settings["samples"], QUALITY)
             if noted is not None:
                 if told is not None:
                     told(0, 1, "audit")

@@ -135,6 +135,12 @@ def _verdict(audit: dict[str, Any]) -> list[str]:
         if audit.get("verdict") == "not shown":
             return ["  audit: too little was looked at again to confirm this run's quality; nothing speaks against it"]
         return []
+    if audit.get("samples_needed"):
+        off = max(audit.get(f"{name}_off", 0.0) for name in ("events", "frames"))
+        return [
+            f"  NOT MET: by their stated error {_percent(off)} of the values are off by more than "
+            f"{audit['tolerance_noise']:g} of the sensor's noise; --samples {audit['samples_needed']} would do"
+        ]
     return [f"  NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]
 
 

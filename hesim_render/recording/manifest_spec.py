@@ -59,13 +59,14 @@ class _Audit(_Open):
     tolerance_noise: float
     verdict: Literal["met", "not shown", "not met"]
     quality_needed: float | None = None
+    samples_needed: int | None = None
     events: _AuditedPart | None = None
     frames: _AuditedPart | None = None
 
     @model_validator(mode="after")
     def _check(self) -> _Audit:
-        if self.verdict == "not met" and self.quality_needed is None:
-            raise ValueError("quality_needed is required where the verdict is 'not met'")
+        if self.verdict == "not met" and self.quality_needed is None and self.samples_needed is None:
+            raise ValueError("quality_needed or samples_needed is required where the verdict is 'not met'")
         return self
 
 

@@ -13,6 +13,7 @@ import pytest
 from test_cli import call, fails
 
 import hesim_render as hr
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core.shipped import data_folder
 from hesim_render.exchange import open_events
 from hesim_render.specs.run import read_run
@@ -42,12 +43,13 @@ def write(folder, text=RUN):
 def test_a_run_is_its_commands_one_after_the_other(capsys, tmp_path):
     status, out, err = call(capsys, "run", write(tmp_path), "--out", tmp_path / "o", "--json")
     told = json.loads(out)
-    assert status == told["status"] == 0 and told["kept"] == [] and "Traceback" not in err
+    assert status == told["status"] == ExitStatus.NOT_MET  # two rays a pixel
+    assert told["kept"] == [] and "Traceback" not in err
     assert sorted(told["written"]) == ["events.raw", "frames", "pictures", "recording", "recording/recording.html"]
     assert sorted(os.listdir(tmp_path / "o")) == ["events.raw", "frames", "pictures", "recording", "run.json"]
     same = ["--sensor", "davis346", "--roi", "48x36", "--duration", "0.03", "--samples", "2"]
     same += ["--set", "light.illuminance_lux=300", "--set", "sensor.aps.exposure_us=2000", "--out", tmp_path / "r"]
-    assert call(capsys, "simulate", "rotating-star", *same)[0] == 0
+    assert call(capsys, "simulate", "rotating-star", *same)[0] == ExitStatus.NOT_MET
     alone = sorted(path.relative_to(tmp_path / "r") for path in (tmp_path / "r").rglob("*") if path.is_file())
     for name in alone:
         assert (tmp_path / "o" / "recording" / name).read_bytes() == (tmp_path / "r" / name).read_bytes(), name
@@ -67,7 +69,7 @@ def test_a_run_is_its_commands_one_after_the_other(capsys, tmp_path):
     # another content is refused, and replaces all of the old one where that is wanted
     other = ["run", tmp_path / "run.yaml", "--out", tmp_path / "o", "--set", "seed=8", "--set", "export=[]"]
     assert "holds a run of other content" in fails(capsys, *other)
-    assert call(capsys, *other, "--overwrite")[0] == 0
+    assert call(capsys, *other, "--overwrite")[0] == ExitStatus.NOT_MET
     assert sorted(os.listdir(tmp_path / "o")) == ["pictures", "recording", "run.json"]
     assert hr.Recording.load(tmp_path / "o" / "recording").manifest["seed"] == 8
 

@@ -54,7 +54,7 @@ def test_json_is_one_object_that_agrees_with_the_recording(capsys, tmp_path):
 
 
 def test_quiet_prints_nothing_and_errors_all_the_same(capsys, tmp_path):
-    assert call(capsys, *STILL, "--out", tmp_path / "o", "--quiet", "--samples", "4") == (0, "", "")
+    assert call(capsys, *STILL, "--out", tmp_path / "o", "--quiet", "--samples", "4") == (ExitStatus.NOT_MET, "", "")
     assert "exists; give another name" in fails(capsys, *STILL, "--out", tmp_path / "o", "--quiet")
     assert fails(capsys, *STILL, "--out", tmp_path / "o", "--json")  # no object where nothing was made
 

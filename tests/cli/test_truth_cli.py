@@ -6,6 +6,7 @@ from test_cli import call, fails
 
 import hesim_render as hr
 from hesim_render.cli.cube import parse_bands
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core.errors import RangeError
 from hesim_render.recording.truth_kinds import TRUTH_KINDS
 from hesim_render.specs.files import data_folder
@@ -15,7 +16,10 @@ RUN = ("simulate", "rotating-star", "--sensor", "gen2", "--roi", "32x24", "--dur
 
 def test_truth_is_written_and_exported(capsys, tmp_path):
     out = tmp_path / "rec"
-    assert call(capsys, *RUN, "--out", out, "--truth", "depth, events", "--truth-every-us", "5000")[0] == 0
+    assert (
+        call(capsys, *RUN, "--out", out, "--truth", "depth, events", "--truth-every-us", "5000")[0]
+        == ExitStatus.NOT_MET
+    )
     recording = hr.Recording.load(out)
     assert recording.stored_truth.kinds == ("depth",)
     assert recording.stored_truth.read("events/depth_m").shape == (5, 6, 8)

@@ -8,12 +8,16 @@ import rendering
 from rendering import mono, pair_tracer, traced
 
 import hesim_render as hr
+from hesim_render.core.backend import jit
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.sampling.sampler import sampler_class
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport import moving_scene as moving
 from hesim_render.sources.render.transport.intersections import meets_ball
+from hesim_render.sources.scene import Scene
 
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
 LAMP = {
@@ -140,6 +144,44 @@ def test_matt_surfaces_have_the_flux_of_the_exact_mode(name):
             assert spread < 0.01 * wanted.mean()
             assert abs(np.mean(found - wanted)) < 5 * spread / found.size**0.5
             assert np.abs(found - wanted).max() < 12 * spread  # groups at edges have more noise than others
+
+
+@pytest.mark.parametrize("power", [-70, 60])
+def test_the_scatter_of_a_pilot_has_no_range(power):
+    """The mean fourth power over the mean square, by NumPy, of fluxes whose own fourth powers leave float32.
+
+    Two pairs of 32 rays: one of two kinds of 16 rays each, with means of their own, and one of a single bright ray.
+    """
+    types, rng = jit(), np.random.default_rng(3)
+    two_kinds, one_bright = np.repeat([5.0, 3.0], 16) + rng.normal(size=32), np.where(np.arange(32) == 7, 900.0, 0.25)
+    rays = np.stack([two_kinds, one_bright])
+    flux, met = (types.Float(np.ldexp(rays, power).ravel().astype(np.float32)), types.UInt32(np.zeros(64, np.uint32)))
+    out = PilotFlux(*(np.zeros(2, np.float32) for _ in range(5)), np.ones(2, np.bool_))
+    with np.errstate(all="raise"):
+        out.put(slice(0, 2), flux, 2 * flux, flux, met, 32, 16)
+    deviation = rays.reshape(2, 2, 16) - rays.reshape(2, 2, 16).mean(axis=2, keepdims=True)
+    expected = np.sqrt((deviation**4).sum(axis=(1, 2)) / (deviation**2).sum(axis=(1, 2)) * 16 / 15)
+    np.testing.assert_allclose(np.ldexp(out.lit_scatter.astype(np.float64), -power), expected, rtol=1e-5)
+    np.testing.assert_allclose(np.ldexp(out.hidden_scatter.astype(np.float64), -power), 2 * expected, rtol=1e-5)
+    np.testing.assert_allclose(np.ldexp(out.lit.astype(np.float64), -power), rays.mean(axis=1), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_scene_in_units_of_its_own_is_planned_as_in_ours():
+    """The same light with radiance in other units and the factor that takes them back: the same values to the bit."""
+
+    def values(power):
+        lamp = {**LAMP, "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3.0 * 2.0**power}}}
+        ball = sphere([0, 0, 0.15], 0.15, 0.4) | {"bsdf": {"type": "conductor"}}
+        keys = [{"t_us": 0}, {"t_us": 1000, "translation_m": [0.05, 0.01, 0]}]
+        shapes = {"floor": plane(DIFFUSE), "lamp": lamp, "ball": ball}
+        scene = rendering.mitsuba_scene(shapes, [{"object": "ball", "keyframes": keys}]).spec
+        scaled = scene.mitsuba.model_copy(update={"radiance_scale": 2.0**-power})
+        source = ChangeDrivenFlux(Scene(scene.model_copy(update={"mitsuba": scaled})), mono(16, 12), seed=3)
+        pixel = np.arange(16 * 12, dtype=np.uint32)
+        return np.stack([np.array(half) for half in source.mean_flux(pixel, 0.0, 700.0)])
+
+    np.testing.assert_array_equal(values(50), values(0))
 
 
 def test_a_pair_does_not_depend_on_its_company():

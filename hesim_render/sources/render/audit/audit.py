@@ -35,6 +35,8 @@ _MOST_EVENTS = {"previous_sample": 1, "last_event": 8}
 _STILL_PART = 0.25
 #: Quality of the reference, as a part of the quality of the run.
 _REFERENCE = 0.5
+#: What an audit can see, for the manifest.
+_COMPARES_WITH = "the same renderer with other random numbers; a wrong model of scene, lens or sensor stays unseen"
 #: Sizes of the first and of the largest batch; after each batch the audit checks whether it has enough units.
 _LEAST_BATCH, _MOST_BATCH = 256, 16384
 #: Upper limit for the rays of an audit: a part of the run's own rays, or a fixed number if that is more.
@@ -71,7 +73,9 @@ class Audit:
         """Run the audit. Returns bounds, estimates, deviations and a verdict, as plain values."""
         own = self._source.rays_traced
         room = max(_PART * own, _RAYS)
-        found: dict[str, Any] = {"confidence": CONFIDENCE, "tolerance_noise": TOLERANCE * self._quality}
+        found: dict[str, Any] = {
+            "compares_with": _COMPARES_WITH, "confidence": CONFIDENCE, "tolerance_noise": TOLERANCE * self._quality
+        }  # fmt: skip
         kinds = [name for name in ("events", "frames") if getattr(self._noted, name)]
         for name in kinds:
             found[name] = self._one(getattr(self._noted, name), name == "events", room / len(kinds))

@@ -94,20 +94,34 @@ class PilotFlux:
         import drjit as dr
 
         types = jit()
-        kind = dr.arange(types.UInt32, len(met)) // dr.opaque(types.UInt32, alike)
+        ray = dr.arange(types.UInt32, len(met))
+        kind, pair = ray // dr.opaque(types.UInt32, alike), ray // dr.opaque(types.UInt32, samples)
         share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, alike / (alike - 1))
         per_share = dr.opaque(types.Float, 1 / alike)
         for values, name in ((lit, "lit"), (hidden, "hidden")):
             mean = dr.block_sum(values, samples) * share
             own = dr.block_sum(values, alike) * per_share
-            square = dr.square(values - dr.gather(types.Float, own, kind))
+            deviation = values - dr.gather(types.Float, own, kind)
+            # relative to the largest one, as fourth powers of fluxes leave the range of float32
+            unit = power_below(dr.block_reduce(dr.ReduceOp.Max, dr.abs(deviation), samples))
+            square = dr.square(deviation * dr.gather(types.Float, 1 / unit, pair))
             fourth, second = dr.block_sum(square * square, samples), dr.block_sum(square, samples)
             # these rays are a sample of the scatter in the scene
-            scatter = dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
+            scatter = unit * dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
             dr.eval(mean, scatter)
             getattr(self, name)[part], getattr(self, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
         self.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
         self.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, met, samples))
+
+
+def power_below(values: Float) -> Float:
+    """The powers of two not above positive values; dividing by them rounds nothing. Of 0 it is the least normal one."""
+    import drjit as dr
+
+    types = jit()
+    exponent = dr.reinterpret_array(types.UInt32, values) & types.UInt32(0x7F800000)
+    power: Float = dr.reinterpret_array(types.Float, exponent)
+    return dr.maximum(power, 2.0**-120)
 
 
 def remembered(

@@ -1,0 +1,41 @@
+"""The exact mode says whether a run is good enough, in the words and with the status of the default mode."""
+
+import numpy as np
+import pytest
+
+from hesim_render.capture.error_meter import ErrorMeter
+from hesim_render.capture.stated_verdict import stated_verdict
+from hesim_render.core.backend import jit
+
+
+def meter(scatter, outliers=0.0, count=20_000, seed=3):
+    """A meter that has seen normal errors of `scatter` noise units, a share of them ten times as large."""
+    types, rng, found = jit(), np.random.default_rng(seed), ErrorMeter()
+    error = rng.normal(size=count) * scatter * np.where(rng.random(count) < outliers, 10, 1)
+    level, noise = 300.0, 7.0
+    found.add(
+        types.Float(level + error * noise), types.Float(level - error * noise), lambda e, _: np.full(e.size, noise)
+    )
+    return found
+
+
+@pytest.mark.parametrize(
+    ("scatter", "outliers", "verdict"),
+    [
+        (0.62, 0.0, "met"),  # |N(0, 1)| exceeds 1.5/0.62 in 1.6 of 100
+        (0.68, 0.0, "not met"),  # 2.7 of 100
+        (0.2, 0.05, "not met"),  # 5 % of N(0, 2): 2.3 of 100
+        (0.2, 0.03, "met"),  # 1.4 of 100
+    ],
+)
+def test_two_of_a_hundred_values_may_be_off_by_three_wanted_errors(scatter, outliers, verdict):
+    found = stated_verdict({"frames": meter(0.1), "events": meter(scatter, outliers)}, 48, 0.5)
+    assert found["verdict"] == verdict and found["tolerance_noise"] == 1.5 and found["frames_off"] == 0
+    assert (found["samples_needed"] is None) == (verdict == "met")
+
+
+def test_the_number_that_would_do_follows_the_root_of_the_rays():
+    """The 98 % quantile of |N(0, 2.9)| is 2.326 · 2.9 = 6.75 units; 1.5 takes 20.2 times the rays, 243 of 12."""
+    assert stated_verdict({"frames": meter(2.9), "events": meter(0.1)}, 12, 0.5)["samples_needed"] == 256
+    nothing = stated_verdict({"frames": ErrorMeter()}, 12, 0.5)
+    assert nothing["verdict"] == "met" and nothing["samples_needed"] is None and "frames_off" not in nothing
