@@ -35,7 +35,8 @@ class Blocks:
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
         self._bands = list(renderer.bands(pixel[self.alive], "events"))
-        self._time = float(first.begin_us[0]), float(first.end_us[0])
+        #: Window whose flux is `_last`.
+        self._time: tuple[float, float] | None = (float(first.begin_us[0]), float(first.end_us[0]))
         self._last = self.base.at(self.alive)
 
     def take(self, block: Block) -> Flux:
@@ -51,7 +52,7 @@ class Blocks:
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us)
-            what = renderer.plan(pilot, band, is_knot=True)
+            what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             if first is None:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
@@ -61,6 +62,8 @@ class Blocks:
                 fill_in(values, what.rendered, centre)
             fill_in(flux.error, what.rendered, centre)
             out.put(band.place, flux)
-        self._time = float(block.begin_us[-1]), float(block.end_us[-1])
+        # where a block goes on after the run, its last window may be unknown
+        is_whole = bool(block.wanted[-1])
+        self._time = (float(block.begin_us[-1]), float(block.end_us[-1])) if is_whole else None
         self._last = Flux(*(values[-1:].copy() for values in out.arrays))
         return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,17 @@ class Plan:
     error: NDArray[np.float32]
     aims: Aims | None = None
 
+    def until(self, window: int) -> Plan:
+        """The plan without the pairs on which no value up to a window depends.
+
+        The last block of a run goes beyond its end, since blocks are the same for all runs. Of each pixel, the first
+        rendered window after the end is needed for interpolation; later ones are not, and are left as unknown.
+        """
+        later = self.rendered[window:].copy()
+        # rendered windows after the first one: those before which another one was rendered
+        later &= np.cumsum(later, axis=0) <= 1
+        return replace(self, rendered=np.concatenate([self.rendered[:window], later]))
+
     def first(self) -> Plan:
         """The plan of the first window alone."""
         return Plan(self.rendered[:1], self.rays[:1], self.lit[:1], self.error[:1], self.aims)
@@ -130,14 +141,15 @@ def fill_in(values: NDArray[np.float32], known: NDArray[np.bool_], centre_us: ND
     Parameters
     ----------
     values : [window, pixel], changed in place.
-    known : [window, pixel], True where a value is known; the first and the last window are.
+    known : [window, pixel], True where a value is known; the first window is. Windows after the last known one stay as
+        they are.
     centre_us : [window], increasing, µs.
     """
     number = np.arange(known.shape[0], dtype=np.int16)[:, None]
     before = np.maximum.accumulate(np.where(known, number, np.int16(-1)), axis=0)
     after = np.minimum.accumulate(np.where(known, number, np.int16(known.shape[0]))[::-1], axis=0)[::-1]
     for window in range(1, known.shape[0] - 1):
-        place = np.flatnonzero(~known[window])
+        place = np.flatnonzero(~known[window] & (after[window] < known.shape[0]))
         low, high = before[window, place], after[window, place]
         part = ((centre_us[window] - centre_us[low]) / (centre_us[high] - centre_us[low])).astype(np.float32)
         begin = values[low, place]
