@@ -46,6 +46,8 @@ class Stream(IntEnum):
     TELEGRAPH_AMPLITUDE = 52
     IMU = 60
     RENDER_GLARE = 61
+    RENDER_EDGE = 62
+    AUDIT_EDGE = 63
 
 
 def stream_key(seed: int, stream: Stream) -> int:

@@ -87,6 +87,11 @@ class RayFactory:
         return not (isinstance(self._blur, KernelBlur) or self.is_dispersive or self.has_pupil)
 
     @property
+    def is_box(self) -> bool:
+        """True if rays of a pixel start uniformly in its square, and their place decides which points they may meet."""
+        return self._blur is None and self.can_aim
+
+    @property
     def spreads(self) -> bool:
         """True if few rays of a pixel may meet what changes it: out of focus, or in the skirts of a measured PSF."""
         return self.has_pupil or isinstance(self._blur, KernelBlur)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.distinct import distinct_columns
+from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
@@ -127,9 +128,13 @@ class AdaptiveRenderer:
         window, place = np.nonzero(todo)
         before = self.tracer.rays_done
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
-        got = self.tracer.trace(
-            *(band.index[place], numbers[todo], windows, what.rays[todo], what.lit[todo]), span_us=span_us, aims=aims
-        )
+        pairs, edges = (band.index[place], numbers[todo], windows), None
+        rays: NDArray[np.integer] = what.rays[todo]
+        if self.tracer.rays.is_box:
+            tried = None if aims is None else aims.count == 0
+            given = rays, what.lit[todo], what.wanted[todo], what.floor[todo]
+            rays, edges = about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried)
+        got = self.tracer.trace(*pairs, rays, what.lit[todo], span_us=span_us, aims=aims, edges=edges)
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
         out.half_a[todo], out.half_b[todo], met[todo] = got.half_a, got.half_b, got.met

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Mask, UInt32
 from hesim_render.core.tables import spread_out, table
+from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.primary_rays import RayFactory
 from hesim_render.sources.render.scene.tracks import DevicePose
 from hesim_render.sources.render.transport.moving_scene import Group, MovingScene
@@ -93,9 +94,9 @@ class PairAims:
 
 
 def in_blocks(
-    packets: NDArray[np.int64], room: int, aims: PairAims | None
-) -> Iterator[tuple[slice | NDArray[np.int64], PairAims | None]]:
-    """Pairs that are traced together, and the objects at which their rays are aimed.
+    packets: NDArray[np.int64], room: int, aims: PairAims | None, edges: PairEdges | None
+) -> Iterator[tuple[slice | NDArray[np.int64], PairAims | PairEdges | None]]:
+    """Pairs that are traced together, and what half of their rays are aimed at.
 
     Pairs with aimed rays have a kernel of their own, so that the bits of the others do not depend on their company.
 
@@ -103,11 +104,18 @@ def in_blocks(
     ----------
     packets : [n], packets of rays of each pair.
     room : largest number of packets at a time, unless a single pair has more.
-    aims : objects of all pairs; None where no rays are aimed.
+    aims, edges : small objects and edges of all pairs; None where there are none. A pair has one kind at most.
     """
-    alike: list[tuple[NDArray[np.int64] | None, PairAims | None]] = [(None, None)]
-    if aims is not None:
-        alike = [(np.flatnonzero(aims.count == 0), None), (np.flatnonzero(aims.count), aims)]
+    plain = np.ones(packets.size, np.bool_)
+    alike: list[tuple[NDArray[np.int64] | None, PairAims | PairEdges | None]] = []
+    for kind, has_any in (
+        (aims, None if aims is None else aims.count > 0),
+        (edges, None if edges is None else edges.is_there),
+    ):
+        if has_any is not None:
+            alike.append((np.flatnonzero(has_any), kind))
+            plain &= ~has_any
+    alike.insert(0, (np.flatnonzero(plain) if alike else None, None))
     for places, aimed in alike:
         ends = np.cumsum(packets if places is None else packets[places])
         first = 0

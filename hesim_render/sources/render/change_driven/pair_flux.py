@@ -12,6 +12,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.journal import Journal, key_of
 from hesim_render.sources.render.change_driven.aim import PairAims
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.windows import Windows
 
 
@@ -127,7 +128,7 @@ def power_below(values: Float) -> Float:
 def remembered(
     journal: Journal | None,
     inputs: tuple[object, ...],
-    out: PairFlux | PilotFlux,
+    out: PairFlux | PilotFlux | EdgeFit,
     part: slice | NDArray[np.int64],
     trace: Callable[[], None],
 ) -> None:
@@ -153,7 +154,9 @@ def remembered(
         journal.keep(key, [values[part] for values in every])
 
 
-def told_of(windows: Windows, span_us: tuple[float, float] | None, aims: PairAims | None) -> tuple[object, ...]:
+def told_of(
+    windows: Windows, span_us: tuple[float, float] | None, aims: PairAims | PairEdges | None
+) -> tuple[object, ...]:
     """What the flux of pairs depends on besides the pairs themselves."""
-    aimed = () if aims is None else (aims.first, aims.count, aims.group)
+    aimed = () if aims is None else tuple(getattr(aims, each.name) for each in fields(aims))
     return windows.begin_us, windows.end_us, span_us, *aimed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -16,6 +17,7 @@ from hesim_render.core.tables import spread_out
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims, in_blocks
+from hesim_render.sources.render.change_driven.edges import EdgeFit, LaneEdges, PairEdges, joined_rays
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, remembered, told_of
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
@@ -32,6 +34,43 @@ from hesim_render.spectral.waveform import Waveform
 #: Least and largest number of rays of a pair; one kernel serves all numbers at once.
 LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
 _PACKET = LEAST_SAMPLES
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Rays before they are traced, one per lane.
+
+    Parameters
+    ----------
+    ray : in world space.
+    now : its time.
+    filter : of its pixel.
+    place : of its start, px from the centre of its pixel.
+    weight : None for 1.
+    model : flux of the model of an edge, e⁻/s on the optical axis; None for 0.
+    """
+
+    ray: Ray
+    now: Moment
+    filter: UInt32
+    place: tuple[Float, Float]
+    weight: Float | None
+    model: Float | None
+
+
+@dataclass(frozen=True)
+class _Traced:
+    """Results of rays, one per lane.
+
+    Parameters
+    ----------
+    fluxes : the integrator's three fluxes, weighted, e⁻/s on the optical axis, and 1 where the ray met the box of a
+        moving object, else 0.
+    place : of its start, px from the centre of its pixel.
+    """
+
+    fluxes: tuple[Float, Float, Float, UInt32]
+    place: tuple[Float, Float]
 
 
 class PairTracer(Tracer):
@@ -100,6 +139,7 @@ class PairTracer(Tracer):
         span_us: tuple[float, float] | None = None,
         repeat: NDArray[np.integer] | int = 0,
         aims: PairAims | None = None,
+        edges: PairEdges | None = None,
     ) -> PairFlux:
         """Flux of every listed pair.
 
@@ -114,6 +154,8 @@ class PairTracer(Tracer):
         span_us : interval in which `PairFlux.met` tests for moving objects, µs; default: the windows themselves.
         repeat : [n] or one number, the repetition; each has random numbers of its own.
         aims : small objects at which half of the rays are aimed, where a pair has any.
+        edges : models of edges, about which half of the rays start, where a pair has one; such a pair has 16 rays or
+            more, so that each half has both kinds.
 
         Returns
         -------
@@ -125,15 +167,20 @@ class PairTracer(Tracer):
         packets = (samples // _PACKET).astype(np.int64)
         moments = self._moments(windows, span_us)
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
-        for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims):
+        for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims, edges):
             lanes = pixel[part], window[part].astype(np.uint32), times[part]
             inputs = "flux", *lanes, lit[part], packets[part], stream, *told_of(windows, span_us, aimed)
             trace = partial(self._trace_block, lanes, lit[part], packets[part], moments, key, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * _PACKET)
+        if edges is not None:
+            there = np.flatnonzero(edges.is_there)
+            model = edges.part(there).mean
+            out.half_a[there] += model
+            out.half_b[there] += model
         # the lit estimate of a dark pixel may be negative; a flux is not
         below = np.minimum(out.mean, 0)
-        scale = self._scale(pixel)
+        scale = self.axis_factor(pixel)
         half_a = out.half_a - below
         out.half_b[:] = scale * np.maximum(out.half_b - below, -half_a)
         out.half_a[:] = scale * half_a
@@ -181,10 +228,83 @@ class PairTracer(Tracer):
             trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report((part.stop - first) * samples)
-        scale = self._scale(pixel)
+        scale = self.axis_factor(pixel)
         for values in (out.lit, out.hidden, out.unshadowed, out.lit_scatter, out.hidden_scatter):
             values *= scale
         return out
+
+    def edges(
+        self,
+        pixel: NDArray[np.uint32],
+        window: NDArray[np.integer],
+        windows: Windows,
+        samples: int,
+        footprint_px: float,
+        lit: NDArray[np.bool_],
+        stream: Stream = Stream.RENDER_EDGE,
+    ) -> EdgeFit:
+        """Lines fitted to a few rays of every listed pair, with random numbers of their own.
+
+        Parameters
+        ----------
+        pixel, window, windows, lit, stream : see `trace`.
+        samples : rays per pair, a power of two, at least `LEAST_SAMPLES`; twice as many where there is a line.
+        footprint_px : width of the area in which the first ones start, pixels.
+
+        Returns
+        -------
+        Fits of the pairs, [n].
+        """
+        import drjit as dr
+
+        out, moments, key = EdgeFit.empty(pixel.size), self._moments(windows, None), self._key(stream)
+        footprint, room = dr.opaque(jit().Float, footprint_px), max(1, self._block_rays // samples)
+        for first in range(0, pixel.size, room):
+            part = slice(first, min(pixel.size, first + room))
+            lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
+            inputs = "edges", *lanes, lit[part], samples, footprint_px, stream, *told_of(windows, None, None)
+            trace = partial(self._edge_block, lanes, lit[part], moments, key, samples, footprint, out, part)
+            remembered(self._journal, self._run_part + inputs, out, part, trace)
+            self._report((part.stop - first) * samples)
+        return out
+
+    def _edge_block(
+        self,
+        lanes: Sequence[NDArray[np.uint32]],
+        lit: NDArray[np.bool_],
+        moments: Moments,
+        key: UInt64,
+        samples: int,
+        footprint: Float,
+        out: EdgeFit,
+        part: slice,
+    ) -> None:
+        """Lines of some pairs: of rays all over the pixel, and, where these show a line, of as many more about it."""
+        import drjit as dr
+
+        def decision_rays(some: NDArray[np.int64], repeat: int, about: PairEdges | None) -> list[Float]:
+            """Place and flux of the rays of some pairs."""
+            packets = np.full(some.size, samples // _PACKET)
+            chosen = [values[some] for values in lanes[:2]] + [np.full(some.size, repeat, np.uint32)]
+            width = footprint if about is None else dr.opaque(jit().Float, 1.0)
+            found = self._packets_of(chosen, packets, packets * _PACKET, moments, key, width, about, is_weighted=False)
+            types = jit()
+            packet = dr.arange(types.UInt32, len(found.fluxes[0])) // _PACKET
+            takes_lit = spread_out(types.UInt32, np.repeat(lit[some].astype(np.uint32), packets), packet)
+            values = [*found.place, dr.select(takes_lit != 0, found.fluxes[0], found.fluxes[1])]
+            dr.eval(values)
+            return values
+
+        every = np.arange(lanes[0].size)
+        first, fit = decision_rays(every, 0, None), EdgeFit.empty(every.size)
+        fit.put(slice(None), first, samples)
+        lines = np.flatnonzero(fit.is_edge)
+        if lines.size:
+            closer = EdgeFit.empty(lines.size)
+            more = decision_rays(lines, 1, fit.models(lines, wider=True))
+            closer.put(slice(None), joined_rays(first, lines, more, samples), 2 * samples)
+            fit.replace(lines, closer)
+        out.replace(part, fit)
 
     def _key(self, stream: Stream) -> UInt64:
         import drjit as dr
@@ -192,7 +312,7 @@ class PairTracer(Tracer):
         mitsuba()  # the variant may have been changed by other code
         return dr.opaque(jit().UInt64, stream_key(self._seed, stream))
 
-    def _scale(self, pixel: NDArray[np.uint32]) -> NDArray[np.float32]:
+    def axis_factor(self, pixel: NDArray[np.uint32]) -> NDArray[np.float32]:
         """Factor from the flux on the optical axis to that of each pixel."""
         row, col = np.divmod(pixel.astype(np.int64), self.sensor.spec.geometry.cols)
         return optics.relative_illumination_at(self.sensor.spec, self.sensor.lens, row, col) * np.float32(
@@ -214,7 +334,7 @@ class PairTracer(Tracer):
         packets: NDArray[np.int64],
         moments: Moments,
         key: UInt64,
-        aims: PairAims | None,
+        aims: PairAims | PairEdges | None,
         out: PairFlux,
         part: slice | NDArray[np.int64],
     ) -> None:
@@ -224,7 +344,7 @@ class PairTracer(Tracer):
         types = jit()
         rays = packets * _PACKET
         footprint = dr.opaque(types.Float, 1.0)
-        if_lit, if_hidden, _, met = self._packets_of(lanes, packets, rays // 2, moments, key, footprint, aims)
+        if_lit, if_hidden, _, met = self._packets_of(lanes, packets, rays // 2, moments, key, footprint, aims).fluxes
         packet = dr.arange(types.UInt32, len(met)) // _PACKET
         takes_lit = spread_out(types.UInt32, np.repeat(lit.astype(np.uint32), packets), packet)
         out.put(part, dr.select(takes_lit != 0, if_lit, if_hidden), met, packets, _PACKET)
@@ -243,7 +363,7 @@ class PairTracer(Tracer):
         """Statistics of some pairs, each with the same number of rays."""
         packets = np.full(lanes[0].size, samples // _PACKET)
         # all rays belong to the first half
-        found = self._packets_of(lanes, packets, packets * _PACKET, moments, key, footprint, aims)
+        found = self._packets_of(lanes, packets, packets * _PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
         out.put(part, *found, samples, samples if aims is None else samples // 2)
 
@@ -255,8 +375,9 @@ class PairTracer(Tracer):
         moments: Moments,
         key: UInt64,
         footprint: Float,
-        aims: PairAims | None,
-    ) -> tuple[Float, Float, Float, UInt32]:
+        aims: PairAims | PairEdges | None,
+        is_weighted: bool = True,
+    ) -> _Traced:
         """Trace pairs in packets of `_PACKET` rays.
 
         The final render and the pilot pass share the kernel of the integrator, which takes seconds to compile.
@@ -266,10 +387,11 @@ class PairTracer(Tracer):
         lanes : pixel, window and repetition of each pair.
         packets, half_rays : number of packets of each pair, and of rays in its first half.
         moments, key, footprint, aims : see `trace` and `pilot`.
+        is_weighted : take the model from the fluxes of pairs with an edge, and apply the weights of rays.
 
         Returns
         -------
-        The integrator's three fluxes of each ray, and 1 where it met the box of a moving object, else 0.
+        Of each ray.
         """
         import drjit as dr
 
@@ -290,28 +412,41 @@ class PairTracer(Tracer):
             # rays of either kind have random numbers of their own, and are stratified among themselves
             per_half //= 2
             is_aimed = within_half >= per_half
-            aimed = LaneAims.of(aims, pair, packet, is_aimed)
+            kind: type[LaneAims | LaneEdges] = LaneAims if isinstance(aims, PairAims) else LaneEdges
+            aimed = kind.of(aims, pair, packet, is_aimed)  # type: ignore[arg-type]
             within_half = dr.select(is_aimed, within_half - per_half, within_half)
             half += dr.select(is_aimed, types.UInt32(2), 0)
         self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
-        primary, now, which, weight = self._rays_of(pixel, window, moments, footprint, aimed)
+        rays = self._rays_of(pixel, window, moments, footprint, aimed)
         # A kernel of its own makes the rays, so that one kernel traces them however they were aimed. Rays that pass
         # through memory cost no time that could be measured.
         self._sampler.evaluate()
-        dr.eval(primary.o, primary.d, now.instant_us, now.window, now.bin, which, weight)
-        lit, hidden, unshadowed, met = self._integrator.flux(self._sampler, primary, now, which)
+        now = rays.now
+        dr.eval(
+            rays.ray.o,
+            rays.ray.d,
+            now.instant_us,
+            now.window,
+            now.bin,
+            rays.filter,
+            rays.weight,
+            rays.model,
+            rays.place,
+        )
+        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter)
         bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * _PACKET))
-        dr.eval(lit, hidden, unshadowed, bits)
+        dr.eval(fluxes, bits)
         self._sampler.rest()
-        if weight is not None:
-            lit, hidden, unshadowed = lit * weight, hidden * weight, unshadowed * weight
-            dr.eval(lit, hidden, unshadowed)
-        return lit, hidden, unshadowed, bits
+        if rays.weight is not None and is_weighted:
+            model = 0 if rays.model is None else rays.model
+            fluxes = [(flux - model) * rays.weight for flux in fluxes]
+            dr.eval(fluxes)
+        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place)
 
     def _rays_of(
-        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | None
-    ) -> tuple[Ray, Moment, UInt32, Float | None]:
-        """One ray per lane: the ray in world space, its time, the filter of its pixel, and its weight if it has one."""
+        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | LaneEdges | None
+    ) -> _Rays:
+        """One ray per lane."""
         import drjit as dr
 
         mi, types = self.built.mi, jit()
@@ -321,12 +456,14 @@ class PairTracer(Tracer):
         widened = (aperture - 0.5) * footprint + 0.5
         blur = self.rays.blur_numbers(sampler)
         centre = types.Float(col), types.Float(row)
-        (x, y), weight, slot = self.rays.offset(widened, blur, centre), None, types.UInt32(0)
-        if aims is not None:
+        (x, y), weight, slot, model = self.rays.offset(widened, blur, centre), None, types.UInt32(0), None
+        if isinstance(aims, LaneAims):
             slot, moment = self._aim.choose(aims, moment)
         now = moments.at(window, moment)
         pose = None if self.camera is None else self.camera.pose_at(now.local_us(len(self.parts.groups)))
-        if aims is not None:
+        if isinstance(aims, LaneEdges):
+            x, y, weight, model = aims.place((x, y), aperture)
+        elif aims is not None:
             x, y, weight = self._aim.place(aims, slot, now, pose, centre, (x, y), aperture)
         origin, direction, weight = self.rays.through_lens(centre, (x, y), sampler, weight=weight)
         if pose is not None:
@@ -335,4 +472,4 @@ class PairTracer(Tracer):
         tile_col = col - col // self._tile_cols * self._tile_cols
         which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
         primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        return primary, now, which, weight
+        return _Rays(primary, now, which, (x, y), weight, model)

@@ -182,7 +182,7 @@ def allocate(
     gain: Gain,
     tuning: Tuning,
     is_knot: bool,
-) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32]]:
+) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.float32], NDArray[np.int16]]:
     """Allocate rays to each listed pixel in one window.
 
     Parameters
@@ -197,7 +197,8 @@ def allocate(
 
     Returns
     -------
-    rays, lit, error : [n] each: number of rays, choice of the lit estimator, and expected error; see `Plan`.
+    rays, lit, error, floor : [n] each: number of rays, choice of the lit estimator, expected error, and number of rays
+        that knowledge of an edge does not lower; see `Plan`.
     """
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
     flux, here = pilot.flux_of(window), sites.listed
@@ -227,12 +228,16 @@ def allocate(
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
+    looked = None
     if pilot.closer:
         # With fewer rays than the closer look, a single ray could hit the small object and weigh far too much.
         looked = np.zeros(sites.size, np.float32)
         np.maximum.at(looked, pilot.closer[window].place, pilot.closer[window].rays.astype(np.float32))
         wanted = np.maximum(wanted, looked[here])
-    wanted = np.maximum(wanted, open_flux[here] / (np.float32(tuning.ray_weight * quality) * own))
+    heavy = np.float32(tuning.ray_weight) * wanted_error
+    wanted = np.maximum(wanted, open_flux[here] / heavy)
+    # light that is hidden from all pilot rays may still come through a gap
+    floor = np.maximum(np.zeros_like(value) if looked is None else looked[here], (open_flux[here] - value) / heavy)
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
     rays = np.left_shift(np.int16(1), bits)
-    return rays, lit, gain.error(scatter, rays)
+    return rays, lit, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16)

@@ -61,6 +61,8 @@ class Plan:
     rays : number of rays of each rendered pair, a power of two.
     lit : True for the lit estimator, False for the hidden one, see `MattIntegrator`.
     error : expected standard error, e⁻/s.
+    wanted : wanted standard error, e⁻/s.
+    floor : number of rays that a pair gets whatever is known of its edges.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     """
 
@@ -68,6 +70,8 @@ class Plan:
     rays: NDArray[np.int16]
     lit: NDArray[np.bool_]
     error: NDArray[np.float32]
+    wanted: NDArray[np.float32]
+    floor: NDArray[np.int16]
     aims: Aims | None = None
 
     def until(self, window: int) -> Plan:
@@ -83,7 +87,8 @@ class Plan:
 
     def first(self) -> Plan:
         """The plan of the first window alone."""
-        return Plan(self.rendered[:1], self.rays[:1], self.lit[:1], self.error[:1], self.aims)
+        first = {name: getattr(self, name)[:1] for name in ("rendered", "rays", "lit", "error", "wanted", "floor")}
+        return replace(self, **first)
 
 
 def plan(
@@ -112,6 +117,8 @@ def plan(
         np.zeros(shape, np.int16),
         np.zeros(shape, np.bool_),
         np.zeros(shape, np.float32),
+        np.float32(quality) * units[:, sites.listed],
+        np.zeros(shape, np.int16),
         pilot.aims,
     )
     if last > 1:
@@ -131,7 +138,7 @@ def plan(
     for window in range(count):
         at_end = is_knot and window in (0, last)
         part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
-        out.rays[window], out.lit[window], out.error[window] = part
+        out.rays[window], out.lit[window], out.error[window], out.floor[window] = part
     return out
 
 

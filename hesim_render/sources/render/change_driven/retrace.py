@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims, PairAims
+from hesim_render.sources.render.change_driven.edge_rays import about_edges
+from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
@@ -123,11 +125,22 @@ def traced_again(
     )
     rays = 1 << np.ceil(np.log2(np.clip(wanted, tuning.least_audit_rays, tuning.most_rays))).astype(np.int64)
     wanted_times = np.ceil((gain.error(scatter, rays) / wanted_error) ** 2)
+    edges: PairEdges | None = None
+    if tracer.rays.is_box:
+        law, floor = rays, np.full(rays.size, tuning.least_audit_rays)
+        rays, edges = about_edges(
+            *(tracer, (pixel, window, windows), law, lit, wanted_error, floor, gain, tuning),
+            tried=None if aims is None else aims.count == 0, flat_part=1.0, stream=Stream.AUDIT_EDGE,
+        )  # fmt: skip
+        wanted_times = np.where(rays < law, 1, wanted_times)
     times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)
     each, first = np.repeat(np.arange(pixel.size), times), np.cumsum(times) - times
     of = pixel[each], window[each], windows, rays[each], lit[each], Stream.AUDIT
     repeat = np.arange(each.size) - first[each]
-    got = tracer.trace(*of, repeat=repeat, aims=None if aims is None else aims.part(each))
+    got = tracer.trace(
+        *of, repeat=repeat, aims=None if aims is None else aims.part(each),
+        edges=None if edges is None else edges.part(each),
+    )  # fmt: skip
     values = 0.5 * np.stack([got.half_a + got.half_b, got.half_a - got.half_b]).astype(np.float64)
     return (np.add.reduceat(values, first, axis=1) / times)[:, place.ravel()]
 

@@ -79,6 +79,16 @@ class Tuning:
         (0): as without `unseen_area`, next to lamps.
     knot_factor : factor, F. Factor on the rays of a pair at the end of a block. Without (1): all windows that are
         interpolated from there carry its error.
+    edge_least_rays : rays, C. Pairs that the law gives at least as many rays get decision rays for a line. Without
+        (0): decision rays of cheap pairs cost more than they save.
+    edge_rays : rays, F. Decision rays of a pair. Fewer: the strip about a line is wider. More: they cost more than
+        they save.
+    edge_footprint_px : px, F. Width of the area in which the first half of the decision rays start. Without (1): a
+        line that only just enters a pixel, or passes beside it, is not seen.
+    edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
+        its sides. Without (0): what the decision rays missed makes single values that are far off.
+    flat_part : part, C. Of the rays by the law, a pair in which decision rays find no contrast keeps this part at
+        least. Without (0): thin objects between the decision rays make single values that are far off.
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
@@ -115,6 +125,11 @@ class Tuning:
     most_unseen_rays: int = 512
     bright_rays: float = 0.25
     knot_factor: float = 2.0
+    edge_least_rays: int = 256
+    edge_rays: int = 64
+    edge_footprint_px: float = 1.5
+    edge_contrast_rays: float = 0.4
+    flat_part: float = 1 / 8
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 0.4

@@ -1,0 +1,76 @@
+"""How many rays a pair needs, once decision rays have said whether it holds an edge."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven.edges import PairEdges
+from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
+from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
+from hesim_render.sources.render.change_driven.windows import Windows
+
+
+def about_edges(
+    tracer: PairTracer,
+    pairs: tuple[NDArray[np.uint32], NDArray[np.integer], Windows],
+    rays: NDArray[np.integer],
+    lit: NDArray[np.bool_],
+    wanted: NDArray[np.float32],
+    floor: NDArray[np.integer],
+    gain: Gain,
+    tuning: Tuning,
+    *,
+    tried: NDArray[np.bool_] | None = None,
+    flat_part: float | None = None,
+    stream: Stream = Stream.RENDER_EDGE,
+) -> tuple[NDArray[np.integer], PairEdges | None]:
+    """Models of the edges in listed pairs, and the numbers of rays that are left to trace.
+
+    Decision rays have a stream of their own, so that nothing which they say depends on the rays of the picture.
+
+    Parameters
+    ----------
+    tracer : traces the decision rays.
+    pairs : pixels [n] on the full sensor, their windows, and all windows.
+    rays : [n], by the law of errors, powers of two.
+    lit : [n], estimator of each pair.
+    wanted : [n], wanted error, e⁻/s.
+    floor : [n], number of rays that knowledge of an edge does not lower.
+    gain : error law of stratified rays.
+    tuning : constants.
+    tried : [n], pairs that may have an edge; None for all.
+    flat_part : in place of `Tuning.flat_part`.
+    stream : stream of the decision rays.
+
+    Returns
+    -------
+    rays : [n], powers of two, never more than before.
+    edges : models of all pairs; None where no pair has one.
+    """
+    is_worth_it = rays >= tuning.edge_least_rays
+    place = np.flatnonzero(is_worth_it if tried is None else is_worth_it & tried)
+    if place.size == 0:
+        return rays, None
+    pixel, window, windows = pairs
+    fit = tracer.edges(
+        pixel[place], window[place], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[place], stream
+    )
+    # fluxes of fits are those on the optical axis
+    wanted = wanted[place] / tracer.axis_factor(pixel[place])
+    contrast, by_scatter = (fit.high - fit.low) / wanted, gain.rays(fit.scatter / wanted)
+    is_edge, is_flat = fit.is_edge, contrast < 1
+    # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
+    needed = np.where(is_edge, np.maximum(2 * by_scatter, tuning.edge_contrast_rays * contrast), by_scatter)
+    # no contrast at all: the neighbours gave this pair its rays, and what they show does not reach it
+    part = tuning.flat_part if flat_part is None else flat_part
+    needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)
+    needed = np.clip(np.maximum(needed, floor[place]), tuning.edge_rays, tuning.most_rays)
+    fewer = 1 << np.ceil(np.log2(needed)).astype(np.int64)
+    # all other pairs, such as corners and penumbrae, keep the rays of the law
+    pays = (is_edge | is_flat) & (fewer < rays[place])
+    out = rays.copy()
+    out[place[pays]] = fewer[pays]
+    lines = np.flatnonzero(pays & is_edge)
+    return out, PairEdges.at(rays.size, place[lines], fit.models(lines)) if lines.size else None

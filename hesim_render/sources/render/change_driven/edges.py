@@ -1,0 +1,330 @@
+"""Edges: a straight line through a pixel that separates two levels of flux, and rays about it.
+
+A pixel with a sharp edge needs thousands of uniform rays, because each says no more than the side of the edge that it
+meets. If a line is known near the edge, the mean over the pixel is that of the two levels, in closed form, plus that of
+the difference between the scene and these levels, which is zero nearly everywhere away from the line. Half of the rays
+of such a pair start uniformly, half of them in a strip about the line. They are combined by the balance heuristic
+[veach1997], so the estimate is unbiased for any line and any levels: a wrong model costs rays, not truth.
+
+The line is fitted to *decision rays*, which are never part of the picture: the straight line with the largest distance
+from all of them, if there is one that separates those above the middle of their range from those below it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float, Mask, UInt32
+from hesim_render.core.tables import spread_out
+
+#: Directions of a line that are tried first, and then around the best one so far, each time closer.
+_COARSE, _FINE, _ROUNDS = 48, 8, 3
+#: Half width of a strip beyond the gap that the decision rays leave, px: of edges that are not quite straight.
+_SLACK_PX = 0.004
+#: Largest scatter about the levels of both sides, over their difference: three levels, or a corner, scatter more.
+_MOST_UNEVEN = 0.02
+#: Least number of decision rays on either side of a line.
+_LEAST_ON_A_SIDE = 2
+
+
+@dataclass(frozen=True)
+class PairEdges:
+    """Models of listed pairs, arrays [n]: flux is `high` where normal · place + offset > 0, and `low` elsewhere.
+
+    Parameters
+    ----------
+    normal_x, normal_y : unit vector towards the side of the higher flux, in columns and rows.
+    offset : of the centre of the pixel from the line, px.
+    half_width : of the strip about the line, px.
+    low, high : levels, e⁻/s on the optical axis.
+    """
+
+    normal_x: NDArray[np.float32]
+    normal_y: NDArray[np.float32]
+    offset: NDArray[np.float32]
+    half_width: NDArray[np.float32]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+
+    @classmethod
+    def at(cls, count: int, place: NDArray[np.int64], models: PairEdges) -> PairEdges:
+        """Models of `count` pairs, of which those at some places have one."""
+        found = cls(*(np.zeros(count, np.float32) for _ in fields(cls)))
+        for values, own in zip(astuple_of(found), astuple_of(models), strict=True):
+            values[place] = own
+        return found
+
+    def part(self, part: slice | NDArray) -> PairEdges:
+        """Those of some pairs."""
+        return PairEdges(*(values[part] for values in astuple_of(self)))
+
+    @property
+    def is_there(self) -> NDArray[np.bool_]:
+        """Pairs that have a model; the strip of the others has no width."""
+        return self.half_width > 0
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """Mean of the model over the pixel, e⁻/s on the optical axis."""
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
+        return low + (high - low) * coverage(self.normal_x, self.normal_y, self.offset)
+
+
+def astuple_of(values: PairEdges | EdgeFit) -> tuple[NDArray, ...]:
+    """The arrays of a data class, without copies."""
+    return tuple(getattr(values, each.name) for each in fields(values))
+
+
+def coverage(
+    normal_x: NDArray[np.floating], normal_y: NDArray[np.floating], offset: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Share of the square [-½, ½]² in which normal · place + offset > 0, for unit normals.
+
+    The square is the convolution of two boxes of widths |n_x| and |n_y| along the normal, so the share is the second
+    integral of four steps. A narrow box counts as one of 1e-6 px, which moves the share by less than that.
+    """
+    wide, narrow = (np.maximum(np.abs(side.astype(np.float64)), 1e-6) for side in (normal_x, normal_y))
+    far, near = (wide + narrow) / 2, (wide - narrow) / 2
+    ramps = [np.square(np.maximum(offset + at, 0)) / 2 for at in (far, near, -near, -far)]
+    return np.clip((ramps[0] - ramps[1] - ramps[2] + ramps[3]) / (wide * narrow), 0, 1)
+
+
+@dataclass(frozen=True)
+class EdgeFit:
+    """Lines fitted to decision rays of listed pairs, arrays [n], float32; fluxes in e⁻/s on the optical axis.
+
+    Parameters
+    ----------
+    normal_x, normal_y, offset : the line, see `PairEdges`.
+    gap : width of the strip without any decision ray between both sides, px; negative where no line separates them.
+    low, high : mean flux of either side.
+    scatter : standard deviation of single rays about the mean of their side.
+    fewer : number of rays on the side that has fewer.
+    """
+
+    normal_x: NDArray[np.float32]
+    normal_y: NDArray[np.float32]
+    offset: NDArray[np.float32]
+    gap: NDArray[np.float32]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    scatter: NDArray[np.float32]
+    fewer: NDArray[np.float32]
+
+    @classmethod
+    def empty(cls, count: int) -> EdgeFit:
+        """Fits to be filled in."""
+        return cls(*(np.empty(count, np.float32) for _ in fields(cls)))
+
+    @property
+    def is_edge(self) -> NDArray[np.bool_]:
+        """True where a line separates two even levels."""
+        is_even = self.scatter < _MOST_UNEVEN * (self.high - self.low)
+        return (self.gap > 0) & (self.fewer >= _LEAST_ON_A_SIDE) & is_even
+
+    def replace(self, part: slice | NDArray[np.int64], fits: EdgeFit) -> None:
+        """Put in the fits of some pairs."""
+        for values, found in zip(astuple_of(self), astuple_of(fits), strict=True):
+            values[part] = found
+
+    def models(self, part: NDArray, wider: bool = False) -> PairEdges:
+        """Models of some pairs; `wider` strips hold lines that lie askew in the gap as well."""
+        half_width = np.float32(1.0 if wider else 0.5) * self.gap[part] + np.float32(_SLACK_PX)
+        levels = self.low[part], self.high[part]
+        return PairEdges(self.normal_x[part], self.normal_y[part], self.offset[part], half_width, *levels)
+
+    def put(self, part: slice, decision_rays: Sequence[Float], rays: int) -> None:
+        """Fit lines to pairs with `rays` decision rays each.
+
+        Parameters
+        ----------
+        part : pairs that were traced.
+        decision_rays : of one pair after the other: x and y of each ray, px from the centre of its pixel, and its flux,
+            e⁻/s on the optical axis.
+        rays : number of rays of each pair, a power of two.
+        """
+        import drjit as dr
+
+        types, (x, y, flux) = jit(), decision_rays
+        ray = dr.arange(types.UInt32, len(flux))
+        of, count = ray // dr.opaque(types.UInt32, rays), dr.opaque(types.Float, rays)
+
+        def spread(each: Float) -> Float:
+            return dr.gather(types.Float, each, of)
+
+        # two sides: above and below the middle of the range
+        middle = 0.5 * (dr.block_reduce(dr.ReduceOp.Min, flux, rays) + dr.block_reduce(dr.ReduceOp.Max, flux, rays))
+        above = flux > spread(middle)
+        above_count = dr.block_sum(dr.select(above, types.Float(1), 0), rays)
+        below_count = count - above_count
+        high = dr.block_sum(dr.select(above, flux, 0), rays) / dr.maximum(above_count, 1)
+        low = dr.block_sum(dr.select(above, 0, flux), rays) / dr.maximum(below_count, 1)
+        deviation = flux - dr.select(above, spread(high), spread(low))
+        # relative to the contrast, so that no square leaves float32
+        contrast = dr.maximum(high - low, 1e-30)
+        scatter = contrast * dr.sqrt(dr.block_sum(dr.square(deviation / spread(contrast)), rays) / count)
+        side = dr.select(above, types.Float(1), -1)
+        dr.eval(side, low, high, scatter, above_count, below_count)
+        angle, gap, at = _widest_gap(x, y, side, rays)
+        sine, cosine = dr.sincos(angle)
+        values = cosine, sine, -at, gap, low, high, scatter, dr.minimum(above_count, below_count)
+        dr.eval(values)
+        for out, value in zip(astuple_of(self), values, strict=True):
+            out[part] = np.array(value)
+
+
+def joined_rays(first: Sequence[Float], pairs: NDArray[np.int64], more: Sequence[Float], rays: int) -> list[Float]:
+    """Values of two sets of decision rays, pair by pair.
+
+    Parameters
+    ----------
+    first : of all pairs, `rays` each.
+    pairs : [n], pairs that have more.
+    more : of these pairs, as many each.
+    rays : a power of two.
+    """
+    import drjit as dr
+
+    types = jit()
+    half = dr.arange(types.UInt32, 2 * rays * pairs.size) // dr.opaque(types.UInt32, rays)
+    within = dr.arange(types.UInt32, 2 * rays * pairs.size) - half * dr.opaque(types.UInt32, rays)
+    is_first, pair = half % 2 == 0, half // 2
+    own = spread_out(types.UInt32, pairs.astype(np.uint32), pair) * dr.opaque(types.UInt32, rays) + within
+    other = pair * dr.opaque(types.UInt32, rays) + within
+    found = [
+        dr.select(is_first, dr.gather(types.Float, a, own), dr.gather(types.Float, b, other, ~is_first))
+        for a, b in zip(first, more, strict=True)
+    ]
+    dr.eval(found)
+    return found
+
+
+def _widest_gap(x: Float, y: Float, side: Float, rays: int) -> tuple[Float, Float, Float]:
+    """Direction in which the two sides of each pair are farthest apart, the gap, and the place of its middle.
+
+    A search over directions in steps that become finer; in each direction, all rays of the pair are projected.
+    """
+    import drjit as dr
+
+    types = jit()
+    pair = dr.arange(types.UInt32, len(side) // rays)
+    first, last = pair * dr.opaque(types.UInt32, rays), (pair + 1) * dr.opaque(types.UInt32, rays)
+
+    def ends(angle: Float) -> tuple[Float, Float]:
+        """Largest projection of the lower side, smallest of the higher one."""
+        sine, cosine = dr.sincos(angle)
+
+        def step(k: UInt32, lower: Float, higher: Float) -> tuple[UInt32, Float, Float]:
+            at = cosine * dr.gather(types.Float, x, k) + sine * dr.gather(types.Float, y, k)
+            is_high = dr.gather(types.Float, side, k) > 0
+            lower = dr.maximum(lower, dr.select(is_high, -10.0, at))
+            return k + 1, lower, dr.minimum(higher, dr.select(is_high, at, 10.0))
+
+        state = types.UInt32(first), dr.full(types.Float, -10, len(pair)), dr.full(types.Float, 10, len(pair))
+        _, lower, higher = dr.while_loop(state, lambda k, *_: k < last, step, label="projected rays")
+        return lower, higher
+
+    def attempt(
+        number: UInt32, centre: Float, best: Float, gap: Float, at: Float
+    ) -> tuple[UInt32, Float, Float, Float, Float]:
+        is_coarse = number < _COARSE
+        fine = number - _COARSE
+        # each round spans one step of the round before it
+        centre = dr.select(~is_coarse & (fine % _FINE == 0), best, centre)
+        span = (2 * np.pi / _COARSE) * dr.power(types.Float(1 / _FINE), types.Float(fine // _FINE))
+        place = (types.Float(fine % _FINE) + 0.5) / _FINE - 0.5
+        angle = dr.select(is_coarse, types.Float(number) * (2 * np.pi / _COARSE), centre + place * span)
+        lower, higher = ends(angle)
+        wider = higher - lower > gap
+        return (
+            number + 1, centre, dr.select(wider, angle, best), dr.select(wider, higher - lower, gap),
+            dr.select(wider, 0.5 * (lower + higher), at),
+        )  # fmt: skip
+
+    zero = dr.zeros(types.Float, len(pair))
+    state = dr.zeros(types.UInt32, len(pair)), zero, zero, dr.full(types.Float, -100, len(pair)), zero
+    found = dr.while_loop(
+        state, lambda number, *_: number < _COARSE + _ROUNDS * _FINE, attempt, label="directions of edges"
+    )
+    return found[2], found[3], found[4]
+
+
+@dataclass(frozen=True)
+class LaneEdges:
+    """Models of pairs, on the device, per ray.
+
+    Parameters
+    ----------
+    normal_x, normal_y, offset, half_width, low, high : see `PairEdges`.
+    is_strip : True if this ray starts in the strip.
+    """
+
+    normal_x: Float
+    normal_y: Float
+    offset: Float
+    half_width: Float
+    low: Float
+    high: Float
+    is_strip: Mask
+
+    @classmethod
+    def of(cls, edges: PairEdges, pair: NDArray[np.integer], lane: UInt32, is_strip: Mask) -> LaneEdges:
+        """Spread the models of pairs over rays.
+
+        Parameters
+        ----------
+        edges : of all pairs.
+        pair : pair of each packet of lanes.
+        lane : packet of each lane.
+        is_strip : True for the rays that start in the strip.
+        """
+        kind = jit().Float
+        spread = {each.name: spread_out(kind, getattr(edges, each.name)[pair], lane) for each in fields(edges)}
+        return cls(**spread, is_strip=is_strip)
+
+    def place(self, uniform: tuple[Float, Float], point: tuple[Float, Float]) -> tuple[Float, Float, Float, Float]:
+        """Place of each ray, px from the centre of its pixel, its weight, and the model's flux there.
+
+        Parameters
+        ----------
+        uniform : places of rays that start uniformly in the pixel.
+        point : [0, 1)², place inside the strip, across and along it.
+        """
+        import drjit as dr
+
+        # a strip is drawn line by line: the distance from its middle, then a point of the part inside of the pixel
+        across = dr.fma(2 * self.half_width, point[0], -self.half_width)
+        begin, length = self._inside(across - self.offset)
+        along = dr.fma(length, point[1], begin)
+        away = across - self.offset
+        strip = self.normal_x * away - self.normal_y * along, self.normal_y * away + self.normal_x * along
+        # a line that misses the pixel has no point in it: such a ray starts anywhere, and counts for nothing
+        is_strip = self.is_strip & (length > 0)
+        x, y = (dr.select(is_strip, a, b) for a, b in zip(strip, uniform, strict=True))
+        distance = dr.fma(self.normal_x, x, dr.fma(self.normal_y, y, self.offset))
+        _, own_length = self._inside(distance - self.offset)
+        inside = (self.is_strip | (abs(distance) <= self.half_width)) & (own_length > 0)
+        density = dr.select(inside, dr.rcp(2 * self.half_width * own_length), 0)
+        weight = dr.select(is_strip | ~self.is_strip, 2 / (1 + density), 0)
+        return x, y, weight, dr.select(distance > 0, self.high, self.low)
+
+    def _inside(self, away: Float) -> tuple[Float, Float]:
+        """Begin and length of the part inside of the pixel of a line, which has a distance from the pixel's centre
+        along the normal, px; the length is 0 or less if there is none.
+        """
+        import drjit as dr
+
+        # along the line, x is n_x·away − n_y·s and y is n_y·away + n_x·s
+        low, high = type(away)(-10), type(away)(10)
+        for middle, slope in ((self.normal_x * away, -self.normal_y), (self.normal_y * away, self.normal_x)):
+            flat = abs(slope) < 1e-7
+            one, other = (-0.5 - middle) / slope, (0.5 - middle) / slope
+            outside = abs(middle) > 0.5
+            low = dr.select(flat, dr.select(outside, 10, low), dr.maximum(low, dr.minimum(one, other)))
+            high = dr.select(flat, high, dr.minimum(high, dr.maximum(one, other)))
+        return low, dr.maximum(high - low, 0)
