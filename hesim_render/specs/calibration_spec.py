@@ -21,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from hesim_render.core.names import FileName
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import Strict
 
@@ -80,7 +81,7 @@ class Finding(_Section):
 class MapsFile(_Section):
     """The map file of a section, beside the calibration, identified by its hash."""
 
-    file: str = Field(min_length=1)
+    file: FileName
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
 
 
