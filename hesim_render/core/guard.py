@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,9 +33,11 @@ def reading(file: str | Path, what: str = "") -> Iterator[None]:
 
     Parameters
     ----------
-    file : the file.
+    file : the file; what is neither a file nor a folder is refused before it is opened, because a pipe would be waited
+        for without end.
     what : how the file was read (``as events``).
     """
+    require_plain(file)
     try:
         yield
     except HesimError:
@@ -45,6 +48,26 @@ def reading(file: str | Path, what: str = "") -> Iterator[None]:
         raise SpecError("is nested too deeply", file=file) from None
     except Exception as error:
         raise SpecError(" ".join(filter(None, ("cannot be read", what, f"({reason(error)})"))), file=file) from None
+
+
+def require_plain(file: str | Path, key: str | None = None) -> None:
+    """Refuse a pipe, a socket or a device; what is missing is left to the reader.
+
+    Parameters
+    ----------
+    file, key : the file, and the key that names it, for the error.
+
+    Raises
+    ------
+    SpecError
+        If it is one.
+    """
+    try:
+        mode = os.stat(file).st_mode
+    except (OSError, ValueError):
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise SpecError("is a pipe or a device, and no file", file=file, key=key)
 
 
 def reason(error: BaseException) -> str:

@@ -21,7 +21,7 @@ from pydantic import (
 )
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import leads_out
+from hesim_render.core.guard import leads_out, reading
 from hesim_render.specs.deformation import DeformationSpec
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
@@ -321,7 +321,7 @@ def read_scene(
     if not allow_outside:
         apply_overrides(data, changes)
         for location, name in _named_files(data):
-            if leads_out(file.parent, name):
+            if any(leads_out(file.parent, path) for path in _with_inner(file.parent, name)):
                 raise SpecError(
                     f"{name!r} {OUTSIDE}",
                     file=file,
@@ -330,6 +330,13 @@ def read_scene(
                 )
     spec = validate(SceneSpec, data, file, changes)
     return spec.model_copy(update={"folder": file.parent, "file": file, "allow_outside": allow_outside})
+
+
+def _with_inner(folder: Path, name: str) -> list[Path]:
+    """A named file; of a folder, what is in it as well."""
+    path = folder / name
+    with reading(path):
+        return [path, *path.iterdir()] if path.is_dir() else [path]
 
 
 def _is_file(location: tuple[Any, ...]) -> bool:
