@@ -19,7 +19,7 @@ from hesim_render.core.errors import HesimError, SpecError
 MOST_BYTES = 1 << 31
 #: Pixels of the largest frame.
 MOST_PIXELS = 1 << 28
-#: Largest text file (YAML, JSON); as Python objects it takes about a hundred times as much memory.
+#: Largest text file.
 MOST_TEXT_BYTES = 64 << 20
 #: Part of the machine's memory that one file may use.
 _SHARE_OF_MEMORY = 0.5
@@ -129,8 +129,32 @@ def require_memory(size_bytes: int, what: str, file: str | Path, most: int | Non
         )
 
 
-def read_text(file: Path) -> str:
+def require_picture(width: int, height: int, pixel_bytes: int, file: str | Path) -> None:
+    """Refuse a picture by the size that its header states.
+
+    Parameters
+    ----------
+    width, height : its size, px.
+    pixel_bytes : memory that a pixel takes while the picture is read, bytes.
+    file : the file, for the error.
+
+    Raises
+    ------
+    SpecError
+        If it has more than `MOST_PIXELS`, or would not fit into memory.
+    """
+    if width * height > MOST_PIXELS:
+        raise SpecError(f"has {width}x{height} px; a picture has at most {MOST_PIXELS} px", file=file)
+    require_memory(pixel_bytes * width * height, "the picture", file)
+
+
+def read_text(file: Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
     """Read a UTF-8 text file of reasonable size.
+
+    Parameters
+    ----------
+    file : the file.
+    most_bytes : largest size, bytes.
 
     Raises
     ------
@@ -139,7 +163,7 @@ def read_text(file: Path) -> str:
     """
     with reading(file):
         size = file.stat().st_size
-        if size > MOST_TEXT_BYTES:
+        if size > most_bytes:
             raise SpecError(f"holds {size / 1e6:.0f} MB; such files are small", file=file)
         try:
             return file.read_text(encoding="utf-8")

@@ -8,7 +8,8 @@ import zlib
 from pathlib import Path
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import MOST_PIXELS, reading, require_memory
+from hesim_render.core.exr import exr_header
+from hesim_render.core.guard import reading, require_memory, require_picture
 
 #: A header is looked for in so many bytes.
 _HEAD = 1 << 16
@@ -46,19 +47,13 @@ def require_fits(file: Path) -> None:
             _serialized(file, head)
         else:
             width, height = _picture(file, head)
-            if width * height > MOST_PIXELS:
-                raise SpecError(f"has {width}x{height} px; a picture has at most {MOST_PIXELS}", file=file)
-            require_memory(_TEXEL * width * height, "the picture", file)
+            require_picture(width, height, _TEXEL, file)
 
 
 def _picture(file: Path, head: bytes) -> tuple[int, int]:
     """Width and height; 0 for a file that is no picture."""
     if head.startswith(b"\x76\x2f\x31\x01"):
-        import OpenEXR
-
-        with OpenEXR.File(str(file), separate_channels=True, header_only=True) as opened:
-            low, high = opened.header()["dataWindow"]
-            return int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
+        return exr_header(file)[0]
     if (found := _PFM.match(head) or (head.startswith(b"#?") and _RGBE.search(head))) is not None and found:
         return int(found[1]), int(found[2])
     from PIL import Image
