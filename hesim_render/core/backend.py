@@ -142,7 +142,7 @@ def candidates() -> list[Candidate]:
     if forced not in ("", "llvm", "cuda"):
         raise BackendError(f"{BACKEND_VARIABLE} is {forced!r}; expected 'llvm' or 'cuda'")
     found: list[Candidate] = []
-    if forced != "llvm" and ctypes.util.find_library("cuda"):
+    if forced != "llvm" and _has_cuda():
         found.append(Candidate("cuda", "GPU", ""))
     if forced != "cuda":
         given = os.environ.get("DRJIT_LIBLLVM_PATH")
@@ -154,6 +154,13 @@ def candidates() -> list[Candidate]:
         if extra:
             found.append(Candidate("llvm", "'llvm' extra", extra[0], extra[1]))
     return found
+
+
+def _has_cuda() -> bool:
+    try:
+        return ctypes.util.find_library("cuda") is not None
+    except OSError:  # it may write a temporary file, for which there may be no place
+        return False
 
 
 def _cache_file() -> Path:

@@ -123,7 +123,7 @@ class MitsubaSpec(Strict):
     file: str | None = None
     builtin: Literal["cornell_box"] | None = None
     inline: Mapping[str, Any] | None = None
-    radiance_scale: float = Field(1.0, ge=1e-30, le=1e30)
+    radiance_scale: float = Field(1.0, ge=1e-30, le=1e9)
     illuminance_lux: float | None = Field(None, ge=1e-9, le=1e9)
     irradiance_w_m2: float | None = Field(None, ge=1e-12, le=1e7, description="integrated over 360 to 830 nm")
     plane_point_m: Vector | None = Field(None, description="where the level holds")
