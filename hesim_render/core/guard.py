@@ -129,6 +129,25 @@ def require_memory(size_bytes: int, what: str, file: str | Path, most: int | Non
         )
 
 
+def require_file_size(file: Path, most_bytes: int = MOST_BYTES) -> None:
+    """Refuse a file that is larger than what its reader takes, which reads it whole.
+
+    Parameters
+    ----------
+    file : the file.
+    most_bytes : largest size, bytes.
+
+    Raises
+    ------
+    SpecError
+        If it is larger.
+    """
+    with reading(file):
+        size = file.stat().st_size
+    if size > most_bytes:
+        raise SpecError(f"holds {size / 1e6:.0f} MB; such a file holds at most {most_bytes / 1e6:.0f}", file=file)
+
+
 def require_picture(width: int, height: int, pixel_bytes: int, file: str | Path) -> None:
     """Refuse a picture by the size that its header states.
 
