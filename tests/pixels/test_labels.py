@@ -312,7 +312,7 @@ def test_what_is_let_go_of_changes_no_label(monkeypatch):
         monkeypatch.setattr(partners, "_FEW", few)
         labeller = Labeller(noise, 9, 0, 10**9)
         stage = EvsStage(noise, 9, labels=labeller)
-        for t in TICKS[:60]:
+        for t in TICKS:
             stage.step(jit().Float(((np.exp(light(t)) - 1) / 2).astype(np.float32)), int(t))
         verdicts = labeller._partners._verdicts
         found.append((EventLabels.of([labeller.taken()]).label, verdicts._open.shape[1], verdicts._given.size))
