@@ -187,7 +187,7 @@ def test_the_law_is_symmetric_and_follows_the_leak():
     near = np.abs(centre - 0.3) < 2.0
     wait = 1 / (np.exp(-0.5 * (5.0 + centre) ** 2) + np.exp(-0.5 * (5.6 - centre) ** 2))
     np.testing.assert_allclose(never[near], wait[near] / wait[near].sum(), atol=0.05 * never.max())
-    assert often.dead_share[0] == pytest.approx(0.05 / (0.05 + 1 / 0.3), rel=1e-3)
+    assert often.dead_share[0] == pytest.approx(0.05 / (0.05 + 1 / 0.3), rel=0.01)  # and noise
 
 
 # ---- shipped sensors ---------------------------------------------------------------------------------------
