@@ -14,6 +14,7 @@ from hesim_render.pixels.evs import reference_law
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.reference_law import Pixels, law
 from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.pixels.evs.start import start_of
 from hesim_render.specs.event_noise import events_per_period
 from hesim_render.specs.sensor import read_sensor
 
@@ -116,6 +117,23 @@ def test_other_seeds_start_otherwise_and_noise_free_pixels_at_their_own_level():
     np.testing.assert_allclose(found[2], 0.0, atol=1e-6)
     # most pixels wait where both thresholds are equally far: at (θ₋ − θ₊)/2
     assert np.median(found[0]) == pytest.approx((0.21 - 0.182) / 2, abs=0.004)
+
+
+def test_levels_of_comparison_are_drawn_from_the_law():
+    """At the thresholds of 3 and 3.5 σ the law of 4608 pixels; between nodes the median moves with the thresholds."""
+    noise = pixels(evs__refractory_period_us=400, evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.245)
+    count = int(np.prod(noise.layout.evs_shape))
+    angle = reference_law.POLE / 16
+    found = start_of(noise, 3, np.full(count, 0.07, np.float32), np.ones(count), angle).reference
+    expected = law(Pixels(np.array([3.0]), np.array([3.5]), 400e-6 * 250, 1e-3 / 250, angle))
+    below = np.append(0.0, np.cumsum(expected.share[0]))
+    # Kolmogorov, 1e-6
+    assert np.abs(np.interp(np.sort(found), expected.edges, below) - (np.arange(count) + 0.5) / count).max() < 0.04
+    # twice the noise halves both thresholds; half the bandwidth halves the dead time in periods
+    other = start_of(noise, 3, np.full(count, 0.14, np.float32), np.full(count, 0.5), angle).reference
+    half = law(Pixels(np.array([1.5]), np.array([1.75]), 400e-6 * 125, 1e-3 / 125, angle / 2))
+    median = np.interp(0.5, np.append(0.0, np.cumsum(half.share[0])), half.edges)
+    assert np.median(other) == pytest.approx(median, abs=0.08)
 
 
 # ---- the law ---------------------------------------------------------------------------------------------
