@@ -296,7 +296,7 @@ def test_noisy_pixels_against_a_pixel_by_pixel_version():
     """64 pixels with band-limited noise: every event, on the same noise."""
     noisy = [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.15, "beta5": 0.0}]
     noise = asynchronous(8, evs__coefficients=noisy, evs__refractory_period_us=900)
-    stage = EvsStage(noise, seed=4)
+    stage = EvsStage(noise, seed=4, is_reset=True)
     events = np.concatenate([stage.step(electrons(0.0, noise), t) for t in range(0, 300_001, 3000)])
     process = BandNoise(noise, seed=4)
     nodes = np.arange(0, 300_000, 1e6 / (16 * 300.0))

@@ -315,7 +315,7 @@ def test_numpy_version_of_last_event_agrees():
     def spread(t):
         return 0.08 * np.exp(-log_x(t))
 
-    stage = EvsStage(noise, seed=4)
+    stage = EvsStage(noise, seed=4, is_reset=True)
     # 6 nodes are 1250 µs, whole microseconds
     times = range(0, duration_us + 1, 1250)
     events = np.concatenate([stage.step(on_device(electrons_at(log_x(t))), t) for t in times])

@@ -16,6 +16,7 @@ from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibratio
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.specs.calibration import file_digest
 
 ROOT = Path(__file__).parents[2]
 SIZE = 32
@@ -149,3 +150,24 @@ def test_what_calibrate_writes_is_as_the_model_says(folder):
     data = read_calibration(folder / "c.yaml")
     assert data["aps"]["K"]["value"] > 0 and data["evs"]["theta"]["value"] > 0
     assert data["capture"]["signal_reference"] == {"k": 0.2, "t_ref_us": 10000.0, "filter": "own"}
+
+
+def test_telegraph_pixels_forget_their_state_at_the_frame_rate_of_the_captures(folder, tmp_path):
+    """A calibration of before has a correlation from frame to frame; the file has 30 frames per second."""
+    shutil.copytree(folder, tmp_path / "here")
+    file = tmp_path / "here" / "c.yaml"
+    section = read_calibration(file)["aps"]
+    maps = tmp_path / "here" / section["maps"]["file"]
+    jumps = {name: np.zeros((SIZE, SIZE), np.float32) for name in ("amplitude_dn", "high_share", "correlation")}
+    for name, value in (("amplitude_dn", 40.0), ("high_share", 0.3), ("correlation", 0.8)):
+        jumps[name][4, 9] = value
+    capture_sets.change(maps, telegraph_change_hz=None, **{f"telegraph_{name}": array for name, array in jumps.items()})
+    text = file.read_text().replace(section["maps"]["sha256"], file_digest(maps))
+    file.write_text(text)
+    for changes in ({}, {"aps.frame_rate_hz": 90}):
+        found = hr.load_sensor(tmp_path / "here" / "s.yaml", changes).aps.telegraph
+        assert found.place.tolist() == [4 * SIZE + 9]
+        assert found.change_hz[0] == pytest.approx(-np.log(0.8) * 30, rel=1e-5)
+    file.write_text(re.sub(r"(?m)^aps:$", "aps:\n  frame_rate_hz: 12.5", text))
+    found = hr.load_sensor(tmp_path / "here" / "s.yaml").aps.telegraph
+    assert found.change_hz[0] == pytest.approx(-np.log(0.8) * 12.5, rel=1e-5)
