@@ -94,7 +94,7 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
     """
     parts = ["<h2>Verdict</h2>"]
     named = {"delta_e_mean": "mean ΔE2000 without noise", "mtf50_cy_per_px": "MTF50, cy/px",
-             "false_colour": "false colour, C*ab", "zone_plate_colour": "zone plate, C*ab", 
+             "false_colour": "false colour, C*ab", "zone_plate_colour": "zone plate, C*ab",
              "picture_error_simulated": "rms error with noise"}  # fmt: skip
     ratios = {"ysnr_noise_aware_ratio_": "YSNR, noise-aware,", "ysnr_ratio_": "YSNR, matrix of colour,"}
     for verdict in verdicts:
