@@ -56,9 +56,9 @@ def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> E
 def merged(exposures: Sequence[Exposure]) -> NDArray[np.float64]:
     """Mean flux of several exposures, weighted by their inverse variances; without motion it is the best linear one.
 
-    The variance of all has the shot noise of one flux, their mean weighted by the dark variances. With the noisy flux of
-    each, those that are too low by chance would weigh more, and the mean of a dark scene would be below black. A pixel
-    that is saturated in all exposures has the flux of the first, which is to be the shortest.
+    The variance of all has the shot noise of one flux, their mean weighted by the dark variances. With the noisy flux
+    of each, those that are too low by chance would weigh more, and the mean of a dark scene would be below black. A
+    pixel that is saturated in all exposures has the flux of the first, which is to be the shortest.
 
     Parameters
     ----------

@@ -41,8 +41,9 @@ class BenchmarkDataset(_Dataset):
 
     An item of ``deblur`` is one frame: ``frame`` float32 [1, row, col] (0 is black, 1 full scale; noise below black is
     kept, so that dark frames have the mean of their light, and pixels without a value are 0), ``sharp`` of the same
-    shape (the nearest sharp image to the middle of the exposure), ``valid`` bool [1, row, col] and ``voxels`` float32 [bin, y, x] of the events of the exposure. An item of ``interpolate`` is a frame k with a neighbour on each
-    side: ``before`` and ``after``, ``sharp`` of frame k, and the voxels from the middle of one neighbour to that of the
+    shape (the nearest sharp image to the middle of the exposure), ``valid`` bool [1, row, col] and ``voxels`` float32
+    [bin, y, x] of the events of the exposure. An item of ``interpolate`` is a frame k with a neighbour on each side:
+    ``before`` and ``after``, ``sharp`` of frame k, and the voxels from the middle of one neighbour to that of the
     other. Both have ``clip`` (name), ``index`` (number of the frame) and ``t_us`` of the sharp image.
 
     Parameters

@@ -182,7 +182,7 @@ class Figures:
         return develop(clean, mosaic, pipeline, exposure_gain=gain).image
 
     def against_clean(self, measure: Callable[..., float]) -> float | None:
-        """A measure of the picture against that of the noise-free frame; 1 is white, and linear noise may lie below 0."""
+        """A measure of the picture against that of the noise-free frame; 1 is white, linear noise may be below 0."""
         if self.picture is None or self.clean_picture is None:
             return None
         return measure(_with_white_at_1(self.picture.image), _with_white_at_1(self.clean_picture))

@@ -1,4 +1,4 @@
-"""What lies below black is kept: dark frames have the mean of their light in the loader, the pictures and the measures."""
+"""What lies below black is kept: dark frames have the mean of their light in loader, pictures and measures."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ LINEAR = ["black_level", "white_balance", "demosaic", "colour_matrix"]
 
 @pytest.fixture(scope="module")
 def dark():
-    """A dark frame of a hybrid sensor with 23 e⁻ of read noise and no dark current, its mosaic, valid pixels, sensor."""
+    """A dark frame of a hybrid sensor with 23 e⁻ of read noise, its mosaic, the pixels with a value, the sensor."""
     keys = {"aps.read_noise_e": 23.0, "aps.dark_current_e_per_s": 0.0}
     sensor = hr.load_sensor("gen2", keys).crop(160, 96)
     aps = sensor.aps.without("prnu", "dsnu", "row")
@@ -27,7 +27,7 @@ def dark():
 
 
 def test_the_loader_keeps_what_lies_below_black(dark):
-    raw, mosaic, valid, sensor = dark
+    raw, mosaic, valid, _ = dark
     found = signal_of(raw, valid, mosaic)
     span = 2**mosaic.bit_depth - 1 - mosaic.black_level_dn
     sigma = 23 * mosaic.system_gain_dn_per_e / span
@@ -39,7 +39,7 @@ def test_the_loader_keeps_what_lies_below_black(dark):
 
 
 def test_pictures_of_a_dark_frame_have_no_light(dark):
-    raw, mosaic, valid, _ = dark
+    raw, mosaic, _, _ = dark
     picture = process(raw, mosaic, Pipeline.of(*LINEAR))
     sigma = picture.std()
     # a pixel of the picture is a sum over some 20 of the mosaic: a tenth of σ is 5 standard errors and more
