@@ -269,7 +269,9 @@ def test_linear_interpolation_spreads_events():
 @pytest.mark.parametrize(("way", "enough"), [("none", np.exp(0.21)), ("linear", 1 + 8 * np.expm1(0.21))])
 def test_what_interpolation_loses_before_a_fixed_tick_is_told(way, enough):
     """Pictures of 8 ticks: a change between two below 1 + 8 (exp(θ) - 1) gives no event if it is spread."""
-    sensor = mono(evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.34, evs__tick_us=1250)
+    sensor = mono(
+        evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.34, evs__tick_us=1250, evs__window_us=50
+    )
     counts = []
     for factor in (0.9 * enough, 1.1 * enough):
         pictures = grey(1e7 * factor ** np.array([0.0, 0.0, 1.0, 1.0]))
