@@ -11,9 +11,12 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import betainc, gammaincc, ndtr
 
+import hesim_render as hr
+from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixels
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
 from hesim_render.calibrate.estimate import Spread, estimated
+from hesim_render.calibrate.evs import dispersion
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.counts import StaticCapture
@@ -357,3 +360,45 @@ def test_intervals_of_a_jackknife_are_as_wide_as_students_law_asks():
         assert (low, high) == pytest.approx((5 - half / 2, 5 + half / 2), abs=5e-5)
         spread = Spread(0.15, 0.002, 0.2, groups).described()
         assert spread["interval_95"][1] == pytest.approx(0.15 + 0.002 * half, abs=1e-6)
+
+
+# ---- counts in time, signals between pixels --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("between", [0.0, 4e-5])
+def test_counts_of_a_trinomial_law_have_no_dispersion(between, monkeypatch):
+    """20,000 pixels with P₊ = 0.31 and P₋ = 0.12; their probabilities may differ by a known variance, each of its own.
+
+    The mean of 20,000 squares is known to 1 %. With the wrong sign of (P₊ − P₋)² the difference has 0.84.
+    """
+    trials, pixels, mean = 400, 20_000, np.array([0.31, 0.12])
+    rng = np.random.default_rng(6)
+    p = mean[:, None] + np.sqrt(between) * rng.standard_normal((2, pixels))
+    counts = rng.multinomial(trials, np.stack([*p, 1 - p.sum(axis=0)], axis=-1))[:, :2].T
+    cells = SimpleNamespace(
+        trials=trials, signal_dn=np.array([30.0, 30.0]), polarity=np.array([1, -1]), spread=None, relative=None
+    )
+    given = SimpleNamespace(
+        cells=cells, is_dark=np.array([False, False]), counts=counts, cell=np.repeat([[0], [1]], pixels, axis=1)
+    )
+    monkeypatch.setattr(dispersion, "log_probability", lambda *_: (np.log(mean), None))
+    monkeypatch.setattr(dispersion, "threshold_over_noise", lambda *_: (np.ones(2), None))
+    monkeypatch.setattr(dispersion, "probability_variance", lambda *_: np.full(2, between))
+    fit = SimpleNamespace(parameters=np.zeros(5), law="linear")
+    found = dispersion.dispersion_in_time(given, fit, 0.7)
+    assert abs(found.total - 1) < 5 * 0.011 and abs(found.difference - 1) < 5 * 0.011
+    assert 0.006 < found.total_error < 0.02 and 0.006 < found.difference_error < 0.02
+
+
+def test_noise_of_the_frames_makes_no_edge_of_an_even_scene():
+    """White event pixels between frame pixels: these differ where they do beyond √3 times their noise."""
+    sensor = hr.load_sensor("gen2").spec
+    rng, shape = np.random.default_rng(3), (64, 96)
+    scatter = 700.0 * (1 + 0.2 * rng.standard_normal(shape))
+    shares = []
+    for error in (140.0, 14.0):
+        composite = Composite(scatter.astype(np.float32), np.full(shape, error, np.float32))
+        signal, uneven = signal_at_event_pixels(composite, sensor, "D65")
+        assert signal.shape == (16, 24) and np.isfinite(signal).all()
+        shares.append(uneven.mean())
+    assert shares[0] < 0.1 and shares[1] > 0.8

@@ -253,21 +253,41 @@ def test_rows_that_show_picture_are_left_alone():
     assert np.abs(row_offsets(noisy(slope, noise), BAYER, noise, 1.0)).max() < 0.6
 
 
-def test_row_offsets_solve_their_normal_equations():
-    """Without noise or picture the differences are exact: the banded solution against a dense one."""
+@pytest.mark.parametrize("row_std", [0.4, 2.5])
+def test_row_offsets_solve_their_normal_equations(row_std):
+    """Without noise or picture the differences are exact: the banded solution against a dense one.
+
+    Twelve columns: the noise of a row's mean is as large as its offset, so that the prior counts.
+    """
     rng = np.random.default_rng(4)
-    offsets = rng.normal(0, 1, 40)
-    flat = (50 + offsets[:, None] + np.zeros((1, 64))).astype(np.float32)
+    offsets = rng.normal(0, row_std, 40)
+    flat = (50 + offsets[:, None] + np.zeros((1, 12))).astype(np.float32)
     noise = noise_of(((0,),))
-    found = row_offsets(flat, [[0]], noise, 1.0)
-    sigma2 = (0.64 + 1 / 12 + 0.16 * 50) * 1.5 / 64
+    found = row_offsets(flat, [[0]], noise, row_std)
+    sigma2 = (0.64 + 1 / 12 + 0.16 * 50) * 1.5 / 12
     difference = np.zeros((38, 40))
     difference[np.arange(38), np.arange(38)] = difference[np.arange(38), np.arange(2, 40)] = -0.5
     difference[np.arange(38), np.arange(1, 39)] = 1
     dense = np.linalg.solve(
-        difference.T @ difference / sigma2 + np.eye(40), difference.T @ (difference @ offsets) / sigma2
+        difference.T @ difference / sigma2 + np.eye(40) / row_std**2, difference.T @ (difference @ offsets) / sigma2
     )
-    np.testing.assert_allclose(found, dense, atol=0.05)
+    # the noise of each row is that at its own level
+    np.testing.assert_allclose(found, dense, atol=0.03 * row_std)
+    assert np.abs(dense - offsets).max() > 0.1 * row_std
+
+
+def test_an_offset_counts_up_to_four_deviations_of_what_is_likely():
+    """A line that differs from its neighbours by more is picture; the deviation is that of rows, squared, and noise.
+
+    Beyond it the line's own comparison does not count; beyond twice as much, nor do those of its neighbours.
+    """
+    noise, row_std = noise_of(((0,),)), 3.0
+    limit = 4 * np.sqrt(1.5 * (row_std**2 + (0.64 + 1 / 12 + 0.16 * 50) / 96))
+    for factor, share in ((0.98, 0.818), (1.02, 0.658), (1.96, 0.656), (2.04, 0.0)):
+        flat = np.full((31, 96), 50.0, np.float32)
+        flat[15] += factor * limit
+        found = row_offsets(flat, [[0]], noise, row_std)
+        assert found[15] / (factor * limit) == pytest.approx(share, abs=0.01)
 
 
 def test_scatter_of_what_is_left_is_what_the_noise_makes():

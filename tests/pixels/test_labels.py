@@ -420,6 +420,11 @@ def test_pairs_of_pixels_with_a_dead_time():
     cause, effect, lost = Balance(3, 10.0).take(causes, effects)
     assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (12, 3), (13, 4)}
     assert lost.tolist() == [11]
+    # the instant of the release belongs to the dead time: an event that waits is still there
+    cause, effect, lost = Balance(2, 10.0).take(
+        steps((15, 0, 1, 20), (16, 1, 1, 21)), steps((5, 0, 1, 6), (5, 1, 1, 7))
+    )
+    assert (cause.tolist(), effect.tolist(), lost.tolist()) == ([20], [6], [])
     # without a dead time the events wait for their partners
     cause, effect, lost = Balance(3).take(causes, effects)
     assert set(zip(cause.tolist(), effect.tolist(), strict=True)) == {(10, 0), (11, 5), (12, 1), (13, 2)}

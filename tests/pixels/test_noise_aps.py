@@ -308,6 +308,9 @@ def test_bits_follow_from_the_seed_alone():
     row, col = crop.layout.row0, crop.layout.col0
     rng = np.random.default_rng(0)
     image = rng.uniform(0, 800, full.layout.shape).astype(np.float32)
+    band = ApsNoise(full.spec, full.layout.crop(full.layout.cols, 24, 0, 100), full.device_seed)  # needs no table
+    lines = full.sample(image, EXPOSURE_US, seed=7, frame=3)[100:124]
+    np.testing.assert_array_equal(band.sample(image[100:124], EXPOSURE_US, seed=7, frame=3), lines)
     part = image[row : row + 384, col : col + 512]
     whole = full.sample(image, EXPOSURE_US, seed=7, frame=3)
     ours = crop.sample(part, EXPOSURE_US, seed=7, frame=3)
