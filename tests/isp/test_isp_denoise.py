@@ -247,7 +247,7 @@ def test_rows_that_show_picture_are_left_alone():
     """A horizon across the whole frame, much higher than row noise, is no offset; nor is a slope."""
     noise = noise_of(BAYER)
     scene = np.where(np.arange(128) < 64, 10.0, 60.0)[:, None] + np.zeros((1, 256))
-    found = row_offsets(noisy(scene, noise), BAYER, noise, 1.0)
+    found = row_offsets(noisy(scene, noise), BAYER, noise, 1.4)
     assert np.abs(found).max() < 0.5
     slope = np.linspace(10, 200, 128)[:, None] + np.zeros((1, 256))
     assert np.abs(row_offsets(noisy(slope, noise), BAYER, noise, 1.0)).max() < 0.6
@@ -294,7 +294,7 @@ def test_scatter_of_what_is_left_is_what_the_noise_makes():
     """On a flat field the error of a row's offset is that of means of samples: chi-square over rows, both sides."""
     noise = noise_of(((0,),))
     raw = noisy(np.full((400, 512), 20.0), noise, seed=9)
-    found = row_offsets(raw, [[0]], noise, 1.0)
+    found = row_offsets(raw, [[0]], noise, 1.4)
     # a row against the mean of its two neighbours: the second difference of what was found
     second = found[1:-1] - (found[2:] + found[:-2]) / 2
     sigma2 = (0.64 + 1 / 12 + 0.16 * 20) * 1.5 / 512

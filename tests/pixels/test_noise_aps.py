@@ -122,7 +122,7 @@ def test_formulas_of_mean_and_variance(electrons, law):
 
 
 def test_mean_and_variance_of_images_use_each_pixels_maps():
-    noise = model(aps__prnu_rel=0.02, aps__dsnu_e=4.0, aps__row_offset_std_dn=1.0, aps__dark_current_e_per_s=500.0,
+    noise = model(aps__prnu_rel=0.02, aps__dsnu_e=4.0, aps__row_offset_std_dn=1.7, aps__dark_current_e_per_s=530.0,
                   aps__dark_current_nonuniformity_rel=0.4)  # fmt: skip
     maps = noise.fixed_pattern
     electrons = np.linspace(0, 900, SIDE * SIDE).reshape(SIDE, SIDE)

@@ -18,7 +18,7 @@ QUALITY, UNIT = 0.5, 0.03
 
 
 def sensor_of(reference="previous_sample"):
-    changes = {"evs.contrast_threshold_on": 0.2, "evs.contrast_threshold_off": 0.2, "evs.reference": reference}
+    changes = {"evs.contrast_threshold_on": 0.2, "evs.contrast_threshold_off": 0.27, "evs.reference": reference}
     if reference == "last_event":
         changes |= {"evs.tick_us": None, "evs.window_us": 1}
     return hr.load_sensor("reference-mono", changes).crop(COLS, ROWS)
@@ -66,8 +66,8 @@ def true_shares(run, truth):
     pixels = np.arange(ROWS * COLS)
     signals = [sensor.evs.log_signal(flux, pixels) for flux in (run, truth)]
     error = sensor.evs.log_signal(run * (1 + 0.001), pixels) - signals[0]
-    theta = np.full(pixels.size, 0.2)
-    counted = compare_ticks(*signals, error, (theta, theta), np.ones(TICKS, np.bool_))
+    theta = np.full(pixels.size, 0.2), np.full(pixels.size, 0.27)
+    counted = compare_ticks(*signals, error, theta, np.ones(TICKS, np.bool_))
     off = np.mean(np.abs(run / truth - 1) > 3 * QUALITY * UNIT)
     return off, counted.missed.sum() / counted.true.sum(), counted.extra.sum() / counted.found.sum()
 
