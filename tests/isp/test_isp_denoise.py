@@ -301,3 +301,13 @@ def test_scatter_of_what_is_left_is_what_the_noise_makes():
     score = (second[::3] ** 2).sum() / sigma2
     # shrunk by the prior a little; false alarm 1e-4 and 5 % for the robust mean, which is less efficient
     assert chi2.ppf(1e-4, second[::3].size) * 0.8 < score < chi2.ppf(1 - 1e-4, second[::3].size) * 1.05
+
+
+def test_noise_times_a_factor_has_that_factor_in_every_standard_deviation():
+    beta = np.array([[[0.64, 0.16, 3.0, 2e-4, 0.7, 11.0]]])
+    noise = FrameNoise(beta, 20_000.0, residual_dn2=1.3, response_std=0.02)
+    once, more = (each.variance((0, 0)) for each in (noise, noise.times(2.5)))
+    rounding = 1 / 12
+    assert more[0] - rounding == pytest.approx(6.25 * (once[0] - rounding), rel=1e-12)
+    assert once[0] == pytest.approx(0.64 + 3.0 * 0.02 + 11.0 * 0.02**2 + 1.3 + rounding, rel=1e-12)
+    np.testing.assert_allclose(more[1:], 6.25 * np.array(once[1:]), rtol=1e-12)
