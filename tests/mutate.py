@@ -260,6 +260,75 @@ FIXED = (
         "theta * (1 + rho)",
         ("tests/sensor/test_calibrated_sensor.py::test_each_threshold_of_a_calibration_reaches_its_own_polarity",),
     ),
+    Fixed(
+        "row noise: the standard error of a variance",
+        "error = scale * ratio * float(np.sqrt(2 / freedom))",
+        "error = scale * ratio * float(np.sqrt(1 / freedom))",
+        ("tests/calibrate/test_calibrate_checks.py::test_the_error_of_the_row_noise_is_its_scatter",),
+    ),
+    Fixed(
+        "dark line: each row counts as a whole frame",
+        "variance = (noise + rows / dark.mean.shape[1]) / dark.frames",
+        "variance = (noise + rows) / dark.frames",
+        (_FORMS,),
+    ),
+    Fixed(
+        "S-curves: the ceiling lies above the floor",
+        "p = values[floor] + (values[6] - values[floor]) * shape",
+        "p = values[floor] + values[6] * shape",
+        (_FORMS,),
+    ),
+    Fixed(
+        "spread of thresholds: counting is added in place of taken off",
+        "m**2 - own / u**2",
+        "m**2 + own / u**2",
+        (_FORMS,),
+    ),
+    Fixed(
+        "first events: correlation of their noise", "return (1.0 + h) * math.exp(-h)", "return math.exp(-h)", (_FORMS,)
+    ),
+    Fixed(
+        "signals of event pixels: µs taken for s",
+        "np.maximum(rate.astype(np.float64), 0.0) * reference.t_ref_us * S_PER_US",
+        "np.maximum(rate.astype(np.float64), 0.0) * reference.t_ref_us",
+        (_FORMS,),
+    ),
+    Fixed(
+        "noise reduction: its strength counts once in a variance",
+        "residual_dn2=self.residual_dn2 * factor**2",
+        "residual_dn2=self.residual_dn2 * factor",
+        ("tests/isp/test_isp_denoise.py",),
+    ),
+    Fixed(
+        "previews: the noise of a mean is that of one pixel",
+        "(noise[0] * shares, noise[1] * shares)",
+        "(noise[0] * shares, noise[1])",
+        ("tests/recording/test_recording.py::test_preview_dng_is_the_binned_quad",),
+    ),
+    Fixed(
+        "pictures of events: OFF is black",
+        "share * ON_COLOUR + (1 - share) * OFF_COLOUR",
+        "share * ON_COLOUR + share * OFF_COLOUR",
+        ("tests/recording/test_preview.py",),
+    ),
+    Fixed(
+        "event pixels: the signal of another filter, the wrong way round",
+        "total[reference] / total[name]",
+        "total[name] / total[reference]",
+        ("tests/sensor/test_radiometry.py",),
+    ),
+    Fixed(
+        "glare: rows and columns of the sensor in each other's place",
+        "np.array([geometry.rows, geometry.cols])[:, None, None]",
+        "np.array([geometry.cols, geometry.rows])[:, None, None]",
+        ("tests/sources/render/test_lens_effects.py::test_glare_is_measured_all_over_a_sensor_that_is_not_square",),
+    ),
+    Fixed(
+        "schedule: a frame has one row more",
+        "self.start_us + (self.rows - 1) * self.line_time_us",
+        "self.start_us + self.rows * self.line_time_us",
+        ("tests/mosaic/test_schedule.py",),
+    ),
 )
 
 
