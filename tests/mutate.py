@@ -335,6 +335,24 @@ FIXED = (
         "np.maximum(1.0 - on, 1e-9)",
         ("tests/pixels/test_formulas.py",),
     ),
+    Fixed(
+        "thresholds of few events: their spread counts once",
+        "1 - (spread * v) ** 2",
+        "1 - (spread * v)",
+        (_FORMS,),
+    ),
+    Fixed(
+        "grey world: a tile counts where one channel is bright enough",
+        "good = (means.min(axis=0) > _DARKEST)",
+        "good = (means.max(axis=0) > _DARKEST)",
+        ("tests/isp/test_isp_steps.py",),
+    ),
+    Fixed(
+        "rates of events: intervals of another length",
+        '((some["t_us"] - begin) / interval_us)',
+        '((some["t_us"] - begin) / (interval_us + 1))',
+        ("tests/events/test_event_arrays.py",),
+    ),
 )
 
 
