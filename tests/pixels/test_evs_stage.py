@@ -31,7 +31,7 @@ def asynchronous(side=128, **overrides):
     coefficients = [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.08, "beta5": 0.0}]
     defaults = {"evs__reference": "last_event", "evs__photoreceptor_cutoff_hz": 300.0,
                 "evs__coefficients": coefficients, "evs__contrast_threshold_on": 0.2,
-                "evs__contrast_threshold_off": 0.2}  # fmt: skip
+                "evs__contrast_threshold_off": 0.23}  # fmt: skip
     return model(side, **{**defaults, **overrides})
 
 

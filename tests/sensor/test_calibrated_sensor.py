@@ -9,6 +9,7 @@ from pathlib import Path
 import capture_sets
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 from scipy.special import ndtr
 
 import hesim_render as hr
@@ -115,6 +116,25 @@ def test_the_files_are_read_when_the_sensor_is_loaded(folder, tmp_path):
     file.unlink()
     with pytest.raises(SpecError, match=r"c_evs_maps-.*: no such file; it belongs to c\.yaml"):
         hr.load_sensor(tmp_path / "here" / "s.yaml")
+
+
+@pytest.mark.parametrize(("on", "off", "known"), [(0.17, 0.29, "steps"), (0.31, 0.22, "counts")])
+def test_each_threshold_of_a_calibration_reaches_its_own_polarity(folder, tmp_path, on, off, known):
+    """From contrast steps, or from the asymmetry of the static counts where that is better known; θ is the mean."""
+    shutil.copytree(folder, tmp_path / "here")
+    file = tmp_path / "here" / "c.yaml"
+    yaml = YAML()
+    data = yaml.load(file.read_text())
+    evs, error = data["evs"], 0.02 if known == "counts" else 1e-4
+    given = {"theta": (on + off) / 2, "theta_on": on, "theta_off": off}
+    if known == "counts":
+        given |= {"theta_on": 0.25, "theta_off": 0.26, "asymmetry": (off - on) / (off + on)}
+    for name, value in given.items():
+        evs[name] = {"value": value, "standard_error": 1e-4 if name == "asymmetry" else error}
+    with file.open("w") as out:
+        yaml.dump(data, out)
+    spec = hr.load_sensor(tmp_path / "here" / "s.yaml").spec.evs
+    assert (spec.contrast_threshold_on, spec.contrast_threshold_off) == pytest.approx((on, off), rel=1e-6)
 
 
 WRONG = [  # text, its replacement, the line that begins so, and what is said of it
