@@ -8,7 +8,7 @@ import numpy as np
 import hesim_render as hr
 from hesim_render.measure import measure_mtf
 
-sensor = hr.load_sensor("reference-mono").crop(256, 192)
+sensor = hr.load_sensor("reference-quiet").crop(256, 192)
 scene = hr.load_scene("slanted-edge", {"light.illuminance_lux": 300})
 rec = hr.simulate(scene, sensor, duration_s=0.02, seed=3)
 response = measure_mtf(rec, region=(78, 20, 100, 150))

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import io
+import re
 from collections import Counter
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hesim_render.benchmark.statistics import FIGURES
+from hesim_render.core.guard import printable
 from hesim_render.specs.benchmark import SPLITS
 
 HISTOGRAM_FILE = "histograms.png"
 _BINS = 24
+_MARKS = re.compile(r"[\\`*\[\]!|#~]")
 
 
 def _decades(values: np.ndarray) -> float:
@@ -74,9 +78,9 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
     scenes = {split: len({c["scene"] for c in clips if c["split"] == split}) for split in SPLITS}
     size = sum(entry["bytes"] for clip in clips for entry in clip["files"].values())
     verdicts = Counter(clip["render"].get("audit", {}).get("verdict", "not audited") for clip in clips)
-    kinds = ", ".join(spec["truth"]) or "none"
+    kinds = _escaped(", ".join(spec["truth"])) or "none"
     lines = [
-        f"# {manifest['name']}", "", spec["description"], "",
+        f"# {_escaped(manifest['name'])}", "", _escaped(spec["description"]), "",
         f"{len(clips)} clips of {spec['duration_s']:g} s, {size / 1e9:.3g} GB, rendered by hesim_render "
         f"{manifest['versions']['hesim_render']}. Every number can be made again from `plan.json`; "
         "`hesim-render benchmark verify` compares all files with their SHA-256.", "",
@@ -85,9 +89,9 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
         "Splits share no part: solids, meshes, textures, materials, motions and lamps of a scene occur in one split "
         "only.", "",
         "| Axis | Values |", "|---|---|",
-        f"| sensors | {', '.join(sorted({clip['sensor'] for clip in clips}))} |",
+        f"| sensors | {_escaped(', '.join(sorted({clip['sensor'] for clip in clips})))} |",
         f"| exposures, µs | {_limits([clip['exposure_us'] for clip in clips])} |",
-        f"| noise | {', '.join(sorted({clip['noise'] for clip in clips}))} |",
+        f"| noise | {_escaped(', '.join(sorted({clip['noise'] for clip in clips})))} |",
         f"| seeds | {', '.join(str(seed) for seed in sorted({clip['seed'] for clip in clips}))} |",
         f"| truth | {kinds} |", "",
         f"![Histograms of the clips]({HISTOGRAM_FILE})", "",
@@ -110,6 +114,12 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
         "| `scene/` | the generated scene with its meshes and textures |", "",
     ]  # fmt: skip
     return "\n".join(lines)
+
+
+def _escaped(text: str) -> str:
+    """A text of others as Markdown that shows it as it is: no element of HTML, link, picture or cell of a table."""
+    lines = (escape(printable(line), quote=False) for line in text.split("\n"))
+    return "\n".join(_MARKS.sub(r"\\\g<0>", line) for line in lines)
 
 
 def _render(spec: dict[str, Any]) -> str:

@@ -25,6 +25,7 @@ from hesim_render.benchmark.statistics import figures
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.simulate import flux_source, go_on, simulate
+from hesim_render.core.guard import read_text, reading
 from hesim_render.core.journal import Journal
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.recording.manifest import software_versions
@@ -89,8 +90,9 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     """
     folder = clip_folder(root, clip)
     if is_complete(root, clip):
-        content = json.loads((folder / CLIP_FILE).read_text(encoding="utf-8"))
-        return Built(clip.name, 0.0, sum(entry["bytes"] for entry in content["files"].values()))
+        with reading(folder / CLIP_FILE, "as JSON"):
+            content = json.loads(read_text(folder / CLIP_FILE))
+            return Built(clip.name, 0.0, sum(entry["bytes"] for entry in content["files"].values()))
     begin = time.monotonic()
     output = OutputFolder(folder, CLIP_FILE, overwrite=True)  # another worker may finish the same clip first
     try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from hesim_render.benchmark.plan import Clip
@@ -27,6 +29,7 @@ def connected(address: str) -> Any:
         from distributed.comm.core import CommClosedError
     except ImportError:
         raise RangeError("--scheduler", address, "dask.distributed: pip install 'hesim_render[cluster]'") from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a lost scheduler is told by our own error
     try:
         return Client(address, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, CommClosedError) as error:  # TimeoutError is an OSError
@@ -59,37 +62,30 @@ def run_on_cluster(
     BackendError
         If the scheduler is gone; the finished clips stay.
     """
-    from asyncio import CancelledError as Cancelled
-    from concurrent.futures import CancelledError
-
     import distributed
-    from distributed.comm.core import CommClosedError
     from distributed.scheduler import KilledWorker
 
     failed: dict[str, str] = {}
     futures = {}
-    for clip in clips:
-        # the key is of this call: a result of an earlier build must not stand for this one
-        parts: list[Any] = []
-        for span in (*spans, None):
-            given = (list(parts),) if span is None and spans else ()
-            future = client.submit(attempt, order, Unit(clip, span).as_dict(), *given, pure=False, retries=0)
-            futures[future.key] = (future, clip)
-            parts.append(future)
-    for future in distributed.as_completed([future for future, _ in futures.values()], loop=client.loop):
-        clip = futures[future.key][1]
-        try:
+    with _scheduler_is_there(client):
+        for clip in clips:
+            # the key is of this call: a result of an earlier build must not stand for this one
+            parts: list[Any] = []
+            for span in (*spans, None):
+                given = (list(parts),) if span is None and spans else ()
+                future = client.submit(attempt, order, Unit(clip, span).as_dict(), *given, pure=False, retries=0)
+                futures[future.key] = (future, clip)
+                parts.append(future)
+    waiting = iter(distributed.as_completed([future for future, _ in futures.values()], loop=client.loop))
+    while futures:
+        with _scheduler_is_there(client):
+            future = next(waiting)
             failure = future.exception()
-        except (Cancelled, CancelledError, CommClosedError):  # a client without a scheduler gives its tasks up
-            raise BackendError(
-                "the scheduler is gone, or has given the clips up; the finished ones stay, and the same command with a "
-                "running scheduler builds the others"
-            ) from None
-        if failure is None:
-            answer = future.result()
-        elif isinstance(failure, KilledWorker):
+            answer = None if failure is not None else future.result()
+        clip = futures.pop(future.key)[1]
+        if isinstance(failure, KilledWorker):
             answer = {"name": clip.name, "error": "its workers died again and again (dask: KilledWorker)"}
-        else:
+        elif answer is None:
             raise failure
         if clip.name not in failed:
             told(answer)
@@ -97,5 +93,30 @@ def run_on_cluster(
             failed.setdefault(clip.name, answer["error"])
             if answer.get("fatal"):
                 raise OutputError(answer["error"])
-        futures.pop(future.key)
     return failed
+
+
+@contextmanager
+def _scheduler_is_there(client: Any) -> Iterator[None]:
+    """Turn what a client raises without a scheduler into one `BackendError`: it gives its tasks up at any call."""
+    from asyncio import CancelledError as Cancelled
+    from concurrent.futures import CancelledError
+
+    from distributed.comm.core import CommClosedError
+
+    try:
+        yield
+    except Exception as error:
+        kinds = (Cancelled, CancelledError, CommClosedError)
+        if not isinstance(error, kinds) and getattr(client, "status", "running") == "running":
+            raise
+        raise _gone() from None
+    except Cancelled:  # no Exception
+        raise _gone() from None
+
+
+def _gone() -> BackendError:
+    return BackendError(
+        "the scheduler is gone, or has given the clips up; the finished ones stay, and the same command with a running "
+        "scheduler builds the others"
+    )

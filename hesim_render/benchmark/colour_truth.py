@@ -9,15 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.sharp import windows
 from hesim_render.capture.simulate import flux_source
-from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import reading
-from hesim_render.core.hdf5 import COMPRESSION, new_file
+from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -95,10 +92,7 @@ class ColourTruth:
     path: Path
 
     def _read(self, name: str, number: int | None = None) -> NDArray:
-        with reading(self.path, "as full-colour images"), h5py.File(self.path, "r") as file:
-            if name not in file:
-                raise SpecError(f"has no {name}", file=self.path)
-            return file[name][()] if number is None else file[name][number]
+        return read_dataset(self.path, "as full-colour images", name, number, kinds="fuiSO")
 
     @property
     def time_us(self) -> NDArray[np.float64]:

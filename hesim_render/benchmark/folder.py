@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from hesim_render.benchmark.clip import CLIP_FILE, RECORDING, SCENE
 from hesim_render.benchmark.colour_truth import COLOURS_FILE, ColourTruth
@@ -17,7 +17,10 @@ from hesim_render.benchmark.generator import SCENE_FILE
 from hesim_render.benchmark.sharp import SHARP_FILE, SharpImages
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, read_text, reading
+from hesim_render.core.names import FileName, PathBelow
 from hesim_render.recording.recording import Recording
+from hesim_render.specs.benchmark import Split
+from hesim_render.specs.problems import spec_error
 
 PLAN_FILE, MANIFEST_FILE, CARD_FILE = "plan.json", "benchmark.json", "README.md"
 SCHEMA = 1
@@ -34,25 +37,49 @@ class _ClipContent(BaseModel):
 
     model_config = ConfigDict(extra="allow")
     schema_version: int
-    name: str
-    split: str
+    name: FileName
+    split: Split
     scene: int
     parts: list[str]
-    files: dict[str, _FileEntry]
+    files: dict[PathBelow, _FileEntry]
 
 
 class _ManifestEntry(BaseModel):
     model_config = ConfigDict(extra="allow")
-    name: str
-    split: str
+    name: FileName
+    split: Split
     sha256: str
 
 
 class _Manifest(BaseModel):
     model_config = ConfigDict(extra="allow")
     schema_version: int
-    name: str
+    name: FileName
     clips: list[_ManifestEntry]
+
+    @field_validator("clips")
+    @classmethod
+    def _once(cls, clips: list[_ManifestEntry]) -> list[_ManifestEntry]:
+        if len({clip.name for clip in clips}) != len(clips):
+            raise ValueError("names a clip twice")
+        return clips
+
+
+def parsed_json(text: str | bytes, model: type[BaseModel], file: str | Path) -> dict[str, Any]:
+    """The content of a JSON text that fits a model; `file` is for errors.
+
+    Raises
+    ------
+    SpecError
+        If it is damaged.
+    """
+    with reading(file, "as JSON"):
+        content = json.loads(text)
+        try:
+            model.model_validate(content)
+        except ValidationError as error:
+            raise spec_error(error, model, content, file) from None
+    return content
 
 
 def read_json(path: Path, model: type[BaseModel]) -> dict[str, Any]:
@@ -65,18 +92,24 @@ def read_json(path: Path, model: type[BaseModel]) -> dict[str, Any]:
     """
     if not path.is_file():
         raise SpecError("no such file", file=path)
-    text = read_text(path)
-    with reading(path, "as JSON"):
-        content = json.loads(text)
-        model.model_validate(content)
+    content = parsed_json(read_text(path), model, path)
     if content["schema_version"] != SCHEMA:
         raise SpecError(f"schema_version {content['schema_version']}; this version reads {SCHEMA}", file=path)
     return content
 
 
 def read_clip(folder: Path) -> dict[str, Any]:
-    """The description of a built clip."""
-    return read_json(folder / CLIP_FILE, _ClipContent)
+    """The description of a built clip, whose name is that of its folder.
+
+    Raises
+    ------
+    SpecError
+        If it is missing, damaged, or that of another clip.
+    """
+    content = read_json(folder / CLIP_FILE, _ClipContent)
+    if content["name"] != folder.name:
+        raise SpecError(f"is of the clip {content['name']!r}; its folder is {folder.name!r}", file=folder / CLIP_FILE)
+    return content
 
 
 @dataclass(frozen=True)
@@ -161,11 +194,11 @@ class Benchmark:
         Raises
         ------
         SpecError
-            If the manifest names a folder outside of the benchmark.
+            If a clip is a link.
         """
         for entry in self.manifest["clips"]:
             if split is None or entry["split"] == split:
                 folder = self.root / "clips" / entry["name"]
-                if not folder.resolve().is_relative_to(self.root):
-                    raise SpecError(f"{entry['name']!r} leads out of the folder", file=self.root / MANIFEST_FILE)
+                if folder.resolve() != folder:
+                    raise SpecError("is a link; the clips of a benchmark are folders in it", file=folder)
                 yield BenchmarkClip(folder)

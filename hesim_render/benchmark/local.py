@@ -7,7 +7,6 @@ import json
 import os
 import selectors
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import IO, Any
@@ -15,13 +14,14 @@ from typing import IO, Any
 from hesim_render.benchmark.plan import Clip
 from hesim_render.benchmark.spans import Span
 from hesim_render.benchmark.units import Unit, Waiting
+from hesim_render.core.child import child_environment, python_command, with_package
 from hesim_render.core.errors import BackendError, OutputError
 
 #: A unit of work at which a worker dies so many times is given up, and so is its clip.
 MOST_DEATHS = 3
 _GRACE_S = 2.0
 #: How a worker process is started.
-COMMAND = (sys.executable, "-c", "from hesim_render.benchmark.worker import main; main()")
+COMMAND = python_command(with_package("from hesim_render.benchmark.worker import main; main()"))
 #: Called with the answer for each unit of work as it comes.
 Told = Callable[[dict[str, Any]], None]
 
@@ -67,7 +67,7 @@ class LocalWorkers:
 
     def _start(self) -> _Worker:
         process = subprocess.Popen(
-            COMMAND,
+            COMMAND, env=child_environment(),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8", start_new_session=True,
         )  # fmt: skip
         worker = _Worker(process)

@@ -106,7 +106,8 @@ class Development:
 
         Both are developed to linear sRGB and multiplied by the factor that brings the truth's brightest half percent to
         0.95. PSNR and SSIM are of the encoded pictures with a peak of 1; ΔE is of the linear ones. `raw_psnr_db` is of
-        the RAW values themselves, over frame pixels, of which 0 is black and 1 is full scale.
+        the RAW values themselves, over frame pixels, of which 0 is black and 1 is full scale. Nothing is clipped at
+        black: the curve of sRGB is odd, as that of bg-sRGB (IEC 61966-2-1, amendment 1).
 
         Parameters
         ----------
@@ -168,8 +169,8 @@ class Development:
         """Measures of a picture in linear sRGB against the wanted one."""
         bright = float(np.percentile(wanted, _PERCENTILE))
         gain = _WHITE / bright if bright > 0 else 1.0
-        picture, wanted = (np.clip(image * gain, 0, 1) for image in (picture, wanted))
-        a, b = encode_exactly(picture), encode_exactly(wanted)
+        picture, wanted = (np.minimum(image * gain, 1) for image in (picture, wanted))
+        a, b = (np.copysign(encode_exactly(np.abs(image)), image) for image in (picture, wanted))
         found = {"psnr_db": psnr(a, b), "delta_e": delta_e(picture, wanted)}
         if min(a.shape[:2]) >= 11:
             found["ssim"] = ssim(a, b)

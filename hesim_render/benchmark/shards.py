@@ -14,21 +14,35 @@ from typing import Any
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
-from hesim_render.benchmark.folder import Benchmark
+from hesim_render.benchmark.folder import Benchmark, parsed_json
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.samples import samples
-from hesim_render.benchmark.store import Store, store_of
+from hesim_render.benchmark.store import Put, store_of
 from hesim_render.benchmark.verify import digest_of
-from hesim_render.core.errors import OutputError, RangeError, SpecError, did_you_mean
-from hesim_render.core.guard import reading
+from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.hdf5 import COMPRESSION
+from hesim_render.core.names import FileName
 from hesim_render.core.progress import Progress
 from hesim_render.specs.benchmark import SPLITS
 
 INDEX_FILE = "index.json"
 FORMATS = {"webdataset": "tar", "hdf5": "h5"}
 _SCHEMA = 1
+
+
+class _ShardEntry(BaseModel):
+    name: FileName
+    sha256: str
+
+
+class _Index(BaseModel):
+    """What is read of `INDEX_FILE`."""
+
+    shards: list[_ShardEntry]
+
+
 _Sample = tuple[str, dict[str, NDArray], dict[str, Any]]
 
 
@@ -36,7 +50,7 @@ class _TarShard:
     """A tar of ``NAME.KEY.npy`` and ``NAME.json``; the same samples give the same bytes."""
 
     def __init__(self, path: Path) -> None:
-        self._file = tarfile.open(path, "w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115
+        self._file = tarfile.open(path, "w", format=tarfile.PAX_FORMAT)  # noqa: SIM115
         self.bytes = 0
 
     def add(self, sample: _Sample) -> None:
@@ -89,7 +103,8 @@ def pack_benchmark(
 ) -> int:
     """Write all samples of a benchmark (`samples`) into shards of each split: ``train-000000.tar``, …
 
-    A shard appears at the target when all of it is written, and ``index.json`` comes last: with it the set is whole.
+    A folder appears whole or not at all. At an address a shard appears when all of it is written, and ``index.json``
+    comes last: with it the set is whole. After an error no shard is left there.
 
     Parameters
     ----------
@@ -118,11 +133,9 @@ def pack_benchmark(
     if not 0 < shard_mb < float("inf"):
         raise RangeError("shard_mb", shard_mb, "a size above 0, MB")
     benchmark, store = Benchmark(root), store_of(target)
-    if store.has(INDEX_FILE) and not overwrite:
-        raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
     shards: list[dict[str, Any]] = []
     total, done = len(benchmark.manifest["clips"]), 0
-    with tempfile.TemporaryDirectory() as folder:
+    with store.writing(INDEX_FILE, overwrite) as put, tempfile.TemporaryDirectory() as folder:
         for split in SPLITS:
             clips = list(benchmark.clips(split))
 
@@ -134,19 +147,19 @@ def pack_benchmark(
                     if progress is not None:
                         progress(done, total, "clips")
 
-            shards += _write_split(split, made(), store, Path(folder), format, shard_mb * 1e6)
+            shards += _write_split(split, made(), put, Path(folder), format, shard_mb * 1e6)
         index = {
             "schema_version": _SCHEMA, "benchmark": benchmark.manifest["name"], "digest": digest_of(benchmark),
             "format": format, "shards": shards,
         }  # fmt: skip
         file = Path(folder) / INDEX_FILE
         file.write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
-        store.put(INDEX_FILE, file)
+        put(INDEX_FILE, file)
     return sum(shard["samples"] for shard in shards)
 
 
 def _write_split(
-    split: str, given: Iterator[_Sample], store: Store, folder: Path, format: str, most_bytes: float
+    split: str, given: Iterator[_Sample], put: Put, folder: Path, format: str, most_bytes: float
 ) -> list[dict[str, Any]]:
     """Write the shards of a split; returns their entries of the index."""
     found: list[dict[str, Any]] = []
@@ -162,7 +175,7 @@ def _write_split(
                 sample = next(given, None)
         finally:
             shard.close()
-        store.put(name, path)
+        put(name, path)
         found.append({
             "name": name, "split": split, "samples": count, "bytes": path.stat().st_size, "sha256": file_hash(path),
         })  # fmt: skip
@@ -188,19 +201,17 @@ def verify_shards(target: str | Path, progress: Progress | None = None) -> list[
         If there is no finished set.
     """
     store = store_of(target)
-    with reading(str(target), "as shards"):
-        index = json.loads(b"".join(store.blocks(INDEX_FILE)))
-        shards = [(str(entry["name"]), str(entry["sha256"])) for entry in index["shards"]]
+    index = parsed_json(b"".join(store.blocks(INDEX_FILE)), _Index, f"{target}/{INDEX_FILE}")
     problems = []
-    for done, (name, expected) in enumerate(shards):
+    for done, shard in enumerate(index["shards"]):
         try:
             digest = hashlib.sha256()
-            for block in store.blocks(name):
+            for block in store.blocks(shard["name"]):
                 digest.update(block)
-            if digest.hexdigest() != expected:
-                problems.append(f"{name}: was changed")
+            if digest.hexdigest() != shard["sha256"]:
+                problems.append(f"{shard['name']}: was changed")
         except SpecError:
-            problems.append(f"{name}: is missing")
+            problems.append(f"{shard['name']}: is missing")
         if progress is not None:
-            progress(done + 1, len(shards), "shards")
+            progress(done + 1, len(index["shards"]), "shards")
     return problems

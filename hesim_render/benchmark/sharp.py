@@ -6,15 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.backend import jit
-from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import reading
-from hesim_render.core.hdf5 import COMPRESSION, new_file
+from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
 from hesim_render.core.units import S_PER_US
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import FluxSource
@@ -120,10 +117,7 @@ class SharpImages:
     path: Path
 
     def _read(self, name: str, number: int | None = None) -> NDArray:
-        with reading(self.path, "as sharp images"), h5py.File(self.path, "r") as file:
-            if name not in file:
-                raise SpecError(f"has no {name}", file=self.path)
-            return file[name][()] if number is None else file[name][number]
+        return read_dataset(self.path, "as sharp images", name, number)
 
     @property
     def time_us(self) -> NDArray[np.float64]:

@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from hesim_render.core.errors import OutputError, SpecError
-from hesim_render.core.guard import leads_out
-from hesim_render.core.output import output_errors, replacing
+from hesim_render.core.guard import inside
+from hesim_render.core.names import file_name, require_file_name
+from hesim_render.core.output import OutputFolder, output_errors
 
 _BLOCK = 1 << 20
+#: Copies a local file to a name.
+Put = Callable[[str, Path], None]
 
 
 class Store(Protocol):
-    """Files by name, with ``/`` between folders. A file appears whole or not at all."""
+    """A set of files by name (`file_name`), of which one, the marker, says that the set is whole."""
 
-    def put(self, name: str, file: Path) -> None:
-        """Copy a local file to a name; it replaces what is there."""
+    def writing(self, marker: str, overwrite: bool) -> AbstractContextManager[Put]:
+        """A function that copies a local file to a name, to be used in a with statement; the marker comes last.
+
+        After an error nothing of the new set is left.
+
+        Raises
+        ------
+        OutputError
+            If there is a set and `overwrite` is False, or it cannot be written.
+        """
         ...
 
     def blocks(self, name: str) -> Iterator[bytes]:
@@ -31,36 +43,35 @@ class Store(Protocol):
         """
         ...
 
-    def has(self, name: str) -> bool:
-        """True if there is a file of that name."""
-        ...
-
 
 class FolderStore:
-    """A folder of this machine.
+    """A folder of this machine, which appears whole or not at all.
 
     Parameters
     ----------
-    root : the folder; it is made when the first file comes.
+    root : the folder.
     """
 
     def __init__(self, root: Path) -> None:
         self._root = root.expanduser().resolve()
 
-    def _path(self, name: str) -> Path:
-        if leads_out(self._root, name):
-            raise SpecError(f"{name!r} leads out of the folder", file=self._root)
-        return self._root / name
+    @contextmanager
+    def writing(self, marker: str, overwrite: bool) -> Iterator[Put]:
+        folder = OutputFolder(self._root, marker, overwrite)
 
-    def put(self, name: str, file: Path) -> None:
-        with replacing(self._path(name)) as unfinished:
-            shutil.copyfile(file, unfinished)
+        def put(name: str, file: Path) -> None:
+            with output_errors(folder.target):
+                shutil.copyfile(file, folder.path / file_name(name))
 
-    def has(self, name: str) -> bool:
-        return self._path(name).is_file()
+        try:
+            yield put
+            folder.commit()
+        except BaseException:
+            folder.discard()
+            raise
 
     def blocks(self, name: str) -> Iterator[bytes]:
-        path = self._path(name)
+        path = inside(self._root, require_file_name(name, self._root))
         try:
             with path.open("rb") as file:
                 while block := file.read(_BLOCK):
@@ -94,21 +105,35 @@ class RemoteStore:
             raise OutputError(f"{address}: {error}") from None
 
     def _path(self, name: str) -> str:
-        if ".." in Path(name).parts or name.startswith("/"):
-            raise SpecError(f"{name!r} leads out of the folder", file=self._address)
-        return f"{self._root.rstrip('/')}/{name}"
+        return f"{self._root.rstrip('/')}/{require_file_name(name, self._address)}"
 
-    def put(self, name: str, file: Path) -> None:
-        path = self._path(name)
-        unfinished = f"{path}.partial"
-        with _told(self._address):
-            self._system.makedirs(path.rpartition("/")[0], exist_ok=True)
-            self._system.put_file(str(file), unfinished)
-            self._system.mv(unfinished, path)  # object stores show an object when all of it is there, others do not
+    @contextmanager
+    def writing(self, marker: str, overwrite: bool) -> Iterator[Put]:
+        made: list[str] = []
 
-    def has(self, name: str) -> bool:
+        def put(name: str, file: Path) -> None:
+            path = self._path(name)
+            unfinished = f"{path}.partial"
+            with _told(self._address):
+                made.append(unfinished)
+                self._system.makedirs(path.rpartition("/")[0], exist_ok=True)
+                self._system.put_file(str(file), unfinished)
+                made.append(path)
+                self._system.mv(unfinished, path)  # object stores show an object when all of it is there, others do not
+
         with _told(self._address):
-            return bool(self._system.isfile(self._path(name)))
+            if self._system.isfile(self._path(marker)):
+                if not overwrite:
+                    told = "exists; give another name, or overwrite it (--overwrite, overwrite=True)"
+                    raise OutputError(f"{self._address}: {told}")
+                self._system.rm_file(self._path(marker))  # the set is no longer whole
+        try:
+            yield put
+        except BaseException:
+            for path in made:
+                with suppress(Exception):  # of any kind, as each system has its own
+                    self._system.rm_file(path)
+            raise
 
     def blocks(self, name: str) -> Iterator[bytes]:
         try:

@@ -228,7 +228,7 @@ class ClipTasks:
                 continue
             truth, valid = sharp.flux_e_per_s(nearest), self._development.layout.aps_mask
             exposures = [flux_of(frame.raw, frame.exposure_us, aps, self._clip.recording.mosaic) for frame in frames]
-            found: dict[str, NDArray] = {"shortest": exposures[0][0], "longest": exposures[-1][0]}
+            found: dict[str, NDArray] = {"shortest": exposures[0].flux, "longest": exposures[-1].flux}
             found["merge"] = merged(exposures)
             found |= self._predicted("hdr", number, truth.shape)
             for name, flux in found.items():

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.events import voxel_grid
+from hesim_render.mosaic.description import Mosaic
 
 try:
     import torch
@@ -22,13 +24,26 @@ Task = Literal["deblur", "interpolate"]
 _NEIGHBOURS = {"deblur": (0, 0), "interpolate": (1, 1)}
 
 
+def signal_of(raw: NDArray, valid: NDArray[np.bool_], mosaic: Mosaic) -> NDArray[np.float32]:
+    """RAW with black at 0 and full scale at 1, not clipped; 0 where there is no value.
+
+    Parameters
+    ----------
+    raw, valid : [row, col], DN and the pixels that give values.
+    mosaic : levels.
+    """
+    span = 2**mosaic.bit_depth - 1 - mosaic.black_level_dn
+    return np.where(valid, (raw.astype(np.float32) - mosaic.black_level_dn) / span, 0).astype(np.float32)
+
+
 class BenchmarkDataset(_Dataset):
     """Frames of a benchmark with their events and their sharp images, as tensors of RAW.
 
-    An item of ``deblur`` is one frame: ``frame`` float32 [1, row, col] in [0, 1] (black to full scale), ``sharp`` of
-    the same shape (the nearest sharp image to the middle of the exposure), ``valid`` bool [1, row, col] and ``voxels``
-    float32 [bin, y, x] of the events of the exposure. An item of ``interpolate`` is a frame k with a neighbour on each
-    side: ``before`` and ``after``, ``sharp`` of frame k, and the voxels from the middle of one neighbour to that of the
+    An item of ``deblur`` is one frame: ``frame`` float32 [1, row, col] (0 is black, 1 full scale; noise below black is
+    kept, so that dark frames have the mean of their light, and pixels without a value are 0), ``sharp`` of the same
+    shape (the nearest sharp image to the middle of the exposure), ``valid`` bool [1, row, col] and ``voxels`` float32
+    [bin, y, x] of the events of the exposure. An item of ``interpolate`` is a frame k with a neighbour on each side:
+    ``before`` and ``after``, ``sharp`` of frame k, and the voxels from the middle of one neighbour to that of the
     other. Both have ``clip`` (name), ``index`` (number of the frame) and ``t_us`` of the sharp image.
 
     Parameters
@@ -80,17 +95,14 @@ class BenchmarkDataset(_Dataset):
         clip = BenchmarkClip(self._clips[number].folder)
         recording, sharp = clip.recording, clip.sharp
         assert sharp is not None
-        mosaic = recording.mosaic
-        span = 2**mosaic.bit_depth - 1 - mosaic.black_level_dn
+        frame = recording.frames[k]
 
-        def signal(raw: np.ndarray) -> Any:
-            values = np.clip((raw.astype(np.float32) - mosaic.black_level_dn) / span, 0, 1).astype(np.float32)
-            return torch.from_numpy(values)[None]
+        def signal(raw: NDArray) -> Any:
+            return torch.from_numpy(signal_of(raw, frame.valid, recording.mosaic))[None]
 
         def middle(frame: Any) -> float:
             return frame.exposure_start_us + frame.exposure_us / 2
 
-        frame = recording.frames[k]
         nearest = sharp.nearest(middle(frame))
         found: dict[str, Any] = {"clip": clip.name, "index": k, "t_us": float(sharp.time_us[nearest])}
         found["sharp"] = signal(sharp.raw_dn(nearest))

@@ -102,7 +102,7 @@ def _files(folder: Path, files: dict[str, dict[str, object]]) -> list[str]:
             problems.append(f"{name}: is missing")
         elif path.stat().st_size != entry["bytes"] or file_hash(path) != entry["sha256"]:
             problems.append(f"{name}: was changed")
-    present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
     return problems + [f"{name}: is not in the manifest" for name in sorted(present - set(files) - {CLIP_FILE})]
 
 

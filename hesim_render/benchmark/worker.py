@@ -5,6 +5,7 @@ A worker of dask calls `attempt`. Errors travel as text, because exceptions with
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
@@ -92,7 +93,14 @@ def _stop(*_: object) -> None:
 
 
 def main() -> None:
-    """Do units of work until the standard input ends."""
+    """Do units of work until the standard input ends, or nobody reads the answers any more."""
+    with contextlib.suppress(BrokenPipeError):
+        _work()
+    discard_unfinished()
+    os._exit(0)  # an orphan has nobody to tell what Python may find at its end
+
+
+def _work() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print is no answer
     signal.signal(signal.SIGTERM, _stop)

@@ -297,7 +297,11 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
         "illuminant": illuminant,
         "roi": {"x": layout.col0, "y": layout.row0, "width_px": layout.cols, "height_px": layout.rows},
     }
+    if bench.aps is not None:
+        content["frame_rate_hz"] = bench.aps.spec.frame_rate_hz
     if bench.evs is not None:
+        if bench.evs.spec.reference == "previous_sample":
+            content["tick_us"] = bench.evs.spec.tick_us
         reference = bench.evs.spec.signal_reference
         if bench.evs.spec.threshold_hardware_v is not None:
             content["theta_hardware_v"] = bench.evs.spec.threshold_hardware_v

@@ -175,7 +175,7 @@ class TrialBench:
         """Which pixels were calm while settling, the time bin of each one's first event (−1: none), its polarity."""
         # waits for leak events begin with the stage: each needs its own seed
         seed, start_us = (self.seed + _SEEDS_APART * self.count) % 2**64, self.t_us
-        stage = EvsStage(self.noise, seed, defects=self._defects)
+        stage = EvsStage(self.noise, seed, defects=self._defects, is_reset=True)
         self.count += 1
         step_us = start_us + plan.settle_us
         end_us = step_us + int(plan.edges_us[-1])

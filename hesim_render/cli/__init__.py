@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from hesim_render.cli.exit_status import ExitStatus
@@ -14,6 +16,9 @@ from hesim_render.cli.interrupts import Interrupts
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
 from hesim_render.core.output import discard_unfinished
+
+#: What Dr.Jit says.
+_OUT_OF_MEMORY = "out of memory"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,6 +37,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if arguments is None:
                 _leave_at_once()
     sys.exit(status)
+
+
+def _is_of_stdout(error: OSError) -> bool:
+    """True if an error came from printing: the innermost of our own functions is one that prints."""
+    own = Path(__file__).parents[1]
+    files = [Path(frame.f_code.co_filename) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    inner = [file for file in files if file.is_relative_to(own)]
+    return not inner or inner[-1] in (Path(__file__), Path(__file__).with_name("terminal.py"))
 
 
 def _leave_at_once() -> None:
@@ -82,7 +95,11 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
             complain(error.format_message().replace("Value error, ", ""))
         elif isinstance(error, OSError):
             silence_stdout()
-            complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+            where = error.filename or ("standard output" if _is_of_stdout(error) else "a file cannot be written")
+            complain(f"{where}: {error.strerror or error}")
+        elif isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _OUT_OF_MEMORY in str(error)):
+            said = (str(error).splitlines() or [""])[0][:200]
+            complain(f"not enough memory{f' ({said})' if said else ''}; a smaller region (--roi) or file needs less")
         else:
             raise
         return ExitStatus.REFUSED

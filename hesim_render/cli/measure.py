@@ -51,6 +51,12 @@ def measure(
     if out is not None:
         free_place(out, overwrite)
     found = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
+    if signal is SignalKind.raw:
+        say("of RAW values, noise included")
+    else:
+        say("of the noise-free electrons of the truth, which no camera gives")
+    if found.clipped:
+        say("CLIPPED: RAW values of this part are saturated, and the electrons are not; use less light or exposure")
     for frequency in (0.125, 0.25, 0.5):
         value = found.mtf[abs(found.frequency_cy_per_px - frequency).argmin()]
         say(f"MTF at {frequency:g} cycles per pixel: {value:.3f}")

@@ -15,8 +15,10 @@ from hesim_render.core.output import check_target
 
 #: Columns of the summary on the terminal.
 _SHOWN = {
-    "filter_set": "filter set", "delta_e_mean": "ΔE2000", "smi": "SMI", "vora": "Vora", "noise_amplification": "ampl.",
-    "ysnr": "YSNR", "snr10_lux": "SNR10 lx", "event_contrast_on": "event contrast", "event_seen": "steps seen",
+    "filter_set": "filter set", "ysnr_noise_aware": "YSNR noise-aware", "snr10_lux_noise_aware": "SNR10 lx noise-aware",
+    "delta_e_mean_noise_aware": "ΔE2000 noise-aware", "white_saturation": "white / saturation",
+    "ysnr": "YSNR noise-free matrix", "delta_e_mean": "ΔE2000 noise-free", "smi": "SMI", "vora": "Vora",
+    "event_contrast_on": "event contrast", "event_seen": "steps seen",
 }  # fmt: skip
 #: Most rows of the summary.
 _MOST = 40
@@ -59,6 +61,7 @@ def study(
     if surfaces:
         keys["surfaces"] = [surfaces_of(text) for text in surfaces]
     chosen = read_study(spec, keys)
+    from hesim_render.studies.headings import NOTE, level_text
     from hesim_render.studies.run import MARKER
 
     check_target(out, MARKER, overwrite)
@@ -72,7 +75,10 @@ def study(
     varied = [name for name in every if len({row[name] for row in table}) > 1]
     lines = [[*varied, *shown.values()]]
     for row in list(table)[:_MOST]:
-        lines.append([_text(row[name]) for name in (*varied, *shown)])
+        cells = {name: _text(row[name]) for name in (*varied, *shown)}
+        if "white_saturation" in cells:
+            cells["white_saturation"] = level_text(row, cells["white_saturation"])
+        lines.append(list(cells.values()))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     told.text(
         "\n".join(
@@ -81,6 +87,8 @@ def study(
     )
     if len(table) > _MOST:
         told.text(f"and {len(table) - _MOST} more rows")
+    if "ysnr_noise_aware" in shown:
+        told.text(NOTE)
     told.result(
         f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}",
         {"results": out / "results.csv", "report": out / "report.html", "rows": list(table)},
@@ -104,13 +112,17 @@ def _design(told: Told, spec: str, out: Path, keys: dict[str, Any], overwrite: b
     costs = found.result.costs
     told.text(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
     for verdict in found.verdicts:
-        ratios = ", ".join(
-            f"{value:.3f} at {key.split('_')[2]} lx" for key, value in verdict.items() if key.startswith("ysnr_ratio")
+        aware, free = (
+            ", ".join(
+                f"{value:.3f} at {key.split('_')[-2]} lx" for key, value in verdict.items() if key.startswith(start)
+            )
+            for start in ("ysnr_noise_aware_ratio", "ysnr_ratio")
         )
         told.text(
             f"against {verdict['against']}: cost {verdict['cost']:.3f} in place of {verdict['cost_against']:.3f} "
-            f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), mean ΔE2000 "
-            f"{verdict['delta_e_mean']:.3f} in place of {verdict['delta_e_mean_against']:.3f}, YSNR times {ratios}"
+            f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), noise-aware "
+            f"YSNR times {aware}; noise-free: mean ΔE2000 {verdict['delta_e_mean']:.3f} in place of "
+            f"{verdict['delta_e_mean_against']:.3f}, YSNR with the matrix of colour times {free}"
         )
     told.result(
         f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",

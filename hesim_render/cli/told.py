@@ -14,6 +14,7 @@ import typer
 
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.terminal import say
+from hesim_render.core.guard import printable
 from hesim_render.core.progress import ProgressReport, progress_report, silent_report
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class Told:
     def text(self, text: str) -> None:
         """Print a line for people."""
         if text and not (self.quiet or self.as_json):
-            say(text)
+            say("\n".join(map(printable, text.split("\n"))))
 
     def estimated(self, progress: ProgressReport) -> Callable[[object], None]:
         """A function that takes the estimate of a run: prints it, keeps it for the result, and ends a dry run."""
@@ -77,7 +78,7 @@ class Told:
         self.text(text)
         if self.as_json:
             known = {} if self._estimate is None else {"estimate": self._estimate}
-            say(json.dumps(_plain({"status": int(status), **known, **facts}), ensure_ascii=False, indent=2))
+            say(json.dumps(_plain({"status": int(status), **known, **facts}), indent=2))
         if status:
             raise typer.Exit(int(status))
 

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hesim_render.core.child import child_environment, python_command
 from hesim_render.core.errors import BackendError
 from hesim_render.core.interrupts import interrupts_held
 
@@ -141,7 +142,7 @@ def candidates() -> list[Candidate]:
     if forced not in ("", "llvm", "cuda"):
         raise BackendError(f"{BACKEND_VARIABLE} is {forced!r}; expected 'llvm' or 'cuda'")
     found: list[Candidate] = []
-    if forced != "llvm" and ctypes.util.find_library("cuda"):
+    if forced != "llvm" and _has_cuda():
         found.append(Candidate("cuda", "GPU", ""))
     if forced != "cuda":
         given = os.environ.get("DRJIT_LIBLLVM_PATH")
@@ -153,6 +154,13 @@ def candidates() -> list[Candidate]:
         if extra:
             found.append(Candidate("llvm", "'llvm' extra", extra[0], extra[1]))
     return found
+
+
+def _has_cuda() -> bool:
+    try:
+        return ctypes.util.find_library("cuda") is not None
+    except OSError:  # it may write a temporary file, for which there may be no place
+        return False
 
 
 def _cache_file() -> Path:
@@ -179,8 +187,8 @@ def probe(candidate: Candidate) -> Candidate:
     """Run a kernel with `candidate` in a child process, and return the candidate with the result."""
     if candidate.path and not os.path.exists(candidate.path):
         return Candidate(**{**candidate.__dict__, "reason": "no such file"})
-    command = [sys.executable, "-c", _PROBE, candidate.backend, candidate.path, *candidate.preload]
-    environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
+    command = python_command(_PROBE, candidate.backend, candidate.path, *candidate.preload)
+    environment = {k: v for k, v in child_environment().items() if k != "DRJIT_LIBLLVM_PATH"}
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
     except (OSError, subprocess.TimeoutExpired) as error:

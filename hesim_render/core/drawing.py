@@ -15,6 +15,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.core.guard import printable
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -114,6 +116,10 @@ def svg(figure: Figure) -> str:
 
     The element needs no other file. Call this function within `report_style`, as all drawing functions.
     """
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):  # not all characters can stand in XML
+        text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
     stream = io.BytesIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     figure.savefig(stream, format="svg", metadata=nothing)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +19,7 @@ from hesim_render.core.errors import HesimError, SpecError
 MOST_BYTES = 1 << 31
 #: Pixels of the largest frame.
 MOST_PIXELS = 1 << 28
-#: Largest text file (YAML, JSON); as Python objects it takes about a hundred times as much memory.
+#: Largest text file.
 MOST_TEXT_BYTES = 64 << 20
 #: Part of the machine's memory that one file may use.
 _SHARE_OF_MEMORY = 0.5
@@ -32,9 +33,11 @@ def reading(file: str | Path, what: str = "") -> Iterator[None]:
 
     Parameters
     ----------
-    file : the file.
+    file : the file; what is neither a file nor a folder is refused before it is opened, because a pipe would be waited
+        for without end.
     what : how the file was read (``as events``).
     """
+    require_plain(file)
     try:
         yield
     except HesimError:
@@ -45,6 +48,26 @@ def reading(file: str | Path, what: str = "") -> Iterator[None]:
         raise SpecError("is nested too deeply", file=file) from None
     except Exception as error:
         raise SpecError(" ".join(filter(None, ("cannot be read", what, f"({reason(error)})"))), file=file) from None
+
+
+def require_plain(file: str | Path, key: str | None = None) -> None:
+    """Refuse a pipe, a socket or a device; what is missing is left to the reader.
+
+    Parameters
+    ----------
+    file, key : the file, and the key that names it, for the error.
+
+    Raises
+    ------
+    SpecError
+        If it is one.
+    """
+    try:
+        mode = os.stat(file).st_mode
+    except (OSError, ValueError):
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise SpecError("is a pipe or a device, and no file", file=file, key=key)
 
 
 def reason(error: BaseException) -> str:
@@ -106,8 +129,51 @@ def require_memory(size_bytes: int, what: str, file: str | Path, most: int | Non
         )
 
 
-def read_text(file: Path) -> str:
+def require_file_size(file: Path, most_bytes: int = MOST_BYTES) -> None:
+    """Refuse a file that is larger than what its reader takes, which reads it whole.
+
+    Parameters
+    ----------
+    file : the file.
+    most_bytes : largest size, bytes.
+
+    Raises
+    ------
+    SpecError
+        If it is larger.
+    """
+    with reading(file):
+        size = file.stat().st_size
+    if size > most_bytes:
+        raise SpecError(f"holds {size / 1e6:.0f} MB; such a file holds at most {most_bytes / 1e6:.0f}", file=file)
+
+
+def require_picture(width: int, height: int, pixel_bytes: int, file: str | Path) -> None:
+    """Refuse a picture by the size that its header states.
+
+    Parameters
+    ----------
+    width, height : its size, px.
+    pixel_bytes : memory that a pixel takes while the picture is read, bytes.
+    file : the file, for the error.
+
+    Raises
+    ------
+    SpecError
+        If it has more than `MOST_PIXELS`, or would not fit into memory.
+    """
+    if width * height > MOST_PIXELS:
+        raise SpecError(f"has {width}x{height} px; a picture has at most {MOST_PIXELS} px", file=file)
+    require_memory(pixel_bytes * width * height, "the picture", file)
+
+
+def read_text(file: Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
     """Read a UTF-8 text file of reasonable size.
+
+    Parameters
+    ----------
+    file : the file.
+    most_bytes : largest size, bytes.
 
     Raises
     ------
@@ -116,7 +182,7 @@ def read_text(file: Path) -> str:
     """
     with reading(file):
         size = file.stat().st_size
-        if size > MOST_TEXT_BYTES:
+        if size > most_bytes:
             raise SpecError(f"holds {size / 1e6:.0f} MB; such files are small", file=file)
         try:
             return file.read_text(encoding="utf-8")

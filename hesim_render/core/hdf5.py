@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,14 @@ from typing import Any
 import h5py
 import hdf5plugin
 
-from hesim_render.core.errors import SpecError
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.guard import MOST_BYTES, reading, require_memory
 
 #: HDF5 filters that may be needed to read: deflate, shuffle, fletcher32, LZF, Blosc.
 _FILTERS = {1, 2, 3, 32000, 32001}
 LARGEST_CHUNK_BYTES = 1 << 26
+#: Largest chunk of pictures and cubes of others, bytes.
+_LARGEST_CHUNK = 1 << 28
 #: How data sets are packed.
 COMPRESSION = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
 _KINDS = {"ui": "whole numbers"}
@@ -111,7 +115,38 @@ def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui") -> Any:
     layout = found.id.get_create_plist()
     if found.is_virtual or layout.get_external_count():
         raise SpecError(f"{name} has its values in another file", file=path)
+    if found.chunks is not None:  # one is read whole, whatever part of it is asked for
+        require_memory(math.prod(found.chunks) * found.dtype.itemsize, f"a chunk of {name}", path, _LARGEST_CHUNK)
     for k in range(layout.get_nfilters()):
         if (used := layout.get_filter(k)[0]) not in _FILTERS:
             raise SpecError(f"{name} is packed by filter {used}; expected one of {sorted(_FILTERS)}", file=path)
     return found
+
+
+def read_dataset(path: Path, what: str, name: str, number: int | None = None, kinds: str = "fui") -> Any:
+    """The values of a data set (`dataset_of`), or of one entry of it.
+
+    Parameters
+    ----------
+    path : the file.
+    what : how it is read (``as truth``), for errors.
+    name : of the data set.
+    number : of the entry; None reads all.
+    kinds : NumPy's letters of the kinds that it may hold.
+
+    Raises
+    ------
+    RangeError
+        If there is no such entry.
+    SpecError
+        If the file cannot be read, has no such data set, or it is too large.
+    """
+    with reading(path, what), h5py.File(path, "r") as file:
+        if name not in file:
+            raise SpecError(f"has no {name}", file=path)
+        found = dataset_of(file, name, path, kinds)
+        if number is not None and not 0 <= number < (found.shape or (0,))[0]:
+            raise RangeError("number", number, f"0 to {(found.shape or (0,))[0] - 1}")
+        shape = found.shape if number is None else found.shape[1:]
+        require_memory(math.prod(shape) * found.dtype.itemsize, name, path, MOST_BYTES)
+        return found[()] if number is None else found[number]

@@ -184,7 +184,15 @@ def output_errors(target: Path) -> Iterator[None]:
     except HesimError:
         raise
     except (OSError, RuntimeError) as error:
-        raise OutputError(f"{target}: cannot be written ({_reason(error)})") from None
+        raise OutputError(f"{_final(target)}: cannot be written ({_reason(error)})") from None
+
+
+def _final(path: Path) -> Path:
+    """The place that a file will have: temporary names mean nothing to a user."""
+    for unfinished, target in _unfinished.items():
+        if path.is_relative_to(unfinished):
+            return target / path.relative_to(unfinished)
+    return path
 
 
 def _reason(error: Exception) -> str:

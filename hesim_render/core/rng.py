@@ -44,6 +44,7 @@ class Stream(IntEnum):
     TELEGRAPH = 50
     TELEGRAPH_SHARE = 51
     TELEGRAPH_AMPLITUDE = 52
+    EVENT_START = 53
     IMU = 60
     RENDER_GLARE = 61
     RENDER_EDGE = 62

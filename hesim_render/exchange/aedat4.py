@@ -42,7 +42,9 @@ _ENTRY = np.dtype([
 _ENTRY_FIELDS = (14, 44, 12, 4, 20, 28, 36)
 _LZ4, _UNPACKED = (1, 2), 0
 _ZSTD = (3, 4)
-_LARGEST_PACKET = 1 << 30
+_PIECE = 1 << 20
+#: Largest packet, 8 million events; cameras send packets of some ms.
+_LARGEST_PACKET = 1 << 27
 
 _INFO = """<dv version="2.0">
     <node name="outInfo" path="/outInfo/">
@@ -122,7 +124,7 @@ def _table(entries: NDArray) -> bytes:
     fields = struct.pack(f"<{len(_ENTRY_FIELDS)}H", *_ENTRY_FIELDS)
     at = len(head) + 4 * entries.size  # place of the fields' description, from behind the size
     first = at + len(fields)
-    first += (4 - first) % 8  # numbers of 8 bytes begin 12, 20, … bytes after it
+    first += -first % 8  # numbers of 8 bytes begin 12, 20, … bytes after it, where the size in front counts as well
     place = first + _ENTRY.itemsize * np.arange(entries.size)
     entries["fields"] = place - at
     offsets = (place - (len(head) + 4 * np.arange(entries.size))).astype("<u4")
@@ -213,12 +215,15 @@ def _unpacked(content: bytes, compression: int, path: Path) -> bytes:
         import zstandard
 
         # a frame that ends early gives too few bytes, which the reader of the packet finds
-        found = zstandard.ZstdDecompressor().stream_reader(content).read(_LARGEST_PACKET + 1)
-        whole = len(found) <= _LARGEST_PACKET
+        unpacker, parts, size = zstandard.ZstdDecompressor().stream_reader(content), list[bytes](), 0
+        while size <= _LARGEST_PACKET and (part := unpacker.read(_PIECE)):
+            parts.append(part)
+            size += len(part)
+        found, whole = b"".join(parts), size <= _LARGEST_PACKET
     else:
         raise SpecError(f"has the compression {compression}; expected 0 to 4", file=path)
     if not whole:
-        raise SpecError("a packet ends early, or is larger than 1 GiB", file=path)
+        raise SpecError(f"a packet ends early, or is larger than {_LARGEST_PACKET >> 20} MiB", file=path)
     return found
 
 

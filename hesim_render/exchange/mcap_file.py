@@ -7,7 +7,9 @@ and reads a packet as one array. The container is that of the package mcap.
 
 from __future__ import annotations
 
+import io
 import struct
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -27,6 +29,7 @@ _PACKET_US, _PACKET_EVENTS = 10_000, 1 << 16
 _LATEST_US = (1 << 31) * 1_000_000
 #: Most bytes that a compressed part of a file may unpack to. Writers make parts of 1 to 16 MB.
 _MOST_CHUNK_BYTES = 1 << 28
+_LONGEST_TOPIC = 1000
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 #: What follows x and y of an event: its time and polarity, and x and y of the next one.
 _BLOCK = np.dtype([("sec", "<i4"), ("nanosec", "<u4"), ("p", "u1"), ("pad", "u1"), ("x", "<u2"), ("y", "<u2"),
@@ -143,7 +146,6 @@ def read_header(path: Path) -> tuple[tuple[int, int], str]:
     SpecError
         If the file is no MCAP file, is damaged, has a part that unpacks to more than it says, or has no events.
     """
-    _check_chunks(path)
     for topic, data in _messages(path, None, _EVENT_TYPES):
         rows, cols, _, _ = _parts(data, path)
         return (rows, cols), topic
@@ -182,7 +184,6 @@ def holds(path: Path) -> tuple[bool, bool]:
     SpecError
         If the file is no MCAP file, or is damaged.
     """
-    _check_chunks(path)
     return tuple(next(_messages(path, None, kind), None) is not None for kind in (_EVENT_TYPES, _FRAME_TYPES))  # type: ignore[return-value]
 
 
@@ -194,7 +195,6 @@ def read_frames(path: Path) -> Iterator[tuple[int, NDArray[np.uint16], str]]:
     SpecError
         If the file is damaged, or an image is not of one grey or Bayer mosaic of 8 or 16 bits.
     """
-    _check_chunks(path)
     first: str | None = None
     for topic, data in _messages(path, None, _FRAME_TYPES):
         first = first or topic
@@ -247,59 +247,81 @@ def _parts(data: bytes, path: Path) -> tuple[int, int, int, int]:
     return rows, cols, count, place + 12
 
 
-def _check_chunks(path: Path) -> None:
-    """Refuse a file of a few kB that would unpack to many GB: the reader of the package unpacks whatever comes."""
+def _messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, bytes]]:
+    """Topic and content of the messages of a topic, or of all, whose type ends with `kind`, in the order of the file.
+
+    One part of the file is in memory at a time. The reader of the package sorts messages by their times, for which it
+    holds as many parts as say that they are of the same time, and believes their sizes.
+    """
+    from mcap.records import Channel, Message, Schema
+
+    fitting: set[int] = set()
+    topics: dict[int, str] = {}
+    for record in _records(path):
+        if isinstance(record, Schema):
+            if record.name.endswith(kind):
+                fitting.add(record.id)
+        elif isinstance(record, Channel):
+            if record.schema_id in fitting and topic in (None, record.topic):
+                if len(record.topic) > _LONGEST_TOPIC:
+                    raise SpecError(f"has a topic of {len(record.topic)} characters", file=path)
+                topics[record.id] = record.topic
+        elif isinstance(record, Message) and record.channel_id in topics:
+            yield topics[record.channel_id], record.data
+
+
+def _records(path: Path) -> Iterator[Any]:
+    """Schemas, channels and messages of a file, from its parts as well."""
     _require(path)
+    from mcap.data_stream import ReadDataStream
     from mcap.exceptions import McapError
-    from mcap.records import Chunk
+    from mcap.opcode import Opcode
+    from mcap.records import Channel, Chunk, Message, Schema
     from mcap.stream_reader import StreamReader
 
     with reading(path, "as an MCAP file"), path.open("rb") as file:
+        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_MOST_CHUNK_BYTES)
         try:
-            for record in StreamReader(file, emit_chunks=True, record_size_limit=_MOST_CHUNK_BYTES).records:
+            for record in reader.records:
                 if not isinstance(record, Chunk):
+                    yield record
                     continue
-                size = _unpacked_bytes(record)
-                if size > min(record.uncompressed_size, _MOST_CHUNK_BYTES):
-                    raise SpecError(
-                        f"has a part that unpacks to {size} bytes or more; expected {record.uncompressed_size}, as it"
-                        f" says, and at most {_MOST_CHUNK_BYTES}",
-                        file=path,
-                    )
+                stream, size = ReadDataStream(io.BytesIO(_content(record, path))), record.uncompressed_size
+                while stream.count < size:
+                    opcode, length = stream.read1(), stream.read8()
+                    if opcode == Opcode.MESSAGE:
+                        yield Message.read(stream, length)
+                    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                        yield (Schema if opcode == Opcode.SCHEMA else Channel).read(stream)
+                    else:
+                        stream.read(length)
         except McapError as error:
             raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None
 
 
-def _unpacked_bytes(chunk: Any) -> int:
-    """Size of a chunk's content; at least one byte above what it may hold if that is too much."""
+def _content(chunk: Any, path: Path) -> bytes:
+    """The content of a part, of the size that it says; a larger one is refused before it is unpacked."""
+    most = chunk.uncompressed_size
+    if most > _MOST_CHUNK_BYTES:
+        raise SpecError(f"has a part of {most} bytes; expected at most {_MOST_CHUNK_BYTES}", file=path)
     if chunk.compression == "zstd":
         import zstandard
 
-        # A frame that does not tell its size (-1) is refused by the reader itself.
-        return max(int(zstandard.frame_content_size(chunk.data)), 0)
-    if chunk.compression == "lz4":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(most + 1)
+    elif chunk.compression == "lz4":
         import lz4.frame
 
-        most = min(chunk.uncompressed_size, _MOST_CHUNK_BYTES)
-        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most + 1)
-        return max(int(lz4.frame.get_frame_info(chunk.data)["content_size"]), len(unpacked))
-    return len(chunk.data)
-
-
-def _messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, bytes]]:
-    """Topic and content of the messages of a topic, or of all, whose type ends with `kind`."""
-    _require(path)
-    from mcap.exceptions import McapError
-    from mcap.reader import make_reader
-
-    with reading(path, "as an MCAP file"), path.open("rb") as file:
-        try:
-            found: Any = make_reader(file, validate_crcs=True).iter_messages(topics=None if topic is None else [topic])
-            for schema, channel, message in found:
-                if schema is not None and schema.name.endswith(kind):
-                    yield channel.topic, message.data
-        except McapError as error:
-            raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most + 1)
+    elif chunk.compression == "":
+        data = chunk.data
+    else:
+        raise SpecError(f"has parts packed by {chunk.compression[:40]!r}; expected zstd or lz4", file=path)
+    if len(data) != most:
+        told = f"has a part that unpacks to {len(data)} bytes{' or more' if len(data) > most else ''}; it says {most}"
+        raise SpecError(told, file=path)
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise SpecError("has a part whose checksum is wrong; the file is damaged", file=path)
+    return data
 
 
 def _require(path: str | Path) -> None:

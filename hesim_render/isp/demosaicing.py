@@ -3,7 +3,8 @@
 The guide is the channel with most samples (green or white). It is predicted from the samples around a pixel, with the
 local priors of `guide`. Every other channel is a local linear function of the guide plus a residual, which is
 interpolated from the channel's own samples (residual interpolation, [kiku2013]). Ridge regression towards 1 gives the
-slope. All steps work on the square root of the signal, where the noise is uniform and edges overshoot less.
+slope. All steps work on the square root of the signal, where the noise is uniform and edges overshoot less; it is odd
+about black, so that a dark frame keeps its mean.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.isp import kriging
 from hesim_render.isp.blocks import BAND_BLOCKS, block_of, bordered, join, split
 from hesim_render.isp.guide import predict_guide
-from hesim_render.spectral.transfer import ROOT_TOE
+from hesim_render.spectral.transfer import from_root, to_root
 
 #: Ridge of the regression on the guide, square-root units squared.
 _RIDGE = 1e-3
@@ -65,7 +66,11 @@ def demosaic(raw: NDArray[np.float32], tile: ArrayLike, method: str = "guided") 
     for channel, estimate in enumerate(estimates):
         join(estimate, out[channel])
     if method != "linear":
-        in_bands(shape[0], lambda rows: _decode(out[:, rows]))
+
+        def decode(rows: slice) -> None:
+            out[:, rows] = from_root(out[:, rows])
+
+        in_bands(shape[0], decode)
     return np.moveaxis(out, 0, -1)
 
 
@@ -103,18 +108,10 @@ def _encoded(raw: NDArray) -> NDArray[np.float32]:
     out = np.empty(raw.shape, dtype=np.float32)
 
     def work(rows: slice) -> None:
-        np.add(raw[rows], np.float32(ROOT_TOE), out=out[rows])
-        np.maximum(out[rows], 0, out=out[rows])
-        np.sqrt(out[rows], out=out[rows])
+        out[rows] = to_root(np.asarray(raw[rows], dtype=np.float32))
 
     in_bands(raw.shape[0], work)
     return out
-
-
-def _decode(roots: NDArray[np.float32]) -> None:
-    np.maximum(roots, 0, out=roots)
-    np.multiply(roots, roots, out=roots)
-    roots -= np.float32(ROOT_TOE)
 
 
 def _targets(block: NDArray, channel: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError
-from hesim_render.spectral.transfer import ROOT_TOE
+from hesim_render.spectral.transfer import from_root, to_root
 
 
 def guided_filter(
@@ -52,7 +52,7 @@ def reduce_noise(
     """
     if min(luma, chroma) < 0:
         raise RangeError("luma, chroma", (luma, chroma), "0 or more")
-    root = np.sqrt(np.maximum(image + np.float32(ROOT_TOE), 0))
+    root = to_root(image)
     brightness = root.mean(axis=-1)
     clean = guided_filter(brightness, brightness, radius_px, luma**2) if luma > 0 else brightness
     out = np.empty((image.shape[2], *image.shape[:2]), dtype=np.float32)
@@ -60,5 +60,5 @@ def reduce_noise(
         difference = root[..., channel] - brightness
         if chroma > 0 and image.shape[2] > 1:
             difference = guided_filter(difference, clean, 2 * radius_px, chroma**2)
-        out[channel] = np.maximum(clean + difference, 0) ** 2 - np.float32(ROOT_TOE)
+        out[channel] = from_root(clean + difference)
     return np.moveaxis(out, 0, -1)

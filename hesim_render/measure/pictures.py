@@ -17,7 +17,7 @@ def psnr(picture: NDArray, truth: NDArray, peak: float = 1.0, valid: NDArray[np.
 
     Parameters
     ----------
-    picture, truth : of the same shape; both are clipped to [0, peak] first.
+    picture, truth : of the same shape; both are clipped at the peak, and not at black: noise below it counts.
     peak : largest value.
     valid : pixels that count; default all.
 
@@ -25,7 +25,7 @@ def psnr(picture: NDArray, truth: NDArray, peak: float = 1.0, valid: NDArray[np.
     -------
     dB; infinite for equal pictures.
     """
-    a, b = in_range(picture, truth, peak)
+    a, b = below_peak(picture, truth, peak)
     if valid is not None and not np.any(valid):
         raise RangeError("valid", 0, "at least one pixel that counts")
     square = (a - b) ** 2
@@ -41,7 +41,7 @@ def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
 
     Parameters
     ----------
-    picture, truth : [row, col] or [row, col, channel], at least 11 px on each side; clipped to [0, peak] first.
+    picture, truth : [row, col] or [row, col, channel], at least 11 px on each side; clipped at the peak.
     peak : largest value.
 
     Returns
@@ -50,7 +50,7 @@ def ssim(picture: NDArray, truth: NDArray, peak: float = 1.0) -> float:
     """
     from scipy.ndimage import gaussian_filter
 
-    a, b = in_range(picture, truth, peak)
+    a, b = below_peak(picture, truth, peak)
     if min(a.shape[:2]) < 11:
         raise RangeError("shape of the picture", a.shape, "11 px or more on each side, the window of SSIM")
     if a.ndim == 2:
@@ -72,19 +72,19 @@ def delta_e(picture: NDArray, truth: NDArray) -> float:
 
     Parameters
     ----------
-    picture, truth : [row, col, 3], linear sRGB in [0, 1].
+    picture, truth : [row, col, 3], linear sRGB; clipped at white, 1, and not at black.
 
     Returns
     -------
     ΔE₀₀, mean over pixels.
     """
-    a, b = in_range(picture, truth, 1.0)
+    a, b = below_peak(picture, truth, 1.0)
     return float(np.mean(delta_e_2000(a.reshape(-1, 3), b.reshape(-1, 3))))
 
 
-def in_range(picture: NDArray, truth: NDArray, peak: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two pictures of one shape, clipped to [0, peak]."""
+def below_peak(picture: NDArray, truth: NDArray, peak: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two pictures of one shape, clipped at the peak, where sensors saturate; noise below black stays."""
     if np.shape(picture) != np.shape(truth):
         raise RangeError("shape of the picture", np.shape(picture), f"that of the truth, {np.shape(truth)}")
-    a, b = (np.clip(np.asarray(image, dtype=np.float64), 0, peak) for image in (picture, truth))
+    a, b = (np.minimum(np.asarray(image, dtype=np.float64), peak) for image in (picture, truth))
     return a, b

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -78,6 +79,9 @@ def measure_mtf(
     part = np.s_[y : y + height, x : x + width]
     values = np.asarray(chosen.raw if signal == "raw" else chosen.electrons_mean, dtype=np.float64)[part]
     used = own[part]
-    if signal == "raw" and used.any() and values[used].max() >= mosaic.white_level_dn:
-        raise RangeError("raw", float(values[used].max()), "values below saturation; use less light or exposure")
-    return edge_response(values, used, frequency_cy_per_px=FREQUENCIES, oversampling=oversampling)
+    largest = float(chosen.raw[part][used].max(initial=0))
+    clipped = largest >= mosaic.white_level_dn
+    if signal == "raw" and clipped:
+        raise RangeError("raw", largest, "values below saturation; use less light or exposure")
+    found = edge_response(values, used, frequency_cy_per_px=FREQUENCIES, oversampling=oversampling)
+    return replace(found, clipped=clipped)

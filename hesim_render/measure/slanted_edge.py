@@ -47,6 +47,7 @@ class EdgeResponse:
     angle_deg : of the edge, clockwise from the vertical as seen, above -90 to 90.
     distance_px : [n], places between the knots, from the edge towards its light side.
     edge_spread : [n], the edge-spread function there, in the unit of the input.
+    clipped : RAW values of the region are saturated, and the response is that of noise-free electrons, which are not.
     """
 
     frequency_cy_per_px: NDArray[np.float64]
@@ -54,6 +55,7 @@ class EdgeResponse:
     angle_deg: float
     distance_px: NDArray[np.float64]
     edge_spread: NDArray[np.float64]
+    clipped: bool = False
 
     def frequency_at(self, level: float = 0.5) -> float:
         """Lowest frequency at which the response falls to a level, cycles per pixel.

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs.calibration import ASYNCHRONOUS_DEFECT_MAPS, DEFECT_MAPS, TELEGRAPH_MAPS, MeasuredMaps
+from hesim_render.specs.calibration import MeasuredMaps
+from hesim_render.specs.calibration_rates import PER_INTERVAL, PER_SECOND, per_second
 from hesim_render.specs.calibration_spec import Defect
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
@@ -19,6 +20,7 @@ _EXPECTED |= {
     "defect_firing_share": ("f", 1.0), "defect_correlation": ("f", 1.0),
     "defect_on_hz": ("f", 1e9), "defect_off_hz": ("f", 1e9), "defect_change_hz": ("f", 1e9),
     "telegraph_amplitude_dn": ("f", 65535.0), "telegraph_high_share": ("f", 1.0), "telegraph_correlation": ("f", 1.0),
+    "telegraph_change_hz": ("f", 1e9),
 }  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
 #: Maps that a calibration may lack: thresholds if no steps were shown; the others in older calibrations.
@@ -49,31 +51,35 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
 
 
 def telegraph_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
-    """``telegraph_amplitude_dn``, ``…_high_share`` and ``…_correlation`` [row, col] over the region; None if not
+    """``telegraph_amplitude_dn``, ``…_high_share`` and ``…_change_hz`` [row, col] over the region; None if not
     measured.
-
-    The correlation is that of the state from one frame to the next.
     """
-    return _if_there(layout, "aps", TELEGRAPH_MAPS, _frame_region)
+    return _misbehaving(layout, "aps", _frame_region)
 
 
 def event_defects(layout: Layout) -> dict[str, NDArray] | None:
-    """``defect`` (its kind) and its rates [y, x] over the region; None if not measured.
-
-    Rates are per comparison for sensors with fixed comparisons, in Hz for asynchronous ones.
-    """
-    evs = layout.spec.evs
-    names = ASYNCHRONOUS_DEFECT_MAPS if evs is not None and evs.reference == "last_event" else DEFECT_MAPS
-    return _if_there(layout, "evs", names, _event_region)
-
-
-def _if_there(layout: Layout, section: str, names: tuple[str, ...], cut: Callable) -> dict[str, NDArray] | None:
-    """Maps over the region, all of them or none."""
-    found = _read(layout, section, names)
-    return None if found is None or len(found[0]) < len(names) else cut(layout, found, names)
+    """``defect`` (its kind) and its rates in Hz [y, x] over the region; None if not measured."""
+    return _misbehaving(layout, "evs", _event_region)
 
 
 _Found = tuple[Mapping[str, NDArray], tuple[int, int]]
+
+
+def _misbehaving(
+    layout: Layout, section: str, cut: Callable[[Layout, _Found, tuple[str, ...]], dict[str, NDArray]]
+) -> dict[str, NDArray] | None:
+    """Maps of a section in Hz over the region, all of them or none."""
+    for names in (PER_SECOND[section], PER_INTERVAL[section]):
+        found = _read(layout, section, names)
+        if found is None or len(found[0]) < len(names):
+            continue
+        maps = cut(layout, found, names)
+        if names == PER_SECOND[section]:
+            return maps
+        assert layout.spec.noise is not None
+        # without an interval no pixel misbehaves: the calibration would have been refused
+        return per_second(section, maps, layout.spec.noise.measured.intervals_s[section] or 1.0)
+    return None
 
 
 def _frame_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict[str, NDArray]:

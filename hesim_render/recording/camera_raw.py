@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import HesimWarning, SpecError
-from hesim_render.core.guard import printable
+from hesim_render.core.guard import printable, require_picture, require_plain
 
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
@@ -22,6 +22,8 @@ CAMERA_SUFFIXES = (
 )
 #: Letters of the colour codes of DNG, as LibRaw names them.
 _LETTERS = "RGBCMYW"
+#: Memory of a pixel: its value and its colour, in the file's frame and in the region, bytes.
+_PIXEL_BYTES = 8
 #: Black levels further apart are told, DN.
 _NEAR_DN = 1.0
 
@@ -44,12 +46,14 @@ def read_camera_raw(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
         import rawpy
     except ImportError:
         raise SpecError("RAW files of cameras need rawpy: pip install 'hesim_render[raw]'", file=file) from None
+    require_plain(file)
     try:
         opened = rawpy.imread(str(file))
     except (rawpy.LibRawError, OSError) as error:
         told = printable(str(error.args[0] if error.args else error))
         raise SpecError(f"cannot be read as a RAW file of a camera ({told})", file=file) from None
     with opened as raw:
+        require_picture(raw.sizes.raw_width, raw.sizes.raw_height, _PIXEL_BYTES, file)
         try:
             visible = raw.raw_image_visible
         except (rawpy.LibRawError, RuntimeError):

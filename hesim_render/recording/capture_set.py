@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
 from hesim_render.core.npz import member_header, read_arrays, stream_member
+from hesim_render.core.units import S_PER_US
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import load_yaml, validate
 from hesim_render.specs.sensor import SensorSpec, read_sensor
@@ -36,6 +37,21 @@ class CaptureSet:
     folder: Path
     spec: CaptureSpec
     sensor: SensorSpec | None
+
+    @property
+    def interval_s(self) -> float | None:
+        """From one fixed comparison of event pixels to the next, s; None where neither file states it."""
+        tick_us = self.spec.tick_us
+        if tick_us is None and self.sensor is not None and self.sensor.evs is not None:
+            tick_us = self.sensor.evs.tick_us
+        return None if tick_us is None else tick_us * S_PER_US
+
+    @property
+    def frame_rate_hz(self) -> float | None:
+        """Frames per second within an exposure; None where neither file states it."""
+        if self.spec.frame_rate_hz is None and self.sensor is not None and self.sensor.aps is not None:
+            return self.sensor.aps.frame_rate_hz
+        return self.spec.frame_rate_hz
 
     def frames(self, name: Literal["aps_dark", "aps_lit"]) -> FrameStack:
         """The stack of frames in ``<name>.npz``, not yet read.

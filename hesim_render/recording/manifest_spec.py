@@ -18,6 +18,7 @@ from pydantic import (
 )
 
 from hesim_render.core.guard import MOST_PIXELS
+from hesim_render.core.names import PathBelow
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Region
@@ -159,13 +160,13 @@ class _Counts(Strict):
 
 
 class _FrameEntry(Strict):
-    index: NonNegativeInt
+    index: int = Field(ge=0, lt=10**9)
     t_us: int = Field(ge=0, le=2 * _LATEST_US)
     exposure_start_us: int = Field(ge=0, le=_LATEST_US)
     exposure_us: int = Field(gt=0, le=_LATEST_US)
     line_time_us: NonNegativeFloat
-    file: str
-    truth: str
+    file: PathBelow
+    truth: PathBelow
 
 
 class RecordingSpec(Strict):
@@ -195,6 +196,8 @@ class RecordingSpec(Strict):
             raise ValueError("event_grid: width and height are both 0 or neither")
         if self.event_grid.width * self.event_grid.height > MOST_PIXELS:
             raise ValueError(f"event_grid: more than {MOST_PIXELS} pixels, as no sensor has")
+        if len({frame.index for frame in self.frames}) != len(self.frames):
+            raise ValueError("frames: two have the same index")
         times = [frame.t_us for frame in self.frames]
         if any(later < earlier for earlier, later in pairwise(times)):
             raise ValueError("frames: are not in order of time")

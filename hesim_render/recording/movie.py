@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Pictures per second of the video, and time that one shows where there are no frames, µs.
 _FPS, _STEP_US = 25, 10_000
+#: Most pictures where there are no frames: four minutes of video. Those of a longer recording show longer times.
+_MOST_PICTURES = 6000
 _WIDEST_PX = 1280
 #: Constant quality of x264, where 0 is without loss.
 _QUALITY = "18"
@@ -25,6 +27,8 @@ _QUALITY = "18"
 
 def write_movie(recording: Recording, path: Path, kind: str) -> int:
     """Write an MP4 file (H.264) with a picture for each frame, or for each 10 ms where there are no frames.
+
+    Without frames there are at most 6000 pictures: those of a recording of more than a minute show longer times.
 
     The events of a picture are those since the one before. The video has 25 pictures a second, so a recording of 100
     frames a second plays four times as slow as it was.
@@ -70,7 +74,8 @@ def _pictures(recording: Recording, kind: str) -> Iterator[Picture]:
     if len(recording.frames):
         edges = [begin_us, *(entry["t_us"] for entry in recording.manifest["frames"])]
     else:
-        edges = [*range(begin_us, end_us, _STEP_US), end_us]
+        step_us = max(_STEP_US, -(-(end_us - begin_us) // _MOST_PICTURES))
+        edges = [*range(begin_us, end_us, step_us), end_us]
     black = black_picture(recording, _WIDEST_PX)
     for number, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
         picture = black

@@ -41,4 +41,9 @@ def noise_profile(sensor: Sensor, without: Sequence[str] = ()) -> tuple[float, f
     variance = np.array([float(model.variance_dn2(float(e), aps.exposure_us, adc=True)) for e in electrons]) / span**2
     (slope, offset), *_ = np.linalg.lstsq(np.stack([x, np.ones_like(x)], 1) / variance[:, None], np.ones(_SIGNALS),
                                           rcond=None)  # fmt: skip
-    return (float(slope), float(offset)) if slope > 0 and offset > 0 else None
+    return (_rounded(slope), _rounded(offset)) if slope > 0 and offset > 0 else None
+
+
+def _rounded(value: float) -> float:
+    """Six significant digits: the last ones of a fit depend on the build of NumPy, and with them the bytes of files."""
+    return float(f"{value:.6g}")

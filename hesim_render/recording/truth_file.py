@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
-from hesim_render.core.guard import MOST_BYTES, reading, require_memory
-from hesim_render.core.hdf5 import COMPRESSION, dataset_of, new_file
+from hesim_render.core.guard import reading
+from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
 from hesim_render.recording.truth_kinds import EVENTS, truth_kinds
 
 if TYPE_CHECKING:
@@ -258,13 +258,7 @@ class StoredTruth:
         """
         if name not in self.names:
             raise RangeError("name", name, f"one of {', '.join(self.names)}{did_you_mean(name, self.names)}")
-        with reading(self._path, "as truth"), h5py.File(self._path, "r") as file:
-            found = dataset_of(file, name, self._path, _NUMBERS)
-            if number is not None and not 0 <= number < found.shape[0]:
-                raise RangeError("number", number, f"0 to {found.shape[0] - 1}")
-            shape = found.shape if number is None else found.shape[1:]
-            require_memory(int(np.prod(shape)) * found.dtype.itemsize, name, self._path, MOST_BYTES)
-            values = found[()] if number is None else found[number]
+        values = read_dataset(self._path, "as truth", name, number, _NUMBERS)
         return np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -225,6 +226,9 @@ class BenchmarkSpec(Strict):
     def _check(self) -> BenchmarkSpec:
         if self.scenes.count == 0 and not self.scenes.given:
             raise ValueError("scenes: give a count above 0, or scenes of your own (given)")
+        for choice in self.sensors:
+            if choice.name is None and not re.fullmatch(NAME, stem := Path(choice.sensor).stem):
+                raise ValueError(f"sensors: {stem!r} cannot be part of the names of clips; give it a name (name: …)")
         for key, names in (
             ("noise", [level.name for level in self.noise]),
             ("seeds", list(self.seeds)),

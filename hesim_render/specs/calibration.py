@@ -12,6 +12,7 @@ from typing import Any
 from numpy.typing import NDArray
 from pydantic import (
     Field,
+    PositiveFloat,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     ValidationError,
@@ -22,7 +23,15 @@ from pydantic import (
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import inside, reading, reason
 from hesim_render.core.npz import read_arrays
-from hesim_render.specs.calibration_spec import SECTIONS, CalibrationSpec
+from hesim_render.core.units import S_PER_US
+from hesim_render.specs.calibration_rates import PER_INTERVAL, PER_SECOND, needs_interval
+from hesim_render.specs.calibration_spec import (
+    AsynchronousSection,
+    CalibrationSpec,
+    EventSection,
+    FrameSection,
+    MapsFile,
+)
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Region
 from hesim_render.specs.problems import spec_error
@@ -47,29 +56,30 @@ def read_calibration(file: str | Path) -> dict[str, Any]:
     """
     path = Path(file)
     data = read_yaml(path, with_lines=False)
-    try:
-        CalibrationSpec.model_validate(data)
-    except ValidationError as error:
-        raise spec_error(error, CalibrationSpec, read_yaml(path), path) from None
+    _checked(path, data)
     return data
 
 
-#: Maps of pixels that misbehave.
-TELEGRAPH_MAPS = ("telegraph_amplitude_dn", "telegraph_high_share", "telegraph_correlation")
-DEFECT_MAPS = (
-    *("defect", "defect_on_per_trial", "defect_off_per_trial"),
-    *("defect_firing_share", "defect_correlation"),
-)
-ASYNCHRONOUS_DEFECT_MAPS = ("defect", "defect_on_hz", "defect_off_hz", "defect_firing_share", "defect_change_hz")
+def load_calibration(file: str | Path) -> CalibrationSpec:
+    """A ``calibration.yaml`` as its model; raises as `read_calibration`."""
+    path = Path(file)
+    return _checked(path, read_yaml(path, with_lines=False))
+
+
+def _checked(path: Path, data: Any) -> CalibrationSpec:
+    try:
+        return CalibrationSpec.model_validate(data)
+    except ValidationError as error:
+        raise spec_error(error, CalibrationSpec, read_yaml(path), path) from None
+
+
 #: Maps that a sensor takes from each section; thresholds are known only where contrast steps were captured.
 SENSOR_MAPS = {
-    "aps": ("n_row", "n_blc", "n_dp", *TELEGRAPH_MAPS),
-    "evs": (
-        "bad_pixels",
-        "threshold_on_relative",
-        "threshold_off_relative",
-        *dict.fromkeys((*DEFECT_MAPS, *ASYNCHRONOUS_DEFECT_MAPS)),
-    ),
+    section: tuple(dict.fromkeys((*names, *PER_SECOND[section], *PER_INTERVAL[section])))
+    for section, names in (
+        ("aps", ("n_row", "n_blc", "n_dp")),
+        ("evs", ("bad_pixels", "threshold_on_relative", "threshold_off_relative")),
+    )
 }
 
 
@@ -86,9 +96,8 @@ def as_written(file: str | Path) -> Iterator[None]:
         raise SpecError(f"is not as 'calibrate' writes it ({reason(error)})", file=file) from None
 
 
-def map_file(file: Path, data: Mapping[str, Any], section: str) -> Path:
+def _map_file(file: Path, name: str, section: str) -> Path:
     """Path of a section's map file, in the folder of the calibration; a `SpecError` if it is missing or elsewhere."""
-    name = data[section]["maps"]["file"]
     if not (file.parent / name).exists():
         raise SpecError(f"no such file; it belongs to {file.name}: copy it along", file=file.parent / name)
     return inside(file.parent, name, file=file, key=f"{section}.maps.file")
@@ -125,16 +134,16 @@ def read_maps(
     data = read_calibration(path) if data is None else data
     if section not in data:
         raise SpecError(f"holds no section {section!r}; run 'calibrate {section}'", file=path)
-    return _maps_and_digest(path, data, section, names)[0]
+    return _maps_and_digest(path, MapsFile.model_validate(data[section]["maps"]), section, names)[0]
 
 
 def _maps_and_digest(
-    file: Path, data: Mapping[str, Any], section: str, names: Iterable[str] | None
+    file: Path, about: MapsFile, section: str, names: Iterable[str] | None
 ) -> tuple[dict[str, NDArray], str]:
-    """Maps of an existing section, and the SHA-256 of their file, which must be the stated one."""
-    maps = map_file(file, data, section)
+    """Maps of a section, and the SHA-256 of their file, which must be the stated one."""
+    maps = _map_file(file, about.file, section)
     digest = file_digest(maps)
-    if data[section]["maps"].get("sha256", digest) != digest:
+    if about.sha256 not in (None, digest):
         raise SpecError(f"is not the one that {file.name} was written with; run 'calibrate {section}' again", file=maps)
     return read_arrays(maps, only=names, kinds="bifu"), digest
 
@@ -149,12 +158,14 @@ class MeasuredMaps:
     file : path for error messages.
     roi : captured region, None for the whole sensor.
     sections : arrays of ``aps`` and ``evs`` by name, as far as they were calibrated.
+    intervals_s : from one frame (comparison) to the next, of each section; None where it is not known.
     """
 
     sha256: str
     file: Path = field(compare=False)
     roi: Region | None = field(compare=False)
     sections: Mapping[str, Mapping[str, NDArray]] = field(compare=False, repr=False)
+    intervals_s: Mapping[str, float | None] = field(compare=False)
 
 
 class NoiseFile(Strict):
@@ -165,6 +176,10 @@ class NoiseFile(Strict):
 
     file: str
     sha256: str | None = Field(None, description="of the calibration and its maps; they are refused if they differ")
+    tick_us: PositiveFloat | None = Field(
+        None, description="of the captures, where the calibration does not state it; default evs.tick_us of the file"
+    )
+    frame_rate_hz: PositiveFloat | None = Field(None, description="the same of frames; default aps.frame_rate_hz")
     folder: Path = Field(Path(), exclude=True)
     _measured: MeasuredMaps | None = PrivateAttr(None)
 
@@ -181,29 +196,50 @@ class NoiseFile(Strict):
         assert self._measured is not None
         return self._measured
 
-    def keep_maps(self, data: Mapping[str, Any]) -> None:
+    def keep_maps(self, data: CalibrationSpec) -> None:
         """Read and keep the maps of the calibration `data`; raises as `measured`."""
         digest = hashlib.sha256(bytes.fromhex(file_digest(self.path)))
-        sections = {}
-        for section in SECTIONS:
-            if section in data:
-                sections[section], own = _maps_and_digest(self.path, data, section, SENSOR_MAPS[section])
-                digest.update(bytes.fromhex(own))
+        sections: dict[str, dict[str, NDArray]] = {}
+        for name, section in data.sections.items():
+            sections[name], own = _maps_and_digest(self.path, section.maps, name, SENSOR_MAPS[name])
+            if needs_interval(name, sections[name]):
+                self.interval_s(name, section)
+            digest.update(bytes.fromhex(own))
         if self.sha256 not in (None, digest.hexdigest()):
             raise SpecError("it, or a map of it, is not the one this sensor was written with", file=self.path)
-        roi = data["capture"].get("roi")
-        region = None if roi is None else Region.model_validate(roi)
-        self._measured = MeasuredMaps(digest.hexdigest(), self.path, region, sections)
+        intervals_s = {name: section.interval_s or self._own_s(name) for name, section in data.sections.items()}
+        self._measured = MeasuredMaps(digest.hexdigest(), self.path, data.capture.roi, sections, intervals_s)
+
+    def _own_s(self, name: str) -> float | None:
+        if name == "aps":
+            return None if self.frame_rate_hz is None else 1.0 / self.frame_rate_hz
+        return None if self.tick_us is None else self.tick_us * S_PER_US
+
+    def interval_s(self, name: str, section: FrameSection | EventSection | AsynchronousSection) -> float:
+        """From one frame (comparison) of the captures to the next, s: that of the calibration, else of the sensor file.
+
+        Raises
+        ------
+        SpecError
+            If neither states it.
+        """
+        found = section.interval_s or self._own_s(name)
+        if found is None:
+            key = "frame_rate_hz" if name == "aps" else "tick_us"
+            text = "is not stated, and values per frame or comparison tell no rate per second without it"
+            raise SpecError(f"{text}; add that of the captures", file=self.path, key=f"{name}.{key}")
+        return found
 
     @model_serializer(mode="wrap")
     def _with_hash(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {**handler(self), "sha256": self.sha256 or self.measured.sha256}
+        known = {key: value for key, value in handler(self).items() if value is not None}
+        return {**known, "sha256": self.sha256 or self.measured.sha256}
 
     @property
     def path(self) -> Path:
         return self.folder / self.file
 
-    def read(self) -> dict[str, Any]:
+    def read(self) -> CalibrationSpec:
         """The calibration.
 
         Raises
@@ -211,8 +247,8 @@ class NoiseFile(Strict):
         SpecError
             If it cannot be read, or is not the one that `sha256` names.
         """
-        data = read_calibration(self.path)
-        if not any(section in data for section in SECTIONS):
+        data = load_calibration(self.path)
+        if not data.sections:
             raise SpecError("holds neither a section 'aps' nor 'evs'", file=self.path)
         if self.sha256 is not None:
             self.keep_maps(data)

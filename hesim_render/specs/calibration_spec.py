@@ -6,6 +6,7 @@ a later calibration reads. Sections hold further keys for human readers.
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import Annotated, Any, Literal
 
@@ -21,6 +22,8 @@ from pydantic import (
     model_validator,
 )
 
+from hesim_render.core.names import FileName
+from hesim_render.core.units import S_PER_US
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import Strict
 
@@ -62,6 +65,11 @@ class Estimate(_Section):
             raise ValueError("value: null needs a reason beside it")
         return self
 
+    @property
+    def error(self) -> float:
+        """The standard error; infinite where it is not stated."""
+        return math.inf if self.standard_error is None else self.standard_error
+
 
 class FullWell(Estimate):
     """Saturation capacity."""
@@ -80,7 +88,7 @@ class Finding(_Section):
 class MapsFile(_Section):
     """The map file of a section, beside the calibration, identified by its hash."""
 
-    file: str = Field(min_length=1)
+    file: FileName
     sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
 
 
@@ -109,6 +117,12 @@ class FrameSection(_Section):
     linearity_error: Estimate
     findings: list[Finding] = []
     maps: MapsFile
+    frame_rate_hz: PositiveFloat | None = Field(None, description="of the captures; older calibrations lack it")
+
+    @property
+    def interval_s(self) -> float | None:
+        """From one frame to the next, s; None where it is not known."""
+        return None if self.frame_rate_hz is None else 1.0 / self.frame_rate_hz
 
 
 class EventParameters(_Section):
@@ -144,6 +158,10 @@ class EventSection(EventParameters):
     threshold_mismatch: Estimate
     asymmetry: Estimate
     leak_per_trial: Estimate
+    leak_rate_hz: Estimate | None = Field(None, description="missing where the period of the comparisons is not known")
+    tick_us: PositiveFloat | None = Field(
+        None, description="period of the comparisons of the captures, µs; older calibrations lack it"
+    )
     goodness: EventGoodness
     trials: PositiveInt
     bad_pixels: NonNegativeInt
@@ -152,6 +170,11 @@ class EventSection(EventParameters):
     )
     findings: list[Finding] = []
     maps: MapsFile
+
+    @property
+    def interval_s(self) -> float | None:
+        """From one comparison to the next, s; None where it is not known."""
+        return None if self.tick_us is None else self.tick_us * S_PER_US
 
 
 class NoiseInLight(Estimate):
@@ -190,6 +213,11 @@ class AsynchronousSection(_Section):
     findings: list[Finding] = []
     maps: MapsFile
 
+    @property
+    def interval_s(self) -> None:
+        """None: there are no comparisons at fixed times."""
+        return None
+
 
 def _kind_of_events(section: Any) -> str:
     is_asynchronous = isinstance(section, dict) and section.get("reference") == "last_event"
@@ -227,3 +255,9 @@ class CalibrationSpec(Strict):
             if len(table) != tile[0] or any(len(row) != tile[1] for row in table):
                 raise ValueError(f"aps.{name}: expected a table of {tile[0]}×{tile[1]}, one entry a tile position")
         return self
+
+    @property
+    def sections(self) -> dict[str, FrameSection | EventSection | AsynchronousSection]:
+        """The sections that the file has, by name."""
+        found = {"aps": self.aps, "evs": self.evs}
+        return {name: section for name, section in found.items() if section is not None}

@@ -31,6 +31,12 @@ class CaptureSpec(Strict):
     signal_reference: SignalReference | None = None
     illuminant: str | None = Field(None, description="light on a neutral scene: tells filters that frames lack")
     contrast_of: Literal["signal", "voltage"] = "signal"
+    tick_us: PositiveFloat | None = Field(
+        None, description="period of the fixed comparisons, µs; default that of the sensor"
+    )
+    frame_rate_hz: PositiveFloat | None = Field(
+        None, description="frames per second within an exposure; default that of the sensor"
+    )
     evs_tile_rows: PositiveInt | None = Field(
         None, description="event pixels of a tile, where they are not one a pixel"
     )

@@ -4,35 +4,35 @@ The noise of ln x is Gaussian, white noise through two equal poles that are −3
 (`hesim_render.pixels.evs.processes.BandNoise`). After an event and its dead time the pixel compares with the level of
 that instant. How often the noise then crosses a threshold has no closed form. Level crossings [rice1945] are the rate
 of a pixel that always compares with the mean; it is ten to fifty times lower at thresholds of four σ, because the level
-of comparison itself wanders with the noise. The tables have the rates of such pixels by simulation
-(``benchmarks/event_noise.py``), as events per period 1/f, of the mean and the difference of both thresholds over σ and
-of the dead time. Between entries log(rate) is a cubic spline of the square of the mean threshold, of the difference and
-of the log of the dead time. Where one threshold is far above the other, a second table goes on.
+of comparison itself wanders with the noise. The table has the rates of pixels in their stationary state
+(``benchmarks/event_noise.py``), as events per period 1/f, of the lower threshold and the difference of both over σ, of
+the dead time and of the rate of leak events. Between entries log(rate) is a cubic spline of the square of the lower
+threshold, of the root of the difference, and of the logs of dead time and leak.
 
 An event of the leak resets a pixel with a dead time to the level of that instant, which is random. For a while after it
-noise events are more (or less) frequent. With n(s) their rate at the time s after such a reset, which the second table
-has, their mean rate is that over the time since the last leak event, which is exponentially distributed::
-
-    r ∫ exp(−r s) n(s) ds
-
-A pixel without a dead time moves its level of comparison by exactly a threshold with each event. Its rate falls for as
-long as one looks; the table has the mean of the 100th to the 1000th period.
+noise events are more frequent. A pixel without a dead time moves its level of comparison by exactly a threshold with
+each event, and leak events do not move it.
 """
 
 from __future__ import annotations
 
 import math
-from functools import cache, lru_cache
-from typing import Literal
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import RegularGridInterpolator, make_interp_spline
 
 from hesim_render.core.errors import RangeError
-from hesim_render.specs import noise_after_reset_table as after_reset
-from hesim_render.specs.event_noise_table import DEAD_PERIODS, DIFFERENCE, EVENTS, EVENTS_NO_DEAD_TIME, MEAN
+from hesim_render.specs.event_noise_table import (
+    DEAD_PERIODS,
+    DIFFERENCE,
+    LEAK_PERIODS,
+    LOG_EVENTS,
+    LOG_EVENTS_NO_DEAD_TIME,
+    LOWER,
+)
 
 #: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
 LEAST_THRESHOLD_REL = 0.05
@@ -45,37 +45,16 @@ _DEVIATES = np.linspace(-4.0, 4.0, 33)
 _WEIGHTS = np.exp(-0.5 * _DEVIATES**2) / np.sum(np.exp(-0.5 * _DEVIATES**2))
 
 
-@cache
-def _table(has_dead_time: bool, method: Literal["linear", "cubic"]) -> RegularGridInterpolator:
-    axes: tuple[NDArray[np.float64], ...] = np.square(MEAN), np.asarray(DIFFERENCE)
-    axes += (np.log(DEAD_PERIODS),) if has_dead_time else ()
-    values = np.log(EVENTS if has_dead_time else EVENTS_NO_DEAD_TIME)
-    return RegularGridInterpolator(axes, values, method, bounds_error=False, fill_value=None)
-
-
 @lru_cache(maxsize=64)
-def _after_reset(dead_periods: float) -> RegularGridInterpolator:
-    """Logarithm of the second table, [age], at a dead time: linear in its logarithm."""
-    nodes, values = np.log(after_reset.DEAD_PERIODS), np.log(after_reset.AFTER_RESET)
-    place = math.log(min(max(dead_periods, after_reset.DEAD_PERIODS[0]), after_reset.DEAD_PERIODS[-1]))
-    k = min(int(np.searchsorted(nodes, place, side="right")) - 1, len(nodes) - 2)
-    part = (place - nodes[k]) / (nodes[k + 1] - nodes[k])
-    axes = np.square(after_reset.LOWER), np.sqrt(after_reset.DIFFERENCE)
-    return RegularGridInterpolator(axes, (1 - part) * values[:, :, k] + part * values[:, :, k + 1], "cubic")
-
-
-def _over_late(
-    lower: NDArray[np.float64], difference: NDArray[np.float64], dead_periods: float, leak_periods: float
-) -> NDArray[np.float64]:
-    """Noise events over those of the first table, which has no leak and ends at a difference of thresholds."""
-    where = [
-        np.clip(lower, after_reset.LOWER[0], after_reset.LOWER[-1]) ** 2,
-        np.sqrt(np.minimum(difference, after_reset.DIFFERENCE[-1])),
-    ]
-    rates = np.exp(_after_reset(dead_periods)(np.stack(where, axis=-1)))
-    # share of the time with the last leak event longer ago than each age
-    older = np.append(np.exp(-leak_periods * np.asarray(after_reset.AGE)), 0.0)
-    return rates @ (older[:-1] - older[1:])
+def _table(dead_periods: float, leak_periods: float) -> RegularGridInterpolator:
+    """log(rate) of the square of the lower threshold and of the root of the difference."""
+    values = np.asarray(LOG_EVENTS_NO_DEAD_TIME) / 1000
+    if dead_periods > 0:
+        values = np.reshape(LOG_EVENTS, (*values.shape, len(DEAD_PERIODS), len(LEAK_PERIODS))) / 1000
+        for nodes, value in ((DEAD_PERIODS, dead_periods), (LEAK_PERIODS, leak_periods)):
+            at = math.log(min(max(value, nodes[0]), nodes[-1]))
+            values = make_interp_spline(np.log(nodes), values, axis=2)(at)
+    return RegularGridInterpolator((np.square(LOWER), np.sqrt(DIFFERENCE)), values, "cubic")
 
 
 def events_per_period(
@@ -91,24 +70,13 @@ def events_per_period(
 
     Returns
     -------
-    Events per period, without those of the leak. Means of both thresholds above 5.5 σ are extrapolated.
+    Events per period, without those of the leak. Lower thresholds above 7 σ are extrapolated as crossings of a level.
     """
     on, off = np.broadcast_arrays(np.asarray(on_sigma, np.float64), np.asarray(off_sigma, np.float64))
     lower, difference = np.minimum(on, off), np.abs(on - off)
-    limited = np.minimum(difference, DIFFERENCE[-1])
-    if dead_periods <= 0:
-        where = np.stack([np.maximum((on + off) / 2, MEAN[0]) ** 2, limited], axis=-1)
-        return np.exp(_table(False, "linear")(where)).reshape(on.shape)
-    dead = np.full(on.shape, math.log(min(max(dead_periods, DEAD_PERIODS[0]), DEAD_PERIODS[-1])))
-    mean = lower + limited / 2
-
-    def at(squared: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([squared, limited, dead], axis=-1)
-
-    log = _table(True, "cubic")(at(np.clip(mean, MEAN[0], MEAN[-1]) ** 2))
-    line, last = _table(True, "linear"), MEAN[-1] ** 2
-    log += line(at(np.maximum(mean**2, last))) - line(at(np.full(on.shape, last)))
-    return (np.exp(log) * _over_late(lower, difference, dead_periods, leak_periods)).reshape(on.shape)
+    where = np.clip(lower, LOWER[0], LOWER[-1]) ** 2, np.sqrt(np.minimum(difference, DIFFERENCE[-1]))
+    log = _table(float(dead_periods), float(leak_periods))(np.stack(where, axis=-1)).reshape(on.shape)
+    return np.exp(log - 0.5 * np.maximum(lower**2 - LOWER[-1] ** 2, 0.0))
 
 
 def noise_rates_hz(
@@ -191,7 +159,7 @@ def noise_sigma(
         found = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s, leak_hz))
         return math.log(max(found, 1e-300) / rate_hz)
 
-    lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / MEAN[0])
+    lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / LOWER[0])
     if excess(highest) < 0:
         most = sum(noise_rates_hz(thresholds, mismatch, math.exp(highest), bandwidth_hz, dead_s, leak_hz))
         raise RangeError(

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,9 +19,13 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.core.guard import printable
 from hesim_render.core.shipped import data_folder, list_names
-from hesim_render.specs.problems import spec_error
+from hesim_render.specs.problems import line_of, spec_error
 from hesim_render.specs.yamlfile import read_yaml
+
+#: Control characters but tabulators and ends of lines, and halves of characters.
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def _with_true_numbers(schema: Any) -> Any:
@@ -141,10 +146,27 @@ def parse_override(text: str) -> tuple[str, Any]:
 def validate(model: type[Model], data: dict[str, Any], file: Path | None, overrides: Mapping[str, Any]) -> Model:
     """Apply overrides and build the model; all errors together become one `SpecError`."""
     apply_overrides(data, overrides)
+    _require_plain_texts(data, data, file)
     try:
         return model.model_validate(_plain(data), context={"folder": file.parent if file else Path()})
     except ValidationError as error:
         raise spec_error(error, model, data, file, overrides) from None
+
+
+def _require_plain_texts(node: Any, data: Any, file: Path | None, place: tuple[Any, ...] = ()) -> None:
+    """Refuse texts with control characters: names stand in pages, drawings and messages."""
+    if isinstance(node, str):
+        if _CONTROL.search(node):
+            where = ".".join(map(str, place))
+            raise SpecError(f"{node[:60]!r} holds a control character", file=file, line=line_of(data, place),
+                            key=printable(where) or None)  # fmt: skip
+    elif isinstance(node, Mapping):
+        for key, value in node.items():
+            _require_plain_texts(key, data, file, (*place, key))
+            _require_plain_texts(value, data, file, (*place, key))
+    elif isinstance(node, list | tuple):
+        for number, value in enumerate(node):
+            _require_plain_texts(value, data, file, (*place, number))
 
 
 def _plain(node: Any) -> Any:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from hesim_render.core.names import FileName
 from hesim_render.core.region import parse_roi
 from hesim_render.specs.files import Strict, load_yaml, validate
 from hesim_render.specs.study import NamesFiles
@@ -39,14 +40,13 @@ class ExportStep(Strict):
     """Write the recording in the format of another program."""
 
     format: str
-    out: str = Field(description="name of the file or folder, in the folder of the run")
+    out: FileName = Field(description="name of the file or folder, in the folder of the run")
 
     @field_validator("out")
     @classmethod
-    def _inside(cls, value: str) -> str:
-        path = Path(value)
-        if len(path.parts) != 1 or value in (".", "..", RECORDING, PICTURES, STATE):
-            raise ValueError(f"expected a name in the folder of the run, other than {RECORDING}, {PICTURES}, {STATE}")
+    def _other(cls, value: str) -> str:
+        if value in (RECORDING, PICTURES, STATE):
+            raise ValueError(f"expected a name other than {RECORDING}, {PICTURES}, {STATE}")
         return value
 
 

@@ -21,7 +21,7 @@ from pydantic import (
 )
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import leads_out
+from hesim_render.core.guard import leads_out, reading
 from hesim_render.specs.deformation import DeformationSpec
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
@@ -123,7 +123,7 @@ class MitsubaSpec(Strict):
     file: str | None = None
     builtin: Literal["cornell_box"] | None = None
     inline: Mapping[str, Any] | None = None
-    radiance_scale: float = Field(1.0, ge=1e-30, le=1e30)
+    radiance_scale: float = Field(1.0, ge=1e-30, le=1e9)
     illuminance_lux: float | None = Field(None, ge=1e-9, le=1e9)
     irradiance_w_m2: float | None = Field(None, ge=1e-12, le=1e7, description="integrated over 360 to 830 nm")
     plane_point_m: Vector | None = Field(None, description="where the level holds")
@@ -321,7 +321,7 @@ def read_scene(
     if not allow_outside:
         apply_overrides(data, changes)
         for location, name in _named_files(data):
-            if leads_out(file.parent, name):
+            if any(leads_out(file.parent, path) for path in _with_inner(file.parent, name)):
                 raise SpecError(
                     f"{name!r} {OUTSIDE}",
                     file=file,
@@ -330,6 +330,13 @@ def read_scene(
                 )
     spec = validate(SceneSpec, data, file, changes)
     return spec.model_copy(update={"folder": file.parent, "file": file, "allow_outside": allow_outside})
+
+
+def _with_inner(folder: Path, name: str) -> list[Path]:
+    """A named file; of a folder, what is in it as well."""
+    path = folder / name
+    with reading(path):
+        return [path, *path.iterdir()] if path.is_dir() else [path]
 
 
 def _is_file(location: tuple[Any, ...]) -> bool:

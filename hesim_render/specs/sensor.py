@@ -15,7 +15,7 @@ from pydantic import Field, PositiveInt, field_validator, model_validator
 from ruamel.yaml.comments import CommentedMap
 
 from hesim_render.core.errors import HesimWarning, SpecError
-from hesim_render.specs.calibrated import apply_calibration
+from hesim_render.specs.calibrated import apply_calibration, with_intervals
 from hesim_render.specs.calibration import NoiseFile, NoisePart
 from hesim_render.specs.data_sheet import DataSheetSpec, V2eSpec
 from hesim_render.specs.defects import EventDefectSpec, TelegraphSpec
@@ -301,15 +301,19 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     data, changes = load_yaml(file), dict(overrides or {})
     folder = Path.cwd() if "noise" in changes else file.parent
     given, calibration = changes.pop("noise", data.get("noise")), None
-    if given is not None or any(key.startswith("noise.") for key in changes):
+    of_noise = {key.removeprefix("noise."): changes.pop(key) for key in list(changes) if key.startswith("noise.")}
+    if given is not None or of_noise:
         given = {"file": given} if isinstance(given, str) else given
         if not isinstance(given, Mapping) or not isinstance(given.get("file"), str):
             raise SpecError("expected the path of a calibration.yaml", file=file, key="noise")
         data.pop("noise", None)
+        own = {name: dict(data[name]) for name in ("aps", "evs") if isinstance(data.get(name), Mapping)}
         _read(data, file, changes)
-        noise = validate(NoisePart, {"noise": {**given, "folder": folder}}, file, {}).noise
-        calibration = apply_calibration(data, noise)
-        data["noise"] = {**given, "folder": folder}
+        noise = validate(NoisePart, {"noise": {**given, **of_noise, "folder": folder}}, file, {}).noise
+        calibration = noise.read()
+        noise = with_intervals(own, noise, calibration)
+        apply_calibration(data, noise, calibration)
+        data["noise"] = {**dict(noise), "folder": folder}
     spec = validate(SensorSpec, data, file, changes) if calibration is not None else _read(data, file, changes)
     if spec.noise is not None and calibration is not None:
         spec.noise.keep_maps(calibration)  # read the maps now: the sensor needs no file afterwards

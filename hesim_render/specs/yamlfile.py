@@ -13,6 +13,8 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import read_text, reading
 
+#: Largest file; as Python objects with line numbers it takes about a hundred times as much memory.
+_MOST_BYTES = 16 << 20
 #: Largest number of values after all aliases are expanded; a calibration of a 16 x 16 tile has a few thousand.
 _MOST_VALUES = 1_000_000
 
@@ -30,7 +32,7 @@ def read_yaml(file: Path, with_lines: bool = True) -> Any:
     SpecError
         If it is not a YAML mapping, or its aliases expand to too much.
     """
-    return parse_yaml(read_text(file), file, with_lines)
+    return parse_yaml(read_text(file, _MOST_BYTES), file, with_lines)
 
 
 def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.core.guard import read_text
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 
 #: Largest step of the grid on which products are integrated, nm.
@@ -286,11 +287,7 @@ def read_csv(file: Path, column: str | int | None = None) -> Spectrum:
     ----------
     column : header name or 1-based number of the value column; default the only one.
     """
-    try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
-        raise SpecError(f"spectrum file cannot be read ({reason})", file=file) from None
+    lines = read_text(file).splitlines()
     header: list[str] | None = None
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
@@ -304,7 +301,7 @@ def read_csv(file: Path, column: str | int | None = None) -> Spectrum:
             if header is None and not rows:
                 header = cells
                 continue
-            raise SpecError(f"expected numbers separated by commas, found {text!r}", file=file, line=number) from None
+            raise SpecError("expected numbers separated by commas", file=file, line=number) from None
         if len(rows[-1]) != len(rows[0]) or len(rows[-1]) < 2:
             raise SpecError(f"expected {max(2, len(rows[0]))} columns, found {len(cells)}", file=file, line=number)
     if len(rows) < 2:

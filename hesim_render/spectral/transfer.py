@@ -15,9 +15,8 @@ from hesim_render.spectral.spectrum import colour_science
 Transfer = Literal["srgb", "bt709", "gamma", "linear"]
 #: Transfers of input pictures, including those of high dynamic range.
 InputTransfer = Literal["srgb", "bt709", "gamma", "linear", "pq", "hlg"]
-#: Steps that use square roots add this first, in units of white: shot noise becomes uniform, and read noise
-#: around black is not distorted.
-ROOT_TOE = 0.01
+#: Steps that use square roots (`to_root`) add this first, in units of white.
+_ROOT_TOE = 0.01
 #: Constants of BT.709 to the digits of ITU-T H.273, with which the two branches of the curve meet. (colour-science
 #: has them rounded, which is 0.3 % off near the knee; its sRGB is the one below, but costs its import of 1.5 s.)
 _BT709_ALPHA, _BT709_BETA = 1.099296826809442, 0.018053968510807
@@ -67,6 +66,27 @@ def encode_exactly(linear: ArrayLike, transfer: Transfer = "srgb", gamma: float 
     if transfer == "linear":
         return x
     raise RangeError("transfer", transfer, "srgb, bt709, gamma or linear")
+
+
+def to_root(linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Square roots of linear light, in which shot noise is uniform: √(x + t) − √t with a small t, odd about black.
+
+    Read noise below black is kept, and that of a dark frame has the mean 0 here as well.
+    """
+    root = np.abs(linear)
+    root += np.float32(_ROOT_TOE)
+    np.sqrt(root, out=root)
+    root -= np.float32(np.sqrt(_ROOT_TOE))
+    return np.copysign(root, linear, out=root)
+
+
+def from_root(root: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Linear light, the inverse of `to_root`."""
+    linear = np.abs(root)
+    linear += np.float32(np.sqrt(_ROOT_TOE))
+    np.square(linear, out=linear)
+    linear -= np.float32(_ROOT_TOE)
+    return np.copysign(linear, root, out=linear)
 
 
 @functools.lru_cache(maxsize=8)

@@ -32,6 +32,9 @@ from hesim_render.studies.exposure import electrons
 from hesim_render.studies.seen import Seen
 from hesim_render.studies.table import Cell
 
+#: Least and largest light at which an SNR of 10 is looked for, as a multiple of that of the row.
+_LIGHT_RANGE = (1e-9, 1e9)
+
 
 def noise_figures(
     spec: StudySpec,
@@ -56,7 +59,9 @@ def noise_figures(
 
     Returns
     -------
-    Figures by column; those of simulation where the study has repeats. If the grey card itself saturates, levels alone.
+    Figures by column: those that end in ``_noise_aware`` have the matrix of the least squared error with the noise of
+    this row, the others the matrix of colour, which knows no noise. Figures of simulation where the study has repeats.
+    If the grey card itself saturates, levels alone; ``white_clipped`` tells that a perfect white does.
     """
     candidate = seen.candidate
     sensor = candidate.sensor
@@ -66,45 +71,57 @@ def noise_figures(
     row: dict[str, Cell] = {
         "white_e": float(white_e.max()),
         "white_saturation": float(white_e.max() / saturation),
+        "white_clipped": bool(white_e.max() > saturation),
         "dynamic_range_db": dynamic_range_db(sensor, exposure_us),
     }
     if GREY * white_e.max() >= saturation:
         return row
     aware = noise_aware_matrix(seen.samples, white_e, noise)
-    if seen.colour is None:
-        row |= _of_luminance(aware[1], white_e, noise, lux)
-        if spec.noise.repeats:
-            balanced = _noisy(spec, seen, light, chart, lux, exposure_us).balanced(white_e, spec.area_px)
-            row |= _cells("ysnr", measured_luminance(balanced, aware[1]))
-        return row
-    rgb = to_srgb(seen.colour.matrix, seen.samples.white_xyz)
-    found = output_noise(rgb, white_e, noise)
-    weights = np.array(YSNR_WEIGHTS) @ rgb / white_e
-    errors = colour_differences(seen.samples, aware)
     row |= {
-        "noise_amplification": found.amplification,
-        "ysnr": found.ysnr,
-        "snr10_lux": light_for_snr(10, weights, white_e / lux, noise),
-        "ysnr_noise_aware": output_noise(to_srgb(aware, seen.samples.white_xyz), white_e, noise).ysnr,
-        "delta_e_mean_noise_aware": float(errors.mean()),
+        "ysnr_noise_aware": _ysnr(_luminance(seen, aware) / white_e, GREY * white_e, noise),
+        "snr10_lux_noise_aware": _light_for_snr_10(seen, white_e / lux, noise, lux),
     }
+    balanced = None
     if spec.noise.repeats:
         balanced = _noisy(spec, seen, light, chart, lux, exposure_us).balanced(white_e, spec.area_px)
-        for end, matrix in (("", seen.colour.matrix), ("_noise_aware", aware)):
-            rgb = to_srgb(matrix, seen.samples.white_xyz)
+    if seen.colour is None:
+        return row if balanced is None else row | _cells("ysnr_noise_aware", measured_luminance(balanced, aware[1]))
+    for end, matrix in (("_noise_aware", aware), ("", seen.colour.matrix)):
+        rgb = to_srgb(matrix, seen.samples.white_xyz)
+        found = output_noise(rgb, white_e, noise)
+        row |= {f"noise_amplification{end}": found.amplification, f"ysnr{end}": found.ysnr}
+        if balanced is not None:
             for name, value in measured_figures(balanced, rgb, matrix, seen.samples).items():
                 row |= _cells(f"{name}{end}", value)
-    return row
+    return row | {
+        "delta_e_mean_noise_aware": float(colour_differences(seen.samples, aware).mean()),
+        "snr10_lux": light_for_snr(10, _luminance(seen, seen.colour.matrix) / white_e, white_e / lux, noise),
+    }
 
 
-def _of_luminance(
-    weights: NDArray[np.float64], white_e: NDArray[np.float64], noise: ChannelNoise, lux: float
-) -> dict[str, Cell]:
-    """Figures of sensors that need not see colour, with the weights of a luminance."""
-    u = weights / white_e
-    signal = GREY * white_e
-    sigma = float(np.sqrt(np.sum(u**2 * noise.variance_e2(signal))))
-    return {"ysnr": float(u @ signal) / sigma, "snr10_lux": light_for_snr(10, u, white_e / lux, noise)}
+def _luminance(seen: Seen, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights of the balanced channels in the luminance; that of XYZ where sensors need not see colour."""
+    if seen.colour is None:
+        return matrix[1]
+    return np.asarray(YSNR_WEIGHTS @ to_srgb(matrix, seen.samples.white_xyz))
+
+
+def _ysnr(weights: NDArray[np.float64], signal_e: NDArray[np.float64], noise: ChannelNoise) -> float:
+    """Luminance over its standard deviation, with weights of electrons."""
+    return float(weights @ signal_e / np.sqrt(weights**2 @ noise.variance_e2(signal_e)))
+
+
+def _light_for_snr_10(seen: Seen, white_per_lux: NDArray[np.float64], noise: ChannelNoise, near: float) -> float:
+    """Light in lux at which the luminance of the grey card has an SNR of 10 with the matrix that is best there."""
+    from scipy.optimize import brentq
+
+    def missing(log_lux: float) -> float:
+        white = white_per_lux * np.exp(log_lux)
+        weights = _luminance(seen, noise_aware_matrix(seen.samples, white, noise)) / white
+        return _ysnr(weights, GREY * white, noise) - 10
+
+    low, high = np.log(near) + np.log(_LIGHT_RANGE)
+    return float("inf") if missing(high) < 0 else float(np.exp(brentq(missing, low, high, xtol=1e-12)))
 
 
 def _noisy(

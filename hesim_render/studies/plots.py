@@ -17,6 +17,10 @@ _MARKERS = "osD^vP*X<>hp"
 _GRID_NM = np.arange(380.0, 731.0, 2.0)
 
 
+#: Columns that are drawn against each other: colour error and luminance SNR, both with the noise-aware matrix.
+PARETO = ("delta_e_mean_noise_aware", "ysnr_noise_aware")
+
+
 def pareto_front(cost: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points no other point beats: none has at most the cost and at least the gain, and one of them better.
 
@@ -34,15 +38,16 @@ def pareto_front(cost: NDArray[np.float64], gain: NDArray[np.float64]) -> NDArra
 
 
 def pareto_plot(rows: Table, title: str) -> str:
-    """SVG of colour error against luminance SNR, one point a filter set; the front is a line."""
-    figure, axes = panel(title, "mean ΔE2000", "YSNR of an 18 % grey card", (400, 300))
-    rows = Table(row for row in rows if row["delta_e_mean"] is not None and row["ysnr"] is not None)
-    error, snr, names = rows["delta_e_mean"], rows["ysnr"], _labels(rows)
+    """SVG of colour error against luminance SNR, one point a filter set; the front is a line. Hollow: white clips."""
+    figure, axes = panel(title, "mean ΔE2000, noise-aware matrix", "YSNR of an 18 % grey card, noise-aware", (400, 300))
+    rows = Table(row for row in rows if all(row[name] is not None for name in PARETO))
+    error, snr, clipped, names = rows[PARETO[0]], rows[PARETO[1]], rows["white_clipped"].astype(bool), _labels(rows)
     for k, name in enumerate(dict.fromkeys(names)):
         own = np.array([other == name for other in names])
         axes.plot(
             error[own], snr[own], linestyle="none", marker=_MARKERS[k % len(_MARKERS)], markersize=7,
-            color=COLOURS[k % len(COLOURS)], label=name,
+            color=COLOURS[k % len(COLOURS)], fillstyle="none" if clipped[own].any() else "full",
+            label=name + (" (white clips)" if clipped[own].any() else ""),
         )  # fmt: skip
     front = np.flatnonzero(pareto_front(error, snr))
     order = front[np.argsort(error[front])]

@@ -15,7 +15,8 @@ from hesim_render.core.html import PAGE_STYLE, inline_picture, number, row_of, t
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
 from hesim_render.studies.cfa import StudyResult
-from hesim_render.studies.plots import chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
+from hesim_render.studies.headings import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, level_text
+from hesim_render.studies.plots import PARETO, chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
 from hesim_render.studies.seen import Seen
 from hesim_render.studies.table import Cell, Table
 
@@ -29,25 +30,22 @@ _COLOUR = {
     "vora_light": "Vora, this light", "luther_residual": "Luther residual",
     "filter_quality_min": "least filter quality",
 }  # fmt: skip
-_NOISE = {
-    "noise_amplification": "amplification", "ysnr": "YSNR", "ysnr_simulated": "YSNR simulated",
-    "delta_e_noisy_simulated": "ΔE2000 with noise", "ysnr_noise_aware": "YSNR, noise-aware",
-    "delta_e_mean_noise_aware": "ΔE2000, noise-aware", "snr10_lux": "SNR10, lx", "dynamic_range_db": "DR, dB",
-    "white_saturation": "white / saturation",
-}  # fmt: skip
 _DETAIL = {
-    "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab", "zipper": "zipper, %",
-    "star_error": "star, rms", "zone_plate_colour": "zone plate, C*ab",
-    "picture_error_simulated": "rms error with noise",
+    "picture_error_simulated": "rms error with noise", "mtf50_cy_per_px": "MTF50, cy/px",
+    "false_colour": "false colour, C*ab", "zipper": "zipper, %", "star_error": "star, rms",
+    "zone_plate_colour": "zone plate, C*ab",
 }  # fmt: skip
 _EVENTS = {
     "event_contrast_on": "event contrast", "event_noise_rate_hz": "event noise, Hz", "event_seen": "steps seen",
     "event_seen_isoluminant": "isoluminant steps seen",
 }  # fmt: skip
-#: Figures with an interval: ends of the columns of its limits.
-_INTERVALS = {
-    "ysnr_simulated": "ysnr", "delta_e_noisy_simulated": "delta_e_noisy", "picture_error_simulated": "picture_error",
-}  # fmt: skip
+#: Tables of one level: heading and columns; those that know the noise come first.
+_OF_LEVEL = (
+    ("Noise-aware", NOISE_AWARE | LEVELS), ("Noise-free matrix of colour", NOISE_FREE),
+    ("After demosaicing; without noise but for the first column where it was simulated", _DETAIL), ("Events", _EVENTS),
+)  # fmt: skip
+#: End of the columns of figures that have an interval.
+_SIMULATED = "_simulated"
 #: Most groups that are drawn.
 _MOST_GROUPS = 24
 
@@ -95,23 +93,24 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
     tile : the designed tile, where shares were varied.
     """
     parts = ["<h2>Verdict</h2>"]
-    named = {"delta_e_mean": "mean ΔE2000", "mtf50_cy_per_px": "MTF50, cy/px", "false_colour": "false colour, C*ab",
-             "zone_plate_colour": "zone plate, C*ab", "picture_error_simulated": "rms error with noise"}  # fmt: skip
+    named = {"delta_e_mean": "mean ΔE2000 without noise", "mtf50_cy_per_px": "MTF50, cy/px",
+             "false_colour": "false colour, C*ab", "zone_plate_colour": "zone plate, C*ab",
+             "picture_error_simulated": "rms error with noise"}  # fmt: skip
+    ratios = {"ysnr_noise_aware_ratio_": "YSNR, noise-aware,", "ysnr_ratio_": "YSNR, matrix of colour,"}
     for verdict in verdicts:
         low, high = (number(verdict[f"cost_difference_{end}"]) for end in ("low", "high"))
-        rows = [
-            ["judged cost", number(verdict["cost"]), number(verdict["cost_against"]), f"difference {low} to {high}"]
-        ]
+        pair = [number(verdict["cost"]), number(verdict["cost_against"])]
+        rows = [["judged cost, noise included", *pair, f"difference {low} to {high}"]]
+        for start, title in ratios.items():
+            for key, value in verdict.items():
+                if key.startswith(start):
+                    lux = key.removeprefix(start).removesuffix("_lux")
+                    rows.append([f"{title} at {lux} lx", "", "", f"{number(value)} times"])
         rows += [
             [title, number(verdict[key]), number(verdict[f"{key}_against"]), ""]
             for key, title in named.items()
             if key in verdict
         ]
-        for key, value in verdict.items():
-            for start, title in (("ysnr_ratio_", "YSNR"), ("ysnr_noise_aware_ratio_", "YSNR, noise-aware matrix,")):
-                if key.startswith(start):
-                    lux = key.removeprefix(start).removesuffix("_lux")
-                    rows.append([f"{title} at {lux} lx", "", "", f"{number(value)} times"])
         parts.append(table(["", "designed", str(verdict["against"]), "95 % interval or ratio"], rows))
     if tile is not None:
         parts.append(f"<p>Designed tile:</p><pre>{escape(tile)}</pre>")
@@ -145,16 +144,16 @@ def _groups(rows: Table) -> list[str]:
         plots = [
             pareto_plot(some, _level(levels, values))
             for values, some in inner
-            if any(row.get("delta_e_mean") is not None and row.get("ysnr") is not None for row in some)
+            if any(row.get(PARETO[0]) is not None and row.get(PARETO[1]) is not None for row in some)
         ]
         parts.append(row_of(*plots) if plots else "")
         named = [name for name in _NAMES if name != "exposure_us" and name in group.columns]
         first = {tuple(row[name] for name in named): row for row in reversed(list(group))}
-        parts.append(_table(Table(reversed(first.values())), _COLOUR))
         for values, some in inner:
-            tables = [_table(some, columns) for columns in (_NOISE, _DETAIL, _EVENTS)]
+            tables = [_captioned(title, _table(some, columns)) for title, columns in _OF_LEVEL]
             if any(tables):
                 parts += [f"<h3>{escape(_level(levels, values))}</h3>", *tables]
+        parts.append(_captioned("Colour, without noise", _table(Table(reversed(first.values())), _COLOUR)))
     return parts
 
 
@@ -172,6 +171,10 @@ def _level(keys: Sequence[str], values: Sequence[Cell]) -> str:
     return text + (f", {named['nominal_exposure_us']:g} µs" if named.get("nominal_exposure_us") else "")
 
 
+def _captioned(title: str, html: str) -> str:
+    return html and f"<p><b>{escape(title)}</b></p>{html}"
+
+
 def _table(rows: Table, columns: Mapping[str, str]) -> str:
     """A table of some figures; empty if no row has any of them."""
     known = [name for name in columns if name in rows.columns and any(row[name] is not None for row in rows)]
@@ -187,8 +190,10 @@ def _table(rows: Table, columns: Mapping[str, str]) -> str:
         cells = [_cell(_in_ms(row[name]) if name == "exposure_us" else row[name]) for name in names]
         for name in known:
             text = _cell(row[name])
-            if name in _INTERVALS and row[name] is not None:
-                low, high = (row.get(f"{_INTERVALS[name]}_{end}") for end in ("low", "high"))
+            if name == "white_saturation":
+                text = level_text(row, text)
+            if name.endswith(_SIMULATED) and row[name] is not None:
+                low, high = (row.get(f"{name.removesuffix(_SIMULATED)}_{end}") for end in ("low", "high"))
                 if isinstance(low, float) and isinstance(high, float) and low == low:
                     text += f" ({number(low)} to {number(high)})"
             cells.append(text)
@@ -237,5 +242,5 @@ def _method(spec: StudySpec) -> str:
     return (
         f"<h2>Method</h2><p>Matrix: {escape(spec.matrix)}. Output pixels are those of {spec.area_px:g} pixels of the "
         f"mosaic. YSNR and SNR10 are of the luminance 0.299 R + 0.587 G + 0.114 B on an 18 % grey card, without fixed "
-        f"patterns. {noisy} <i>Noise-aware</i>: with the matrix of the least squared error, noise included.</p>"
+        f"patterns. {noisy} {NOTE}</p>"
     )

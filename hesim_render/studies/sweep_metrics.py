@@ -182,10 +182,10 @@ class Figures:
         return develop(clean, mosaic, pipeline, exposure_gain=gain).image
 
     def against_clean(self, measure: Callable[..., float]) -> float | None:
-        """A measure of the picture against that of the noise-free frame, both between 0 and 1."""
+        """A measure of the picture against that of the noise-free frame; 1 is white, linear noise may be below 0."""
         if self.picture is None or self.clean_picture is None:
             return None
-        return measure(_between_0_and_1(self.picture.image), _between_0_and_1(self.clean_picture))
+        return measure(_with_white_at_1(self.picture.image), _with_white_at_1(self.clean_picture))
 
     @property
     def picture_delta_e(self) -> float | None:
@@ -215,7 +215,7 @@ class Figures:
         return {f"isp_{key}": float(value) for key, value in found.items() if isinstance(value, int | float)}
 
 
-def _between_0_and_1(picture: NDArray) -> NDArray[np.float64]:
+def _with_white_at_1(picture: NDArray) -> NDArray[np.float64]:
     top = np.iinfo(picture.dtype).max if picture.dtype.kind == "u" else 1
     return picture.astype(np.float64) / top
 
@@ -243,7 +243,7 @@ _METRICS: dict[str, tuple[str, Callable[[Figures], Cell | dict[str, Cell]]]] = {
     "mtf_nyquist": ("mtf_nyquist", lambda figures: figures.mtf_nyquist),
     "picture_mean": (
         "picture_mean",
-        lambda figures: None if figures.picture is None else float(_between_0_and_1(figures.picture.image).mean()),
+        lambda figures: None if figures.picture is None else float(_with_white_at_1(figures.picture.image).mean()),
     ),
     "picture_psnr": ("picture_psnr_db", lambda figures: figures.against_clean(psnr)),
     "picture_ssim": ("picture_ssim", lambda figures: figures.against_clean(ssim)),

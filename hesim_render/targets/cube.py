@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.exr import exr_header, require_exr_fits
 from hesim_render.core.guard import reading, require_memory
 from hesim_render.targets.cube_file import EXR_CHANNELS, open_cube
 from hesim_render.targets.cube_file import READERS as CUBE_READERS
@@ -86,10 +87,7 @@ def _is_rgb(file: Path) -> bool:
     """True for an EXR file with channels R, G, B and no spectral ones."""
     if file.suffix.lower() != ".exr" or not file.is_file():
         return False
-    import OpenEXR
-
-    with reading(file, "as a picture"), OpenEXR.File(str(file), separate_channels=True, header_only=True) as opened:
-        names = {channel.name for channel in opened.header()["channels"]}
+    names = {channel.name for channel in exr_header(file)[1]["channels"]}
     # spectral files often hold a small picture in R, G, B besides
     return {"R", "G", "B"} <= names and not any(pattern.fullmatch(name) for pattern in EXR_CHANNELS for name in names)
 
@@ -97,10 +95,7 @@ def _is_rgb(file: Path) -> bool:
 def _exr(file: Path) -> Cube:
     import OpenEXR
 
-    with OpenEXR.File(str(file), separate_channels=True, header_only=True) as opened:
-        low, high = opened.header()["dataWindow"]
-        size = np.asarray(high, dtype=np.int64) - np.asarray(low, dtype=np.int64) + 1
-        require_memory(16 * int(size.prod()), "the picture", file)
+    require_exr_fits(file)
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = opened.channels()
         return Cube(np.stack([channels[name].pixels for name in "RGB"], axis=-1).astype(np.float32), None)

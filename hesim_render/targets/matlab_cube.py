@@ -15,6 +15,8 @@ from hesim_render.targets.opened_cube import CubeFile, Rows, known_bands
 
 _WAVELENGTHS = ("bands", "wavelength", "wavelength_nm", "wavelengths", "wave")
 _CUBES = ("cube", "rad", "ref", "reflectances", "photons", "data", "mcCOEF")
+#: Most bytes of wavelengths, a basis or a mean.
+_MOST_SMALL_BYTES = 1 << 26
 #: Largest MATLAB v5 file that is loaded whole, as numbers of float64, bytes.
 MOST_MATLAB_BYTES = 4 << 30
 
@@ -95,9 +97,7 @@ def read_hdf5(file: Path) -> CubeFile:
             f"expected a data set {', '.join(_CUBES)} with three dimensions; found {', '.join(opened)}", file=file
         )
     data = dataset_of(opened, name, file, "fui")
-    bands = _bands_in(
-        {key: np.asarray(opened[key]) for key in _WAVELENGTHS if isinstance(opened.get(key), h5py.Dataset)}
-    )
+    bands = _bands_in({key: _whole(opened, key, file) for key in _WAVELENGTHS if key in opened})
     count, second, third = data.shape
     bands = known_bands(name, count) if bands is None else bands
 
@@ -114,11 +114,11 @@ def read_hdf5(file: Path) -> CubeFile:
     if name == "mcCOEF":
         group = opened.get("basis")
         parts = {
-            key: np.asarray(dataset_of(group, key, file, "fui")).T
+            key: _whole(group, key, file).T
             for key in ("wave", "basis")
             if isinstance(group, h5py.Group) and key in group
         }
-        mean = np.asarray(dataset_of(opened, "imgMean", file, "fui")) if "imgMean" in opened else None
+        mean = _whole(opened, "imgMean", file) if "imgMean" in opened else None
         return _of_basis(file, (third, second, count), transposed, parts, mean, None)
     if name == "photons" and bands is not None:
         return CubeFile(
@@ -126,6 +126,13 @@ def read_hdf5(file: Path) -> CubeFile:
             "ISETCam",
         )  # fmt: skip
     return CubeFile(file, (third, second, count), bands, transposed, "HDF5")
+
+
+def _whole(group: Any, name: str, file: Path) -> NDArray:
+    """A small data set."""
+    found = dataset_of(group, name, file, "fui")
+    require_memory(found.size * found.dtype.itemsize, name, file, _MOST_SMALL_BYTES)
+    return np.asarray(found)
 
 
 def _bands_in(data: dict[str, Any]) -> NDArray[np.float64] | None:

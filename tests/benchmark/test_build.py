@@ -340,18 +340,23 @@ def test_a_scheduler_that_dies_and_a_clip_that_kills_its_workers_are_told(monkey
         def exception(self):
             if isinstance(self.failure, CancelledError):
                 raise self.failure
-            return self.failure
+            return None if self.failure == "late" else self.failure
 
         def result(self):
+            if self.failure == "late":  # the scheduler died between the two questions
+                raise CancelledError
             return {"name": clips[self.key].name, "seconds": 1.0, "bytes": 2}
 
     class Client:
         loop = None
+        status = "running"
 
         def __init__(self, *failures):
             self.waiting = [Answer(k, failure) for k, failure in enumerate(failures)][::-1]
 
         def submit(self, *arguments, **options):
+            if self.status == "closed":
+                raise RuntimeError("Client is closed")
             return self.waiting.pop()
 
     monkeypatch.setattr(distributed, "as_completed", lambda futures, loop: futures)
@@ -360,6 +365,12 @@ def test_a_scheduler_that_dies_and_a_clip_that_kills_its_workers_are_told(monkey
     assert len(told) == 3 and list(failed) == [clips[1].name] and "died again and again" in failed[clips[1].name]
     with pytest.raises(BackendError, match="the finished ones stay"):
         run_on_cluster(Client(None, CancelledError()), "{}", clips[:2], told.append)
+    with pytest.raises(BackendError, match="the finished ones stay"):
+        run_on_cluster(Client(None, "late"), "{}", clips[:2], told.append)
+    closed = Client(None)
+    closed.status = "closed"
+    with pytest.raises(BackendError, match="the finished ones stay"):
+        run_on_cluster(closed, "{}", clips[:1], told.append)
 
 
 @pytest.mark.slow

@@ -175,9 +175,10 @@ def test_the_data_set_has_tensors_of_every_frame(built, clip):
     assert len(data) == len(clip.recording.frames)
     item, frame = data[1], clip.recording.frames[1]
     span = 1023 - 64
-    signal = np.clip((frame.raw.astype(float) - 64) / span, 0, 1)
+    signal = np.where(frame.valid, (frame.raw.astype(float) - 64) / span, 0)
     assert item["frame"].dtype == torch.float32 and np.allclose(item["frame"][0].numpy(), signal)
-    assert np.allclose(item["sharp"][0].numpy(), np.clip((clip.sharp.raw_dn(1).astype(float) - 64) / span, 0, 1))
+    sharp = np.where(frame.valid, (clip.sharp.raw_dn(1).astype(float) - 64) / span, 0)
+    assert np.allclose(item["sharp"][0].numpy(), sharp)
     assert np.array_equal(item["valid"][0].numpy(), frame.valid) and item["t_us"] == MIDDLES[1]
     begin = frame.exposure_start_us
     expected = hr.events.voxel_grid(clip.recording.events, (4, 6), 3, begin, begin + frame.exposure_us)

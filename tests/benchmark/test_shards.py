@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import tarfile
 
 import h5py
@@ -10,8 +11,11 @@ import pytest
 
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark
+from hesim_render.benchmark.folder import Benchmark
+from hesim_render.benchmark.layouts import LAYOUTS, export_benchmark
 from hesim_render.benchmark.shards import pack_benchmark, verify_shards
 from hesim_render.benchmark.store import store_of
+from hesim_render.benchmark.verify import discard_damaged, verify_benchmark
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 
 
@@ -118,9 +122,10 @@ def test_hdf5_shards_and_what_is_changed_or_wrong(built, tmp_path):
         pack_benchmark(built.root, tmp_path / "i", format="hdf")
     with pytest.raises(RangeError, match="shard_mb"):
         pack_benchmark(built.root, tmp_path / "i", shard_mb=0)
-    with pytest.raises(SpecError, match="leads out"):
-        store_of(tmp_path / "h").has("../x")
-    with pytest.raises(SpecError, match="cannot be read"):
+    for place in (tmp_path / "h", f"file://{tmp_path}/h"):
+        with pytest.raises(SpecError, match="is not the name of a file"):
+            list(store_of(place).blocks("../x"))
+    with pytest.raises(SpecError, match="no such file"):
         verify_shards(tmp_path / "none")
 
 
@@ -148,3 +153,119 @@ def test_addresses_that_nobody_knows_are_refused():
     pytest.importorskip("fsspec")
     with pytest.raises(OutputError, match="nosuch"):
         store_of("nosuch://bucket/x")
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "memory"])
+def test_an_error_leaves_no_shards_and_no_half_of_two_sets(built, tmp_path, kind, monkeypatch):
+    """A folder keeps its old set; an address has none then."""
+    from hesim_render.benchmark import shards
+
+    if kind != "folder":
+        pytest.importorskip("fsspec")
+    target = {"folder": tmp_path / "x", "file": f"file://{tmp_path}/y", "memory": "memory://shards/e"}[kind]
+    whole, samples_left = shards.samples, 4
+
+    def failing(clip):
+        nonlocal samples_left
+        for sample in whole(clip):
+            samples_left -= 1
+            if not samples_left:
+                raise OSError(28, "No space left on device")
+            yield sample
+
+    for is_new in (True, False):
+        with monkeypatch.context() as patch:
+            samples_left = 4
+            patch.setattr(shards, "samples", failing)
+            with pytest.raises(OSError, match="No space"):
+                pack_benchmark(built.root, target, shard_mb=1e-6, overwrite=True)
+        store = store_of(target)
+        if is_new or kind != "folder":
+            for name in ("index.json", "train-000000.tar", "train-000002.tar", "train-000002.tar.partial"):
+                with pytest.raises(SpecError):
+                    b"".join(store.blocks(name))
+            pack_benchmark(built.root, target, shard_mb=1e-6)
+        assert verify_shards(target) == []
+    if kind != "memory":
+        assert len(list(tmp_path.iterdir())) == 1 and len(list(next(tmp_path.iterdir()).iterdir())) == 7
+
+
+@pytest.mark.parametrize("name", ["../../outside", "..", "/etc/x", "a/b", "other", "x\n"])
+def test_a_clip_with_another_name_than_its_folder_writes_nothing(built, tmp_path, name):
+    """It was joined to the folder that is written, and stood in tar files as it was."""
+    root = shutil.copytree(built.root, tmp_path / "in" / "b")
+    file = next(Benchmark(root).clips()).folder / "clip.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"name": name}))
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SpecError, match="name"):
+        pack_benchmark(root, tmp_path / "out" / "a")
+    for layout in LAYOUTS:
+        with pytest.raises(SpecError, match="name"):
+            export_benchmark(root, layout, tmp_path / "out" / "b")
+    found = sorted(path for path in tmp_path.rglob("*") if path != tmp_path / "out")
+    assert found == before
+
+
+@pytest.mark.parametrize("key", ["name", "split"])
+def test_a_manifest_that_names_other_folders_is_refused_and_nothing_is_discarded(built, tmp_path, key):
+    root = shutil.copytree(built.root, tmp_path / "b")
+    (tmp_path / "b" / "clips" / "photos").mkdir()
+    (tmp_path / "b" / "clips" / "photos" / "1.jpg").touch()
+    manifest = json.loads((root / "benchmark.json").read_text())
+    for value in ("..", ".", "", "../clips/photos", "photos/..", "/"):
+        changed = [manifest["clips"][0], manifest["clips"][1] | {key: value}]
+        (root / "benchmark.json").write_text(json.dumps(manifest | {"clips": changed}))
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(SpecError, match=r"benchmark\.json"):
+            discard_damaged(root, verify_benchmark(root))
+        with pytest.raises(SpecError, match=r"benchmark\.json"):
+            export_benchmark(root, "raw-npz", tmp_path / "out")
+        assert sorted(tmp_path.rglob("*")) == before
+    (root / "benchmark.json").write_text(json.dumps(manifest | {"clips": manifest["clips"][:1] * 2}))
+    with pytest.raises(SpecError, match="twice"):
+        Benchmark(root)
+
+
+def test_a_sensor_file_whose_name_cannot_be_part_of_a_clip_needs_one():
+    for file in ("..", "a\x1b[1m.yaml", "a b.yaml", "a.b.yaml"):
+        with pytest.raises(ValueError, match="give it a name"):
+            small(sensors=[{"sensor": f"x/{file}"}])
+        assert small(sensors=[{"sensor": f"x/{file}", "name": "own"}]).sensors[0].name == "own"
+
+
+def test_a_clip_that_is_a_link_is_refused(built, tmp_path):
+    root = shutil.copytree(built.root, tmp_path / "b")
+    clip = next(Benchmark(root).clips()).folder
+    shutil.rmtree(clip)
+    for target in (clip.parent, root, tmp_path):
+        clip.symlink_to(target)
+        with pytest.raises(SpecError, match="is a link"):
+            discard_damaged(root, verify_benchmark(root))
+        clip.unlink()
+    assert (root / "benchmark.json").is_file()
+
+
+def test_shards_of_names_that_are_none_are_refused(built, tmp_path):
+    pack_benchmark(built.root, tmp_path / "s")
+    index = json.loads((tmp_path / "s" / "index.json").read_text())
+    for name in ("../b/secret", "..", "/etc/passwd", "a\x1b[31m"):
+        index["shards"][0]["name"] = name
+        (tmp_path / "s" / "index.json").write_text(json.dumps(index))
+        for place in (tmp_path / "s", f"file://{tmp_path}/s"):
+            with pytest.raises(SpecError, match=r"^[^\x1b]*is not the name of a file"):
+                verify_shards(place)
+
+
+def test_long_names_fit_into_a_tar(built, tmp_path):
+    """Names of clips have up to 120 bytes; a header of USTAR has 100."""
+    root = shutil.copytree(built.root, tmp_path / "b")
+    manifest = json.loads((root / "benchmark.json").read_text())
+    for number, entry in enumerate(manifest["clips"]):
+        old, entry["name"] = entry["name"], f"{number}-{'long' * 30}"
+        folder = (root / "clips" / old).rename(root / "clips" / entry["name"])
+        content = json.loads((folder / "clip.json").read_text()) | {"name": entry["name"]}
+        (folder / "clip.json").write_text(json.dumps(content))
+    (root / "benchmark.json").write_text(json.dumps(manifest))
+    assert pack_benchmark(root, tmp_path / "s") == 6
+    found = tar_samples((tmp_path / "s" / "train-000000.tar").read_bytes())
+    assert [len(name) for name in found] == [122 + 7] * 3

@@ -11,18 +11,25 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import betainc, gammaincc, ndtr
 
+import hesim_render as hr
+from hesim_render.calibrate.aps import checks as frame_checks
+from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixels
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
+from hesim_render.calibrate.asynchronous.first_event import correlation
 from hesim_render.calibrate.estimate import Spread, estimated
+from hesim_render.calibrate.evs import counts, dispersion
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.counts import StaticCapture
+from hesim_render.calibrate.evs.curve_levels import curve_levels
 from hesim_render.calibrate.evs.defects import bad_event_pixels, bad_in_steps
 from hesim_render.calibrate.evs.fitted import fit_events
+from hesim_render.calibrate.evs.medians import middle_and_spread
 from hesim_render.calibrate.evs.model import from_natural, natural
 from hesim_render.calibrate.evs.output import _gauge
-from hesim_render.calibrate.evs.steps import Steps
-from hesim_render.calibrate.evs.thresholds import Thresholds
+from hesim_render.calibrate.evs.steps import GROUPS, Steps
+from hesim_render.calibrate.evs.thresholds import Thresholds, curve
 
 BETA = np.array([4.0, 0.3, 20.0, 2e-5, 0.05, 30.0])  # 1, I, t, I², I t, t²
 FRAMES, TAU = 16, 6.0
@@ -357,3 +364,130 @@ def test_intervals_of_a_jackknife_are_as_wide_as_students_law_asks():
         assert (low, high) == pytest.approx((5 - half / 2, 5 + half / 2), abs=5e-5)
         spread = Spread(0.15, 0.002, 0.2, groups).described()
         assert spread["interval_95"][1] == pytest.approx(0.15 + 0.002 * half, abs=1e-6)
+
+
+# ---- counts in time, signals between pixels --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("between", [0.0, 4e-5])
+def test_counts_of_a_trinomial_law_have_no_dispersion(between, monkeypatch):
+    """20,000 pixels with P₊ = 0.31 and P₋ = 0.12; their probabilities may differ by a known variance, each of its own.
+
+    The mean of 20,000 squares is known to 1 %. With the wrong sign of (P₊ − P₋)² the difference has 0.84.
+    """
+    trials, pixels, mean = 400, 20_000, np.array([0.31, 0.12])
+    rng = np.random.default_rng(6)
+    p = mean[:, None] + np.sqrt(between) * rng.standard_normal((2, pixels))
+    counts = rng.multinomial(trials, np.stack([*p, 1 - p.sum(axis=0)], axis=-1))[:, :2].T
+    cells = SimpleNamespace(
+        trials=trials, signal_dn=np.array([30.0, 30.0]), polarity=np.array([1, -1]), spread=None, relative=None
+    )
+    given = SimpleNamespace(
+        cells=cells, is_dark=np.array([False, False]), counts=counts, cell=np.repeat([[0], [1]], pixels, axis=1)
+    )
+    monkeypatch.setattr(dispersion, "log_probability", lambda *_: (np.log(mean), None))
+    monkeypatch.setattr(dispersion, "threshold_over_noise", lambda *_: (np.ones(2), None))
+    monkeypatch.setattr(dispersion, "probability_variance", lambda *_: np.full(2, between))
+    fit = SimpleNamespace(parameters=np.zeros(5), law="linear")
+    found = dispersion.dispersion_in_time(given, fit, 0.7)
+    assert abs(found.total - 1) < 5 * 0.011 and abs(found.difference - 1) < 5 * 0.011
+    assert 0.006 < found.total_error < 0.02 and 0.006 < found.difference_error < 0.02
+
+
+def test_noise_of_the_frames_makes_no_edge_of_an_even_scene():
+    """White event pixels between frame pixels: these differ where they do beyond √3 times their noise."""
+    sensor = hr.load_sensor("gen2").spec
+    rng, shape = np.random.default_rng(3), (64, 96)
+    scatter = 700.0 * (1 + 0.2 * rng.standard_normal(shape))
+    shares = []
+    for error in (140.0, 14.0):
+        composite = Composite(scatter.astype(np.float32), np.full(shape, error, np.float32))
+        signal, uneven = signal_at_event_pixels(composite, sensor, "D65")
+        assert signal.shape == (16, 24) and np.isfinite(signal).all()
+        shares.append(uneven.mean())
+    assert shares[0] < 0.1 and shares[1] > 0.8
+
+
+@pytest.mark.parametrize("mismatch", [0.03, 0.08])
+def test_spread_of_thresholds_is_freed_of_counting(mismatch):
+    """Counts of 60,000 pixels in 3000 trials: counting alone has 5 % of the threshold, near the spread itself."""
+    rng, trials, u = np.random.default_rng(12), 3000, np.array([1.1, 1.7])
+    own = u[:, None] * (1 + mismatch * rng.standard_normal((2, 60_000)))
+    both = [rng.binomial(trials, ndtr(-each)).astype(float) for each in own]
+    middles, spread = middle_and_spread(both, np.zeros(60_000, np.intp), trials)
+    assert spread == pytest.approx(mismatch, rel=0.05)
+    np.testing.assert_allclose([float(each[0]) for each in middles], u, rtol=0.01)
+
+
+def test_thresholds_of_few_events_are_freed_of_their_spread():
+    """An event a pixel: the mean over normal thresholds is Q(u/√(1 + m² u²)), which tells u to 5 %, for starts of fits:
+    half an event is added to the mean. Without the spread u would be 8 % low.
+    """
+    rng, trials, u, mismatch = np.random.default_rng(13), 3000, np.array([3.4, 3.55]), 0.11
+    both = [
+        rng.binomial(trials, ndtr(-each * (1 + mismatch * rng.standard_normal(60_000)))).astype(float) for each in u
+    ]
+    middles, spread = middle_and_spread(both, np.zeros(60_000, np.intp), trials, known=mismatch)
+    assert spread == mismatch and max(counts.mean() for counts in both) < 2.5
+    np.testing.assert_allclose([float(each[0]) for each in middles], u, rtol=0.05)
+
+
+def test_floors_and_ceiling_of_exact_curves_are_found():
+    """S-curves of ON and OFF that begin above 0 and end below 1, with different thresholds and floors."""
+    step = np.linspace(-0.6, 0.6, 25)
+    values, floors, ceiling = np.array([0.17, 0.26, 0.05, 0.0]), (0.013, 0.038), 0.91
+    rates = [
+        floor + (ceiling - floor) * curve(values, sign, step) for sign, floor in zip((1.0, -1.0), floors, strict=True)
+    ]
+    pixels, trials = np.full(GROUPS, 40.0), 500
+    on, off = (np.outer(rate, pixels * trials) for rate in rates)
+    steps = SimpleNamespace(on=on, off=off, pixels=pixels, trials=trials)
+    found = curve_levels(steps, SimpleNamespace(values=values * [1.02, 0.98, 1.05, 1.0], step=step))
+    for (value, error), true in zip((found.floor_on, found.floor_off, found.ceiling), (*floors, ceiling), strict=True):
+        assert value == pytest.approx(true, abs=1e-6) and error < 1e-6
+
+
+def test_noise_of_two_equal_poles_has_its_correlation():
+    """The cosine transform of 1/(1 + (f/f_p)²)², which is ½ at the cut-off."""
+    cutoff_hz = 130.0
+    pole = cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    f = np.linspace(0, 40 * pole, 200_001)
+    power = (1 + (f / pole) ** 2) ** -2.0
+    for elapsed_s in (0.0, 2e-4, 1.1e-3, 4e-3):
+        expected = np.trapezoid(power * np.cos(2 * np.pi * f * elapsed_s), f) / np.trapezoid(power, f)
+        assert correlation(cutoff_hz, elapsed_s) == pytest.approx(expected, abs=1e-4)
+
+
+def test_dark_line_is_judged_by_the_noise_of_rows_and_pixels():
+    """Five exposures, one off the line: the p-value is that of χ² with the variance of a mean over rows of a frame."""
+    t, frames, shape = np.array([1e-3, 3e-3, 9e-3, 2e-2, 5e-2]), 25, (48, 80)
+    mean = 64 + 90.0 * t
+    mean[3] += 0.06
+    dark = SimpleNamespace(
+        exposures_s=t, frames=frames, mean=np.full((5, *shape), 1.0) * mean[:, None, None],
+        variance=np.full((5, *shape), 1.7),
+    )  # fmt: skip
+    none = np.zeros(shape, bool)
+    result = SimpleNamespace(bad=none, dark=SimpleNamespace(bad=none, hot=none))
+    rows = 0.3
+    variance = (1.7 / none.size + rows / shape[0]) / frames
+    residual = mean - np.polynomial.Polynomial.fit(t, mean, 1)(t)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frame_checks, "_dark_variance", lambda _: 1e-9)  # any shift that is significant counts
+        patch.setattr(frame_checks, "ALARM", 1.0)
+        found = frame_checks._line(result, dark, rows)
+    assert found.p_value == pytest.approx(gammaincc(1.5, np.sum(residual**2) / variance / 2), rel=1e-6)
+    assert 1e-6 < found.p_value < 0.9
+
+
+def test_signals_of_event_pixels_are_those_of_the_reference_exposure(tmp_path, monkeypatch):
+    """A rate of the frames, in DN/s, times the exposure of the reference, in µs; NaN at edges, and none below 0."""
+    rate = np.array([[1200.0, -30.0], [500.0, 80.0]], np.float32)
+    uneven = np.array([[False, False], [True, False]])
+    (tmp_path / "c.yaml").write_text("")
+    monkeypatch.setattr(counts, "read_calibration", lambda _: {"aps": {}})
+    monkeypatch.setattr(counts, "read_maps", lambda *_: {"evs_signal_dn_per_s": rate, "evs_signal_uneven": uneven})
+    reference = SimpleNamespace(filter="own", t_ref_us=7000.0)
+    captures = SimpleNamespace(folder=tmp_path, spec=SimpleNamespace(signal_reference=reference))
+    found = counts._composite_signal(captures, tmp_path / "c.yaml", tmp_path / "evs_static.npz")
+    np.testing.assert_allclose(found, [[8.4, 0.0], [np.nan, 0.56]], rtol=1e-6)

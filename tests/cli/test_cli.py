@@ -507,3 +507,26 @@ def test_isp_develops_a_recording(capsys, tmp_path):
     smooth, plain = (np.asarray(Image.open(tmp_path / k / "000000.png")) for k in ("rec-pictures", "plain"))
     assert not np.array_equal(smooth, plain)
     assert "has no calibration" in fails(capsys, "isp", recording, "--calibration", "c.yaml", "--overwrite")
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("Unable to allocate 9 GiB"), "not enough memory (Unable to allocate 9 GiB); a smaller region"),
+        (MemoryError(), "not enough memory; a smaller region"),
+        (RuntimeError("jit_malloc(): out of memory! Could not allocate"), "not enough memory (jit_malloc(): out of"),
+        (OSError(27, "File too large"), "a file cannot be written: File too large"),
+        (OSError(27, "File too large", "x.h5"), "x.h5: File too large"),
+    ],
+)
+def test_no_memory_and_limits_of_files_are_one_line(capsys, monkeypatch, tmp_path, error, told):
+    """The error comes from within; one of printing has another name (above)."""
+    from hesim_render.core import shipped
+
+    code = compile("def fail(*_):\n    raise error", shipped.__file__, "exec")
+    inside = {"error": error}
+    exec(code, inside)
+    monkeypatch.setattr("hesim_render.cli.commands.program", lambda: lambda **_: inside["fail"]())
+    with pytest.raises(SystemExit) as end:
+        cli.main(["list"])
+    assert end.value.code == 2 and capsys.readouterr().err.startswith(f"hesim-render: {told}")

@@ -184,3 +184,15 @@ def test_the_shell_completes_names(shell, answer):
     program = "import sys; sys.argv[0] = 'hesim-render'; from hesim_render.cli import main; main([])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=place)
     assert answer in done.stdout and "Usage" not in done.stdout, done.stderr
+
+
+def test_what_is_printed_moves_no_cursor_and_is_json(capsys):
+    """Names of files and texts in them are of others."""
+    from hesim_render.cli.told import Told
+
+    name = "a\x1b[2Jb\x9b1mc\u202ed\ud800 ö"
+    Told().result(f"made {name}\nof x", {})
+    assert capsys.readouterr().out == "made a\\x1b[2Jb\\x9b1mc\\u202ed\\ud800 ö\nof x\n"
+    Told(as_json=True).result("", {"name": name})
+    text = capsys.readouterr().out
+    assert json.loads(text)["name"] == name and text.replace("\n", "").isprintable()

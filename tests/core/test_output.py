@@ -366,3 +366,12 @@ def test_file_systems_without_locks_are_written_to(tmp_path, monkeypatch):
     monkeypatch.setattr(output.fcntl, "flock", none)
     with output.alone_in(tmp_path / "new"):
         assert (tmp_path / "new").is_dir()
+
+
+def test_an_error_names_the_place_that_a_file_was_to_have(tmp_path):
+    """And no temporary name, also where a file is written within an unfinished folder."""
+    folder = OutputFolder(tmp_path / "out", "marker")
+    told = rf"^{tmp_path}/out/results\.csv: cannot be written \(File too large\)$"
+    with pytest.raises(OutputError, match=told), replacing(folder.path / "results.csv"):
+        raise OSError(27, "File too large")
+    folder.discard()

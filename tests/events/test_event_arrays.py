@@ -137,3 +137,19 @@ def test_events_of_a_recording_fit_its_grid():
 def test_mistakes_are_named(act, text):
     with pytest.raises(RangeError, match=text):
         act()
+
+
+def test_rates_of_many_intervals_are_those_of_a_histogram():
+    """173 intervals of 37 µs from 411 µs on, the last one cut short; an event on a bound belongs to what follows."""
+    rng, begin, end = np.random.default_rng(6), 411, 411 + 172 * 37 + 20
+    events = np.zeros(5000, EVENT_DTYPE)
+    events["t_us"] = np.sort(rng.integers(0, end + 500, events.size))
+    events["polarity"] = rng.choice([-1, 1], events.size, p=[0.3, 0.7])
+    rate = event_rate(events, 37, begin_us=begin, end_us=end)
+    edges = np.append(begin + 37 * np.arange(173), end)
+    for sign, found in ((1, rate.on_per_s), (-1, rate.off_per_s)):
+        own = events["t_us"][events["polarity"] == sign]
+        counts = np.array(
+            [np.count_nonzero((own >= a) & (own < b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        )
+        np.testing.assert_allclose(found, counts / np.diff(edges) * 1e6, rtol=1e-9)

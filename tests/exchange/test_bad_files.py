@@ -1,6 +1,7 @@
 """Damaged and foreign event files, and outputs that exist: one clear line, and nothing is changed."""
 
 import os
+import struct
 
 import lz4.frame
 import numpy as np
@@ -11,7 +12,7 @@ from event_files import DATA, SHAPE, columns, made, many, raw, written
 import hesim_render as hr
 from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
-from hesim_render.exchange import EVENT_FORMATS, EventStream, open_events
+from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events
 from hesim_render.recording.exports import import_events
 
 READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
@@ -221,6 +222,33 @@ def test_what_a_recording_does_not_have(tmp_path):
     with pytest.raises(RangeError, match=r"did you mean 'tiff'"):
         recordings.make("davis346").export("tif", tmp_path / "e")
     assert not os.listdir(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["zstd", "lz4"])
+def test_a_packet_that_unpacks_to_more_than_can_be_held_is_refused(kind, tmp_path):
+    """Half a GiB of zeros in some kB; no more is unpacked than is allowed."""
+    import tracemalloc
+
+    import zstandard
+
+    data = written(many(10, 1000), "aedat4", tmp_path).read_bytes()
+    begin = aedat4.read_header(tmp_path / "events.aedat4")[3]
+    packer = zstandard.ZstdCompressor().compressobj() if kind == "zstd" else lz4.frame.LZ4FrameCompressor()
+    packed = packer.begin() if kind == "lz4" else b""
+    packed += b"".join(packer.compress(bytes(1 << 24)) for _ in range(32)) + packer.flush()
+    place = len("#!AER-DAT4.0\r\n") + 4 + 24 + 4
+    number = {"zstd": 3, "lz4": 1}[kind].to_bytes(4, "little")
+    table = (begin + 8 + len(packed)).to_bytes(8, "little")
+    header = data[:place] + number + data[place + 4 : place + 8] + table + data[place + 16 : begin]
+    (tmp_path / "bomb.aedat4").write_bytes(header + struct.pack("<ii", 0, len(packed)) + packed)
+    tracemalloc.start()
+    try:
+        with pytest.raises(SpecError, match=r"bomb\.aedat4: a packet ends early, or is larger than 128 MiB"):
+            open_events(tmp_path / "bomb.aedat4").count()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 300e6
 
 
 def command(capsys, *words):

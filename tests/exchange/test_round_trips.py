@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange import aedat4, open_events, stream
+from hesim_render.exchange.dsec import read_events as read_dsec
 from hesim_render.exchange.flatbuffer import Table
 
 READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
@@ -246,6 +247,32 @@ def test_files_of_dsec_are_read(tmp_path):
         open_events(path)
     events["t_us"] += 49_599_300_523
     np.testing.assert_array_equal(joined(open_events(path, shape=(480, 640))), events)
+
+
+def test_an_interval_of_a_file_of_dsec_is_read_by_its_index(tmp_path):
+    """Times count from `t_offset`: the events of an interval, and an index that does not fit in either direction."""
+    events, offset = many(3000, 1 << 16, (48, 64)), 7_300_523
+    on = (events["polarity"] > 0).astype("u1")
+    starts = np.searchsorted(events["t_us"], np.arange(0, 67) * 1000)
+
+    def written(name, shift):
+        with h5py.File(tmp_path / name, "w") as file:
+            for key, values, kind in (("t", events["t_us"], "u4"), ("x", events["x"], "u2"), ("y", events["y"], "u2")):
+                file[f"events/{key}"] = values.astype(kind)
+            file["events/p"] = on
+            file["ms_to_idx"] = np.clip(starts + shift, 0, events.size).astype(np.uint64)
+            file["t_offset"] = np.int64(offset)
+        return tmp_path / name
+
+    moved = events.copy()
+    moved["t_us"] += offset
+    begin, end = offset + 21_304, offset + 40_777
+    part = moved[(moved["t_us"] >= begin) & (moved["t_us"] < end)]
+    assert 500 < part.size < 1500
+    np.testing.assert_array_equal(read_dsec(written("good.h5", 0), begin, end, shape=(48, 64)), part)
+    for name, shift, interval in (("late.h5", 300, (begin, None)), ("early.h5", -300, (None, end))):
+        with pytest.raises(SpecError, match="ms_to_idx does not fit the times"):
+            read_dsec(written(name, shift), *interval, shape=(48, 64))
 
 
 @pytest.mark.slow

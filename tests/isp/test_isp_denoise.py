@@ -247,37 +247,67 @@ def test_rows_that_show_picture_are_left_alone():
     """A horizon across the whole frame, much higher than row noise, is no offset; nor is a slope."""
     noise = noise_of(BAYER)
     scene = np.where(np.arange(128) < 64, 10.0, 60.0)[:, None] + np.zeros((1, 256))
-    found = row_offsets(noisy(scene, noise), BAYER, noise, 1.0)
+    found = row_offsets(noisy(scene, noise), BAYER, noise, 1.4)
     assert np.abs(found).max() < 0.5
     slope = np.linspace(10, 200, 128)[:, None] + np.zeros((1, 256))
     assert np.abs(row_offsets(noisy(slope, noise), BAYER, noise, 1.0)).max() < 0.6
 
 
-def test_row_offsets_solve_their_normal_equations():
-    """Without noise or picture the differences are exact: the banded solution against a dense one."""
+@pytest.mark.parametrize("row_std", [0.4, 2.5])
+def test_row_offsets_solve_their_normal_equations(row_std):
+    """Without noise or picture the differences are exact: the banded solution against a dense one.
+
+    Twelve columns: the noise of a row's mean is as large as its offset, so that the prior counts.
+    """
     rng = np.random.default_rng(4)
-    offsets = rng.normal(0, 1, 40)
-    flat = (50 + offsets[:, None] + np.zeros((1, 64))).astype(np.float32)
+    offsets = rng.normal(0, row_std, 40)
+    flat = (50 + offsets[:, None] + np.zeros((1, 12))).astype(np.float32)
     noise = noise_of(((0,),))
-    found = row_offsets(flat, [[0]], noise, 1.0)
-    sigma2 = (0.64 + 1 / 12 + 0.16 * 50) * 1.5 / 64
+    found = row_offsets(flat, [[0]], noise, row_std)
+    sigma2 = (0.64 + 1 / 12 + 0.16 * 50) * 1.5 / 12
     difference = np.zeros((38, 40))
     difference[np.arange(38), np.arange(38)] = difference[np.arange(38), np.arange(2, 40)] = -0.5
     difference[np.arange(38), np.arange(1, 39)] = 1
     dense = np.linalg.solve(
-        difference.T @ difference / sigma2 + np.eye(40), difference.T @ (difference @ offsets) / sigma2
+        difference.T @ difference / sigma2 + np.eye(40) / row_std**2, difference.T @ (difference @ offsets) / sigma2
     )
-    np.testing.assert_allclose(found, dense, atol=0.05)
+    # the noise of each row is that at its own level
+    np.testing.assert_allclose(found, dense, atol=0.03 * row_std)
+    assert np.abs(dense - offsets).max() > 0.1 * row_std
+
+
+def test_an_offset_counts_up_to_four_deviations_of_what_is_likely():
+    """A line that differs from its neighbours by more is picture; the deviation is that of rows, squared, and noise.
+
+    Beyond it the line's own comparison does not count; beyond twice as much, nor do those of its neighbours.
+    """
+    noise, row_std = noise_of(((0,),)), 3.0
+    limit = 4 * np.sqrt(1.5 * (row_std**2 + (0.64 + 1 / 12 + 0.16 * 50) / 96))
+    for factor, share in ((0.98, 0.818), (1.02, 0.658), (1.96, 0.656), (2.04, 0.0)):
+        flat = np.full((31, 96), 50.0, np.float32)
+        flat[15] += factor * limit
+        found = row_offsets(flat, [[0]], noise, row_std)
+        assert found[15] / (factor * limit) == pytest.approx(share, abs=0.01)
 
 
 def test_scatter_of_what_is_left_is_what_the_noise_makes():
     """On a flat field the error of a row's offset is that of means of samples: chi-square over rows, both sides."""
     noise = noise_of(((0,),))
     raw = noisy(np.full((400, 512), 20.0), noise, seed=9)
-    found = row_offsets(raw, [[0]], noise, 1.0)
+    found = row_offsets(raw, [[0]], noise, 1.4)
     # a row against the mean of its two neighbours: the second difference of what was found
     second = found[1:-1] - (found[2:] + found[:-2]) / 2
     sigma2 = (0.64 + 1 / 12 + 0.16 * 20) * 1.5 / 512
     score = (second[::3] ** 2).sum() / sigma2
     # shrunk by the prior a little; false alarm 1e-4 and 5 % for the robust mean, which is less efficient
     assert chi2.ppf(1e-4, second[::3].size) * 0.8 < score < chi2.ppf(1 - 1e-4, second[::3].size) * 1.05
+
+
+def test_noise_times_a_factor_has_that_factor_in_every_standard_deviation():
+    beta = np.array([[[0.64, 0.16, 3.0, 2e-4, 0.7, 11.0]]])
+    noise = FrameNoise(beta, 20_000.0, residual_dn2=1.3, response_std=0.02)
+    once, more = (each.variance((0, 0)) for each in (noise, noise.times(2.5)))
+    rounding = 1 / 12
+    assert more[0] - rounding == pytest.approx(6.25 * (once[0] - rounding), rel=1e-12)
+    assert once[0] == pytest.approx(0.64 + 3.0 * 0.02 + 11.0 * 0.02**2 + 1.3 + rounding, rel=1e-12)
+    np.testing.assert_allclose(more[1:], 6.25 * np.array(once[1:]), rtol=1e-12)

@@ -256,3 +256,13 @@ def test_integer_depths_round_the_curve(depth):
     assert found.dtype == (np.uint8 if depth == 8 else np.uint16)
     # 8 bit: a table of 65536 levels, at most 0.03 of a code off half a code; 16 bit: float32 input rounds once
     assert np.abs(found - exact).max() < 0.55
+
+
+def test_grey_world_leaves_out_tiles_of_which_one_channel_is_dark_or_saturated():
+    """The gains are those of the well exposed part; the others have other colours."""
+    tile, colour = ((0, 1), (1, 2)), np.array([0.31, 0.62, 0.44])
+    raw = colour[np.tile(tile, (20, 30))].astype(np.float32)
+    for rows, channel, level in ((slice(0, 12), 2, 0.004), (slice(12, 24), 0, 0.97)):
+        part = raw[rows]
+        part[np.tile(tile, (6, 30)) == channel] = level
+    np.testing.assert_allclose(balance.grey_world(raw, tile), colour.max() / colour, rtol=1e-5)

@@ -77,6 +77,7 @@ def test_one_filter_of_a_mosaic_is_measured_in_a_part_of_a_frame(recording):
         np.testing.assert_allclose(found.mtf[:51], expected, atol=0.05)
         assert abs(found.angle_deg - 5) < 0.2
     raw = measure_mtf(loaded, region=(10, 0, 100, 96), filter_name=known[1])
+    assert not raw.clipped
     assert abs(raw.mtf[10] - expected[10]) < 0.05
     with pytest.raises(RangeError, match="filter_name is None; expected one of"):
         measure_mtf(loaded)
@@ -110,6 +111,7 @@ def test_the_command_prints_and_writes_the_response(recording, tmp_path, capsys)
     ]
     assert run(*given) == 0
     printed = capsys.readouterr().out
+    assert "noise-free electrons" in printed and "CLIPPED" not in printed
     assert "MTF at 0.25 cycles per pixel: 0." in printed and "edge 5.0" in printed and f"in {out}" in printed
     table = np.loadtxt(out, delimiter=",", skiprows=1)
     loaded = hr.Recording.load(recording)
@@ -132,12 +134,15 @@ def test_a_recording_without_frames_says_so():
         measure_mtf(events)
 
 
-def test_saturated_pixels_are_refused(tmp_path):
+def test_saturated_pixels_are_refused(tmp_path, capsys):
     bright = hr.load_scene("slanted-edge", {"light.illuminance_lux": 1e6})
-    recording = hr.simulate(bright, mono(64, 48), duration_s=0.02, clean=True)
+    recording = hr.simulate(bright, mono(64, 48), duration_s=0.02, clean=True, out=tmp_path / "bright")
     with pytest.raises(RangeError, match="values below saturation"):
         measure_mtf(recording)
-    assert measure_mtf(recording, signal="electrons").mtf[25] > 0.8  # the truth is not clipped
+    found = measure_mtf(recording, signal="electrons")
+    assert found.mtf[25] > 0.8 and found.clipped  # the truth is not clipped
+    assert run("measure", "mtf", tmp_path / "bright", "--signal", "electrons") == 0
+    assert "CLIPPED: RAW values" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("page", ["docs/cli.md", pytest.param("docs/targets.md", marks=pytest.mark.slow)])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.mosaic.schedule import blocks_of_run, sample_of_blocks, tick_blocks
+from hesim_render.mosaic.schedule import blocks_of_run, exposures, sample_of_blocks, tick_blocks
 
 #: 16 cells of 1 ms.
 STRETCH_US = 16_000
@@ -71,3 +71,17 @@ def test_fixed_ticks_are_sampled_like_instants():
     assert begin_us + length_us - part_us < sample.blocks[-1].end_us[-1] <= begin_us + length_us
     assert sample.count == pytest.approx(length_us / stretch_us)
     assert sample.windows == pytest.approx(length_us / spec.tick_us)
+
+
+def test_a_frame_ends_with_its_last_row():
+    """32 rows, 7.5 µs apart: the last one begins 31 delays after the first; a run that ends there has the frame."""
+    spec = hr.load_sensor("reference-mono").spec.aps.model_copy(
+        update={"shutter": "rolling", "line_time_us": 7.5, "exposure_us": 1300, "frame_rate_hz": 70.0}
+    )
+    end_us = 1300 + 31 * 7.5
+    assert [len(exposures(spec, 32, int(end_us) + more)) for more in (0, 1)] == [0, 1]
+    first, second = exposures(spec, 32, 20_000)
+    assert first.end_us == end_us and second.start_us == 14_286 and second.t_us == 15_586
+    np.testing.assert_array_equal(second.row_begin_us(np.array([0, 31])), [14_286, 14_286 + 232.5])
+    still = spec.model_copy(update={"shutter": "global"})
+    assert exposures(still, 32, 1300)[0].end_us == 1300

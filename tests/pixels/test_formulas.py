@@ -178,7 +178,14 @@ print(json.dumps({"found": [f.tolist() for f in found], "loaded": loaded}))
 """
 
 
-@pytest.mark.slow
+def test_events_of_a_defect_show_where_the_comparison_gave_none():
+    """Counted are a good pixel's own events, and in what is left those of the defect: own + (1 − ON − OFF) q."""
+    on, off, q = np.array([0.0, 0.12, 0.3]), np.array([0.07, 0.25, 0.2]), np.array([0.02, 0.4, 0.9])
+    rest = 1 - on - off
+    for polarity, own in ((1, on), (-1, off)):
+        np.testing.assert_allclose(evs.own_events(own + rest * q, on, off, polarity), q, rtol=1e-12)
+
+
 def test_calibration_fits_the_formulas_where_drjit_and_mitsuba_cannot_be_imported(tmp_path):
     """The formulas of both kinds of pixel, and both fits, run there; no sampler is loaded."""
     capture_sets.write_events(tmp_path / "set", size=64, trials=20000)

@@ -159,3 +159,14 @@ def test_wrong_electrons(electrons):
     noise = model("gen2", crop=(256, 256))
     with pytest.raises(RangeError, match="electrons_1"):
         noise.event_probability(1.0, electrons)
+
+
+def test_the_quiet_reference_shows_what_moves_and_no_noise():
+    """In still light the whole sensor has less than one noise event in ten minutes; a change of 25 % is seen."""
+    quiet = model("reference-quiet", crop=(96, 64))
+    for electrons in (0.0, 3.0, 200.0, 20_000.0):
+        on, off = quiet.event_probability(electrons, electrons)
+        assert (on + off) * 1024**2 * 1000 * 600 < 1.0
+        assert quiet.event_probability(electrons + 1, 1.25 * electrons + 2)[0] > 0.9
+    # the other reference is mostly noise in light that both see well
+    assert model("reference-mono", crop=(96, 64)).event_probability(200.0, 200.0)[0] > 0.05

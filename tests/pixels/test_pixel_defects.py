@@ -374,9 +374,9 @@ def test_defects_of_events_are_found_and_named(events_session):
     tick_s = given.spec.evs.tick_us * 1e-6
     chance = -np.expm1(-true.on_hz[steady] * tick_s)
     error = np.sqrt(chance * (1 - chance) / (2 * TICKS))
-    score = (maps["defect_on_per_trial"].ravel()[true.place[steady]] - chance) / error
+    score = (-np.expm1(-maps["defect_on_hz"].ravel()[true.place[steady]] * tick_s) - chance) / error
     assert np.abs(score).max() < 4.8 and 0.5 < score.std() < 1.6
-    assert maps["defect_off_per_trial"].max() < 2e-3
+    assert maps["defect_off_hz"].max() * tick_s < 2e-3 and section["tick_us"] == given.spec.evs.tick_us
 
 
 def test_a_calibrated_sensor_misbehaves_alike(events_session):
@@ -533,8 +533,8 @@ def test_telegraph_pixels_of_frames_are_found(frames_session):
     ratio = maps["telegraph_amplitude_dn"].ravel()[found] / true.amplitude_dn[mine]
     assert abs(np.median(ratio) - 1) < 0.03 and np.quantile(np.abs(ratio - 1), 0.9) < 0.15
     assert np.median(maps["telegraph_high_share"].ravel()[found]) == pytest.approx(1 / 3, abs=0.05)
-    correlation = np.exp(-(5 + 2.5) / 30)
-    assert np.median(maps["telegraph_correlation"].ravel()[found]) == pytest.approx(correlation, abs=0.04)
+    correlation = np.exp(-np.median(maps["telegraph_change_hz"].ravel()[found]) / 30)
+    assert correlation == pytest.approx(np.exp(-(5 + 2.5) / 30), abs=0.04) and section["frame_rate_hz"] == 30
     # what is left is a good sensor: the noise of the others is the file's
     assert section["read_noise_e"]["value"] == pytest.approx(6.0, rel=0.01)
 

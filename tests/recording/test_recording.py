@@ -142,6 +142,10 @@ def test_preview_dng_is_the_binned_quad(tmp_path):
     valid = frame.valid.reshape(48, 2, 64, 2).transpose(0, 2, 1, 3).reshape(48, 64, 4)
     expected = np.rint(np.where(valid, cells, 0).sum(-1) / valid.sum(-1))
     np.testing.assert_array_equal(found, expected)
+    # a mean of three pixels, as one of four is an event pixel, has a third of the noise; the pitch is twice as large
+    own, smaller = made.mosaic, binned(frame.raw, made.mosaic)[1]
+    assert smaller.noise_profile == pytest.approx(np.array(own.noise_profile) / 3, rel=1e-12)
+    assert smaller.pitch_um == 2 * own.pitch_um
     assert binned(frame.raw, recordings.make("reference-bayer", frames=0).mosaic) is None
 
 

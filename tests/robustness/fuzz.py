@@ -1,5 +1,7 @@
 """Damage files and read them, many times over: ``fuzz.py SUBJECT:FIRST:LAST …`` prints one JSON line a try.
 
+``SUBJECT/places`` puts something else in the place of each file: a pipe, a device, a folder, six GB that are not there.
+
 A try ends well (``fine``) or in one clear error (``refused``); ``broke`` is another exception. Whoever runs this takes
 a try that is not reported in time for a hang, and one that ends the process for a crash.
 """
@@ -16,19 +18,22 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from mutations import mutate
+from places import LONG, PLACES, put, put_back
 from subjects import SUBJECTS, files_of, quiet
 
 from hesim_render.core.errors import HesimError
 
 
-def attempt(name, folder, seed):
+def attempt(name, folder, seed, files, in_place=False):
     """Damage one file, read, put it right again."""
     read = SUBJECTS[name][1]
-    files = files_of(name, folder)
-    file = files[seed % len(files)]
+    file, kind = files[seed // len(PLACES) if in_place else seed % len(files)], PLACES[seed % len(PLACES)]
     whole = file.read_bytes()
-    file.write_bytes(mutate(file.name, whole, seed))
-    told = {"seed": seed, "file": str(file.relative_to(folder))}
+    if in_place:
+        put(kind, file)
+    else:
+        file.write_bytes(mutate(file.name, whole, seed))
+    told = {"seed": seed, "file": str(file.relative_to(folder)), **({"kind": kind} if in_place else {})}
     try:
         with quiet(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -42,17 +47,22 @@ def attempt(name, folder, seed):
         ours = next((f"{f.filename}:{f.lineno}" for f in reversed(where) if "hesim_render/" in f.filename), "")
         return told | {"end": "broke", "error": f"{type(error).__name__}: {str(error)[:200]}", "where": ours}
     finally:
-        file.write_bytes(whole)
+        put_back(file, whole)
 
 
 def main(name, first, last):
+    name, _, places = name.partition("/")
     folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
     try:
         SUBJECTS[name][0](folder)
         with quiet():
             SUBJECTS[name][1](folder)  # what is not damaged is read
+        files = files_of(name, folder)
+        last = min(last, len(files) * len(PLACES)) if places else last
         for seed in range(first, last):
-            print(json.dumps({"subject": name} | attempt(name, folder, seed)), flush=True)
+            if places and name in LONG and PLACES[seed % len(PLACES)] == "large":
+                continue
+            print(json.dumps({"subject": name} | attempt(name, folder, seed, files, bool(places))), flush=True)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

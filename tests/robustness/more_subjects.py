@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import tempfile
 from pathlib import Path
 
 import h5py
@@ -120,3 +122,68 @@ def read_plan(folder):
 
     for clip in Plan(read_benchmark(folder / "b.yaml")).clips:
         assert clip.name
+
+
+def built(folder):
+    """A benchmark of two clips; names in its files become folders, files and members of shards."""
+    from hesim_render.benchmark import build_benchmark
+    from hesim_render.specs.benchmark import BenchmarkSpec
+
+    given = [{"scene": "flat-field", "split": "train"}, {"scene": "checkerboard", "split": "test"}]
+    changes = {"scenes": {"given": given}, "truth": [], "sharp": None, "audit": 0}
+    sensors = [{"sensor": "reference-mono", "roi": "8x6"}]
+    spec = BenchmarkSpec.model_validate({**SMALL, **changes, "sensors": sensors})
+    build_benchmark(spec, folder / "b", workers=0, estimate=False)
+
+
+def use_built(folder):
+    """Verify, discard, pack and export a copy; beside it nothing may appear, change or vanish."""
+    from hesim_render.benchmark.layouts import export_benchmark
+    from hesim_render.benchmark.shards import pack_benchmark
+    from hesim_render.benchmark.verify import discard_damaged, verify_benchmark
+
+    with tempfile.TemporaryDirectory() as other:
+        place = Path(other)
+        (place / "mine").mkdir()
+        (place / "mine" / "thesis").write_text("years")
+        root = place / "in" / "b"
+        root.parent.mkdir()
+        subprocess.run(["cp", "-a", folder / "b", root], check=True)  # pipes and links as well
+        (root / "clips" / "mine").mkdir()
+        (root / "clips" / "mine" / "notes").touch()
+        try:
+            pack_benchmark(root, place / "out" / "shards")
+            export_benchmark(root, "raw-npz", place / "out" / "raw")
+            discard_damaged(root, verify_benchmark(root))
+        finally:
+            assert (place / "mine" / "thesis").read_text() == "years" and (root / "clips" / "mine" / "notes").is_file()
+            assert {path.name for path in place.iterdir()} <= {"mine", "in", "out"}
+            assert {path.name for path in (place / "in").iterdir()} == {"b"}
+            assert {path.name for path in place.glob("out/*")} <= {"shards", "raw"}
+
+
+def shards(folder):
+    from hesim_render.benchmark.shards import pack_benchmark
+
+    built(folder)
+    pack_benchmark(folder / "b", folder / "s")
+
+
+def verify_packed(folder):
+    from hesim_render.benchmark.shards import verify_shards
+
+    verify_shards(folder / "s")
+
+
+def run_file(folder):
+    (folder / "r.yaml").write_text(
+        "schema_version: 1\nname: r\nscene: flat-field\nsensor: eiger\nroi: 8x8\nduration_s: 0.002\nsamples: 2\n"
+        "export:\n  - {format: evt3, out: events.raw}\n  - {format: tiff, out: frames}\n"
+    )
+
+
+def read_run(folder):
+    from hesim_render.specs.run import read_run as read
+
+    for step in read(folder / "r.yaml").export:
+        assert (folder / step.out).resolve().parent == folder.resolve()

@@ -288,9 +288,11 @@ def labelled(folder):
 
 def read_labelled(folder):
     loaded = hr.Recording.load(folder / "r")
-    for name in loaded.stored_truth.names:
-        loaded.stored_truth.read(name)
-    loaded.event_labels.counts()
+    if (stored := loaded.stored_truth) is not None:
+        for name in stored.names:
+            stored.read(name)
+    if (labels := loaded.event_labels) is not None:
+        labels.counts()
 
 
 #: name: (makes valid files in a folder, reads them, files that are damaged)
@@ -316,6 +318,9 @@ SUBJECTS = {
     "studies": (more.studies, more.read_studies, "*.yaml"),
     "cubes": (more.cubes, more.read_cubes, "a.hdr a.img b.mat c.mat"),
     "benchmark": (more.benchmark, more.read_plan, "b.yaml"),
+    "built": (more.built, more.use_built, "b/*.json b/clips/*/clip.json"),
+    "shards": (more.shards, more.verify_packed, "s/index.json s/*.tar"),
+    "run": (more.run_file, more.read_run, "r.yaml"),
 }
 
 

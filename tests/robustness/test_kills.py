@@ -230,6 +230,26 @@ def test_a_killed_command_loses_nothing(name, tmp_path):
     trial.end()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_limit_on_the_size_of_files_is_one_line(name, tmp_path):
+    """``ulimit -f``: a write beyond it fails with another error than a full disk."""
+    import resource
+
+    prepare(name, tmp_path)
+    arguments = COMMANDS[name][0]
+    for limit in (0, 3000, 40_000):
+        done = subprocess.run(
+            [sys.executable, "-m", "hesim_render.cli", *map(str, arguments)], cwd=tmp_path, capture_output=True,
+            text=True, env={**os.environ, "PYTHONPATH": str(HERE.parents[1])},
+            preexec_fn=lambda limit=limit: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        )  # fmt: skip
+        told = [line for line in done.stderr.splitlines() if not line.startswith("jit_")]
+        assert done.returncode in (0, 2) and "Traceback" not in done.stderr, done.stderr
+        assert (done.returncode == 2) == any("cannot be written" in line for line in told), told
+        assert not any(".partial" in line and "EXR" not in line and "image file" not in line for line in told), told
+
+
 def ended_twice(tmp_path, command, run, given, number, more_bytes, how=("-m", "hesim_render.cli")):
     """Ended twice by a signal, a command goes on, and ends with the bytes of one that ran through (`whole`).
 

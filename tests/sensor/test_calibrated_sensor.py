@@ -9,6 +9,7 @@ from pathlib import Path
 import capture_sets
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 from scipy.special import ndtr
 
 import hesim_render as hr
@@ -16,6 +17,7 @@ from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibratio
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.specs.calibration import file_digest
 
 ROOT = Path(__file__).parents[2]
 SIZE = 32
@@ -116,6 +118,25 @@ def test_the_files_are_read_when_the_sensor_is_loaded(folder, tmp_path):
         hr.load_sensor(tmp_path / "here" / "s.yaml")
 
 
+@pytest.mark.parametrize(("on", "off", "known"), [(0.17, 0.29, "steps"), (0.31, 0.22, "counts")])
+def test_each_threshold_of_a_calibration_reaches_its_own_polarity(folder, tmp_path, on, off, known):
+    """From contrast steps, or from the asymmetry of the static counts where that is better known; θ is the mean."""
+    shutil.copytree(folder, tmp_path / "here")
+    file = tmp_path / "here" / "c.yaml"
+    yaml = YAML()
+    data = yaml.load(file.read_text())
+    evs, error = data["evs"], 0.02 if known == "counts" else 1e-4
+    given = {"theta": (on + off) / 2, "theta_on": on, "theta_off": off}
+    if known == "counts":
+        given |= {"theta_on": 0.25, "theta_off": 0.26, "asymmetry": (off - on) / (off + on)}
+    for name, value in given.items():
+        evs[name] = {"value": value, "standard_error": 1e-4 if name == "asymmetry" else error}
+    with file.open("w") as out:
+        yaml.dump(data, out)
+    spec = hr.load_sensor(tmp_path / "here" / "s.yaml").spec.evs
+    assert (spec.contrast_threshold_on, spec.contrast_threshold_off) == pytest.approx((on, off), rel=1e-6)
+
+
 WRONG = [  # text, its replacement, the line that begins so, and what is said of it
     ("\n  black_dn: ", "\n  black_dn: high #", "  black_dn", "aps.black_dn: Input should be a valid number"),
     ("\n  black_dn: ", "\n  black_dn: '64' #", "  black_dn", "aps.black_dn: expected a number, not a text"),
@@ -149,3 +170,24 @@ def test_what_calibrate_writes_is_as_the_model_says(folder):
     data = read_calibration(folder / "c.yaml")
     assert data["aps"]["K"]["value"] > 0 and data["evs"]["theta"]["value"] > 0
     assert data["capture"]["signal_reference"] == {"k": 0.2, "t_ref_us": 10000.0, "filter": "own"}
+
+
+def test_telegraph_pixels_forget_their_state_at_the_frame_rate_of_the_captures(folder, tmp_path):
+    """A calibration of before has a correlation from frame to frame; the file has 30 frames per second."""
+    shutil.copytree(folder, tmp_path / "here")
+    file = tmp_path / "here" / "c.yaml"
+    section = read_calibration(file)["aps"]
+    maps = tmp_path / "here" / section["maps"]["file"]
+    jumps = {name: np.zeros((SIZE, SIZE), np.float32) for name in ("amplitude_dn", "high_share", "correlation")}
+    for name, value in (("amplitude_dn", 40.0), ("high_share", 0.3), ("correlation", 0.8)):
+        jumps[name][4, 9] = value
+    capture_sets.change(maps, telegraph_change_hz=None, **{f"telegraph_{name}": array for name, array in jumps.items()})
+    text = file.read_text().replace(section["maps"]["sha256"], file_digest(maps))
+    file.write_text(text)
+    for changes in ({}, {"aps.frame_rate_hz": 90}):
+        found = hr.load_sensor(tmp_path / "here" / "s.yaml", changes).aps.telegraph
+        assert found.place.tolist() == [4 * SIZE + 9]
+        assert found.change_hz[0] == pytest.approx(-np.log(0.8) * 30, rel=1e-5)
+    file.write_text(re.sub(r"(?m)^aps:$", "aps:\n  frame_rate_hz: 12.5", text))
+    found = hr.load_sensor(tmp_path / "here" / "s.yaml").aps.telegraph
+    assert found.change_hz[0] == pytest.approx(-np.log(0.8) * 12.5, rel=1e-5)

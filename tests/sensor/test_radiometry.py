@@ -186,3 +186,15 @@ def test_bad_input_is_refused():
     with pytest.raises(SpecError, match="evenly spaced"):
         hr.photocurrent(np.ones(3), [400, 500, 700], sensor, 1, filter=sensor.layout.filters[0],
                         quadrature="rectangle", responses=np.ones(3))  # fmt: skip
+
+
+def test_signals_of_event_pixels_are_scaled_from_their_own_filter_to_that_of_the_reference():
+    """Under flat light: ∫ response of the reference / ∫ own response, for each position of `eiger`'s four filters."""
+    sensor = hr.load_sensor("eiger", {"evs.signal_reference.filter": "green"})
+    grid = np.arange(300.0, 1200.0, 0.25)
+    total = {name: np.trapezoid(values, grid) for name, values in sensor.spectral_response(grid).items()}
+    positions = sensor.spec.positions("evs")
+    own = [sensor.spec.pixels[sensor.spec.tile_rows[i][j]].filter for i, j in positions]
+    assert len(set(own)) > 2
+    np.testing.assert_allclose(sensor.evs.signal_scale, [total["green"] / total[name] for name in own], rtol=2e-3)
+    np.testing.assert_array_equal(hr.load_sensor("eiger").evs.signal_scale, 1)

@@ -402,9 +402,13 @@ def test_events_count_only_against_sets_that_have_event_pixels():
            "delta_e_noisy_noise_aware_high": 3.1}  # fmt: skip
     table = Table([
         {**row, "filter_set": "designed", "event_contrast_on": 0.3},
-        {**row, "filter_set": "with", "event_contrast_on": 0.5}, {**row, "filter_set": "without"},
+        {**row, "filter_set": "with", "event_contrast_on": 0.5, "ysnr_simulated": 4.0,
+         "ysnr_noise_aware_simulated": 7.5},
+        {**row, "filter_set": "without"},
     ])  # fmt: skip
     both, frames_alone = _verdicts(spec, table)
+    assert both["ysnr_noise_aware_ratio_20_lux"] == pytest.approx(6.0 / 7.5)
+    assert both["ysnr_ratio_20_lux"] == pytest.approx(5.0 / 4.0)
     assert both["cost"] == pytest.approx(1 + 0.5 * 3 + 2 * 0.3) and both["cost_difference"] == pytest.approx(-0.4)
     assert frames_alone["cost"] == frames_alone["cost_against"] == pytest.approx(2.5)
     half = 0.5 * 0.1 * np.sqrt(2)

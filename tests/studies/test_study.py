@@ -67,9 +67,9 @@ def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_
     })  # fmt: skip
     table, bright = (every.where(illuminance_lux=lux) for lux in (3, 100))
     # where colour decides the weights
-    np.testing.assert_allclose(bright["ysnr_simulated"], bright["ysnr"], rtol=0.03)
-    assert bright["ysnr"][-1] > bright["ysnr"][-2]
-    assert table["filter_set"].tolist() == names and "smi" not in table.columns
+    np.testing.assert_allclose(bright["ysnr_noise_aware_simulated"], bright["ysnr_noise_aware"], rtol=0.03)
+    assert bright["ysnr_noise_aware"][-1] > bright["ysnr_noise_aware"][-2]
+    assert table["filter_set"].tolist() == names and "smi" not in table.columns and "ysnr" not in table.columns
     d65, grid = spectra.illuminant("D65"), np.arange(360.0, 831.0)
     power = 3 * d65.at(grid) / np.trapezoid(d65.at(grid) * spectra.photopic().at(grid), grid)
     power /= LUMINOUS_EFFICACY_LM_PER_W
@@ -96,10 +96,11 @@ def test_one_pixel_with_many_filter_sets_orders_in_dim_light_as_photon_counting_
         expected.append(weights @ signal / math.sqrt(variance))
         if name == "mono":  # four equal pixels: photons and read noise alone
             assert expected[0] == pytest.approx(2 * signal[0] / math.sqrt(signal[0] + dark), rel=1e-12)
-    np.testing.assert_allclose(table["ysnr"], expected, rtol=3e-3)
-    np.testing.assert_allclose(table["ysnr_simulated"], expected, rtol=0.03)
-    assert list(table["ysnr_simulated"]) == sorted(table["ysnr_simulated"], reverse=True)
-    assert np.all((table["ysnr_low"] < table["ysnr_simulated"]) & (table["ysnr_simulated"] < table["ysnr_high"]))
+    np.testing.assert_allclose(table["ysnr_noise_aware"], expected, rtol=3e-3)
+    np.testing.assert_allclose(table["ysnr_noise_aware_simulated"], expected, rtol=0.03)
+    assert list(table["ysnr_noise_aware_simulated"]) == sorted(table["ysnr_noise_aware_simulated"], reverse=True)
+    low, seen, high = (table[f"ysnr_noise_aware_{end}"] for end in ("low", "simulated", "high"))
+    assert np.all((low < seen) & (seen < high))
 
 
 def test_exposures_are_equal_in_what_the_study_says():
@@ -119,9 +120,52 @@ def test_exposures_are_equal_in_what_the_study_says():
 
 def test_a_grey_card_that_saturates_has_no_noise_figures():
     table = run(filter_sets=["rggb"], illuminance_lux=[100, 3e4], figures=["noise"])
-    assert table["ysnr"][0] > 0 and np.isnan(table["ysnr"][1]) and np.isnan(table["snr10_lux"][1])
+    assert table["ysnr_noise_aware"][0] > 0
+    assert all(np.isnan(table[name][1]) for name in ("ysnr_noise_aware", "snr10_lux_noise_aware"))
     # 18 % of white fills the pixel
     assert 0.18 * table["white_saturation"][1] > 1 > 0.18 * table["white_saturation"][0]
+    assert table["white_clipped"].tolist() == [False, True]
+
+
+def test_noise_aware_figures_are_those_of_the_matrix_with_the_least_squared_error_and_come_first(tmp_path, capsys):
+    """RGBW before RGGB in dim light, the other way round with the matrix of colour; and white clips at 1000 lx."""
+    spec = tmp_path / "study.yaml"
+    spec.write_text(
+        "schema_version: 1\nname: order\nsensors: [reference-bayer]\nfilter_sets: [rggb, rgbw]\n"
+        "illuminance_lux: [3, 1000]\nfigures: [colour, noise]\nnoise: {repeats: 2, patch_px: 8}\n"
+    )
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["study", "cfa", str(spec), "--out", str(tmp_path / "out"), "--json"])
+    assert not stop.value.code
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    at = {(row["illuminance_lux"], row["filter_set"]): row for row in rows}
+    rggb, rgbw = at[3, "rggb"], at[3, "rgbw"]
+    assert rgbw["ysnr"] < rggb["ysnr"] and rgbw["ysnr_noise_aware"] > 1.4 * rggb["ysnr_noise_aware"]
+    assert rgbw["snr10_lux_noise_aware"] < rggb["snr10_lux_noise_aware"] and rgbw["snr10_lux"] > rggb["snr10_lux"]
+    for row in rows:  # 2 × 8 × 16 output pixels and more: 10 % are two standard errors
+        assert row["ysnr_noise_aware_simulated"] == pytest.approx(row["ysnr_noise_aware"], rel=0.2)
+        for end, other in (("_noise_aware", ""), ("", "_noise_aware")):
+            name = f"noise_amplification{end}"
+            assert abs(math.log(row[f"{name}_simulated"] / row[name])) < 0.15
+            assert end or row[name] > row[f"noise_amplification{other}"]
+    # at the light of SNR 10 the SNR is 10, with the matrix that is best there
+    (again,) = run(filter_sets=["rgbw"], figures=["colour", "noise"], illuminance_lux=[rgbw["snr10_lux_noise_aware"]])
+    assert again["ysnr_noise_aware"] == pytest.approx(10, rel=1e-6)
+    (mono,) = run(filter_sets=["mono"], figures=["noise"], illuminance_lux=[3])
+    (again,) = run(filter_sets=["mono"], figures=["noise"], illuminance_lux=[mono["snr10_lux_noise_aware"]])
+    assert again["ysnr_noise_aware"] == pytest.approx(10, rel=1e-6)
+    # only rgbw clips at 1000 lx, and says so in the tables
+    assert [key for key, row in at.items() if row["white_clipped"]] == [(1000, "rgbw")]
+    with pytest.raises(SystemExit):
+        cli.main(["study", "cfa", str(spec), "--out", str(tmp_path / "out"), "--overwrite"])
+    told = capsys.readouterr().out
+    head, *lines = told.splitlines()
+    assert head.index("YSNR noise-aware") < head.index("YSNR noise-free matrix") and "Noise-free: with" in told
+    assert ["CLIPPED" in line for line in lines[:4]] == [False, False, False, True]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("<td>1.15 CLIPPED</td>") == 1 and "(white clips)" in page
+    assert page.index("<b>Noise-aware</b>") < page.index("<b>Noise-free matrix of colour</b>")
+    assert page.index("<b>Noise-free matrix of colour</b>") < page.index("<b>Colour, without noise</b>")
 
 
 def test_sensors_without_frames_have_one_row_for_all_exposures(tmp_path):

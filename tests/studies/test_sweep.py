@@ -127,7 +127,7 @@ def test_keys_of_the_isp_are_varied_on_one_recording(tmp_path, monkeypatch):
     picture = process(rec.frames[0], rec.mosaic, Pipeline.of(*steps))
     clean = process((64 + 0.25 * rec.frames[0].electrons_mean).astype(np.float32), rec.mosaic, Pipeline.of(*steps))
     assert row["picture_mean"] == pytest.approx(float(picture.mean()), rel=1e-6)
-    expected = peak_signal_noise_ratio(np.clip(clean, 0, 1), np.clip(picture, 0, 1), data_range=1)
+    expected = peak_signal_noise_ratio(np.minimum(clean, 1), np.minimum(picture, 1), data_range=1)
     assert row["picture_psnr_db"] == pytest.approx(expected, rel=1e-6)
     assert 0 < row["picture_ssim"] < 1 and row["picture_delta_e"] > 0
     # the noise-free picture is never smoothed
@@ -152,7 +152,7 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
     )
     palette = (data_folder("palettes") / "dyes.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(palette)
-    spec = {"schema_version": 1, "name": "sweep", "study": str(file), "metrics": ["ysnr"],
+    spec = {"schema_version": 1, "name": "sweep", "study": str(file), "metrics": ["ysnr_noise_aware"],
             "vary": {"sensor.aps.read_noise_e": [1.0, 20.0], "illuminance_lux": [[5], [50]]}}  # fmt: skip
     table = sweep(spec, out=tmp_path / "out")
     assert len(table) == 8 and table["illuminance_lux"].tolist() == [5, 5, 50, 50] * 2
@@ -160,22 +160,24 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
                       "figures": ["noise"], "illuminance_lux": [5],
                       "sensor_keys": {"aps.read_noise_e": 20.0}})  # fmt: skip
     found = table.where(**{"sensor.aps.read_noise_e": 20.0, "illuminance_lux": 5, "filter_set": "ryyb"}).row(0)
-    assert found["ysnr"] == pytest.approx(alone["ysnr"][0], rel=1e-12) and "snr10_lux" not in found
+    assert found["ysnr_noise_aware"] == pytest.approx(alone["ysnr_noise_aware"][0], rel=1e-12)
+    assert "snr10_lux_noise_aware" not in found
     # again: nothing is computed; a changed palette is a changed run
     monkeypatch.setattr(sweeps, "study", None)
     assert sweep(spec, out=tmp_path / "out").to_csv() == table.to_csv()
     monkeypatch.undo()
     assert palette.count("depth_um: 3.0") == 1
     (tmp_path / "mine.yaml").write_text(palette.replace("depth_um: 3.0", "depth_um: 1.0"))
-    assert np.all(sweep(spec, out=tmp_path / "out")["ysnr"] < table["ysnr"])
+    assert np.all(sweep(spec, out=tmp_path / "out")["ysnr_noise_aware"] < table["ysnr_noise_aware"])
     # seeds are those of the noisy frames
-    noisy = {**spec, "metrics": ["ysnr", "ysnr_simulated"], "seeds": [1, 2], "vary": {"noise.repeats": [1]}}
+    exact, simulated = "ysnr_noise_aware", "ysnr_noise_aware_simulated"
+    noisy = {**spec, "metrics": [exact, simulated], "seeds": [1, 2], "vary": {"noise.repeats": [1]}}
     first, second = (sweep(noisy, out=tmp_path / "out").where(seed=seed) for seed in (1, 2))
-    assert np.all(first["ysnr"] == second["ysnr"]) and np.all(first["ysnr_simulated"] != second["ysnr_simulated"])
+    assert np.all(first[exact] == second[exact]) and np.all(first[simulated] != second[simulated])
     spec["vary"] = {"noise.repeats": [0]}
     assert len(sweep({**spec, "metrics": []}, out=tmp_path / "out")) == 2
     for changes, message in (
-        ({"metrics": ["ysrn"]}, "no column 'ysrn'.*did you mean 'ysnr'"),
+        ({"metrics": ["ysnr_noise_awar"]}, "no column 'ysnr_noise_awar'.*did you mean 'ysnr_noise_aware'"),
         ({"vary": {"isp.demosaic.method": ["linear"]}}, "for sweeps of recordings"),
         ({"vary": {"filter_set": ["rggb"]}}, "run with filter_set=rggb.*unknown key"),
         ({"scenes": ["flat-field"]}, "scenes: not in a sweep of a study"),

@@ -108,8 +108,8 @@ def test_exr_pictures_that_do_not_fit_into_memory_are_refused_before_they_are_re
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
     planes = {name: np.zeros((64, 128), np.float32) for name in "RGB"}
     OpenEXR.File(header, planes).write(str(tmp_path / "large.exr"))
-    monkeypatch.setattr("hesim_render.core.guard._machine_bytes", lambda: 2 * 16 * 64 * 128 - 1)
-    with pytest.raises(SpecError, match=r"large\.exr: the picture would take 0\.000131 GB"):
+    monkeypatch.setattr("hesim_render.core.guard._machine_bytes", lambda: 2 * 24 * 64 * 128 - 1)
+    with pytest.raises(SpecError, match=r"large\.exr: the picture would take 0\.000197 GB"):
         read_cube(tmp_path / "large.exr")
 
 

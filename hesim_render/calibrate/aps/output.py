@@ -18,6 +18,7 @@ from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.moments import Moments
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet
+from hesim_render.specs.calibration_rates import PER_INTERVAL, per_second
 
 _FIGURE_PX = 320
 #: Number of points of pooled variances drawn per position, approximately.
@@ -42,7 +43,9 @@ def content(captures: CaptureSet, result: ApsCalibration, dark_moments: Moments,
         if fit.hidden_pixels:
             notes.append(f"position ({i}, {j}): {fit.hidden_pixels} values left out, their noise is hidden by rounding")
     dark, checks = result.dark, check_frames(result, dark_moments, lit)
+    stated = {} if captures.frame_rate_hz is None else {"frame_rate_hz": captures.frame_rate_hz}
     return {
+        **stated,
         "findings": [finding.described() for finding in checks.findings],
         "terms": list(TERMS),
         "units": "DN (light above black) and seconds; the ADC's 1/12 DN² is taken out",
@@ -115,15 +118,18 @@ def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moment
     covariance = np.full((*tile, 6, 6), np.nan)
     for position, fit in result.fits.items():
         covariance[position] = fit.covariance
+    telegraph, frame_rate_hz = result.telegraph, captures.frame_rate_hz
+    found = telegraph.amplitude_dn, telegraph.high_share, telegraph.correlation
+    of_telegraph: dict[str, NDArray] = dict(zip(PER_INTERVAL["aps"], found, strict=True))
+    if frame_rate_hz is not None:
+        of_telegraph = per_second("aps", of_telegraph, 1.0 / frame_rate_hz)
     arrays: dict[str, NDArray] = {
         "n_row": dark.n_row,
         "n_blc": dark.n_blc,
         "n_dp": dark.n_dp,
         "bad_pixels": result.bad,
         "hot_pixels": dark.hot,
-        "telegraph_amplitude_dn": result.telegraph.amplitude_dn,
-        "telegraph_high_share": result.telegraph.high_share,
-        "telegraph_correlation": result.telegraph.correlation,
+        **of_telegraph,
         "signal_dn_per_s": composite.rate_dn_per_s,
         "signal_standard_error_dn_per_s": composite.standard_error_dn_per_s,
         "beta_covariance": covariance,

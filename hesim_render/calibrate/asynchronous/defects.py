@@ -13,7 +13,7 @@ from hesim_render.calibrate.asynchronous.fit import Fit
 from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.flicker import dynamics, unsteady
-from hesim_render.pixels.evs.formulas import rate_hz
+from hesim_render.specs.calibration_rates import rate_hz
 from hesim_render.specs.calibration_spec import Defect
 
 #: Probability that a good pixel's counts are called bad.

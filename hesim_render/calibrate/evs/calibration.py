@@ -89,7 +89,7 @@ def _fixed_ticks(
     static = read_static(captures, out)
     result = analyse(captures, static, seed, tell)
     errors = bootstrap_errors(result, bootstrap, seed) if bootstrap else None
-    return content(captures, result, errors), maps(result)
+    return content(captures, result, errors), maps(captures, result)
 
 
 def _asynchronous(captures: CaptureSet, seed: int, tell: Progress) -> tuple[dict[str, Any], dict[str, NDArray]]:

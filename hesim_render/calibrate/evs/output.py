@@ -16,7 +16,9 @@ from hesim_render.calibrate.evs.fitted import EventFit
 from hesim_render.calibrate.evs.model import both_probabilities
 from hesim_render.calibrate.evs.steps import GROUPS
 from hesim_render.calibrate.evs.thresholds import curve
+from hesim_render.core.units import US_PER_S
 from hesim_render.recording.capture_set import CaptureSet
+from hesim_render.specs.calibration_rates import PER_INTERVAL, per_second, rate_hz
 from hesim_render.specs.calibration_spec import Defect
 
 _FIGURE_PX = 320
@@ -73,9 +75,13 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
     error = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
     absent = "not significant (likelihood ratio at 1e-3): the model without it is kept"
     section["asymmetry"] = estimated(rho, error[4]) if fit.free[4] else {"value": 0.0, "note": absent}
-    section["leak_per_trial"] = (
-        estimated(leak, error[5], "ON events") if fit.free[5] else {"value": 0.0, "note": absent}
-    )
+    leaks = fit.free[5]
+    section["leak_per_trial"] = estimated(leak, error[5], "ON events") if leaks else {"value": 0.0, "note": absent}
+    interval_s = captures.interval_s
+    if interval_s is not None:
+        rate = float(rate_hz(leak, interval_s)), error[5] / (1 - leak) / interval_s
+        section["tick_us"] = interval_s * US_PER_S
+        section["leak_rate_hz"] = estimated(*rate, "Hz") if leaks else {"value": 0.0, "note": absent}
     hidden = "hidden behind the mismatch of thresholds, or too few events"
     section["dispersion"] = {
         name: estimated(value, error) if np.isfinite(value) else not_identifiable(hidden)
@@ -152,14 +158,14 @@ def _gauge(result: EvsCalibration) -> dict[str, Any]:
     }
 
 
-def maps(result: EvsCalibration) -> dict[str, NDArray]:
+def maps(captures: CaptureSet, result: EvsCalibration) -> dict[str, NDArray]:
     """Map files of the section, and small arrays for the report (their names start with ``figure_``)."""
-    defects, static = result.defects, result.static
-    arrays: dict[str, NDArray] = {
-        "bad_pixels": result.bad, "defect": defects.kind, "defect_on_per_trial": defects.on,
-        "defect_off_per_trial": defects.off, "defect_firing_share": defects.firing_share,
-        "defect_correlation": defects.correlation,
-    }  # fmt: skip
+    defects, static, interval_s = result.defects, result.static, captures.interval_s
+    found = defects.kind, defects.on, defects.off, defects.firing_share, defects.correlation
+    of_defects: dict[str, NDArray] = dict(zip(PER_INTERVAL["evs"], found, strict=True))
+    if interval_s is not None:
+        of_defects = per_second("evs", of_defects, interval_s)
+    arrays = {"bad_pixels": result.bad, **of_defects}
     if result.thresholds is not None:
         arrays["threshold_on_relative"] = result.thresholds.pixel_on
         arrays["threshold_off_relative"] = result.thresholds.pixel_off

@@ -171,9 +171,10 @@ def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     names = {
         "theta": "θ, mean of both", "theta_on": "θ₊", "theta_off": "θ₋", "threshold_mismatch": "threshold mismatch",
         "asymmetry": "asymmetry ρ = (θ₋ − θ₊)/(θ₋ + θ₊)", "leak_per_trial": "leak per trial",
+        "leak_rate_hz": "leak",
     }  # fmt: skip
     rows = [parameter_row(f"{n} (all positions)", section[n]) for n in "ABCD"]
-    rows += [parameter_row(text, section[key]) for key, text in names.items()]
+    rows += [parameter_row(text, section[key]) for key, text in names.items() if key in section]
     rows.append(parameter_row("dispersion in time, ON + OFF", section["dispersion"]["temporal"]))
     rows.append(parameter_row("dispersion in time, ON − OFF", section["dispersion"]["temporal_difference"]))
     logs = section["shot_law_log_likelihood"]

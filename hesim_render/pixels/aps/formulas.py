@@ -264,19 +264,3 @@ def telegraph_levels(amplitude: Values, high_share: Values) -> tuple[Values, Val
 def telegraph_variance(amplitude: Values, high_share: Values) -> Values:
     """Variance of random telegraph noise, a² p (1 − p), in the square of the amplitude's unit [machlup1954]."""
     return amplitude * amplitude * high_share * (1.0 - high_share)
-
-
-def telegraph_correlation(high_s: Values, low_s: Values, interval_s: Values, xp: Namespace) -> Values:
-    """Autocorrelation of random telegraph noise at an interval, exp(−Δt (1/τ_high + 1/τ_low)) [machlup1954].
-
-    Parameters
-    ----------
-    high_s, low_s : mean times τ_high and τ_low in each state, s.
-    interval_s : Δt, s.
-    xp : functions of the arrays' library.
-
-    Returns
-    -------
-    Correlation, 0 to 1.
-    """
-    return xp.exp(-interval_s * (1.0 / high_s + 1.0 / low_s))

@@ -84,10 +84,9 @@ def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> Telegra
     """
     frame_us, measured = US_PER_S / spec.frame_rate_hz, telegraph_maps(layout)
     if measured is not None:
-        amplitude, share, correlation = (values.ravel().astype(np.float64) for values in measured.values())
+        amplitude, share, change_hz = (values.ravel().astype(np.float64) for values in measured.values())
         place = np.flatnonzero(amplitude > 0)
-        change_hz = -np.log(np.clip(correlation[place], 1e-9, 1 - 1e-9)) * spec.frame_rate_hz
-        found = amplitude[place], share[place], change_hz
+        found = amplitude[place], share[place], change_hz[place]
     elif spec.telegraph is not None:
         given = spec.telegraph
         key = layout.full_index.ravel()

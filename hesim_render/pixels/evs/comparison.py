@@ -18,8 +18,13 @@ from hesim_render.pixels.evs.formulas import leak_probability
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
-from hesim_render.pixels.evs.refractory import Refractory
+from hesim_render.pixels.evs.refractory import LONG_AGO_US, Refractory
+from hesim_render.pixels.evs.start import start_of
 from hesim_render.pixels.normal import normal_pair
+
+#: Periods of the noise in still light before the first sample, in which noise and level of comparison become those of
+#: one another.
+_SETTLING_PERIODS = 4
 
 
 def _events(t_us: ArrayLike, pixel: NDArray[np.integer], polarity: ArrayLike, cols: int) -> NDArray[np.void]:
@@ -100,8 +105,8 @@ class LastEvent:
         *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
     )
 
-    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None) -> None:
-        self._noise, self._defects = noise, defects
+    def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None, is_reset: bool) -> None:
+        self._noise, self._seed, self._defects, self._is_reset = noise, seed, defects, is_reset
         self._cols = noise.layout.evs_shape[1]
         self._t_us = 0
         self._log: Float = None  # ln x of the last sample
@@ -120,41 +125,64 @@ class LastEvent:
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
 
-        parts: list[NDArray[np.void]] = []
         log, variance = self._noise.log_level(electrons)
         spread = dr.sqrt(variance)
         dr.eval(log, spread)
         if self._log is None:
-            start = self._photoreceptor.start(log, t_us) if self._photoreceptor else log
-            self.level = start + (spread * self._band_noise.start(t_us) if self._band_noise else 0.0)
-            self.reference = dr.copy(self.level)
-            dr.eval(self.level, self.reference)
-            if self._leak:
-                self._leak.start(t_us)
-        else:
-            begin_us = float(self._t_us)
-            low_pass = self._photoreceptor
-            if low_pass and low_pass.rests(log, t_us):
-                low_pass = None
-            for end_us in _nodes_us(t_us, self._band_noise, low_pass):
-                part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
-                level = dr.fma(log - self._log, part, self._log)
-                if low_pass:
-                    level = low_pass.to(level, end_us)
-                if self._band_noise:
-                    level = dr.fma(
-                        dr.fma(spread - self._spread, part, self._spread), self._band_noise.at(end_us), level
-                    )
-                parts.append(self._crossings(level, begin_us, end_us))
-                begin_us = end_us
-            if self._leak and not self._refractory:
-                for due_us, pixel in self._leak.until(t_us):
-                    parts.append(_events(self._stamp(due_us), pixel, Origin.LEAK, self._cols))
-            if self._defects and not self._refractory:
-                own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
-                parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
+            self._start(log, spread, t_us)
+            return no_events()
+        return self._go_on(log, spread, t_us)
+
+    def _start(self, log: Float, spread: Float, t_us: int) -> None:
+        """Begin in still light: where noise makes events, as pixels are after a long time in it, or all at a reset."""
+        import drjit as dr
+
+        settles = self._band_noise is not None and not self._is_reset
+        self._t_us = t_us - self._band_noise.periods_us(_SETTLING_PERIODS) if settles and self._band_noise else t_us
+        start = self._photoreceptor.start(log, self._t_us) if self._photoreceptor else log
+        self.level = start + (spread * self._band_noise.start(self._t_us) if self._band_noise else 0.0)
+        self.reference = dr.copy(self.level)
+        if self._leak:
+            self._leak.start(self._t_us)
+        self._log, self._spread = log, spread
+        if self._band_noise and settles:
+            count = dr.width(self.level)
+            share = self._band_noise.share(count)
+            spreads = np.broadcast_to(spread.numpy(), count)
+            begin = start_of(self._noise, self._seed, spreads, share, self._band_noise.angle)
+            self.reference = dr.fma(spread, jit().Float(begin.reference), log)
+            if self._refractory:
+                self._refractory.begin(np.where(begin.dead_us > 0, self._t_us + begin.dead_us, LONG_AGO_US))
+        dr.eval(self.level, self.reference)
+        if self._t_us < t_us:
+            self._go_on(log, spread, t_us)
+
+    def _go_on(self, log: Float, spread: Float, t_us: int) -> NDArray[np.void]:
+        """Events up to the sample at `t_us`."""
+        import drjit as dr
+
+        parts: list[NDArray[np.void]] = []
+        begin_us = float(self._t_us)
+        low_pass = self._photoreceptor
+        if low_pass and low_pass.rests(log, t_us):
+            low_pass = None
+        for end_us in _nodes_us(t_us, self._band_noise, low_pass):
+            part = dr.opaque(jit().Float, (end_us - self._t_us) / (t_us - self._t_us))
+            level = dr.fma(log - self._log, part, self._log)
+            if low_pass:
+                level = low_pass.to(level, end_us)
+            if self._band_noise:
+                level = dr.fma(dr.fma(spread - self._spread, part, self._spread), self._band_noise.at(end_us), level)
+            parts.append(self._crossings(level, begin_us, end_us))
+            begin_us = end_us
+        if self._leak and not self._refractory:
+            for due_us, pixel in self._leak.until(t_us):
+                parts.append(_events(self._stamp(due_us), pixel, Origin.LEAK, self._cols))
+        if self._defects and not self._refractory:
+            own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
+            parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
         self._t_us, self._log, self._spread = t_us, log, spread
-        events = np.concatenate(parts) if parts else no_events()
+        events = np.concatenate(parts)
         if self._defects:
             events = self._defects.alive(events, self._cols)
         # stable: the events of a pixel in one microsecond keep their order

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream, device_normal, device_uniform
-from hesim_render.core.units import S_PER_US, US_PER_S
+from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.events import Origin
@@ -74,7 +74,7 @@ def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
     key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
     measured = event_defects(layout)
     if measured is not None:
-        return _measured(measured, key, spec)
+        return _measured(measured, key)
     return _drawn(spec.defects or EventDefectSpec(), key, device_seed)
 
 
@@ -103,31 +103,12 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
     )
 
 
-def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32], spec: EvsSpec) -> EventDefects:
+def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32]) -> EventDefects:
     stuck = np.flatnonzero(maps["defect"].ravel() == Defect.STUCK)
-    if spec.reference == "last_event":
-        names = ("on_hz", "off_hz", "firing_share", "change_hz")
-        values = np.stack([maps[f"defect_{name}"].ravel() for name in names]).astype(np.float64)
-        place = np.flatnonzero((values[:2] > 0).any(axis=0))
-        return EventDefects(stuck, place, key[place], *values[:, place])
-    assert spec.tick_us is not None
-    tick_s = spec.tick_us * S_PER_US
-    on, off = (maps[f"defect_{name}_per_trial"].ravel().astype(np.float64) for name in ("on", "off"))
-    share, correlation = (maps[f"defect_{name}"].ravel().astype(np.float64) for name in ("firing_share", "correlation"))
-    place = np.flatnonzero((on > 0) | (off > 0))
-    on, off, share, correlation = (values[place] for values in (on, off, share, correlation))
-    switching = (correlation > 0) & (share < 1)
-    with np.errstate(divide="ignore"):
-        change_hz = np.where(switching, -np.log(np.where(switching, correlation, 1.0)) / tick_s, 0.0)
-    return EventDefects(
-        stuck=stuck,
-        place=place,
-        key=key[place],
-        on_hz=formulas.rate_hz(on, tick_s),
-        off_hz=formulas.rate_hz(off, tick_s),
-        firing_share=np.where(switching, share, 1.0),
-        change_hz=change_hz,
-    )
+    names = ("on_hz", "off_hz", "firing_share", "change_hz")
+    values = np.stack([maps[f"defect_{name}"].ravel() for name in names]).astype(np.float64)
+    place = np.flatnonzero((values[:2] > 0).any(axis=0))
+    return EventDefects(stuck, place, key[place], *values[:, place])
 
 
 class DefectEvents:

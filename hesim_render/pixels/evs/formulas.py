@@ -223,22 +223,6 @@ def leak_probability(rate_hz: float, interval_s: float) -> float:
     return -math.expm1(-rate_hz * interval_s)
 
 
-def rate_hz(probability: ArrayLike, interval_s: float) -> NDArray[np.float64]:
-    """Rate of the Poisson process that gives an event in an interval with this probability; inverse of
-    `leak_probability`.
-
-    Parameters
-    ----------
-    probability : probability of an event; 1 is taken as 1 − 1e-9.
-    interval_s : Δt, s.
-
-    Returns
-    -------
-    Rate, Hz.
-    """
-    return -np.log1p(-np.clip(probability, 0.0, 1.0 - 1e-9)) / interval_s
-
-
 def own_events(counted: ArrayLike, own_on: ArrayLike, own_off: ArrayLike, polarity: ArrayLike) -> NDArray[np.float64]:
     """Probability of an event of a defect in a comparison, from all events. It shows only where the comparison gave
     none.

@@ -95,6 +95,21 @@ class BandNoise:
         dr.eval(self._value)
         return self.at(t_us)
 
+    @property
+    def angle(self) -> float:
+        """a times the time between nodes, of pixels with the largest bandwidth."""
+        return self._largest
+
+    def share(self, pixels: int) -> NDArray[np.float64]:
+        """Bandwidth of each pixel's noise over the largest, [pixels]."""
+        if self._photoreceptor is None:
+            return np.ones(pixels)
+        return np.broadcast_to(np.asarray(self._angle(), np.float64) / self._largest, pixels)
+
+    def periods_us(self, count: float) -> int:
+        """Time of `count` periods of the largest bandwidth, whole µs."""
+        return math.ceil(count * NODES_PER_CUTOFF_PERIOD * self._period_us)
+
     def nodes_us(self, end_us: float) -> list[float]:
         """Times of the nodes after the present and before `end_us`."""
         last = math.ceil(end_us / self._period_us) - 1

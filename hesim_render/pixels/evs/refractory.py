@@ -16,6 +16,8 @@ from hesim_render.pixels.arrays import take
 
 #: Least time of an event after the begin of its segment, µs: rounding may have moved it out of the previous segment.
 _SOON_US = 1e-3
+#: Before any time, µs.
+LONG_AGO_US = -1e18
 
 
 class Refractory:
@@ -33,7 +35,11 @@ class Refractory:
         import drjit as dr
 
         self._period_us = float(period_us)
-        self._ready_us = dr.full(jit().Float64, -1e18, pixels)
+        self._ready_us = dr.full(jit().Float64, LONG_AGO_US, pixels)
+
+    def begin(self, ready_us: NDArray[np.float64]) -> None:
+        """Let each pixel be ready at a time [pixel], µs."""
+        self._ready_us = jit().Float64(ready_us)
 
     def crossings(
         self,

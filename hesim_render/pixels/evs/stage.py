@@ -49,6 +49,8 @@ class EvsStage:
     seed : the events are a pure function of the seed, the device seed, the sample times and the electrons.
     defects : events of defective pixels, where several stages share them; default those of this `seed`.
     labels : takes the events with their origins; it changes none of them.
+    is_reset : asynchronous pixels compare with their own level at the first sample, as after a reset of all. Otherwise
+        they begin as they are after a long time in the light of that sample.
 
     Notes
     -----
@@ -73,14 +75,23 @@ class EvsStage:
     STATE = ("_mode", "_t_us", "_readout")
 
     def __init__(
-        self, noise: EvsNoise, seed: int, defects: DefectEvents | None = None, labels: Labels | None = None
+        self,
+        noise: EvsNoise,
+        seed: int,
+        defects: DefectEvents | None = None,
+        labels: Labels | None = None,
+        is_reset: bool = False,
     ) -> None:
         self.noise, self._labels = noise, labels
         has_ticks = noise.spec.reference == "previous_sample"
         if defects is None and noise.defects:
             tick_s = noise.spec.tick_us * S_PER_US if has_ticks and noise.spec.tick_us else None
             defects = DefectEvents(noise.defects, int(seed), tick_s)
-        self._mode: _Mode = (PreviousSample if has_ticks else LastEvent)(noise, int(seed), defects)
+        self._mode: _Mode
+        if has_ticks:
+            self._mode = PreviousSample(noise, int(seed), defects)
+        else:
+            self._mode = LastEvent(noise, int(seed), defects, is_reset)
         self._t_us: int | None = None
         self._readout: EventReadout | None = None
         if noise.readout_max_events_per_s is not None:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, UInt32
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.exr import require_exr_fits
 from hesim_render.core.output import replacing
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.lens import Lens
@@ -261,6 +262,7 @@ def read_spectral_exr(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np
     source = Path(path)
     if not source.is_file():
         raise SpecError("no such file", file=source)
+    require_exr_fits(source)
     try:
         with OpenEXR.File(str(source), separate_channels=True) as file:
             is_spectral = "spectralLayoutVersion" in file.header()  # empty once the file is closed

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import require_plain
 from hesim_render.sources.video.digest import Hashed
 from hesim_render.sources.video.picture import Planes, Timing
-from hesim_render.sources.video.pyav import frame_format, planes_of, reason, tags_of
+from hesim_render.sources.video.pyav import frame_format, planes_of, reason, require_decodable, tags_of
 
 _PIECE_BYTES = 1 << 20
 
@@ -58,6 +59,7 @@ class FileVideo(Hashed):
         import av
 
         self._close_container()
+        require_plain(self._path)
         try:
             self._container = av.open(self.name)
         except (av.error.FFmpegError, OSError, ValueError) as error:
@@ -68,6 +70,7 @@ class FileVideo(Hashed):
         self._stream = self._container.streams.video[0]
         if self._stream.codec_context is None:
             raise SpecError("has a video that no decoder here reads", file=self._path)
+        require_decodable(self._stream, self._path)
         # frames decoded ahead would log checksum errors before _checksum_errors listens
         self._stream.thread_type = "SLICE" if self._stream.codec_context.name == "ffv1" else "AUTO"
         self._stream.codec_context.options = {"err_detect": "crccheck+explode"}

@@ -16,6 +16,7 @@ from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock
 from hesim_render.sources.video.colours import to_linear_srgb
+from hesim_render.sources.video.event_notes import event_notes
 from hesim_render.sources.video.file import FileVideo
 from hesim_render.sources.video.folder import FolderVideo
 from hesim_render.sources.video.geometry import Resampler, mapping
@@ -147,17 +148,8 @@ class VideoFlux(WindowByWindow):
         scale = min(self.mapping.rows.scale, self.mapping.cols.scale)
         if scale < 1:
             found.append(f"the pictures are enlarged {1 / scale:.3g} times: the sensor sees their pixels as squares")
-        spec, period_us = self.sensor.spec.evs, self.clock.period_us
-        if spec is not None and self._is_held and spec.tick_us is not None and period_us > spec.tick_us:
-            found.append(
-                f"pictures come every {period_us:.0f} µs, event comparisons every {spec.tick_us} µs: events gather "
-                "where pictures change; interpolation spreads them"
-            )
-        if spec is not None and self._is_held and spec.tick_us is None:
-            found.append(
-                "the sensor's event pixels are asynchronous: their ln x goes in a straight line from the middle of one "
-                "picture to that of the next, so that events are not half a picture late; frames see held pictures"
-            )
+        if self.sensor.spec.evs is not None:
+            found += event_notes(self.sensor.spec.evs, self.clock.period_us, self._is_held)
         effects = [name for name in self.sensor.optics.used_effects() if name != "relative_illumination"]
         if effects:
             found.append(f"the pictures are the image on the chip: {', '.join(effects)} of the lens are not applied")

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.exr import require_exr_fits
+from hesim_render.core.guard import require_memory, require_plain
 from hesim_render.sources.video.arrays import picture_bits, without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.digest import Hashed
@@ -145,8 +147,14 @@ def _words(shape: PictureFormat) -> str:
 def _read_tiff(path: Path) -> NDArray:
     import tifffile
 
+    require_plain(path)
     try:
-        image = tifffile.imread(path, key=0)
+        with tifffile.TiffFile(path) as file:
+            page = file.pages[0].aspage()
+            require_memory(3 * page.nbytes, "the picture", path)
+            image = page.asarray()
+    except SpecError:
+        raise
     except Exception as error:  # tifffile raises many kinds on files that are not what they say
         raise SpecError(f"cannot be read ({str(error).splitlines()[0] if str(error) else error})", file=path) from None
     if image.ndim not in (2, 3):
@@ -158,6 +166,7 @@ def _read_exr(path: Path) -> NDArray:
     """[row, col] or [row, col, 3], float16 or float32; alpha is left out: colours are already times alpha."""
     import OpenEXR
 
+    require_exr_fits(path)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.parts[0].channels.items()}

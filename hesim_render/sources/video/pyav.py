@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import require_file_size, require_picture
 from hesim_render.sources.video.arrays import without_alpha
 from hesim_render.sources.video.colours import ColourTags
 from hesim_render.sources.video.picture import PictureFormat, Planes
@@ -25,6 +26,9 @@ _REORDERED = {
 }  # fmt: skip
 #: Codecs whose chroma sits between two luma samples.
 _CENTRED = {"mjpeg", "mjpegb", "mpeg1video", "webp", "vp8"}
+
+#: Memory of a pixel while it is decoded: three values of 16 bits, in some pictures at once.
+_PIXEL_BYTES = 24
 
 
 def frame_format(frame: Any, codec: str, where: str) -> tuple[PictureFormat, str]:
@@ -104,8 +108,10 @@ def decode_picture(path: Path) -> tuple[PictureFormat, ColourTags, Planes]:
     """Decode a picture file. Its tags hold what the file states; the default primaries of pictures are BT.709."""
     import av
 
+    require_file_size(path)
     try:
         with av.open(str(path)) as container:
+            require_decodable(container.streams.video[0], path)
             frame = next(container.decode(video=0))
             codec = container.streams.video[0].codec_context.name
     except (av.error.FFmpegError, StopIteration, IndexError, OSError) as error:
@@ -117,6 +123,18 @@ def decode_picture(path: Path) -> tuple[PictureFormat, ColourTags, Planes]:
     if shape.layout in ("planar", "grey"):
         tags = tags.with_given(range=tags.range or "full")
     return shape, tags.with_given(primaries=tags.primaries or "bt709"), planes_of(frame, shape, target, str(path))
+
+
+def require_decodable(stream: Any, file: Path) -> None:
+    """Refuse a video by the size that its header states; its decoder takes memory for whole pictures.
+
+    Raises
+    ------
+    SpecError
+        If a picture is too large.
+    """
+    context = stream.codec_context
+    require_picture(context.width, context.height, _PIXEL_BYTES, file)
 
 
 def reason(error: BaseException) -> str:

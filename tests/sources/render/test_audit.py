@@ -18,7 +18,7 @@ QUALITY, UNIT = 0.5, 0.03
 
 
 def sensor_of(reference="previous_sample"):
-    changes = {"evs.contrast_threshold_on": 0.2, "evs.contrast_threshold_off": 0.2, "evs.reference": reference}
+    changes = {"evs.contrast_threshold_on": 0.2, "evs.contrast_threshold_off": 0.27, "evs.reference": reference}
     if reference == "last_event":
         changes |= {"evs.tick_us": None, "evs.window_us": 1}
     return hr.load_sensor("reference-mono", changes).crop(COLS, ROWS)
@@ -66,8 +66,8 @@ def true_shares(run, truth):
     pixels = np.arange(ROWS * COLS)
     signals = [sensor.evs.log_signal(flux, pixels) for flux in (run, truth)]
     error = sensor.evs.log_signal(run * (1 + 0.001), pixels) - signals[0]
-    theta = np.full(pixels.size, 0.2)
-    counted = compare_ticks(*signals, error, (theta, theta), np.ones(TICKS, np.bool_))
+    theta = np.full(pixels.size, 0.2), np.full(pixels.size, 0.27)
+    counted = compare_ticks(*signals, error, theta, np.ones(TICKS, np.bool_))
     off = np.mean(np.abs(run / truth - 1) > 3 * QUALITY * UNIT)
     return off, counted.missed.sum() / counted.true.sum(), counted.extra.sum() / counted.found.sum()
 
@@ -170,6 +170,33 @@ def test_verdict_and_the_quality_that_would_do():
     assert short["verdict"] == "not shown" and short["quality_needed"] is None
 
 
+class HalfStill(Given):
+    """Pixels of the lower half stand still: a quarter of them is looked at, each with four times the weight."""
+
+    def still_pixels(self, pixel):
+        return pixel >= ROWS * COLS // 2
+
+
+def test_a_quarter_of_what_stands_still_is_looked_at(monkeypatch):
+    """All pairs: rays tell how many were looked at, and the share of wrong values does not depend on where they are."""
+    monkeypatch.setattr(audit_module, "_RAYS", 10**9)
+    truth = np.full((TICKS, ROWS * COLS), 1e5)
+    run = truth.copy()
+    run[:, ROWS * COLS // 2 :: 5] *= 1.4  # a tenth of all, all of them in the still half
+    shares, rays = [], []
+    for kind in (Given, HalfStill):
+        sensor, source = sensor_of(), kind(run, truth)
+        pixels = sensor.layout.evs_pixel.ravel()
+        noted = NotedFlux(source, pixels, TICKS, 1, *STRETCHES["previous_sample"], 2)
+        for _ in noted.flux_of_blocks(pixels, tick_blocks(sensor.spec.evs, 0, TICKS * TICK_US)):
+            pass
+        shares.append(Audit(noted, source, QUALITY, sensor.evs, pixels, 2).run()["events"]["off"])
+        rays.append(source.rays_traced)
+    assert shares[0] == pytest.approx(0.1, abs=0.01) and shares[1] == pytest.approx(0.1, abs=0.015)
+    # a still pixel is looked at with a chance of 0.25, and takes one time for all its ticks
+    assert rays[1] < 0.65 * rays[0]
+
+
 # ---- bounds -------------------------------------------------------------------------------------
 
 
@@ -231,6 +258,19 @@ def test_events_within_three_errors_of_the_threshold_are_flips():
         assert (told["missed"], told["flips"]) == (missed, 1 - missed)
         told = ticks([0, step, step], [0, 0, 0])
         assert (told["extra"], told["flips"]) == (missed, 1 - missed)
+
+
+def test_crossings_within_three_errors_of_the_threshold_are_flips():
+    """Of an asynchronous pixel: on one side the step is taken, on the other it is not; 3 · 0.001 decides."""
+    core, theta = np.ones(4, np.bool_), (np.array([0.2]), np.array([0.31]))
+    for sign, level in ((1.0, 0.2), (-1.0, 0.31)):
+        for over, beyond in ((0.002, 0), (0.004, 1)):
+            step = np.array([0, 0, 1, 1.0])[:, None] * sign * (level + over)
+            flat, error = np.zeros((4, 1)), np.full((4, 1), 0.001)
+            told = compare_crossings(step, flat, error, theta, core, 8)
+            assert (told.extra[0], told.flips[0], told.found[0], told.true[0]) == (beyond, 1 - beyond, 1, 0)
+            told = compare_crossings(flat, step, error, theta, core, 8)
+            assert (told.missed[0], told.flips[0], told.found[0], told.true[0]) == (beyond, 1 - beyond, 0, 1)
 
 
 def test_each_polarity_has_its_own_threshold():

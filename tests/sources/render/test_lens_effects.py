@@ -1,6 +1,7 @@
 """Veiling glare and lateral chromatic aberration, effects that are switched off, and what recordings say."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render import RenderedFlux
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.glare import VeilingGlare
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 
 CAMERA = {"origin_m": [0, 0, 1]}
@@ -47,6 +49,16 @@ def test_glare_spreads_a_part_of_the_light_of_the_whole_sensor():
     assert mean > 2 * wall
     with pytest.raises(NeedsExactMode, match=r"lens\.veiling_glare"):
         ChangeDrivenFlux(scene, rendering.mono(32, 24, lens__veiling_glare=0.1))
+
+
+def test_glare_is_measured_all_over_a_sensor_that_is_not_square():
+    """One pixel in each of 32 × 32 cells, of a sensor of 346 × 260 pixels."""
+    sensor = hr.load_sensor("davis346")
+    glare = VeilingGlare(SimpleNamespace(sensor=sensor, radiance_scale=1.7), None, [0], seed=3)
+    row, col = np.divmod(glare._index.reshape(32, 32), 346)
+    for place, size, axis in ((row, 260, 0), (col, 346, 1)):
+        middle = (np.indices((32, 32))[axis] + 0.5) * size / 32
+        assert np.abs(place + 0.5 - middle).max() <= size / 64 + 0.5
 
 
 @pytest.mark.slow

@@ -123,7 +123,7 @@ def test_bad_cubes_and_files_are_one_clear_error(tmp_path):
         write_spectral_exr(tmp_path / "x.exr", cube, [500, 500])
     assert os.listdir(tmp_path) == ["file"]
     (tmp_path / "not.exr").write_text("hello")
-    with pytest.raises(SpecError, match="not a readable EXR"):
+    with pytest.raises(SpecError, match="cannot be read as an EXR file"):
         read_spectral_exr(tmp_path / "not.exr")
     with pytest.raises(SpecError, match="no such file"):
         read_spectral_exr(tmp_path / "none.exr")

@@ -266,6 +266,38 @@ def test_linear_interpolation_spreads_events():
     assert ticks["none"] <= 6 < 12 < ticks["linear"]
 
 
+@pytest.mark.parametrize(("way", "enough"), [("none", np.exp(0.21)), ("linear", 1 + 8 * np.expm1(0.21))])
+def test_what_interpolation_loses_before_a_fixed_tick_is_told(way, enough):
+    """Pictures of 8 ticks: a change between two below 1 + 8 (exp(θ) - 1) gives no event if it is spread."""
+    sensor = mono(
+        evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.34, evs__tick_us=1250, evs__window_us=50
+    )
+    counts = []
+    for factor in (0.9 * enough, 1.1 * enough):
+        pictures = grey(1e7 * factor ** np.array([0.0, 0.0, 1.0, 1.0]))
+        recording = hr.simulate_video(pictures, sensor, fps=100, clean=True, interpolation=way, **UNIT)
+        counts.append(recording.events.size)
+        (note,) = (each for each in recording.manifest["settings"]["video"]["notes"] if "1250 µs" in each)
+        assert "every 10000 µs" in note and "over 8 comparisons" in note
+        assert "less than 2.87 times" in note and "and 1.23 times are enough" in note
+        advice = "not advised for this sensor" if way == "none" else "events are LOST"
+        assert advice in note and "interpolation spreads them" not in note
+    assert counts[0] == 0 and counts[1] >= 64
+
+
+def test_pixels_that_keep_the_level_of_their_last_event_lose_nothing_by_interpolation():
+    keys = {"evs.tick_us": 1250, "evs.contrast_threshold_on": 0.21}
+    sensor = hr.load_sensor("davis346", keys).crop(8, 8)
+    pictures, counts = grey(np.geomspace(0.1, 0.9, 7)), []
+    for way in ("none", "linear"):
+        options = {"fps": 100, "transfer": "linear", "white_lux": 300, "clean": True}
+        recording = hr.simulate_video(pictures, sensor, interpolation=way, **options)
+        counts.append(recording.events.size)
+        notes = [note for note in recording.manifest["settings"]["video"]["notes"] if "1250 µs" in note]
+        assert [("loses none" in note) for note in notes] == ([True] if way == "none" else [])
+    assert counts[0] >= 64 * int(np.log(9) / 0.21 - 1) and abs(counts[1] - counts[0]) <= 64
+
+
 def test_sensors_without_a_tick_follow_the_pictures():
     sensor = hr.load_sensor("davis346").crop(16, 16)
     options = {"fps": 1000, "transfer": "linear", "white_lux": 100}

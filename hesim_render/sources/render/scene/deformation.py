@@ -12,6 +12,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import require_memory
 from hesim_render.core.npz import read_arrays
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error
+from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.deformation import DeformationSpec
 
 
@@ -101,6 +102,7 @@ def _from_folder(
     found = np.empty((len(names), count, 3), np.float32)
     for number, name in enumerate(names):
         path = spec.folder / name
+        require_fits(path)
         with as_spec_error(path, key):
             mesh = mi.load_dict({"type": path.suffix.lower().lstrip("."), "filename": str(path)})
         if mesh.vertex_count() != count or not np.array_equal(_faces(mi, mesh), faces):

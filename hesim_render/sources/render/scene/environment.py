@@ -12,6 +12,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading
 from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, transform
+from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.geometry import rotation_about
 from hesim_render.specs.light import LightSpec
 from hesim_render.spectral.spectrum import photopic
@@ -45,6 +46,7 @@ def environment(mi: MitsubaModule, light: LightSpec, normal: NDArray[np.float64]
     if mi.variant().startswith("scalar"):
         raise SpecError("environment maps of scene files are rendered in vectorised variants of Mitsuba only", key=key)
     file = light.folder / str(light.file)
+    require_fits(file)
     with as_spec_error(file, f"{key}.file"), reading(file, "as a picture"):
         picture = mi.Bitmap(str(file)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
     values = np.array(picture, dtype=np.float32)

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
-from hesim_render.core.guard import leads_out, reading
+from hesim_render.core.guard import leads_out, reading, require_file_size, require_memory, require_plain
 from hesim_render.sources.render.scene.deformation import Deformation, read_deformation
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
 from hesim_render.sources.render.scene.pictures import picture_texture
+from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.sources.render.scene.surfaces import area_emitter, radiance_of
 from hesim_render.specs.scene import OUTSIDE, ObjectSpec, SceneSpec
 from hesim_render.spectral.transfer import decode
@@ -24,6 +25,8 @@ from hesim_render.targets.piece import Picture
 _OF_MITSUBA, _OF_TRIMESH = ("obj", "ply"), ("stl", "glb", "gltf")
 #: What Mitsuba says of PLY files with larger faces, binary ones and those of text.
 _NO_TRIANGLES = ("is this a triangle mesh", "trailing tokens after end of PLY file")
+#: Memory of a texel while its colour becomes linear, three numbers of float64 in two arrays, bytes.
+_TEXEL_BYTES = 48
 #: Textures of glTF materials that are not rendered, by trimesh's name.
 _UNUSED = {
     "metallicRoughnessTexture": "metallic and roughness texture",
@@ -70,6 +73,7 @@ def mesh_shapes(
         raise SpecError(f"no such mesh file: {path}", key=key)
     kind = path.suffix.lower().lstrip(".")
     if kind in _OF_MITSUBA:
+        require_fits(path)
         try:
             with as_spec_error(path, key):
                 shape = mi.load_dict({"type": kind, "filename": str(path)})
@@ -98,7 +102,7 @@ def mesh_shapes(
         own = f"{name}_{number}"
         vertices = np.asarray(part.vertices, dtype=np.float64) @ fit[:3, :3].T + fit[:3, 3]
         uv = getattr(part.visual, "uv", None)
-        surface = bsdf if item.materials == "own" else _principled(mi, part)
+        surface = bsdf if item.materials == "own" else _principled(mi, part, path)
         found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv, emitter)
     return found, None
 
@@ -137,8 +141,10 @@ def _load(path: Path, kind: str, root: Path | None, key: str) -> list[Any]:
         def get(self, name: str) -> bytes:
             if root is not None and leads_out(root, path.parent / name):
                 raise SpecError(f"{name!r} {OUTSIDE}", file=path, key=key)
+            require_plain(path.parent / name)
             return super().get(name)
 
+    require_file_size(path)
     with reading(path, "as a mesh"):
         loaded = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=kind, resolver=Beside(str(path)))
         return [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh)]
@@ -231,12 +237,14 @@ def _material_of(part: Any) -> FileMaterial:
     )
 
 
-def _principled(mi: MitsubaModule, part: Any) -> dict[str, Any]:
+def _principled(mi: MitsubaModule, part: Any, path: Path) -> dict[str, Any]:
     """The material of a part as Mitsuba's."""
     told = _material_of(part)
     base: Any = {"type": "rgb", "value": list(told.base_color)}
     if told.has_texture:
-        codes = np.asarray(_pbr(part).baseColorTexture.convert("RGB"), dtype=np.float64) / 255
+        picture = _pbr(part).baseColorTexture
+        require_memory(_TEXEL_BYTES * picture.width * picture.height, "the texture", path)
+        codes = np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
         base = picture_texture(mi, Picture((decode(codes, "srgb") * told.base_color).astype(np.float32), "srgb"))
     surface = {"type": "principled", "base_color": base, "metallic": told.metallic, "roughness": told.roughness}
     return {"type": "twosided", "material": surface}

@@ -19,7 +19,7 @@ from hesim_render.core import backend
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.interrupts import interrupts_held
-from hesim_render.sources.render.scene.files import check_xml, require_state_inside
+from hesim_render.sources.render.scene.files import SceneFiles
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals, ordered_normals
 from hesim_render.spectral.spectrum import Spectrum
 
@@ -139,19 +139,20 @@ def load_scene(
         inner.prepend(str(source.resolve().parent))
     elif root is not None:
         inner.prepend(str(root.resolve()))
-    inner.prepend(str(_home(mi)))
     mi.set_file_resolver(inner)
     try:
         if isinstance(source, Path):
-            check_xml(source, root, lambda name: str(inner.resolve(name)))
-        state = (
-            parser.parse_file(config, str(source)) if isinstance(source, Path) else parser.parse_dict(config, source)
-        )
-        if root is not None:
-            file = source if isinstance(source, Path) else None
-            require_state_inside(mi, state, root, _opened, file)
+            SceneFiles(mi.FileResolver(inner), root).check_xml(source)
+            state = parser.parse_file(config, str(source))
+        else:
+            SceneFiles(inner, root).check_dictionary(source, None)
+            inner.prepend(str(_home(mi)))  # to read a dictionary is to load its plugins
+            state = parser.parse_dict(config, source)
         parser.transform_all(config, state)
-        mi.file_resolver().prepend(str(_home(mi)))  # again: a <path> element puts its own folder first
+        mi.file_resolver().prepend(str(_home(mi)))  # type: ignore[operator]  # again: <path> puts its own folder first
+        SceneFiles(mi.file_resolver(), root).check_state(  # type: ignore[operator]
+            mi, state, source if isinstance(source, Path) else None
+        )
         review(state)
         needs_normals = _without_normals(state)
         scene = parser.instantiate(config, state)

@@ -9,10 +9,12 @@ import numpy as np
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.files import require_material
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, spectrum_dict, transform
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.plugins import HONOURED, REFUSED
+from hesim_render.sources.render.scene.sizes import require_fits
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.surface import TextureSpec
@@ -21,8 +23,6 @@ from hesim_render.targets.image import read_picture
 
 #: Shapes without an inside; both of their sides are visible.
 _OPEN_SHAPES = ("rectangle", "mesh")
-#: Plugins with files that Mitsuba reads itself.
-_NAME_FILES = ("bitmap", "measured", "volume")
 
 
 def is_matt(item: ObjectSpec) -> bool:
@@ -122,11 +122,14 @@ def _plugin(
             content[name_of_key] = _picture(mi, value, place)
         elif isinstance(value, Mapping):
             content[name_of_key] = _plugin(mi, value, item, spec, place)
-        elif name_of_key == "filename" and name in _NAME_FILES:
+        elif name_of_key == "filename":
             file = spec.folder / str(value)
             if not file.is_file():
                 raise SpecError(f"no such file: {file}", file=spec.file, key=place)
+            require_fits(file)
             content[name_of_key] = str(file)
+        elif name_of_key == "material" and isinstance(value, str):
+            content[name_of_key] = require_material(value, spec.file, place)
         elif isinstance(value, list) and np.shape(value) == (4, 4):
             content[name_of_key] = transform(mi, value)
         elif isinstance(value, list):

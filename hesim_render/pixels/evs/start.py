@@ -1,0 +1,127 @@
+"""State in which asynchronous pixels begin: that of a camera which has looked at the first light for a long time.
+
+The level of comparison of each pixel is drawn from its law (`hesim_render.pixels.evs.reference_law`), with the
+thresholds, the noise and the bandwidth that the pixel has in the light of the first sample. Then the pixels run for a
+few periods of their noise, whose events nobody sees (`hesim_render.pixels.evs.comparison.LastEvent`).
+
+The laws are known at nodes of thresholds over noise and of the bandwidth. Between nodes, quantiles are interpolated.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from hesim_render.core.rng import Stream, uniform, words
+from hesim_render.core.units import US_PER_S
+from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.reference_law import Pixels, law
+
+#: Thresholds over noise at which laws are known. Beyond, noise events are too rare, or so frequent that any law is left
+#: at once.
+_NODES = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 7.0, 9.0])
+#: Quantiles of a law that are kept, as normal deviates.
+_QUANTILES = np.linspace(-4.0, 4.0, 161)
+#: How long ago all pixels were reset, s, on average: only pixels with fewer noise events than that notice.
+_LONG_S = 1000.0
+
+
+class Start(NamedTuple):
+    """State of the pixels at the begin.
+
+    Parameters
+    ----------
+    reference : [pixel], level of comparison less ln x, in standard deviations of the noise.
+    dead_us : [pixel], time until each is ready, µs; 0 for most.
+    """
+
+    reference: NDArray[np.float32]
+    dead_us: NDArray[np.float64]
+
+
+class _Laws:
+    """Laws at the nodes of both thresholds, for one bandwidth; each is worked out when it is first needed."""
+
+    def __init__(self, dead: float, leak: float, angle: float) -> None:
+        self._dead, self._leak, self._angle = dead, leak, angle
+        size = _NODES.size
+        self.quantiles = np.full((size * size, _QUANTILES.size), np.nan, np.float32)
+        self.dead_share = np.zeros(size * size)
+
+    def know(self, nodes: NDArray[np.intp]) -> None:
+        """Work out the laws of nodes, numbered ON first."""
+        new = nodes[np.isnan(self.quantiles[nodes, 0])]
+        if new.size == 0:
+            return
+        on, off = (_NODES[place] for place in np.divmod(new, _NODES.size))
+        found = law(Pixels(on, off, self._dead, self._leak, self._angle))
+        below = np.concatenate([np.zeros((new.size, 1)), np.cumsum(found.share, axis=1)], axis=1)
+        wanted = special.ndtr(_QUANTILES)
+        for node, one in zip(new, below, strict=True):
+            self.quantiles[node] = np.interp(wanted, one, found.edges)
+        self.dead_share[new] = found.dead_share
+
+
+_laws = lru_cache(maxsize=64)(_Laws)
+
+
+def start_of(
+    noise: EvsNoise, seed: int, spread: NDArray[np.float32], share: NDArray[np.float64], angle: float
+) -> Start:
+    """State of the pixels in the light of the first sample: a pure function of the seed, the pixel and this light.
+
+    Parameters
+    ----------
+    noise : noise model of the pixels.
+    seed : seed of the noise.
+    spread : [pixel], standard deviation of ln x.
+    share : [pixel], bandwidth of each pixel's noise over the largest.
+    angle : rate of the poles at the largest bandwidth times the time between nodes of the noise.
+    """
+    layout = noise.layout
+    key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
+    none = np.zeros(key.size, np.uint32)
+    chance, of_dead = uniform(words(seed, Stream.EVENT_START, key, none, none)[:2])
+    sigma = np.maximum(spread.astype(np.float64), 1e-12)
+    thresholds = noise.threshold_on_map, noise.threshold_off_map
+    where = [_place(np.ravel(theta) / sigma, _NODES) for theta in thresholds]
+    octave = -np.log2(np.clip(share, 1e-6, 1.0))
+    whole = np.floor(octave).astype(np.intp)
+    z = (np.clip(special.ndtri(chance), _QUANTILES[0], _QUANTILES[-1]) - _QUANTILES[0]) / (
+        _QUANTILES[1] - _QUANTILES[0]
+    )
+    low = np.minimum(z.astype(np.intp), _QUANTILES.size - 2)
+    part = (z - low).astype(np.float32)
+    reference, dead_share = np.zeros(key.size, np.float32), np.zeros(key.size)
+    bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
+    assert bandwidth_hz is not None
+    dead_s = (period_us or 0) / US_PER_S
+    resets_hz = 1 / _LONG_S + (noise.leak_rate_hz if period_us else 0.0)
+    octaves = np.unique(np.concatenate([whole, whole[octave > whole] + 1]))
+    for step in octaves:
+        here = np.flatnonzero(np.abs(octave - step) < 1)
+        own_hz = bandwidth_hz / 2.0**step
+        laws = _laws(dead_s * own_hz, resets_hz / own_hz, angle / 2.0**step)
+        weight = (1 - np.abs(octave[here] - step)).astype(np.float32)
+        for (on, on_weight), (off, off_weight) in product(*(((n, 1 - p), (n + 1, p)) for n, p in where)):
+            node = on[here] * _NODES.size + off[here]
+            laws.know(np.flatnonzero(np.bincount(node, minlength=_NODES.size**2)))
+            all_weight = weight * on_weight[here] * off_weight[here]
+            value, following = (laws.quantiles[node, low[here] + k] for k in (0, 1))
+            reference[here] += all_weight * (value + part[here] * (following - value))
+            dead_share[here] += all_weight * laws.dead_share[node]
+    asleep = of_dead < dead_share
+    dead_us = np.where(asleep, (period_us or 0) * of_dead / np.where(asleep, dead_share, 1.0), 0.0)
+    return Start(reference, dead_us)
+
+
+def _place(value: NDArray[np.float64], nodes: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Node below each value, and how far the value is to the next one, 0 to 1."""
+    number = np.interp(value, nodes, np.arange(nodes.size))
+    below = np.minimum(number.astype(np.intp), nodes.size - 2)
+    return below, (number - below).astype(np.float32)
