@@ -109,4 +109,4 @@ def test_without_rerun_a_view_is_as_before_and_its_file_is_refused(recording, ca
         with pytest.raises(SystemExit) as ended:
             main(["view", str(recording.path), *more])
         assert ended.value.code == status
-    assert "pip install 'hesim_render[view]'" in capsys.readouterr().err and not any(tmp_path.iterdir())
+    assert "pip install 'rerun-sdk>=" in capsys.readouterr().err and not any(tmp_path.iterdir())
