@@ -135,7 +135,7 @@ def evaluate(
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".json",))
     told = Told(json_, quiet)
     with told.progress(f"evaluate {folder.name}") as progress:
         result = evaluate_benchmark(
@@ -217,7 +217,7 @@ def peers(
     from hesim_render.specs.peers import read_peers
 
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".json",))
     content = read_peers(spec, dict(map(parse_override, set_ or [])))
     told = Told(json_, quiet)
     with told.progress(content.name) as progress:

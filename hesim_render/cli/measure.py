@@ -49,7 +49,7 @@ def measure(
 
     region = None if roi is None else _region(roi)
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".csv",))
     found = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
     for frequency in (0.125, 0.25, 0.5):
         value = found.mtf[abs(found.frequency_cy_per_px - frequency).argmin()]

@@ -33,7 +33,7 @@ def write_picture(sensor: Sensor, file: Path) -> None:
 
     Parameters
     ----------
-    sensor : the sensor.
+    sensor : the sensor; of one with a calibration, the part that was measured stands for the whole.
     file : PNG, SVG or PDF by the end of its name; replaced in one step.
 
     Raises
@@ -44,6 +44,7 @@ def write_picture(sensor: Sensor, file: Path) -> None:
     kind = file.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise RangeError("format of the picture", file.name, f"a name that ends in {', '.join(FORMATS)}")
+    sensor = sensor.calibrated_part
     draws = [_spectra]
     if sensor.spec.evs is not None:
         draws += [_noise, _rates, _latency, _s_curves]

@@ -10,7 +10,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_an_extra_is_advised_by_the_names_of_its_packages(monkeypatch):
-    lines = ["numpy>=2.1", "mcap >=1.2 ; extra == 'ros'", 'trimesh>=4.5; extra == "meshes"', "networkx (>=3) ; extra == 'meshes'",
+    lines = ["numpy>=2.1", "mcap >=1.2 ; extra == 'ros'", 'trimesh>=4.5; extra == "meshes"',
+             "networkx (>=3) ; extra == 'meshes'",
              "colour-science[plotting]>=0.4; python_version < '4' and extra == 'ros-more'"]  # fmt: skip
     monkeypatch.setattr(extras, "requires", lambda name: lines)
     assert extras.how_to_install("meshes") == "pip install 'trimesh>=4.5' 'networkx>=3'"
