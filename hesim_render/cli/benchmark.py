@@ -9,7 +9,7 @@ import typer
 
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes, listed
-from hesim_render.cli.terminal import complain
+from hesim_render.cli.terminal import complain, is_short_of_wish, verdict_lines
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, facts_of
 from hesim_render.core.errors import RangeError, TooLongError
 from hesim_render.core.output import free_place
@@ -43,7 +43,10 @@ def build(
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Build all clips of a benchmark, with manifest and card."""
+    """Build all clips of a benchmark, with manifest and card.
+
+    Ends with status 3 where the audits find clips that are worse than the benchmark asks for.
+    """
     from hesim_render.benchmark.build import build_benchmark, check_build, last_run
     from hesim_render.specs.benchmark import read_benchmark
     from hesim_render.specs.files import parse_override
@@ -70,7 +73,13 @@ def build(
     splits = ", ".join(f"{number} {split}" for split, number in count.items())
     text = f"{len(clips)} clips ({splits})\n  {last_run(built.root)}\n  in {built.root}\n"
     card = built.root / "README.md"
-    told.result(f"{text}  card: {card}", {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count})
+    audits = {clip.name: clip.content["render"].get("audit") for clip in built.clips()}
+    short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
+    told.result(
+        "\n".join([f"{text}  card: {card}", *verdict_lines(audits, "clips")]),
+        {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count, "not_met": short},
+        ExitStatus.NOT_MET if short else ExitStatus.DONE,
+    )
 
 
 def _estimated(told: Told, expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool) -> None:

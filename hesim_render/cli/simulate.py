@@ -180,12 +180,15 @@ def demo(
     runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
     for target in runs:
         check_output(target, overwrite=True)
+    audits = {}
     for target, (scene, sensor) in runs.items():
         recording = _simulate(told, scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        audits[target.name] = recording.manifest["settings"].get("render", {}).get("audit")
         told.text(summary(recording) + "\n")
     still, moving = runs
     told.text(f"Look at {still / 'preview.png'} (24 measured patches)")
-    told.text(f"    and {moving / 'preview.gif'} (events of a moving scene).")
+    status = ExitStatus.NOT_MET if any(map(is_short_of_wish, audits.values())) else ExitStatus.DONE
+    told.result(f"    and {moving / 'preview.gif'} (events of a moving scene).", {}, status)
 
 
 def _simulate(

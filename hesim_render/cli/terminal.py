@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from hesim_render.core.errors import RangeError
@@ -14,6 +14,10 @@ from hesim_render.core.guard import printable
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
+
+
+#: Runs of many that are named as worse than asked for.
+_MOST_NAMED = 5
 
 
 def split_overrides(texts: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -142,6 +146,30 @@ def _verdict(audit: dict[str, Any]) -> list[str]:
             f"{audit['tolerance_noise']:g} of the sensor's noise; --samples {audit['samples_needed']} would do"
         ]
     return [f"  NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]
+
+
+def verdict_lines(audits: Mapping[str, dict[str, Any] | None], noun: str) -> list[str]:
+    """Lines about the audits of many runs, in the words for one: those that miss their quality, those not shown.
+
+    Parameters
+    ----------
+    audits : what the audit of each run found, by the run's name; None where there was none.
+    noun : what a run is called, in the plural.
+    """
+    short = {name: audit for name, audit in audits.items() if audit is not None and is_short_of_wish(audit)}
+    open_ = sum(audit is not None and audit.get("verdict") == "not shown" for audit in audits.values())
+    lines = []
+    if short:
+        needed = [audit["quality_needed"] for audit in short.values() if audit.get("quality_needed") is not None]
+        told = ", ".join(list(short)[:_MOST_NAMED]) + (", …" if len(short) > _MOST_NAMED else "")
+        would_do = f"; quality {min(needed):g} would do" if needed else ""
+        lines.append(f"  NOT MET: {len(short)} of {len(audits)} {noun} are worse than asked for ({told}){would_do}")
+    if open_:
+        lines.append(
+            f"  audit: too little was looked at again to confirm the quality of {open_} of {len(audits)} {noun}; "
+            "nothing speaks against it"
+        )
+    return lines
 
 
 def is_short_of_wish(audit: dict[str, Any] | None) -> bool:

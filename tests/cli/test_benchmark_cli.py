@@ -6,6 +6,8 @@ import pytest
 from test_cli import call, fails
 
 from benchmarks import SMALL
+from hesim_render.cli.terminal import verdict_lines
+from hesim_render.sources.render.audit.audit import Audit
 
 #: One clip of a scene without motion.
 TINY = SMALL | {
@@ -41,6 +43,30 @@ def test_a_benchmark_is_built_verified_evaluated_and_exported(spec, tmp_path, ca
     next(out.glob("clips/*/sharp.h5")).unlink()
     status, text, err = call(capsys, "benchmark", "verify", out)
     assert status == 1 and text == "" and err.endswith("sharp.h5: is missing\n") and err.count("\n") == 1
+
+
+def test_clips_that_miss_their_quality_are_told_with_the_status_of_a_run(spec, tmp_path, capsys, monkeypatch):
+    out, plain = tmp_path / "b", Audit.run
+    monkeypatch.setattr(Audit, "run", lambda self: plain(self) | {"verdict": "not met", "quality_needed": 1.25})
+    build = ("benchmark", "build", spec, "--out", out, "--workers", 0, "--no-estimate")
+    for _ in range(2):  # a build that finds all clips there says the same
+        status, text, _ = call(capsys, *build)
+        name = next(out.glob("clips/*")).name
+        told = f"  NOT MET: 1 of 1 clips are worse than asked for ({name}); quality 1.25 would do"
+        assert status == 3 and text.splitlines()[-1] == told
+    status, text, _ = call(capsys, *build, "--json")
+    assert (status, json.loads(text)["status"], json.loads(text)["not_met"]) == (3, 3, [name])
+
+
+def test_verdicts_of_many_runs_are_counted():
+    met, short = {"verdict": "met"}, {"verdict": "not met", "quality_needed": 0.3}
+    assert verdict_lines({"a": met, "b": None}, "clips") == []
+    audits = {f"c{k}": short | {"quality_needed": 0.9 - 0.1 * k} for k in range(6)}
+    audits |= {"m": met, "o": {"verdict": "not shown"}}
+    assert verdict_lines(audits, "runs") == [
+        "  NOT MET: 6 of 8 runs are worse than asked for (c0, c1, c2, c3, c4, …); quality 0.4 would do",
+        "  audit: too little was looked at again to confirm the quality of 1 of 8 runs; nothing speaks against it",
+    ]
 
 
 def test_mistakes_are_one_line(spec, tmp_path, capsys):
