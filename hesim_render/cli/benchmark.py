@@ -9,7 +9,7 @@ import typer
 
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes, listed
-from hesim_render.cli.terminal import complain, is_short_of_wish, verdict_lines
+from hesim_render.cli.terminal import complain
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, facts_of
 from hesim_render.core.errors import RangeError, TooLongError
 from hesim_render.core.output import free_place
@@ -48,6 +48,7 @@ def build(
     Ends with status 3 where the audits find clips that are worse than the benchmark asks for.
     """
     from hesim_render.benchmark.build import build_benchmark, check_build, last_run
+    from hesim_render.recording.quality import is_short_of_wish, verdict_lines
     from hesim_render.specs.benchmark import read_benchmark
     from hesim_render.specs.files import parse_override
 
@@ -76,7 +77,7 @@ def build(
     audits = {clip.name: clip.content["render"].get("audit") for clip in built.clips()}
     short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
     told.result(
-        "\n".join([f"{text}  card: {card}", *verdict_lines(audits, "clips")]),
+        "\n".join([f"{text}  card: {card}", *(f"  {line}" for line in verdict_lines(audits, "clips"))]),
         {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count, "not_met": short},
         ExitStatus.NOT_MET if short else ExitStatus.DONE,
     )

@@ -25,7 +25,7 @@ from hesim_render.cli.options import (
     listed,
     names_of,
 )
-from hesim_render.cli.terminal import is_short_of_wish, split_overrides, summary
+from hesim_render.cli.terminal import split_overrides, summary
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.guard import printable
@@ -101,6 +101,8 @@ def simulate(
 
 def tell_recording(told: Told, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None) -> None:
     """The result of a run: its recording, with the status that the audit gives."""
+    from hesim_render.recording.quality import is_short_of_wish
+
     short = is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit"))
     status = ExitStatus.NOT_MET if short else ExitStatus.DONE
     told.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
@@ -176,6 +178,8 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
 ) -> None:
     """Two small recordings with pictures: a ColorChecker, and a moving scene."""
+    from hesim_render.recording.quality import is_short_of_wish
+
     told = Told()
     runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
     for target in runs:

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.terminal import is_short_of_wish, verdict_lines
 from hesim_render.cli.told import DryRun, Json, Quiet, Told
 
 
@@ -23,6 +22,7 @@ def sweep(
 
     Ends with status 3 where the audits find runs that are worse than the sweep asks for.
     """
+    from hesim_render.recording.quality import is_short_of_wish, verdict_lines
     from hesim_render.studies.sweep import VERDICT, check_sweep
     from hesim_render.studies.sweep import sweep as run
 
@@ -38,7 +38,9 @@ def sweep(
     audits: dict[str, dict[str, object] | None] = {f"row {k + 1}": {"verdict": each} for k, each in enumerate(verdicts)}
     short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
     told.result(
-        "\n".join([f"{len(table)} runs in {out / 'results.csv'}", *verdict_lines(audits, "runs")]),
+        "\n".join(
+            [f"{len(table)} runs in {out / 'results.csv'}", *(f"  {line}" for line in verdict_lines(audits, "runs"))]
+        ),
         {"results": out / "results.csv", "runs": len(table), "not_met": short},
         ExitStatus.NOT_MET if short else ExitStatus.DONE,
     )

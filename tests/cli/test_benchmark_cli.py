@@ -6,7 +6,6 @@ import pytest
 from test_cli import call, fails
 
 from benchmarks import SMALL
-from hesim_render.cli.terminal import verdict_lines
 from hesim_render.sources.render.audit.audit import Audit
 
 #: One clip of a scene without motion.
@@ -56,17 +55,6 @@ def test_clips_that_miss_their_quality_are_told_with_the_status_of_a_run(spec, t
         assert status == 3 and text.splitlines()[-1] == told
     status, text, _ = call(capsys, *build, "--json")
     assert (status, json.loads(text)["status"], json.loads(text)["not_met"]) == (3, 3, [name])
-
-
-def test_verdicts_of_many_runs_are_counted():
-    met, short = {"verdict": "met"}, {"verdict": "not met", "quality_needed": 0.3}
-    assert verdict_lines({"a": met, "b": None}, "clips") == []
-    audits = {f"c{k}": short | {"quality_needed": 0.9 - 0.1 * k} for k in range(6)}
-    audits |= {"m": met, "o": {"verdict": "not shown"}}
-    assert verdict_lines(audits, "runs") == [
-        "  NOT MET: 6 of 8 runs are worse than asked for (c0, c1, c2, c3, c4, …); quality 0.4 would do",
-        "  audit: too little was looked at again to confirm the quality of 1 of 8 runs; nothing speaks against it",
-    ]
 
 
 def test_mistakes_are_one_line(spec, tmp_path, capsys):
