@@ -23,10 +23,10 @@ def lines(verdict="met", needed=None, true=370.0, found=371.0, **shares):
 
 def test_bounds_are_told_where_enough_was_seen():
     assert lines() == [
-        "render, events: stated error 0.29 of the sensor's noise (rms, asked for 0.5); 95 % of values below 0.6, 99 % below "
-        "0.8",
-        "audit, events: true deviation rms 0.31; 0.1 % of values are off by more than 1.5 of the noise, with 99 % confidence "
-        "at most 1.3 %; missed 0.4 % of signal events, at most 1.8 %; too many 0.2 %, at most 0.9 %",
+        "render, events: stated error 0.29 of the sensor's noise (rms, asked for 0.5); 95 % of values below 0.6, 99 % "
+        "below 0.8",
+        "audit, events: true deviation rms 0.31; 0.1 % of values are off by more than 1.5 of the noise, with 99 % "
+        "confidence at most 1.3 %; missed 0.4 % of signal events, at most 1.8 %; too many 0.2 %, at most 0.9 %",
     ]
     assert render_lines(None) == []
 
@@ -42,8 +42,8 @@ def test_a_bound_that_says_nothing_is_no_threat(shares, told):
     assert told in text[1] and text[1].endswith("too few for a bound")
     assert "at most 100 %" not in text[1]
     assert text[2:] == [
-        "audit: nothing speaks against this run, but too little was seen to confirm its quality; a longer --duration or a "
-        "larger --roi shows more"
+        "audit: nothing speaks against this run, but too little was seen to confirm its quality; a longer --duration or "
+        "a larger --roi shows more"
     ]
 
 
