@@ -7,8 +7,8 @@ from typing import Any
 
 #: Runs of many that are named as worse than asked for.
 _MOST_NAMED = 5
-#: Bounds of shares above so many times what is wanted say nothing: too little was seen.
-_SAYS_NOTHING = 5.0
+#: Bounds above this share say nothing: too little was seen.
+_SAYS_NOTHING = 0.25
 #: Wanted shares of missed and extra events, for audits that do not say them.
 _WANTED = {"missed": 0.02, "extra": 0.01}
 _SEE_MORE = "a longer --duration or a larger --roi shows more"
@@ -91,7 +91,7 @@ def _saw_too_little(part: dict[str, Any]) -> bool:
     """True if no share of the events speaks against a run, but one has a bound that says nothing."""
     wanted = {name: part.get(f"{name}_wanted_at_most", most) for name, most in _WANTED.items()}
     return all(part[name] <= most for name, most in wanted.items()) and any(
-        part[f"{name}_at_most"] > _SAYS_NOTHING * most for name, most in wanted.items()
+        part[f"{name}_at_most"] > _SAYS_NOTHING for name in wanted
     )
 
 

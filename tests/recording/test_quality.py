@@ -42,9 +42,13 @@ def test_a_bound_that_says_nothing_is_no_threat(shares, told):
     assert told in text[1] and text[1].endswith("too few for a bound")
     assert "at most 100 %" not in text[1]
     assert text[2:] == [
-        "audit: nothing speaks against this run, but too little was seen to confirm its quality; a longer --duration or "
-        "a larger --roi shows more"
+        "audit: nothing speaks against this run, but too little was seen to confirm its quality; a longer --duration "
+        "or a larger --roi shows more"
     ]
+
+
+def test_a_wide_bound_is_still_told():
+    assert "missed 0 % of signal events, at most 24 %" in lines("not shown", missed=0.0, missed_at_most=0.24)[1]
 
 
 def test_what_speaks_against_a_run_keeps_its_figures():
