@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 FORMATS = ("png", "svg", "pdf")
 #: Illuminances of the curves and of the S-curves, lx.
 _LUX = np.geomspace(1e-2, 1e5, 141)
+_LUX_TICKS = (0.01, 1.0, 100.0, 10000.0)
 _S_LUX = (0.1, 1.0, 10.0, 1000.0)
 _SIZE_PX = (430, 310)
 #: Rates below are not drawn, 1/s.
@@ -82,6 +83,8 @@ def _spectra(sensor: Sensor, axes: Axes) -> None:
 
 def _against_light(axes: Axes, title: str, unit: str) -> None:
     axes.set(title=title, xlabel="illuminance on the sensor, lx", ylabel=unit, xscale="log", yscale="log")
+    axes.set_xlim(_LUX[0] / 2, 2 * _LUX[-1])
+    axes.set_xticks(_LUX_TICKS)
 
 
 def _noise(sensor: Sensor, axes: Axes) -> None:
@@ -100,12 +103,15 @@ def _noise(sensor: Sensor, axes: Axes) -> None:
 def _rates(sensor: Sensor, axes: Axes) -> None:
     _against_light(axes, "Events in steady light", "events per s and pixel")
     curves = event_curves(sensor, _LUX)
-    for rate, colour, label in ((curves.on_hz, COLOURS[1], "ON, with leak"), (curves.off_hz, COLOURS[0], "OFF")):
+    for rate, colour, label in (
+        (curves.on_hz + curves.off_hz, COLOURS[7], "all events"), (curves.on_hz, COLOURS[1], "ON, with leak"),
+        (curves.off_hz, COLOURS[0], "OFF"),
+    ):  # fmt: skip
         axes.plot(curves.lux, np.where(rate >= _LEAST_HZ, rate, np.nan), color=colour, label=label)
     sheet = sensor.evs.spec.data_sheet
     for level in sheet.background if sheet is not None else ():
         if level.lux > 0:
-            axes.plot(level.lux, level.rate_hz, "o", color=COLOURS[7], label="data sheet, ON and OFF")
+            axes.plot(level.lux, level.rate_hz, "o", color=COLOURS[7], label="data sheet, all events")
     if np.all(np.maximum(curves.on_hz, curves.off_hz) < _LEAST_HZ):
         axes.set_ylim(_LEAST_HZ, 1)
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center")

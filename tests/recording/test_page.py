@@ -53,9 +53,27 @@ def test_the_page_is_whole_and_names_only_files_of_the_recording(recording, caps
     for _, value in parameters(recording):
         assert value in text
     assert text.count("<svg") == 2 and "colorchecker" in text and "contrast_threshold_on" in text
+    assert "max-width:none" in text and "grid-template-columns" in text  # the whole window, with parts side by side
     # twice the same bytes
     write_page(recording, recording.path)
     assert (recording.path / "recording.html").read_text(encoding="utf-8") == text
+
+
+def test_the_page_has_the_audit_in_the_words_of_the_commands(tmp_path):
+    made = recordings.make("davis346", tmp_path / "r")
+    part = {"deviation_noise": {"rms": 0.4}, "off": 0.03, "off_at_most": 0.041}
+    audit = {"tolerance_noise": 1.5, "verdict": "not met", "quality_needed": 0.21, "frames": part}
+    render = {"error_noise": {"frames": {"rms": 0.3, "p95": 0.6, "p99": 0.8}}, "quality": 0.5, "audit": audit}
+    for given, told in (
+        (
+            render,
+            ["audit, frames: true deviation rms 0.4; 3 % of values are off", "<p class=findings>NOT MET: this run is"],
+        ),
+        ({**render, "audit": {}}, ["No audit: nothing was rendered again"]),
+    ):
+        made.manifest["settings"]["render"] = given
+        text = write_page(made, made.path).read_text(encoding="utf-8")
+        assert all(words in text for words in told)
 
 
 def test_plots_hold_all_events_and_all_pixels(recording):
