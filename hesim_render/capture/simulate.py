@@ -12,6 +12,7 @@ import numpy as np
 from hesim_render.capture.exact_estimate import estimate_exact
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import TERMS, noise_models
+from hesim_render.capture.overheads import with_overheads
 from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
@@ -156,6 +157,8 @@ def simulate(
     if kinds:
         settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
+        if told is not None:
+            told(0, 1, "preparation")
         seen, level = in_absolute_light(scene)
         flux, mode = renderer or flux_source(seen, sensor, seed, quality, samples, exact, told)
         warn_if_unseen(scene.spec, flux.view, duration_us)
@@ -171,10 +174,15 @@ def simulate(
         expected: Estimate | None = None
         is_asked = told is not None or on_estimate is not None or max_minutes is not None
         if rendering and is_asked:  # it takes as long as a short run, and changes nothing
-            expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
+            expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures, progress=told)
         elif on_estimate is not None or max_minutes is not None:
             expected = estimate_exact(flux, plain, settings["samples"])
+            sample = BlockSample([], 1.0) if flux.is_static else plain.sample_of_event_blocks()
         if expected is not None:
+            expected = with_overheads(
+                expected, flux.sensor, duration_us, sample.windows, len(plain.frame_exposures[1]),
+                audited=bool(rendering) and audit, rests=flux.is_static,
+            )  # fmt: skip
             if on_estimate is not None:
                 on_estimate(expected)
             if max_minutes is not None and expected.seconds > 60 * max_minutes:
