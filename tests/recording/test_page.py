@@ -19,7 +19,7 @@ from hesim_render.recording.recording import Recording
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page") / "recording"
     sensor = hr.load_sensor("gen2", {"evs.contrast_threshold_on": 0.03}).crop(64, 48)
-    hr.simulate(hr.load_scene("colorchecker"), sensor, duration_s=0.06, out=folder, exact=True, samples=4)
+    hr.simulate(hr.load_scene("colorchecker"), sensor, duration_s=0.06, out=folder, exact=True, samples=512)
     return Recording.load(folder)
 
 

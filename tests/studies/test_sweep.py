@@ -193,7 +193,7 @@ def test_ranges_and_files(tmp_path, capsys):
     for name in list_names("sweep_specs"):
         assert read_sweep(name).vary
     file = tmp_path / "sweep.yaml"
-    file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True}))
+    file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
         cli.main(["sweep", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0 and "1 runs in" in capsys.readouterr().out
