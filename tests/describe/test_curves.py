@@ -309,4 +309,10 @@ def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeyp
         lines = {line.get_label(): line for line in rates.lines}
         curve, point = lines["all events"], lines["data sheet, all events"]
         (lux,), (rate,) = point.get_data()
+        # no curve goes below dark_lux, where the model turns round in a V: noise falls towards it
+        for axes in figure.axes:
+            for line in axes.lines if "illuminance" in axes.get_xlabel() else ():
+                assert line.get_label().startswith("θ") or np.min(line.get_xdata()) >= 0.08 - 1e-12
+        (noise,) = (axes.lines[0].get_ydata() for axes in figure.axes if axes.get_title(loc="left") == "Noise of ln x")
+        assert np.count_nonzero(np.diff(np.sign(np.diff(noise)))) == 1  # rises to its one maximum, then falls
         np.testing.assert_allclose(np.interp(lux, *curve.get_data()), rate, rtol=0.05)
