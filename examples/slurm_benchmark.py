@@ -2,7 +2,7 @@
 
     python examples/slurm_benchmark.py benchmark.yaml OUT --partition compute --jobs 20
 
-dask-jobqueue (`pip install 'hesim_render[cluster]' dask-jobqueue`) sends jobs to SLURM. Each starts workers, which
+dask-jobqueue (`pip install 'distributed>=2024.8' dask-jobqueue`) sends jobs to SLURM. Each starts workers, which
 connect to a scheduler in this process. Stopping this script, or the end of a job's time, loses no finished clip: run it
 again. OUT must lie on a file system that all nodes see.
 """

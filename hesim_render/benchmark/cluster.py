@@ -12,6 +12,7 @@ from hesim_render.benchmark.spans import Span
 from hesim_render.benchmark.units import Unit
 from hesim_render.benchmark.worker import attempt
 from hesim_render.core.errors import BackendError, OutputError, RangeError
+from hesim_render.core.extras import how_to_install
 
 _PATIENCE_S = 10
 
@@ -28,7 +29,7 @@ def connected(address: str) -> Any:
         from distributed import Client
         from distributed.comm.core import CommClosedError
     except ImportError:
-        raise RangeError("--scheduler", address, "dask.distributed: pip install 'hesim_render[cluster]'") from None
+        raise RangeError("--scheduler", address, f"dask.distributed: {how_to_install('cluster')}") from None
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a lost scheduler is told by our own error
     try:
         return Client(address, timeout=_PATIENCE_S, set_as_default=False)

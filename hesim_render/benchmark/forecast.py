@@ -12,6 +12,7 @@ import numpy as np
 from hesim_render.benchmark.plan import Clip, Plan
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.overheads import noise_seconds
 from hesim_render.capture.simulate import flux_source
 from hesim_render.core.progress import in_words
 from hesim_render.mosaic.schedule import Exposure
@@ -107,11 +108,11 @@ def _render_seconds(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> flo
     level = spec.noise[clip.noise]
     capture = Capture(flux, flux.sensor, *noise_models(sensor, level.clean, level.without), spec.duration_us, seed)
     pixel, exposures = capture.frame_exposures
+    blocks = capture.sample_of_event_blocks()
     expected = forecast(
-        parts, capture.event_pixels, capture.sample_of_event_blocks(), pixel,
-        [*exposures, *_sharp_exposures(plan, sensor)],
+        parts, capture.event_pixels, blocks, pixel, [*exposures, *_sharp_exposures(plan, sensor)]
     )  # fmt: skip
-    return expected.seconds
+    return expected.seconds + noise_seconds(flux.sensor, spec.duration_us, blocks.windows, rests=flux.is_static)
 
 
 def _bytes(plan: Plan, sensor: Sensor) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.benchmark.event_filters import last_before
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.units import US_PER_S
 
 try:
@@ -68,7 +69,7 @@ class LearnedFilter:
 
     def __init__(self, streams: Sequence[tuple[NDArray, NDArray[np.bool_], tuple[int, int]]], seed: int = 0) -> None:
         if torch is None:
-            raise SpecError("a learned filter needs PyTorch: pip install 'hesim_render[torch]'")
+            raise SpecError(f"a learned filter needs PyTorch: {how_to_install('torch')}")
         x = np.concatenate([features(events, shape) for events, _, shape in streams])
         y = np.concatenate([labels for _, labels, _ in streams])
         if not 0 < np.count_nonzero(y) < len(y):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.guard import inside
 from hesim_render.core.names import file_name, require_file_name
 from hesim_render.core.output import OutputFolder, output_errors
@@ -97,7 +98,7 @@ class RemoteStore:
         try:
             import fsspec
         except ImportError:
-            raise OutputError(f"{address}: needs fsspec: pip install 'hesim_render[remote]'") from None
+            raise OutputError(f"{address}: needs fsspec: {how_to_install('remote')}") from None
         self._address = address
         try:
             self._system, self._root = fsspec.core.url_to_fs(address)

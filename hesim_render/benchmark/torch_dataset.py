@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.events import voxel_grid
 from hesim_render.mosaic.description import Mosaic
 
@@ -71,7 +72,7 @@ class BenchmarkDataset(_Dataset):
         transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         if torch is None:
-            raise SpecError("the loader needs PyTorch: pip install 'hesim_render[torch]'")
+            raise SpecError(f"the loader needs PyTorch: {how_to_install('torch')}")
         if task not in _NEIGHBOURS:
             raise RangeError("task", task, "deblur or interpolate")
         self._task, self._bins, self._transform = task, bins, transform

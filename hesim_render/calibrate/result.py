@@ -83,7 +83,7 @@ def check_calibration(file: str | Path, capture: Mapping[str, Any]) -> dict[str,
         If there can be no file.
     """
     path = Path(file)
-    check_place(path)
+    check_place(path, (".yaml", ".yml"))
     if not path.exists():
         return {"schema_version": SCHEMA_VERSION, "capture": dict(capture)}
     previous = read_calibration(path)
@@ -133,7 +133,7 @@ def check_report(calibration: str | Path, report: str | Path, overwrite: bool = 
     OutputError
         If it may not.
     """
-    path, own = check_place(report), report_beginning(calibration)
+    path, own = check_place(report, (".html", ".htm")), report_beginning(calibration)
     if path.resolve() == Path(calibration).expanduser().resolve():
         raise OutputError(f"{report}: is the calibration itself; give the report another name")
     if not path.is_file() or path.stat().st_size == 0:

@@ -13,7 +13,7 @@ from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.geometry import scene_of
-from hesim_render.recording.recording import Recording
+from hesim_render.recording.recording import Recording, as_recording
 from hesim_render.sensor.lens import Lens
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.scene import Scene
@@ -21,7 +21,7 @@ from hesim_render.specs.files import content_hash
 
 
 def simulate_again(
-    recording: Recording, out: str | Path | None = None, scene: Scene | None = None, **options: Any
+    recording: Recording | str | Path, out: str | Path | None = None, scene: Scene | None = None, **options: Any
 ) -> Recording:
     """Simulate a recording again: same scene, sensor, region, times, seed, terms and quality.
 
@@ -29,7 +29,7 @@ def simulate_again(
 
     Parameters
     ----------
-    recording : a recording of a scene.
+    recording : a recording of a scene, or its folder.
     out : folder of the new one; None keeps it in memory.
     scene : the scene, if it needs files that a recording does not hold.
     options : `overwrite`, `progress`, `on_estimate`, `max_minutes` and `resume` of `simulate`.
@@ -45,6 +45,7 @@ def simulate_again(
     OutputError
         If `out` exists or cannot be written.
     """
+    recording = as_recording(recording)
     manifest, folder = recording.manifest, recording.path
     file = None if folder is None else folder / manifests.MANIFEST_NAME
     settings, told = manifest["settings"], manifest.get("scene")

@@ -26,7 +26,7 @@ from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.sensor.sensor import Sensor
+from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.specs.files import content_hash, list_names
 from hesim_render.specs.sensor import read_sensor
 
@@ -46,7 +46,7 @@ _NODES_PER_CUTOFF_PERIOD = 16  # of the noise of asynchronous pixels, each of wh
 
 
 def write_captures(
-    sensor: Sensor,
+    sensor: Sensor | str | Path,
     out: str | Path,
     *,
     frames: int = 64,
@@ -66,8 +66,8 @@ def write_captures(
 
     Parameters
     ----------
-    sensor : from `load_sensor`; crop it to capture a part. Frames are streamed to disk, so memory does not grow with
-        their number.
+    sensor : from `load_sensor`, or its name or path; crop it to capture a part. Frames are streamed to disk, so memory
+        does not grow with their number.
     out : folder to write.
     frames : number of frames per exposure, dark and lit.
     ticks : number of comparisons on the static target, and again in the dark; the S-curve takes a
@@ -100,6 +100,7 @@ def write_captures(
     OutputError
         If `out` exists or cannot be written.
     """
+    sensor = as_sensor(sensor)
     for name, exposures in (("dark exposures", dark_exposures_us), ("lit exposures", lit_exposures_us)):
         if len(set(exposures)) < max(2, len(exposures)) or min(exposures) <= 0:
             raise RangeError(name, list(exposures), "two or more different times above 0, in µs")

@@ -22,7 +22,7 @@ from hesim_render.core.progress import Progress, ProgressReport
 from hesim_render.core.region import parse_roi
 from hesim_render.isp import DENOISED_PICTURE, Pipeline, develop_recording, load_pipeline
 from hesim_render.mosaic.colour_profile import load_camera
-from hesim_render.recording.exports import check_format
+from hesim_render.recording.exports import check_format, check_name
 from hesim_render.recording.manifest import MANIFEST_NAME
 from hesim_render.recording.page import write_page
 from hesim_render.recording.recording import Recording
@@ -170,6 +170,7 @@ def _read(file: Path, out: Path, overrides: dict[str, Any], allow_outside: bool)
                 options = _options(file, key, given, model)
         for step in spec.export:
             check_format(step.format, sensor.spec.evs is not None, sensor.spec.aps is not None)
+            check_name(step.format, step.out)
         pipeline = None
         if spec.isp is not None:
             if sensor.spec.aps is None:

@@ -12,6 +12,7 @@ import numpy as np
 from hesim_render.capture.exact_estimate import estimate_exact
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import TERMS, noise_models
+from hesim_render.capture.overheads import with_overheads
 from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core import backend
 from hesim_render.core.errors import ConflictError, RangeError, TooLongError
@@ -19,6 +20,7 @@ from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, ProgressReport, shown
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.schedule import BlockSample, require_countable
+from hesim_render.recording.exposure import warn_of_exposure
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.truth_kinds import EVENTS, truth_kinds
 from hesim_render.recording.writer import RecordingWriter
@@ -33,7 +35,7 @@ from hesim_render.sources.render.framing import warn_if_unseen
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, scene_and_sensor
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.spectral.waveform import Waveform
 
@@ -44,8 +46,8 @@ MOVING_SAMPLES = 16
 
 
 def simulate(
-    scene: Scene,
-    sensor: Sensor,
+    scene: Scene | str | Path,
+    sensor: Sensor | str | Path,
     *,
     duration_s: float = 0.1,
     seed: int = 7,
@@ -69,7 +71,7 @@ def simulate(
 
     Parameters
     ----------
-    scene, sensor : from `load_scene` and `load_sensor` (crop the sensor for a region of interest).
+    scene, sensor : from `load_scene` and `load_sensor` (crop the sensor for a region of interest), or names or paths.
     duration_s : simulated time from 0, s.
     seed : seed of the temporal noise and of the render's samples. The fixed maps of the device come from the
         device seed of the sensor file.
@@ -123,7 +125,7 @@ def simulate(
     RangeError
         If duration, seed, quality, sample count, noise term or kind of truth is out of range.
     ConflictError
-        If `quality` comes with `exact` or `samples`.
+        If `quality` comes with `exact` or `samples`, or scene and sensor are swapped.
     TooLongError
         If the run would take longer than `max_minutes`.
     SpecError
@@ -132,6 +134,7 @@ def simulate(
         If `out` exists or cannot be written, or, with `resume`, if another run was interrupted there. No partial
         output is left.
     """
+    scene, sensor = scene_and_sensor(scene, sensor)
     duration_us = _duration_us(duration_s)
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
@@ -154,6 +157,8 @@ def simulate(
     if kinds:
         settings["truth"] = {"kinds": list(kinds), "every_us": truth_every_us}
     with shown(progress, f"{scene.name} → {sensor.name}") as told:
+        if told is not None:
+            told(0, 1, "preparation")
         seen, level = in_absolute_light(scene)
         flux, mode = renderer or flux_source(seen, sensor, seed, quality, samples, exact, told)
         warn_if_unseen(scene.spec, flux.view, duration_us)
@@ -169,10 +174,15 @@ def simulate(
         expected: Estimate | None = None
         is_asked = told is not None or on_estimate is not None or max_minutes is not None
         if rendering and is_asked:  # it takes as long as a short run, and changes nothing
-            expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures)
+            expected = forecast(rendering, plain.event_pixels, sample, *plain.frame_exposures, progress=told)
         elif on_estimate is not None or max_minutes is not None:
             expected = estimate_exact(flux, plain, settings["samples"])
+            sample = BlockSample([], 1.0) if flux.is_static else plain.sample_of_event_blocks()
         if expected is not None:
+            expected = with_overheads(
+                expected, flux.sensor, duration_us, sample.windows, len(plain.frame_exposures[1]),
+                audited=bool(rendering) and audit, rests=flux.is_static,
+            )  # fmt: skip
             if on_estimate is not None:
                 on_estimate(expected)
             if max_minutes is not None and expected.seconds > 60 * max_minutes:
@@ -215,7 +225,7 @@ def simulate(
             if set(kinds) - {EVENTS}:
                 step = None if told is None else lambda done, total: told(done, total, "truth")
                 writer.write_truth(SceneTruth(scene, sensor), step)
-            return writer.finish()
+            return warn_of_exposure(writer.finish())
 
 
 def _cheaper(settings: Mapping[str, Any]) -> str:

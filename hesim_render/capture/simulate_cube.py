@@ -16,15 +16,16 @@ from hesim_render.core.progress import Progress, shown
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.description import describe
 from hesim_render.mosaic.schedule import require_countable
+from hesim_render.recording.exposure import warn_of_exposure
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
-from hesim_render.sensor.sensor import Sensor
+from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.sources.cube import CubeFlux, CubeOptions
 
 
 def simulate_cube(
     cube: str | Path,
-    sensor: Sensor,
+    sensor: Sensor | str | Path,
     *,
     duration_s: float = 0.1,
     seed: int = 7,
@@ -41,7 +42,7 @@ def simulate_cube(
     Parameters
     ----------
     cube : file or folder of the cube (``docs/studies.md``).
-    sensor : from `load_sensor` (crop it for a region of interest).
+    sensor : from `load_sensor` (crop it for a region of interest), or its name or path.
     duration_s : simulated time, s.
     seed, clean, without, out, overwrite, progress : as for `simulate`.
     on_estimate : called with the work before the run begins, a text, as a cube takes no rays; an exception that it
@@ -78,6 +79,7 @@ def simulate_cube(
     OutputError
         If `out` exists or cannot be written. No partial output is left.
     """
+    sensor = as_sensor(sensor)
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
     if not 0 < duration_s < float("inf") or round(duration_s * US_PER_S) < 1:
@@ -109,4 +111,4 @@ def simulate_cube(
     ) as writer:
         with shown(progress, f"{Path(cube).name} → {sensor.name}") as told:
             capture.record(writer, told)
-        return writer.finish()
+        return warn_of_exposure(writer.finish())

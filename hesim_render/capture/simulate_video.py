@@ -22,9 +22,10 @@ from hesim_render.core.progress import Progress, ProgressReport, in_words, shown
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.description import Mosaic, describe
 from hesim_render.mosaic.schedule import require_countable
+from hesim_render.recording.exposure import warn_of_exposure
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
-from hesim_render.sensor.sensor import Sensor
+from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.sources.video import VideoFlux, VideoOptions
 from hesim_render.sources.video.digest import stamp_of
 from hesim_render.sources.video.flux import Source
@@ -83,7 +84,7 @@ def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimat
 
 def simulate_video(
     source: Source,
-    sensor: Sensor,
+    sensor: Sensor | str | Path,
     *,
     duration_s: float | None = None,
     seed: int = 7,
@@ -103,7 +104,7 @@ def simulate_video(
     ----------
     source : path of a video file, of a folder of numbered pictures or of a ``.npy`` file, or an array
         [time, row, col] or [time, row, col, channel].
-    sensor : from `load_sensor` (crop it for a region of interest).
+    sensor : from `load_sensor` (crop it for a region of interest), or its name or path.
     duration_s : simulated time from the video's first picture, s; default: the whole video.
     seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as for `simulate`.
     resume : keep the frames and events of a run of more than about 20 s in a file beside `out`, until the recording is
@@ -142,6 +143,7 @@ def simulate_video(
         If `out` exists or cannot be written, or, with `resume`, if another run was interrupted there. No partial
         output is left.
     """
+    sensor = as_sensor(sensor)
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
     backend.jit()
@@ -188,7 +190,7 @@ def simulate_video(
                     kept.go_on(writer, told)
                 capture.record(writer, told, None if kept is None else kept.keep)
             writer.add_settings({"video": flux.describe()})
-            return writer.finish()
+            return warn_of_exposure(writer.finish())
     finally:
         flux.close()
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.interrupts import Interrupts
+from hesim_render.cli.option_names import in_options
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
 from hesim_render.core.output import discard_unfinished
@@ -90,7 +91,7 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
         if interrupts.happened or type(error).__name__ == "Abort":
             return ExitStatus.INTERRUPTED
         if isinstance(error, HesimError):
-            complain(*str(error).splitlines())
+            complain(*in_options(error, program(), given).splitlines())
         elif isinstance(error, usage_error):
             complain(error.format_message().replace("Value error, ", ""))
         elif isinstance(error, OSError):

@@ -43,8 +43,12 @@ def build(
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Build all clips of a benchmark, with manifest and card."""
+    """Build all clips of a benchmark, with manifest and card.
+
+    Ends with status 3 where the audits find clips that are worse than the benchmark asks for.
+    """
     from hesim_render.benchmark.build import build_benchmark, check_build, last_run
+    from hesim_render.recording.quality import is_short_of_wish, verdict_lines
     from hesim_render.specs.benchmark import read_benchmark
     from hesim_render.specs.files import parse_override
 
@@ -70,7 +74,13 @@ def build(
     splits = ", ".join(f"{number} {split}" for split, number in count.items())
     text = f"{len(clips)} clips ({splits})\n  {last_run(built.root)}\n  in {built.root}\n"
     card = built.root / "README.md"
-    told.result(f"{text}  card: {card}", {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count})
+    audits = {clip.name: clip.content["render"].get("audit") for clip in built.clips()}
+    short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
+    told.result(
+        "\n".join([f"{text}  card: {card}", *(f"  {line}" for line in verdict_lines(audits, "clips"))]),
+        {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count, "not_met": short},
+        ExitStatus.NOT_MET if short else ExitStatus.DONE,
+    )
 
 
 def _estimated(told: Told, expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool) -> None:
@@ -135,7 +145,7 @@ def evaluate(
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".json",))
     told = Told(json_, quiet)
     with told.progress(f"evaluate {folder.name}") as progress:
         result = evaluate_benchmark(
@@ -217,7 +227,7 @@ def peers(
     from hesim_render.specs.peers import read_peers
 
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".json",))
     content = read_peers(spec, dict(map(parse_override, set_ or [])))
     told = Told(json_, quiet)
     with told.progress(content.name) as progress:

@@ -46,7 +46,7 @@ def cube(
 ) -> None:
     """Render the spectral radiance on the pixels of a sensor: an instant, or the mean over a window of time."""
     wavelengths = parse_bands(bands)
-    free_place(out, overwrite)
+    free_place(out, overwrite, (".exr",))
     import hesim_render as hr
 
     scene_changes, sensor_changes = split_overrides(set_ or [])

@@ -46,7 +46,7 @@ def doctor() -> None:
     chosen = next((candidate for candidate in found if candidate.works), None)
     if chosen is None:
         say(f"{'backend':<14}none")
-        complain(f"no Dr.Jit backend works on this machine: {backend.INSTALL_HINT}")
+        complain(f"no Dr.Jit backend works on this machine: {backend.install_hint()}")
         raise typer.Exit(int(ExitStatus.REFUSED))
     say(f"{'backend':<14}{chosen.describe()}, Mitsuba variant {chosen.backend}_ad_spectral")
 

@@ -52,8 +52,10 @@ def export(
 
     loaded, told = Recording.load(recording), Told(json_, quiet)
     if format in _GEOMETRY:
+        from hesim_render.recording.exports import check_name
         from hesim_render.recording.truth_export import export_truth
 
+        check_name(format, out)
         if scene is not None:
             from hesim_render.sources.scene import load_scene
 
@@ -100,7 +102,7 @@ def import_(
     quiet: Quiet = False,
 ) -> None:
     """Write the events of another program in the layout of events.h5, or a capture of a real sensor as a recording."""
-    from hesim_render.exchange import is_event_file
+    from hesim_render.exchange import is_event_file, open_events
 
     told = Told(json_, quiet)
     if sensor is None:
@@ -110,7 +112,16 @@ def import_(
             raise ConflictError("FILE", len(sources), "more than one file, or --roi, needs --sensor")
         shape = None if size is None else parse_size(size)
         written = import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)
-        told.result(f"events in {written}", {"written": written})
+        stream = open_events(written)
+        on = count = 0
+        for block in stream:
+            count, on = count + block.size, on + int((block["polarity"] > 0).sum())
+        rows, cols = stream.shape
+        told.result(
+            f"{count} events ({on} ON, {count - on} OFF) of {cols}x{rows} px in {written}",
+            {"written": written, "events": count, "events_on": on, "events_off": count - on,
+             "event_grid": {"width": cols, "height": rows}},
+        )  # fmt: skip
         return
     if size is not None or format is not None:
         raise ConflictError("--sensor", sensor, "give --sensor or --size and --format, not both")

@@ -66,7 +66,7 @@ def view(
     if rrd is not None and viewer:
         raise ConflictError("--rrd", str(rrd), "give --rrd or --viewer, not both")
     if rrd is not None:
-        free_place(rrd, overwrite)
+        free_place(rrd, overwrite, (".rrd",))
     told, loaded = Told(json_, quiet), Recording.load(recording)
     assert loaded.path is not None
     with output_errors(loaded.path):

@@ -49,7 +49,7 @@ def measure(
 
     region = None if roi is None else _region(roi)
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".csv",))
     found = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
     if signal is SignalKind.raw:
         say("of RAW values, noise included")

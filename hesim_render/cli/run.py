@@ -9,7 +9,7 @@ import typer
 
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import LONG_MINUTES, AllowOutside, Overwrite, Yes
-from hesim_render.cli.terminal import is_short_of_wish, summary
+from hesim_render.cli.terminal import summary
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
 
 
@@ -28,6 +28,7 @@ def run(
 ) -> None:
     """Do a whole run from one file: record a scene, video or cube, then develop, export and view it."""
     from hesim_render.capture.run_file import run as run_all
+    from hesim_render.recording.quality import is_short_of_wish
     from hesim_render.specs.files import parse_override
 
     told = Told(json_, quiet, dry_run)

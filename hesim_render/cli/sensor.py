@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -13,18 +12,19 @@ import typer
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, names_of, sensor_keys_only
 from hesim_render.cli.terminal import say, split_overrides
 from hesim_render.cli.told import Json
-from hesim_render.core.errors import OutputError
+from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.output import free_place, replacing
+from hesim_render.core.shipped import list_names
 
 app = typer.Typer(no_args_is_help=True, help="Show what a sensor does, or begin a sensor file.", rich_markup_mode=None)
 
 
-class Like(StrEnum):
-    """Kinds of sensors to begin with."""
+#: Kinds of sensors that there is a template for.
+_KINDS = ("frames", "events", "hybrid")
 
-    frames = "frames"
-    events = "events"
-    hybrid = "hybrid"
+
+def _kinds_and_names(incomplete: str) -> list[str]:
+    return [kind for kind in _KINDS if kind.startswith(incomplete)] + names_of("sensors")(incomplete)
 
 
 @app.command()
@@ -41,7 +41,7 @@ def describe(
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     if out is not None:
-        free_place(out, overwrite)
+        free_place(out, overwrite, (".png", ".svg", ".pdf"))
     from hesim_render.describe import figures_of, table_lines, write_picture
     from hesim_render.sensor.sensor import load_sensor
 
@@ -69,15 +69,26 @@ def describe(
 @app.command()
 def new(
     out: Annotated[Path, typer.Argument(help="sensor file to write, such as mine.yaml")],
-    like: Annotated[Like, typer.Option(help="pixels for frames, for events, or for both")] = Like.hybrid,
+    like: Annotated[
+        str,
+        typer.Option(
+            help=f"a template with comments for {', '.join(_KINDS)}, or a shipped sensor to copy (see 'list sensors')",
+            autocompletion=_kinds_and_names,
+        ),
+    ] = "hybrid",
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a sensor file to begin with, in which comments explain every key."""
-    if out.suffix not in (".yaml", ".yml"):
-        raise OutputError(f"{out}: give a name that ends in .yaml")
-    free_place(out, overwrite)
-    from hesim_render.specs.sensor_template import sensor_template
+    """Write a sensor file to begin with: a template in which comments explain every key, or a copy of a shipped one."""
+    free_place(out, overwrite, (".yaml", ".yml"))
+    from hesim_render.specs.sensor_template import sensor_copy, sensor_template
 
+    if like in _KINDS:
+        text = sensor_template(out.stem, like)
+    elif like in list_names("sensors"):
+        text = sensor_copy(out.stem, like)
+    else:
+        known = (*_KINDS, *list_names("sensors"))
+        raise RangeError("--like", like, f"one of {', '.join(known)}{did_you_mean(like, known)}")
     with replacing(out) as unfinished:
-        unfinished.write_text(sensor_template(out.stem, like.value), encoding="utf-8")
+        unfinished.write_text(text, encoding="utf-8")
     say(f"{out}: a sensor file; look at it with 'hesim-render sensor describe {out}'")

@@ -25,7 +25,7 @@ from hesim_render.cli.options import (
     listed,
     names_of,
 )
-from hesim_render.cli.terminal import is_short_of_wish, split_overrides, summary
+from hesim_render.cli.terminal import split_overrides, summary
 from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.guard import printable
@@ -101,6 +101,8 @@ def simulate(
 
 def tell_recording(told: Told, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None) -> None:
     """The result of a run: its recording, with the status that the audit gives."""
+    from hesim_render.recording.quality import is_short_of_wish
+
     short = is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit"))
     status = ExitStatus.NOT_MET if short else ExitStatus.DONE
     told.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
@@ -176,16 +178,21 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
 ) -> None:
     """Two small recordings with pictures: a ColorChecker, and a moving scene."""
+    from hesim_render.recording.quality import is_short_of_wish
+
     told = Told()
     runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
     for target in runs:
         check_output(target, overwrite=True)
+    audits = {}
     for target, (scene, sensor) in runs.items():
         recording = _simulate(told, scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        audits[target.name] = recording.manifest["settings"].get("render", {}).get("audit")
         told.text(summary(recording) + "\n")
     still, moving = runs
     told.text(f"Look at {still / 'preview.png'} (24 measured patches)")
-    told.text(f"    and {moving / 'preview.gif'} (events of a moving scene).")
+    status = ExitStatus.NOT_MET if any(map(is_short_of_wish, audits.values())) else ExitStatus.DONE
+    told.result(f"    and {moving / 'preview.gif'} (events of a moving scene).", {}, status)
 
 
 def _simulate(

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.told import DryRun, Json, Quiet, Told
 
 
@@ -17,8 +18,12 @@ def sweep(
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate every combination of varied keys, and tabulate figures of each run; can be resumed."""
-    from hesim_render.studies.sweep import check_sweep
+    """Simulate every combination of varied keys, and tabulate figures of each run; can be resumed.
+
+    Ends with status 3 where the audits find runs that are worse than the sweep asks for.
+    """
+    from hesim_render.recording.quality import is_short_of_wish, verdict_lines
+    from hesim_render.studies.sweep import VERDICT, check_sweep
     from hesim_render.studies.sweep import sweep as run
 
     told = Told(json_, quiet, dry_run)
@@ -29,4 +34,13 @@ def sweep(
         return
     with told.progress("sweep") as progress:
         table = run(spec, out=out, progress=progress)
-    told.result(f"{len(table)} runs in {out / 'results.csv'}", {"results": out / "results.csv", "runs": len(table)})
+    verdicts = table[VERDICT].tolist() if VERDICT in table.columns else []
+    audits: dict[str, dict[str, object] | None] = {f"row {k + 1}": {"verdict": each} for k, each in enumerate(verdicts)}
+    short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
+    told.result(
+        "\n".join(
+            [f"{len(table)} runs in {out / 'results.csv'}", *(f"  {line}" for line in verdict_lines(audits, "runs"))]
+        ),
+        {"results": out / "results.csv", "runs": len(table), "not_met": short},
+        ExitStatus.NOT_MET if short else ExitStatus.DONE,
+    )

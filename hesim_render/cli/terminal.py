@@ -75,6 +75,7 @@ def complain(*lines: str) -> None:
 def summary(recording: Recording) -> str:
     """Content and place of a recording, in a few lines."""
     from hesim_render.recording.outline import scene_name
+    from hesim_render.recording.quality import render_lines
 
     manifest = recording.manifest
     counts, roi, grid = manifest["counts"], manifest["roi"], manifest["event_grid"]
@@ -91,68 +92,8 @@ def summary(recording: Recording) -> str:
         )
     if counts.get("events_dropped"):
         lines.append(f"  {counts['events_dropped']} more events were lost in the sensor's read-out")
-    lines += render_lines(manifest["settings"].get("render"))
+    lines += [f"  {line}" for line in render_lines(manifest["settings"].get("render"))]
     if recording.path is not None:
         pictures = ", ".join(sorted(path.name for path in recording.path.glob("preview.*")))
         lines += [f"  in {recording.path}", f"  pictures: {pictures}"]
     return "\n".join(map(printable, lines))
-
-
-def render_lines(render: dict[str, Any] | None) -> list[str]:
-    """Lines about the error that a render has reached."""
-    if render is None:
-        return []
-    wanted = f", asked for {render['quality']:g}" if "quality" in render else ""
-    lines = []
-    for name, error in render["error_noise"].items():
-        if error is not None:
-            lines.append(
-                f"  render, {name}: stated error {_short(error['rms'])} of the sensor's noise (rms{wanted}); "
-                f"95 % of values below {_short(error['p95'])}, 99 % below {_short(error['p99'])}"
-            )
-    audit = render.get("audit", {})
-    for name in ("events", "frames"):
-        part = audit.get(name)
-        if part is None:
-            continue
-        line = (
-            f"  audit, {name}: true deviation rms {_short(part['deviation_noise']['rms'])}; "
-            f"{_percent(part['off'])} of values are off by more than {audit['tolerance_noise']:g} of the noise, "
-            f"with 99 % confidence at most {_percent(part['off_at_most'])}"
-        )
-        if part.get("true_events") or part.get("found_events"):
-            line += (
-                f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
-                f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"
-            )
-        lines.append(line)
-    return lines + _verdict(audit)
-
-
-def _verdict(audit: dict[str, Any]) -> list[str]:
-    """A line if the run misses its quality, or if the audit could not show that it reaches it."""
-    if not is_short_of_wish(audit):
-        if audit.get("verdict") == "not shown":
-            return ["  audit: too little was looked at again to confirm this run's quality; nothing speaks against it"]
-        return []
-    if audit.get("samples_needed"):
-        off = max(audit.get(f"{name}_off", 0.0) for name in ("events", "frames"))
-        return [
-            f"  NOT MET: by their stated error {_percent(off)} of the values are off by more than "
-            f"{audit['tolerance_noise']:g} of the sensor's noise; --samples {audit['samples_needed']} would do"
-        ]
-    return [f"  NOT MET: this run is worse than asked for; --quality {audit['quality_needed']:g} would do"]
-
-
-def is_short_of_wish(audit: dict[str, Any] | None) -> bool:
-    """True if an audit found that a run misses the requested quality."""
-    return audit is not None and audit.get("verdict") == "not met"
-
-
-def _short(value: float) -> str:
-    return f"{value:.2g}"
-
-
-def _percent(share: float) -> str:
-    percent = 100 * share
-    return f"{percent:.0f} %" if percent >= 10 else f"{percent:.2g} %"

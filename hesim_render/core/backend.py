@@ -30,14 +30,11 @@ from typing import Any
 
 from hesim_render.core.child import child_environment, python_command
 from hesim_render.core.errors import BackendError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.interrupts import interrupts_held
 
 OLDEST_LLVM = 17
 BACKEND_VARIABLE = "HESIM_RENDER_BACKEND"  # "llvm" or "cuda" forces one
-INSTALL_HINT = (
-    "install LLVM >= 17, either with the system's package manager (Debian 12+, Ubuntu 24.04+: "
-    "'sudo apt install libllvm19') or without root: pip install 'hesim_render[llvm]'"
-)
 
 #: The value that this process itself wrote into DRJIT_LIBLLVM_PATH, as opposed to a choice of the user.
 _chosen_here = ""
@@ -253,6 +250,14 @@ def _adopt(chosen: Candidate) -> Candidate:
     )
 
 
+def install_hint() -> str:
+    """What to do on a machine where no backend works."""
+    return (
+        "install LLVM >= 17, either with the system's package manager (Debian 12+, Ubuntu 24.04+: "
+        f"'sudo apt install libllvm19') or without root: {how_to_install('llvm')}"
+    )
+
+
 @functools.cache
 def select() -> Candidate:
     """First candidate that works; its library is set up for Dr.Jit in this process.
@@ -278,7 +283,7 @@ def select() -> Candidate:
             os.environ["DRJIT_LIBLLVM_PATH"] = result.path
         return result
     detail = f" (tried {'; '.join(tried)})" if tried else ""
-    raise BackendError(f"no Dr.Jit backend works on this machine{detail}: {INSTALL_HINT}")
+    raise BackendError(f"no Dr.Jit backend works on this machine{detail}: {install_hint()}")
 
 
 def prepare() -> None:

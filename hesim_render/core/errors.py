@@ -11,10 +11,18 @@ from pathlib import Path
 
 
 def closest(given: str, known: Iterable[str]) -> str | None:
-    """The known name that is most similar to an unknown one; None if no name is similar."""
+    """The known name that is most similar to an unknown one; None if no name is similar.
+
+    A name that the given one begins, as ``illuminance_lux`` by ``illuminance``, comes first: only its unit is missing.
+    A name that has the given one as a word, as ``horizontal_fov_deg`` has ``fov``, comes last, if there is one alone.
+    """
     import difflib
 
-    return next(iter(difflib.get_close_matches(given, list(known), n=1)), None)
+    names = sorted(known)
+    begun = [name for name in names if name.startswith(f"{given}_")]
+    holding = [name for name in names if given in name.split("_")]
+    similar = begun or difflib.get_close_matches(given, names, n=1)
+    return next(iter(similar or (holding if len(holding) == 1 else [])), None)
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:

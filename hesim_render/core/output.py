@@ -13,7 +13,7 @@ import re
 import shutil
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hesim_render.core.errors import HesimError, OutputError
@@ -124,13 +124,18 @@ def check_target(target: str | Path, marker: str, overwrite: bool = False) -> Pa
     return path
 
 
-def check_place(target: str | Path) -> Path:
+def check_place(target: str | Path, suffixes: Sequence[str] = ()) -> Path:
     """Check that a file may be written at `target`; returns its absolute path, without following a final link.
+
+    Parameters
+    ----------
+    target : the file.
+    suffixes : ends of names that say what the file holds; () for any.
 
     Raises
     ------
     OutputError
-        If there is a folder, or the place cannot hold a file.
+        If there is a folder, the place cannot hold a file, or the name ends otherwise.
     """
     with output_errors(Path(target)):
         path = Path(target).expanduser().absolute()
@@ -138,18 +143,20 @@ def check_place(target: str | Path) -> Path:
         _tidy_up(path)
         if path.is_dir():
             raise OutputError(f"{target}: is a folder; give the name of a file")
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise OutputError(f"{target}: give a name that ends in {' or '.join(suffixes)}")
     return path
 
 
-def free_place(target: str | Path, overwrite: bool) -> Path:
+def free_place(target: str | Path, overwrite: bool, suffixes: Sequence[str] = ()) -> Path:
     """As `check_place`; a file that is there already must be meant to be replaced.
 
     Raises
     ------
     OutputError
-        If there is something and `overwrite` is False, or a file cannot be there.
+        If there is something and `overwrite` is False, or a file cannot be there, or its name ends otherwise.
     """
-    path = check_place(target)
+    path = check_place(target, suffixes)
     if (path.exists() or path.is_symlink()) and not overwrite:
         raise OutputError(f"{target}: exists; give another name, or overwrite it (--overwrite, overwrite=True)")
     return path

@@ -46,7 +46,7 @@ class _Pixel:
     """One event position of a sensor in one light."""
 
     def __init__(self, sensor: Sensor, light: Spectrum | None, position: int) -> None:
-        spec, self.noise = sensor.spec, sensor.evs
+        spec, self.noise = sensor.spec, sensor.calibrated_part.evs
         positions = spec.positions("evs")
         if not 0 <= position < len(positions):
             raise RangeError("position", position, f"an event position, 0 to {len(positions) - 1}")
@@ -202,7 +202,7 @@ def photon_transfer(sensor: Sensor, points: int = 60) -> tuple[NDArray, NDArray,
     SpecError
         If the sensor has no frame pixels.
     """
-    aps = sensor.aps
+    aps = sensor.calibrated_part.aps
     electrons = np.geomspace(0.1, aps.spec.full_well_e, points)
     exposure_us = aps.spec.exposure_us
     mean = np.array([float(aps.mean_dn(value, exposure_us)) for value in electrons])

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hesim_render.core.drawing import COLOURS, new_figure, report_style
 from hesim_render.core.errors import RangeError
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 FORMATS = ("png", "svg", "pdf")
 #: Illuminances of the curves and of the S-curves, lx.
 _LUX = np.geomspace(1e-2, 1e5, 141)
+_LUX_TICKS = (0.01, 1.0, 100.0, 10000.0)
 _S_LUX = (0.1, 1.0, 10.0, 1000.0)
 _SIZE_PX = (430, 310)
 #: Rates below are not drawn, 1/s.
@@ -33,7 +35,7 @@ def write_picture(sensor: Sensor, file: Path) -> None:
 
     Parameters
     ----------
-    sensor : the sensor.
+    sensor : the sensor; of one with a calibration, the part that was measured stands for the whole.
     file : PNG, SVG or PDF by the end of its name; replaced in one step.
 
     Raises
@@ -44,6 +46,7 @@ def write_picture(sensor: Sensor, file: Path) -> None:
     kind = file.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise RangeError("format of the picture", file.name, f"a name that ends in {', '.join(FORMATS)}")
+    sensor = sensor.calibrated_part
     draws = [_spectra]
     if sensor.spec.evs is not None:
         draws += [_noise, _rates, _latency, _s_curves]
@@ -81,11 +84,25 @@ def _spectra(sensor: Sensor, axes: Axes) -> None:
 
 def _against_light(axes: Axes, title: str, unit: str) -> None:
     axes.set(title=title, xlabel="illuminance on the sensor, lx", ylabel=unit, xscale="log", yscale="log")
+    axes.set_xlim(_LUX[0] / 2, 2 * _LUX[-1])
+    axes.set_xticks(_LUX_TICKS)
+
+
+def _lux(sensor: Sensor) -> NDArray[np.float64]:
+    """Illuminances of the curves, lx. Of a data sheet they begin at its `dark_lux`, about the least usable light: below
+    it the model only holds the least corner of the photoreceptor, and its curves have a kink that no pixel has.
+    """
+    evs = sensor.evs.spec
+    is_derived = evs.data_sheet is not None or evs.v2e is not None
+    if not is_derived or evs.photoreceptor is None or not evs.photoreceptor.follows_light:
+        return _LUX
+    dark = evs.coefficients[0].beta2  # in lx, as the signal of a data sheet is
+    return np.append(dark, _LUX[dark < _LUX])
 
 
 def _noise(sensor: Sensor, axes: Axes) -> None:
     _against_light(axes, "Noise of ln x", "standard deviation")
-    curves = event_curves(sensor, _LUX)
+    curves = event_curves(sensor, _lux(sensor))
     if np.any(curves.sigma > 0):
         axes.plot(curves.lux, curves.sigma, color=COLOURS[0], label="model")
     axes.plot(curves.lux, curves.shot_limit, color=COLOURS[6], linestyle="--", label="shot noise of the electrons")
@@ -98,13 +115,16 @@ def _noise(sensor: Sensor, axes: Axes) -> None:
 
 def _rates(sensor: Sensor, axes: Axes) -> None:
     _against_light(axes, "Events in steady light", "events per s and pixel")
-    curves = event_curves(sensor, _LUX)
-    for rate, colour, label in ((curves.on_hz, COLOURS[1], "ON, with leak"), (curves.off_hz, COLOURS[0], "OFF")):
+    curves = event_curves(sensor, _lux(sensor))
+    for rate, colour, label in (
+        (curves.on_hz + curves.off_hz, COLOURS[7], "all events"), (curves.on_hz, COLOURS[1], "ON, with leak"),
+        (curves.off_hz, COLOURS[0], "OFF"),
+    ):  # fmt: skip
         axes.plot(curves.lux, np.where(rate >= _LEAST_HZ, rate, np.nan), color=colour, label=label)
     sheet = sensor.evs.spec.data_sheet
     for level in sheet.background if sheet is not None else ():
         if level.lux > 0:
-            axes.plot(level.lux, level.rate_hz, "o", color=COLOURS[7], label="data sheet, ON and OFF")
+            axes.plot(level.lux, level.rate_hz, "o", color=COLOURS[7], label="data sheet, all events")
     if np.all(np.maximum(curves.on_hz, curves.off_hz) < _LEAST_HZ):
         axes.set_ylim(_LEAST_HZ, 1)
         axes.text(0.5, 0.5, "none", transform=axes.transAxes, ha="center")
@@ -118,7 +138,7 @@ def _latency(sensor: Sensor, axes: Axes) -> None:
     sheet = sensor.evs.spec.data_sheet
     stated = 1.0 if sheet is None else 0.01 * sheet.speed_step_percent
     for k, step in enumerate(dict.fromkeys((0.5, stated, 3.0))):
-        curves = event_curves(sensor, _LUX, step)
+        curves = event_curves(sensor, _lux(sensor), step)
         if np.any(curves.latency_us > 0):
             axes.plot(curves.lux, curves.latency_us, color=COLOURS[k], label=f"step of {100 * step:g} %")
     for speed in sheet.speed if sheet is not None else ():

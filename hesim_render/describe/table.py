@@ -39,13 +39,13 @@ def figures_of(sensor: Sensor) -> dict[str, list[Row]]:
 
     Parameters
     ----------
-    sensor : the sensor.
+    sensor : the sensor; of one with a calibration, the part that was measured stands for the whole.
 
     Returns
     -------
     {section: rows}; sections that the sensor lacks are left out.
     """
-    geometry = sensor.spec.geometry
+    geometry, sensor = sensor.spec.geometry, sensor.calibrated_part
     found = {
         "geometry": [
             Row("columns", geometry.cols, "px"), Row("rows", geometry.rows, "px"),

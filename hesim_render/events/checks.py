@@ -9,14 +9,16 @@ from hesim_render.core.errors import RangeError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 
-def checked(events: NDArray, shape: tuple[int, int]) -> NDArray[np.intp]:
-    """Places of events on the grid, row-major.
+def check_form(events: NDArray, shape: tuple[int, int]) -> None:
+    """Check that these are events and the size of a grid; places are not looked at.
 
     Raises
     ------
     RangeError
-        If the array lacks a field of `EVENT_DTYPE`, or an event is outside the grid.
+        If the array lacks a field of `EVENT_DTYPE`, or the grid is empty.
     """
+    if not isinstance(events, np.ndarray):
+        raise RangeError("events", events, "an array of events, such as the events of a recording")
     names = events.dtype.names or ()
     if events.ndim != 1 or not set(EVENT_DTYPE.names or ()) <= set(names):
         raise RangeError(
@@ -25,6 +27,18 @@ def checked(events: NDArray, shape: tuple[int, int]) -> NDArray[np.intp]:
     rows, cols = shape
     if not (rows >= 1 and cols >= 1):
         raise RangeError("shape", shape, "rows and columns of the event grid, 1 or more")
+
+
+def checked(events: NDArray, shape: tuple[int, int]) -> NDArray[np.intp]:
+    """Places of events on the grid, row-major.
+
+    Raises
+    ------
+    RangeError
+        If the array lacks a field of `EVENT_DTYPE`, or an event is outside the grid.
+    """
+    check_form(events, shape)
+    rows, cols = shape
     if events.size and (int(events["y"].max()) >= rows or int(events["x"].max()) >= cols):
         raise RangeError(
             "shape", shape, f"at least {int(events['y'].max()) + 1} rows and {int(events['x'].max()) + 1} columns, "

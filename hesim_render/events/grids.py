@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError
-from hesim_render.events.checks import checked, interval, within
+from hesim_render.events.checks import check_form, checked, interval, within
 
 #: Largest number of values of one array.
 _MOST_VALUES = 2**31
@@ -49,7 +49,7 @@ def event_frame(
     RangeError
         If an event is outside the grid, the interval is empty, or the kind unknown.
     """
-    checked(events[:0], shape)
+    check_form(events, shape)
     begin, end = interval(events, begin_us, end_us)
     return event_frames(events, shape, end - begin, begin, end, kind)[0]
 
@@ -88,7 +88,7 @@ def event_frames(
     """
     if kind not in ("sum", "counts", "last"):
         raise RangeError("kind", kind, "sum, counts or last")
-    checked(events[:0], shape)
+    check_form(events, shape)
     begin, end = interval(events, begin_us, end_us)
     if not period_us > 0:
         raise RangeError("period_us", period_us, "a length above 0")
@@ -152,7 +152,7 @@ def time_surface(
     """
     if decay not in ("exponential", "linear"):
         raise RangeError("decay", decay, "exponential or linear")
-    checked(events[:0], shape)
+    check_form(events, shape)
     if not tau_us > 0:
         raise RangeError("tau_us", tau_us, "a time above 0")
     if t_us is not None:
@@ -208,7 +208,7 @@ def voxel_grid(
     RangeError
         If an event is outside the grid, the number of bins is below 1, t₁ is before t₀, or for more than 2³¹ values.
     """
-    checked(events[:0], shape)
+    check_form(events, shape)
     pixels, planes = shape[0] * shape[1], 2 if split else 1
     if bins < 1 or bins * planes * pixels > _MOST_VALUES:
         raise RangeError("bins", bins, f"1 to {_MOST_VALUES // max(planes * pixels, 1)}")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.core.units import US_PER_S
-from hesim_render.events.checks import checked, interval, within
+from hesim_render.events.checks import check_form, interval, within
 
 #: Largest number of intervals.
 _MOST_INTERVALS = 10_000_000
@@ -58,7 +58,7 @@ def event_rate(
     RangeError
         If the interval is not positive, or there are more than ten million of them.
     """
-    checked(events[:0], (1, 1))
+    check_form(events, (1, 1))
     begin, end = interval(events, begin_us, end_us)
     if not interval_us > 0 or (end - begin) / interval_us > _MOST_INTERVALS:
         raise RangeError("interval_us", interval_us, f"above 0, at most {_MOST_INTERVALS} intervals")

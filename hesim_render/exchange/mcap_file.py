@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.guard import reading
 from hesim_render.exchange.stream import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
@@ -328,4 +329,4 @@ def _require(path: str | Path) -> None:
     try:
         import mcap.writer  # noqa: F401
     except ImportError:
-        raise SpecError("MCAP files need the package mcap: pip install 'hesim_render[ros]'", file=path) from None
+        raise SpecError(f"MCAP files need the package mcap: {how_to_install('ros')}", file=path) from None

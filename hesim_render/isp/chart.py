@@ -25,10 +25,22 @@ def patch_centres(corners: Sequence[Corner], rows: int = 4, cols: int = 6) -> ND
     ----------
     corners : (row, col) of the centres of the chart's four corner patches: top left, top right, bottom right,
         bottom left as printed (dark skin, bluish green, black, white of a ColorChecker). Perspective is allowed.
+
+    Raises
+    ------
+    RangeError
+        If they are no corners of a chart: not four, or three of them on a line.
     """
     points = np.asarray(corners, dtype=np.float64)
     if points.shape != (4, 2):
         raise RangeError("chart corners", points.tolist(), "four (row, col)")
+    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    turns = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    if not (np.all(turns > 0) or np.all(turns < 0)):
+        raise RangeError(
+            "chart corners", points.tolist(),
+            "the (row, col) of top left, top right, bottom right and bottom left patch, in this order around the chart",
+        )  # fmt: skip
     # homography of the unit square (u to the right, v down) onto the four points
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     equations, right = [], []
@@ -66,7 +78,12 @@ def patch_means(
     for row, col in centres:
         top, bottom, left, right = (round(value) for value in (row - half, row + half, col - half, col + half))
         if top < 0 or left < 0 or bottom >= image.shape[0] or right >= image.shape[1]:
-            raise RangeError("chart patch at", (round(row), round(col)), f"inside the image {image.shape[:2]}")
+            raise RangeError(
+                "chart corners",
+                np.asarray(corners, dtype=np.float64).tolist(),
+                f"corners inside the image of {image.shape[0]} rows and {image.shape[1]} columns: the patch around row "
+                f"{round(row)}, column {round(col)} would lie outside",
+            )
         means.append(np.nanmean(image[top : bottom + 1, left : right + 1].reshape(-1, image.shape[2]), axis=0))
     return np.array(means)
 

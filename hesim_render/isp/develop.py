@@ -15,7 +15,7 @@ from hesim_render.isp.pipeline import DENOISED_PICTURE, Pipeline, develop
 from hesim_render.mosaic.colour_profile import Camera
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording import manifest as manifests
-from hesim_render.recording.recording import Recording
+from hesim_render.recording.recording import Recording, as_recording
 from hesim_render.sensor.lens import Lens, relative_illumination
 
 #: File by which a folder of pictures is recognised.
@@ -23,7 +23,7 @@ MARKER = "isp.json"
 
 
 def develop_recording(
-    folder: str | Path,
+    folder: str | Path | Recording,
     out: str | Path | None = None,
     pipeline: Pipeline | None = None,
     progress: Callable[[int, int, str], None] | None = None,
@@ -39,7 +39,7 @@ def develop_recording(
 
     Parameters
     ----------
-    folder : the recording.
+    folder : the recording, or its folder.
     out : folder to write; default: beside the recording, with its name and ``-pictures``.
     pipeline : default `DENOISED_PICTURE`; `PICTURE` is the same without noise reduction.
     progress : called with (done, total, what).
@@ -60,9 +60,11 @@ def develop_recording(
     OutputError
         If the pictures cannot be written.
     """
-    recording = Recording.load(folder)
-    if recording.path is None or len(recording.frames) == 0:
-        raise SpecError("the recording has no frames", file=str(folder))
+    recording = as_recording(folder)
+    if recording.path is None:
+        raise SpecError("the recording is in memory: save it first (Recording.save)")
+    if len(recording.frames) == 0:
+        raise SpecError("the recording has no frames", file=str(recording.path))
     chain = pipeline or DENOISED_PICTURE
     camera = Camera.of(recording.mosaic)
     noise = None

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import ConflictError, RangeError, did_you_mean
 from hesim_render.measure.slanted_edge import FREQUENCIES, OVERSAMPLING, EdgeResponse, edge_response
-from hesim_render.recording.recording import Recording
+from hesim_render.recording.recording import Recording, as_recording
 
 #: What is measured: RAW values, or the noise-free electrons of the truth.
 Signal = Literal["raw", "electrons"]
 
 
 def measure_mtf(
-    recording: Recording,
+    recording: Recording | str | Path,
     frame: int = 0,
     region: tuple[int, int, int, int] | None = None,
     *,
@@ -31,7 +32,7 @@ def measure_mtf(
 
     Parameters
     ----------
-    recording : the recording.
+    recording : the recording, or its folder.
     frame : number of the frame.
     region : first column, first row, width and height of the part with the edge, px of the frame; default all.
     signal : ``raw`` or ``electrons``.
@@ -57,7 +58,10 @@ def measure_mtf(
     RangeError
         If the frame, the region or the filter does not exist, a RAW value is saturated, or the region has no edge that
         can be measured.
+    ConflictError
+        If the mosaic has several filters and `filter_name` is left out.
     """
+    recording = as_recording(recording)
     if not recording.frames:
         raise RangeError("frame", frame, "a frame of a recording that has frames; this one has none")
     if not 0 <= frame < len(recording.frames):
@@ -73,7 +77,13 @@ def measure_mtf(
     if filter_name is None and len(known) == 1:
         filter_name = known[0]
     if filter_name not in known:
-        raise RangeError("filter_name", filter_name, f"one of {', '.join(known)}")
+        if filter_name is None:
+            raise ConflictError(
+                "filter_name", None,
+                f"this mosaic has {len(known)} filters: say on which to measure, --filter NAME (filter_name), one of "
+                f"{', '.join(known)}",
+            )  # fmt: skip
+        raise RangeError("filter_name", filter_name, f"one of {', '.join(known)}{did_you_mean(filter_name, known)}")
     tiles = -(-rows // filters.shape[0]), -(-cols // filters.shape[1])
     own = np.tile((filters == filter_name) & aps, tiles)[:rows, :cols] & chosen.valid
     part = np.s_[y : y + height, x : x + width]

@@ -39,6 +39,16 @@ def require_region(layout: Layout) -> None:
         _offset(layout, layout.spec.noise.measured)
 
 
+def measured_part(layout: Layout) -> Layout:
+    """The region that the maps of the calibration cover, if it lies inside the given one; else the given one."""
+    if layout.spec.noise is None:
+        return layout
+    row, col, rows, cols = _region(layout, layout.spec.noise.measured)
+    inside = layout.row0 <= row and row + rows <= layout.row0 + layout.rows
+    inside &= layout.col0 <= col and col + cols <= layout.col0 + layout.cols
+    return layout.crop(cols, rows, col - layout.col0, row - layout.row0) if inside else layout
+
+
 def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
     """``n_row`` [row, 1], ``n_blc`` and ``n_dp`` [row, col] over the region: DN, DN and DN/s; None if not measured."""
     found = _read(layout, "aps", ("n_row", "n_blc", "n_dp"))
@@ -169,7 +179,8 @@ def _offset(layout: Layout, measured: MeasuredMaps) -> tuple[int, int]:
     if not inside:
         region = f"{cols}x{rows}+{col}+{row}"
         raise SpecError(
-            f"was measured on {region} of the sensor; read out that region or a part of it (--roi {region})",
+            f"was measured on {region} of the sensor; read out that region or a part of it (--roi {region}, in Python "
+            "Sensor.crop)",
             file=measured.file,
         )
     return layout.row0 - row, layout.col0 - col

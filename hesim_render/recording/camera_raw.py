@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import HesimWarning, SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.guard import printable, require_picture, require_plain
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def read_camera_raw(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
     try:
         import rawpy
     except ImportError:
-        raise SpecError("RAW files of cameras need rawpy: pip install 'hesim_render[raw]'", file=file) from None
+        raise SpecError(f"RAW files of cameras need rawpy: {how_to_install('raw')}", file=file) from None
     require_plain(file)
     try:
         opened = rawpy.imread(str(file))

@@ -23,6 +23,14 @@ FRAMES_NAME = "frames.json"
 WHOLE_FORMATS = ("mcap", "raw-npz", "mp4", "mp4-colour", "mp4-events")
 #: Writers of the formats that are drawn. The package adds them, as recordings do not know their pictures.
 DRAWN: dict[str, Callable[[Recording, Path], object]] = {}
+#: Ends of the names of formats that are one file; all others are folders.
+SUFFIXES: dict[str, tuple[str, ...]] = {
+    **{name: (kind.suffix,) for name, kind in EVENT_FORMATS.items()},
+    "dsec": (".h5", ".hdf5"),
+    **{name: (".mcap" if name == "mcap" else ".mp4",) for name in WHOLE_FORMATS if name != "raw-npz"},
+}
+_FILES = {end for ends in SUFFIXES.values() for end in ends} | {kind.suffix for kind in FRAME_FORMATS.values()}
+_FILES |= {".tif", ".exr", ".yaml", ".csv", ".json"}
 _NEED_FRAMES = (*FRAME_FORMATS, "mp4-colour")
 
 
@@ -44,6 +52,7 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
     from hesim_render.recording.truth_export import export_truth
 
     check_format(format, 0 not in recording.event_shape, bool(len(recording.frames)))
+    check_name(format, path)
     if format in TRUTH_FORMATS:
         return export_truth(recording, format, path, overwrite=overwrite)
     if format in EVENT_FORMATS:
@@ -78,6 +87,21 @@ def check_format(format: str, has_events: bool, has_frames: bool) -> None:
         raise RangeError("format", format, f"a format of frames ({', '.join(FRAME_FORMATS)}): there are no events")
     if format in _NEED_FRAMES and not has_frames:
         raise RangeError("format", format, f"a format of events ({', '.join(EVENT_FORMATS)}): there are no frames")
+
+
+def check_name(format: str, path: str | Path) -> None:
+    """Refuse a name that says something else than the format: another kind of file, or a file where a folder comes.
+
+    Raises
+    ------
+    OutputError
+        With the end that the name has to have.
+    """
+    own, given = SUFFIXES.get(format, ()), Path(path).suffix.lower()
+    if own and given not in own:
+        raise OutputError(f"{path}: {format} is a file; give a name that ends in {' or '.join(own)}")
+    if not own and given in _FILES:
+        raise OutputError(f"{path}: {format} is a folder of files; give a name without {given}")
 
 
 def write_events(stream: EventStream, format: str, path: str | Path, overwrite: bool = False) -> Path:
@@ -129,6 +153,7 @@ def import_events(
     SpecError
         If `source` is damaged, of another format, or has events out of order or outside of the grid.
     """
+    check_name("dsec", path)
     return write_events(open_events(source, format, shape), "dsec", path, overwrite)
 
 

@@ -63,9 +63,13 @@ class Frame:
         }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EventTruth:
     """Noise-free flux of the event pixels, mean over the recording, float32 [y, x], e⁻/s."""
 
     flux_mean_e_per_s: NDArray[np.float32]
     flux_stderr_e_per_s: NDArray[np.float32]
+
+    def __repr__(self) -> str:
+        rows, cols = self.flux_mean_e_per_s.shape
+        return f"<EventTruth of {cols}x{rows} px, mean {self.flux_mean_e_per_s.mean():.4g} e⁻/s>"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from hesim_render.core.errors import RangeError
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording.colour_view import Picture, colour_picture
 from hesim_render.recording.event_view import black_picture, events_picture
+from hesim_render.recording.preview import magnified
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
@@ -21,6 +23,8 @@ _FPS, _STEP_US = 25, 10_000
 #: Most pictures where there are no frames: four minutes of video. Those of a longer recording show longer times.
 _MOST_PICTURES = 6000
 _WIDEST_PX = 1280
+#: Fewest pictures of a video, if the recording has as many µs: it shows two seconds at least.
+_FEWEST = 50
 #: Constant quality of x264, where 0 is without loss.
 _QUALITY = "18"
 
@@ -30,8 +34,9 @@ def write_movie(recording: Recording, path: Path, kind: str) -> int:
 
     Without frames there are at most 6000 pictures: those of a recording of more than a minute show longer times.
 
-    The events of a picture are those since the one before. The video has 25 pictures a second, so a recording of 100
-    frames a second plays four times as slow as it was.
+    A recording that gives fewer than 50 of them has several pictures for each, in equal steps of time, so that what
+    is short plays for two seconds. The events of a picture are those since the one before, over the frame that ends
+    next. The video has 25 pictures a second, so a recording of 100 frames a second plays four times as slow as it was.
 
     Parameters
     ----------
@@ -57,7 +62,8 @@ def write_movie(recording: Recording, path: Path, kind: str) -> int:
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=_FPS)
         stream.pix_fmt, stream.options = "yuv420p", {"crf": _QUALITY, "threads": "1"}
-        for picture in _pictures(recording, kind):
+        for small in _pictures(recording, kind):
+            picture = magnified(small)
             even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
             if not count:
                 stream.height, stream.width = even.shape[:2]
@@ -76,12 +82,15 @@ def _pictures(recording: Recording, kind: str) -> Iterator[Picture]:
     else:
         step_us = max(_STEP_US, -(-(end_us - begin_us) // _MOST_PICTURES))
         edges = [*range(begin_us, end_us, step_us), end_us]
+    parts = -(-_FEWEST // (len(edges) - 1))
     black = black_picture(recording, _WIDEST_PX)
-    for number, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
-        picture = black
+    for number, ends in enumerate(pairwise(edges)):
+        background = black
         if kind != "mp4-events" and len(recording.frames):
-            picture = colour_picture(recording.frames[number].raw, recording.mosaic, _WIDEST_PX)
-        if kind != "mp4-colour" and min(recording.event_shape) > 0:
+            background = colour_picture(recording.frames[number].raw, recording.mosaic, _WIDEST_PX)
+        for first, last in pairwise(np.linspace(*ends, parts + 1).round().astype(int).tolist()):
+            if kind == "mp4-colour" or min(recording.event_shape) == 0:
+                yield background
+                continue
             events = recording.event_slice(first + 1, last + 1) if last > first else no_events()
-            picture = events_picture(picture, events, recording.event_shape)
-        yield picture
+            yield events_picture(background, events, recording.event_shape)

@@ -16,6 +16,7 @@ from hesim_render.core.html import PAGE_STYLE, inline_picture, table
 from hesim_render.core.output import replacing
 from hesim_render.recording.outline import parameters, scene_name
 from hesim_render.recording.plots import draw_histogram, draw_rates
+from hesim_render.recording.quality import render_lines
 from hesim_render.recording.showcase import contact_sheet
 
 if TYPE_CHECKING:
@@ -25,6 +26,13 @@ PAGE = "recording.html"
 #: Longest lists of numbers that the page shows in full.
 _LONGEST_LIST = 24
 _THUMBNAIL_PX = 480
+#: The page takes the whole window; its parts stand side by side where there is room, and fill their places.
+_STYLE = """
+body{max-width:none;margin:1.5rem 2.5vw}h2{margin-top:.6rem}
+.parts{display:grid;grid-template-columns:repeat(auto-fit,minmax(520px,1fr));gap:18px;align-items:start}
+@media(max-width:560px){.parts{display:block}}
+.parts img,.parts svg{width:100%;height:auto}.pixels{image-rendering:pixelated}
+"""
 
 
 def write_page(recording: Recording, folder: Path) -> Path:
@@ -36,7 +44,7 @@ def write_page(recording: Recording, folder: Path) -> Path:
     folder : where its files and previews are.
     """
     name = f"{scene_name(recording)} seen by {recording.manifest['sensor']['name']}"
-    pictures = [file for file in ("preview.png", "preview.gif") if (folder / file).is_file()]
+    pictures = [file for file in ("preview.gif", "preview.png") if (folder / file).is_file()]
     with report_style():
         plots = []
         for draw, wanted in ((draw_rates, min(recording.event_shape) > 0), (draw_histogram, len(recording.frames) > 0)):
@@ -46,10 +54,9 @@ def write_page(recording: Recording, folder: Path) -> Path:
                 plots.append(f"<figure>{svg(figure)}</figure>")
     parts = [
         f"<h1>{escape(name)}</h1>",
-        table(("", ""), parameters(recording)),
-        *(f'<p><img alt="{file}" src="{file}" style="max-width:100%"></p>' for file in pictures),
-        f'<div class="row">{"".join(plots)}</div>',
-        *_render(recording.manifest["settings"].get("render")),
+        f'<div class="parts">{table(("", ""), parameters(recording))}',
+        f"<div>{''.join(_render(recording.manifest['settings'].get('render')))}</div></div>",
+        f'<div class="parts">{"".join(map(_picture, pictures))}{"".join(plots)}</div>',
         *(
             _specification(title, recording.manifest.get(key))
             for key, title in (("scene", "Scene"), ("sensor", "Sensor"))
@@ -59,7 +66,7 @@ def write_page(recording: Recording, folder: Path) -> Path:
     target = folder / PAGE
     page = (
         '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{escape(name)}</title><style>{PAGE_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
+        f"<title>{escape(name)}</title><style>{PAGE_STYLE}{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
     )
     with replacing(target) as unfinished:
         # names in a recording from elsewhere may hold anything
@@ -74,15 +81,29 @@ def html_summary(recording: Recording) -> str:
     return f"{table(('', ''), parameters(recording))}{inline_picture(np.asarray(sheet), 'contact sheet')}"
 
 
+def _picture(file: str) -> str:
+    """A picture as wide as its place; the pixels of an animation stay squares where it is magnified."""
+    style = ' class="pixels"' if file.endswith(".gif") else ""
+    return f'<figure><a href="{file}"><img alt="{file}" src="{file}"{style}></a></figure>'
+
+
 def _render(render: dict[str, Any] | None) -> list[str]:
-    """The stated error of a render, over the sensor's noise."""
+    """The stated error of a render, over the sensor's noise, and what its audit found, in the words of the commands."""
     rows = [
         (name, *(f"{error[key]:.2g}" for key in ("rms", "p95", "p99")))
         for name, error in ((render or {}).get("error_noise") or {}).items()
         if error is not None
     ]
     head = ("", "rms", "95 % below", "99 % below")
-    return ["<h2>Error of the render, over the sensor's noise</h2>", table(head, rows)] if rows else []
+    if not rows:
+        return []
+    told = [line for line in render_lines(render) if not line.startswith("render,")]
+    told = told or ["No audit: nothing was rendered again to compare with."]
+    return [
+        "<h2>Error of the render, over the sensor's noise</h2>",
+        table(head, rows),
+        *(f"<p{' class=findings' if line.startswith('NOT MET') else ''}>{escape(line)}</p>" for line in told),
+    ]
 
 
 def _specification(title: str, entry: dict[str, Any] | None) -> str:

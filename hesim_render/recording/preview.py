@@ -79,6 +79,12 @@ def fitted(picture: Picture, width_px: int) -> Picture:
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
 
 
+def magnified(picture: Picture) -> Picture:
+    """A small picture at about the width of a panel, by a whole number; a larger one as it is."""
+    scale = max(1, round(_PANEL_PX / picture.shape[1]))
+    return picture.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
 def busiest_window(picture: Picture, fraction: float) -> tuple[float, float]:
     """Relative (row, col) of the top left corner of the window with the most contrast; `fraction` is its relative
     size.

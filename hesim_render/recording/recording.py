@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.errors import SpecError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import inside
 from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.exchange.dsec import read_events
@@ -56,6 +56,10 @@ class StoredFrames(Sequence[Frame]):
 
     def __init__(self, folder: Path, entries: Sequence[Mapping[str, Any]], shape: tuple[int, int]) -> None:
         self._folder, self._entries, self._shape = folder, list(entries), shape
+
+    def __repr__(self) -> str:
+        rows, cols = self._shape
+        return f"<{len(self)} frame{'' if len(self) == 1 else 's'} of {cols}x{rows} px in {self._folder}>"
 
     @cached_property
     def _valid(self) -> NDArray[np.bool_]:
@@ -342,6 +346,23 @@ class Recording:
         manifest = manifests.read(folder)
         shape = manifest["roi"]["height_px"], manifest["roi"]["width_px"]
         return cls(StoredFrames(folder, manifest["frames"], shape), manifest, path=folder)
+
+
+def as_recording(given: Recording | str | Path) -> Recording:
+    """A recording as it is, or opened by its folder.
+
+    Raises
+    ------
+    RangeError
+        If something else is given.
+    SpecError
+        If the folder is not a recording that this version reads.
+    """
+    if isinstance(given, str | Path):
+        return Recording.load(given)
+    if not isinstance(given, Recording):
+        raise RangeError("recording", given, "a recording, or the path of its folder")
+    return given
 
 
 def _read_maps(file: Path, names: tuple[str, ...], shape: tuple[int, int]) -> list[NDArray[np.float32]]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.colour_view import colour_picture
@@ -81,7 +82,7 @@ def _stream(recording: Recording) -> Any:
         import rerun
     except ImportError:
         raise SpecError(
-            "the viewer needs rerun: pip install 'hesim_render[view]'", file=str(recording.path or "recording")
+            f"the viewer needs rerun: {how_to_install('view')}", file=str(recording.path or "recording")
         ) from None
     name = None if recording.path is None else recording.path.name
     return rerun.RecordingStream("hesim_render", recording_id=name)

@@ -44,7 +44,7 @@ def write_previews(recording: Recording, folder: Path) -> list[Path]:
     if len(pictures) > 1:
         written.append(folder / "preview.gif")
         with replacing(written[-1]) as temporary:
-            preview.save_animation(str(temporary), pictures)
+            preview.save_animation(str(temporary), [preview.magnified(picture) for picture in pictures])
     return written
 
 

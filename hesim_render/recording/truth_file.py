@@ -237,6 +237,9 @@ class StoredTruth:
             #: Names of all data sets.
             self.names: tuple[str, ...] = tuple(_names(file))
 
+    def __repr__(self) -> str:
+        return f"<StoredTruth of {', '.join(self.kinds)}: {len(self.names)} data sets in {self._path}>"
+
     def read(self, name: str, number: int | None = None) -> NDArray:
         """A data set, or one entry of it.
 

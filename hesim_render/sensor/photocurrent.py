@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.tables import table as device_table
 from hesim_render.core.units import S_PER_US
-from hesim_render.sensor.sensor import Sensor
+from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.spectral.spectrum import (
     INTEGRATION_STEP_NM,
     REQUIRED_COVERAGE,
@@ -80,7 +81,7 @@ def band_weights(
 def photocurrent(
     spectral_radiance: NDArray | Float,
     wavelength_nm: ArrayLike,
-    sensor: Sensor,
+    sensor: Sensor | str | Path,
     exposure_us: float,
     *,
     filter: str | None = None,
@@ -98,7 +99,7 @@ def photocurrent(
         derivatives. Without `filter` it must be [row, col, band] with the rows and columns of the sensor;
         each pixel then applies its own filter and its relative illumination V.
     wavelength_nm : [band], increasing, nm.
-    sensor : supplies responses, mosaic and relative illumination.
+    sensor : the sensor, or its name or path; supplies responses, mosaic and relative illumination.
     exposure_us : Δt, µs.
     filter : name of one filter that all elements are seen through, on the optical axis (V = 1). The
         leading shape is then free.
@@ -131,6 +132,7 @@ def photocurrent(
     SpecError
         If the bands do not cover a response.
     """
+    sensor = as_sensor(sensor)
     bands = np.asarray(wavelength_nm, dtype=np.float64)
     shape = tuple(spectral_radiance.shape)
     if bands.ndim != 1 or bands.size < 2 or not np.all(np.diff(bands) > 0):

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hesim_render.core.errors import SpecError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.html import table
 from hesim_render.core.plain import PlainState
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.model import ApsNoise
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.measured import require_region
+from hesim_render.pixels.measured import measured_part, require_region
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.lens import Lens
 from hesim_render.specs.files import load_yaml, locate
@@ -157,6 +157,11 @@ class Sensor(PlainState):
         return replace(self, lens=replace(self.lens, off=self.lens.off | off)) if off else self
 
     @property
+    def calibrated_part(self) -> Sensor:
+        """The sensor over the region that its calibration has measured; itself where there is no calibration."""
+        return replace(self, layout=measured_part(self.layout))
+
+    @property
     def optics(self) -> LensSpec:
         """The lens of the sensor file, without the effects that are switched off."""
         return self.spec.lens.without(self.lens.off)
@@ -272,3 +277,20 @@ def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
         If the file is not valid; the message names file, line and key.
     """
     return Sensor.from_spec(read_sensor(name_or_path, overrides), str(name_or_path))
+
+
+def as_sensor(given: Sensor | str | Path) -> Sensor:
+    """A sensor as it is, or loaded by its name or path.
+
+    Raises
+    ------
+    RangeError
+        If something else is given.
+    SpecError
+        If the file is not valid.
+    """
+    if isinstance(given, str | Path):
+        return load_sensor(given)
+    if not isinstance(given, Sensor):
+        raise RangeError("sensor", given, "a sensor from load_sensor, a name, or the path of a sensor file")
+    return given

@@ -9,8 +9,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hesim_render.core.errors import SpecError
+from hesim_render.core.errors import ConflictError, RangeError, SpecError
 from hesim_render.core.html import table
+from hesim_render.core.shipped import list_names
+from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.specs.motion import TrackSpec
 from hesim_render.specs.problems import spec_error
 from hesim_render.specs.scene import CameraSpec, SceneSpec, read_scene
@@ -167,3 +169,34 @@ def load_scene(
         If the file is not valid; the message names file, line and key.
     """
     return Scene(read_scene(name_or_path, overrides, allow_outside))
+
+
+def scene_and_sensor(scene: Scene | str | Path, sensor: Sensor | str | Path) -> tuple[Scene, Sensor]:
+    """Scene and sensor as they are, or loaded by their names or paths.
+
+    Raises
+    ------
+    ConflictError
+        If they are swapped.
+    RangeError
+        If something else is given.
+    SpecError
+        If a file is not valid.
+    """
+    if _is_sensor(scene) or _is_scene(sensor):
+        raise ConflictError("scene", scene, f"the scene comes first, then the sensor; given were {scene!r}, {sensor!r}")
+    if isinstance(scene, str | Path):
+        scene = load_scene(scene)
+    if not isinstance(scene, Scene):
+        raise RangeError(
+            "scene", scene, "a scene from load_scene or Scene.from_mitsuba, a name, or the path of a scene file"
+        )
+    return scene, as_sensor(sensor)
+
+
+def _is_sensor(given: object) -> bool:
+    return isinstance(given, Sensor) or (str(given) in list_names("sensors") and str(given) not in list_names("scenes"))
+
+
+def _is_scene(given: object) -> bool:
+    return isinstance(given, Scene) or (str(given) in list_names("scenes") and str(given) not in list_names("sensors"))

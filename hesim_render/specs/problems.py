@@ -102,7 +102,7 @@ def _one(
 ) -> SpecError:
     location = _keys_of(problem, data)
     if problem["type"] == "extra_forbidden":
-        message = f"unknown key{did_you_mean(str(problem['loc'][-1]), _known_keys(model, location[:-1]))}"
+        message = f"unknown key{_meant(str(problem['loc'][-1]), model, location[:-1])}"
     elif _is_short_list(problem):
         message = "the list is too short"
     elif problem["type"] == "missing":
@@ -119,6 +119,15 @@ def _one(
         return SpecError(f"{message}; set by an override", file=file, key=dotted)
     line = None if file is None else line_of(data, location)
     return SpecError(message, file=file, line=line, key=dotted or None)
+
+
+def _meant(key: str, model: type[BaseModel], section: list[Any]) -> str:
+    """Text about the key that an unknown one may stand for: of the same section, or of one section inside it."""
+    known = _known_keys(model, section)
+    if closest(key, known) is None:
+        known = {f"{part}.{key}" for part in known if key in _known_keys(model, [*section, part])}
+        return f" (did you mean {min(known)!r}?)" if len(known) == 1 else ""
+    return did_you_mean(key, known)
 
 
 def _is_short_list(problem: Any) -> bool:

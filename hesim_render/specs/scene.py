@@ -318,6 +318,8 @@ def read_scene(
     """
     file = locate(name_or_path, "scenes")
     data, changes = load_yaml(file), overrides or {}
+    if "pixels" in data and "tile" in data:
+        raise SpecError("is a sensor file; expected a scene file", file=file)
     if not allow_outside:
         apply_overrides(data, changes)
         for location, name in _named_files(data):

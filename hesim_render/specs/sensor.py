@@ -19,6 +19,7 @@ from hesim_render.specs.calibrated import apply_calibration, with_intervals
 from hesim_render.specs.calibration import NoiseFile, NoisePart
 from hesim_render.specs.data_sheet import DataSheetSpec, V2eSpec
 from hesim_render.specs.defects import EventDefectSpec, TelegraphSpec
+from hesim_render.specs.doubts import doubts
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
 from hesim_render.specs.from_data_sheet import derive, placeholders
 from hesim_render.specs.lens import LensSpec
@@ -295,10 +296,12 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     ------
     SpecError
         With file, line and key of all that is wrong. A letter or filter of the file that no pixel uses is an error; one
-        that no pixel uses after `overrides` is a `HesimWarning`.
+        that no pixel uses after `overrides` is a `HesimWarning`, as is a value that no sensor has (`doubts`).
     """
     file = locate(name_or_path, "sensors")
     data, changes = load_yaml(file), dict(overrides or {})
+    if "pixels" not in data and {"target", "objects", "light", "camera", "mitsuba"} & set(data):
+        raise SpecError("is a scene file; expected a sensor file", file=file)
     folder = Path.cwd() if "noise" in changes else file.parent
     given, calibration = changes.pop("noise", data.get("noise")), None
     of_noise = {key.removeprefix("noise."): changes.pop(key) for key in list(changes) if key.startswith("noise.")}
@@ -322,6 +325,9 @@ def read_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
         raise SpecError.together(problems)
     for problem in problems:  # after an override this may be intended: the replaced part stays in the file
         warnings.warn(str(problem), HesimWarning, stacklevel=3)
+    for key, text in doubts(spec):
+        known = None if key in changes else line_of(data, key.split("."))
+        warnings.warn(str(SpecError(text, file=file, line=known, key=key)), HesimWarning, stacklevel=3)
     return spec
 
 

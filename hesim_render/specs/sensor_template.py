@@ -1,6 +1,10 @@
-"""A sensor file to begin with: every number is a round one, and comments say what to put there."""
+"""A sensor file to begin with: round numbers with comments that say what to put there, or those of a shipped one."""
 
 from __future__ import annotations
+
+import re
+
+from hesim_render.core.shipped import data_folder
 
 _HEAD = """\
 # A sensor file. Every number here is a placeholder: replace it by a figure of your sensor, and note under `sources`
@@ -119,6 +123,19 @@ def sensor_template(name: str, like: str) -> str:
     parts = [text, _APS * frames, _EVS * events, _TAIL.format()]
     notes = ["  aps: placeholder\n"] * frames + ["  evs: placeholder\n"] * events
     return "".join([*parts, *notes])
+
+
+def sensor_copy(name: str, shipped: str) -> str:
+    """Text of a shipped sensor file under another name.
+
+    Parameters
+    ----------
+    name : name of the new sensor.
+    shipped : name of the shipped one.
+    """
+    text = (data_folder("sensors") / f"{shipped}.yaml").read_text(encoding="utf-8")
+    named = re.sub(r"(?m)^name:.*$", lambda _: f"name: {_quoted(name)}", text, count=1)
+    return f"# A copy of {shipped}: correct what differs, and note its source. docs/sensors.md has all keys.\n{named}"
 
 
 def _quoted(name: str) -> str:

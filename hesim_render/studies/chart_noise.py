@@ -66,7 +66,7 @@ def noisy_chart(
 
     Parameters
     ----------
-    sensor : the whole sensor; the chart lies in its middle.
+    sensor : the whole sensor; the chart lies in its middle, or in that of the part that its calibration has measured.
     filters : of the frame pixels, the channels of the result.
     patch_e : [patch, filter of the sensor], electrons of a pixel behind every filter, without crosstalk.
     exposure_us : µs.
@@ -89,13 +89,13 @@ def noisy_chart(
     across = ceil(sqrt(count))
     down = ceil(count / across)
     high, wide = (-(-patch_px // size) * size for size in (tile_rows, tile_cols))
-    geometry = sensor.spec.geometry
-    if across * wide > geometry.cols or down * high > geometry.rows:
+    whole = sensor.calibrated_part
+    if across * wide > whole.cols or down * high > whole.rows:
         raise RangeError(
             "noise.patch_px", patch_px,
-            f"a size at which {count} patches fit on {geometry.cols}x{geometry.rows} px of sensor {sensor.name!r}",
+            f"a size at which {count} patches fit on {whole.cols}x{whole.rows} px of sensor {sensor.name!r}",
         )  # fmt: skip
-    part = sensor.crop(across * wide, down * high)
+    part = whole.crop(across * wide, down * high)
     number = np.arange(down)[:, None] * across + np.arange(across)
     patch = np.minimum(np.kron(number, np.ones((high, wide), dtype=np.int64)), count - 1)
     image = mixed(patch_e[patch, part.layout.filter_index], crosstalk)

@@ -87,7 +87,7 @@ def demosaic_figures(
     geometry = sensor.spec.geometry
     if shape[0] > geometry.rows or shape[1] > geometry.cols:
         raise RangeError("sensor", sensor.name, f"at least {shape[1]}x{shape[0]} px for demosaic figures")
-    part = sensor.crop(shape[1], shape[0], 0, 0)
+    part = sensor.calibrated_part.crop(shape[1], shape[0], 0, 0)
     reflectance = DARK + (LIGHT - DARK) * _chart()
     image = mixed(reflectance * rates_of_white[part.layout.filter_index], crosstalk)
     mosaic = describe(sensor, light)

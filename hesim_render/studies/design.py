@@ -130,7 +130,7 @@ class Problem:
         exposure_us = float(spec.exposure_us or aps.exposure_us)
         scale, window_us = (0.0, 0.0), 1.0
         if evs is not None:
-            table = sensor.evs.table
+            table = sensor.calibrated_part.evs.table
             scale = float(np.expm1(evs.contrast_threshold_on)), float(np.mean(table.base / table.slope))
             window_us = float(evs.window_us)
         return DesignCost(

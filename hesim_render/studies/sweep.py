@@ -29,6 +29,8 @@ from hesim_render.studies.table import Cell, Table
 
 #: File that marks the folder of a sweep.
 MARKER = "sweep.json"
+#: Column of what the audit of a run found: met, not met, not shown or not audited.
+VERDICT = "audit"
 _SENSOR, _ISP = "sensor.", "isp."
 
 
@@ -98,8 +100,8 @@ def sweep(
 
     Returns
     -------
-    A row for each run: scene, sensor, varied keys, seed, and the metrics. Runs of a study have a row for each of its
-    combinations.
+    A row for each run: scene, sensor, varied keys, seed, the metrics, and what its audit found (`VERDICT`). Runs of a
+    study have a row for each of its combinations.
 
     Raises
     ------
@@ -210,13 +212,16 @@ class _Recordings:
         return [
             self._contents[run.scene], self._contents[run.sensor], run.scene, run.sensor, run.changes, run.seed,
             spec.duration_s, spec.roi, sorted(spec.options.items()), sorted(spec.wanted),
-            self._pipeline.model_dump(mode="json"),
+            self._pipeline.model_dump(mode="json"), VERDICT,
         ]  # fmt: skip
 
     def rows(self, run: Run) -> list[dict[str, Cell]]:
         """The one row of a run."""
-        figures = Figures(self._recording(run), self._developed(run))
-        return [{name: cell for metric in self._spec.wanted for name, cell in figures(metric).items()}]
+        recording = self._recording(run)
+        figures = Figures(recording, self._developed(run))
+        audit = recording.manifest["settings"].get("render", {}).get("audit", {})
+        row: dict[str, Cell] = {name: cell for metric in self._spec.wanted for name, cell in figures(metric).items()}
+        return [row | {VERDICT: audit.get("verdict", "not audited")}]
 
     def _developed(self, run: Run) -> Pipeline:
         return changed_pipeline(self._pipeline, run.keys(_ISP))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.core.extras import how_to_install
 from hesim_render.specs.boards import (
     AprilGridTarget,
     CharucoTarget,
@@ -33,7 +34,7 @@ def opencv() -> Any:
         import cv2
     except ImportError:
         raise SpecError(
-            "this target is drawn by OpenCV, which is not installed: pip install 'hesim_render[targets]'", key="target"
+            f"this target is drawn by OpenCV, which is not installed: {how_to_install('targets')}", key="target"
         ) from None
     return cv2
 

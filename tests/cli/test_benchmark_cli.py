@@ -6,6 +6,7 @@ import pytest
 from test_cli import call, fails
 
 from benchmarks import SMALL
+from hesim_render.sources.render.audit.audit import Audit
 
 #: One clip of a scene without motion.
 TINY = SMALL | {
@@ -41,6 +42,19 @@ def test_a_benchmark_is_built_verified_evaluated_and_exported(spec, tmp_path, ca
     next(out.glob("clips/*/sharp.h5")).unlink()
     status, text, err = call(capsys, "benchmark", "verify", out)
     assert status == 1 and text == "" and err.endswith("sharp.h5: is missing\n") and err.count("\n") == 1
+
+
+def test_clips_that_miss_their_quality_are_told_with_the_status_of_a_run(spec, tmp_path, capsys, monkeypatch):
+    out, plain = tmp_path / "b", Audit.run
+    monkeypatch.setattr(Audit, "run", lambda self: plain(self) | {"verdict": "not met", "quality_needed": 1.25})
+    build = ("benchmark", "build", spec, "--out", out, "--workers", 0, "--no-estimate")
+    for _ in range(2):  # a build that finds all clips there says the same
+        status, text, _ = call(capsys, *build)
+        name = next(out.glob("clips/*")).name
+        told = f"  NOT MET: 1 of 1 clips are worse than asked for ({name}); quality 1.25 would do"
+        assert status == 3 and text.splitlines()[-1] == told
+    status, text, _ = call(capsys, *build, "--json")
+    assert (status, json.loads(text)["status"], json.loads(text)["not_met"]) == (3, 3, [name])
 
 
 def test_mistakes_are_one_line(spec, tmp_path, capsys):

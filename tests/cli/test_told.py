@@ -12,7 +12,6 @@ from test_cli import call, fails
 
 import hesim_render as hr
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.terminal import render_lines
 from hesim_render.core.shipped import data_folder, list_names, read_keys
 from hesim_render.specs.files import load_yaml
 
@@ -24,22 +23,6 @@ def test_the_page_has_every_exit_status_and_no_other():
     page = (DOCS / "cli.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\d+) \| `(\w+)` \|", page, re.MULTILINE)
     assert {name: int(number) for number, name in rows} == {each.name: each.value for each in ExitStatus}
-
-
-def test_the_summary_names_extra_events_where_no_true_one_was_seen():
-    shares = {
-        "off": 0.001,
-        "off_at_most": 0.01,
-        "missed": 0.0,
-        "missed_at_most": 1.0,
-        "extra": 1.0,
-        "extra_at_most": 1.0,
-    }
-    for found, words in ((0, 0), (2, 1)):
-        part = {"deviation_noise": {"rms": 0.1}, "true_events": 0, "found_events": found, **shares}
-        audit = {"events": part, "tolerance_noise": 1.5, "verdict": "met"}
-        text = "\n".join(render_lines({"error_noise": {}, "audit": audit}))
-        assert text.count("too many 100 %, at most 100 %") == words
 
 
 def test_json_is_one_object_that_agrees_with_the_recording(capsys, tmp_path):

@@ -255,22 +255,23 @@ def test_a_report_takes_no_other_files_place(captures, monkeypatch):
     first = report.read_bytes()
     calibrate_aps(captures / "set", out, report)  # its own is brought up to date
     assert report.read_bytes() == first
-    (captures / "thesis.txt").write_text("x")
-    (captures / "link").symlink_to("thesis.txt")
+    (captures / "thesis.html").write_text("x")
+    (captures / "link.html").symlink_to("thesis.html")
+    (captures / "thesis.yaml").write_text("x")
     monkeypatch.setattr("hesim_render.calibrate.aps.calibration._read", lambda *_: pytest.fail("the work was begun"))
     for given, message in (
-        ("thesis.txt", "is no report"), ("link", "is no report"), ("c.yaml", "is the calibration itself"),
-        (".", "is a folder"), ("thesis.txt/r.html", "is not a folder"), ("a" * 300, "too long"),
+        ("thesis.html", "is no report"), ("link.html", "is no report"), ("c.yaml", r"ends in \.html"),
+        (".", "is a folder"), ("thesis.html/r.html", "is not a folder"), ("a" * 300, "too long"),
     ):  # fmt: skip
         for overwrite in (False, True):
             with pytest.raises(OutputError, match=message):
                 calibrate_aps(captures / "set", out, captures / given, overwrite=overwrite)
     with pytest.raises(OutputError, match=r"is of another calibration.*--overwrite"):
         calibrate_aps(captures / "set", captures / "other.yaml", report)
-    for given, kind in (("set", OutputError), ("thesis.txt", SpecError)):
+    for given, kind in (("set", OutputError), ("thesis.html", OutputError), ("thesis.yaml", SpecError)):
         with pytest.raises(kind):
             calibrate_aps(captures / "set", captures / given)
-    assert (captures / "thesis.txt").read_text() == "x" and report.read_bytes() == first
+    assert (captures / "thesis.html").read_text() == "x" and report.read_bytes() == first
     assert not (captures / "other.yaml").exists()
     monkeypatch.undo()
     calibrate_aps(captures / "set", captures / "other.yaml", report, overwrite=True)
@@ -279,10 +280,10 @@ def test_a_report_takes_no_other_files_place(captures, monkeypatch):
 
 def test_events_ask_as_frames_do(tmp_path):
     capture_sets.write_events(tmp_path / "set", size=16, trials=20000)
-    (tmp_path / "thesis.txt").write_text("x")
+    (tmp_path / "thesis.html").write_text("x")
     with pytest.raises(OutputError, match="is no report"):
-        calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "thesis.txt", overwrite=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "thesis.txt"]
+        calibrate_evs(tmp_path / "set", tmp_path / "c.yaml", tmp_path / "thesis.html", overwrite=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "thesis.html"]
 
 
 #: Runs a command line that stops between reading the old calibration and replacing it, until ``go`` is there.

@@ -1,15 +1,17 @@
 """What a description of a sensor says, against simulations of the sensor."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy import integrate, special
 
 import hesim_render as hr
+from hesim_render.core import drawing
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
-from hesim_render.describe import event_curves, figures_of, photon_transfer, s_curve, table_lines
+from hesim_render.describe import event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.specs import read_sensor
@@ -284,3 +286,33 @@ def test_mistakes_are_named(arguments, text):
         event_curves(hr.load_sensor("gen2"), **arguments)
     with pytest.raises(RangeError, match="above -1"):
         s_curve(hr.load_sensor("gen2"), 1.0, [-1.0])
+
+
+@pytest.mark.parametrize("name", ["imx636", "eiger", "reference-bayer"])
+def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeypatch):
+    """And the point of the data sheet, which counts all events, lies on a curve that counts all events."""
+    drawn = []
+    monkeypatch.setattr(picture, "new_figure", lambda size: drawn.append(drawing.new_figure(size)) or drawn[-1])
+    picture.write_picture(hr.load_sensor(name), tmp_path / "p.png")
+    (figure,) = drawn
+    with drawing.report_style():
+        figure.canvas.draw()
+        for axes in figure.axes:
+            for axis, side in ((axes.xaxis, 0), (axes.yaxis, 1)):
+                seen = [tick.label1 for tick in axis.get_major_ticks() if tick.label1.get_text()]
+                boxes = [label.get_window_extent() for label in seen]
+                inside = [box for box in boxes if axes.bbox.intervalx[0] - 60 < box.x1 < axes.bbox.intervalx[1] + 30]
+                starts = sorted(box.get_points()[:, side].tolist() for box in inside)
+                assert all(before[1] < after[0] for before, after in pairwise(starts)), axes.get_title(loc="left")
+    if name == "imx636":
+        (rates,) = (axes for axes in figure.axes if axes.get_title(loc="left") == "Events in steady light")
+        lines = {line.get_label(): line for line in rates.lines}
+        curve, point = lines["all events"], lines["data sheet, all events"]
+        (lux,), (rate,) = point.get_data()
+        # no curve goes below dark_lux, where the model turns round in a V: noise falls towards it
+        for axes in figure.axes:
+            for line in axes.lines if "illuminance" in axes.get_xlabel() else ():
+                assert line.get_label().startswith("θ") or np.min(line.get_xdata()) >= 0.08 - 1e-12
+        (noise,) = (axes.lines[0].get_ydata() for axes in figure.axes if axes.get_title(loc="left") == "Noise of ln x")
+        assert np.count_nonzero(np.diff(np.sign(np.diff(noise)))) == 1  # rises to its one maximum, then falls
+        np.testing.assert_allclose(np.interp(lux, *curve.get_data()), rate, rtol=0.05)

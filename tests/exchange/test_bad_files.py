@@ -1,5 +1,6 @@
 """Damaged and foreign event files, and outputs that exist: one clear line, and nothing is changed."""
 
+import json
 import os
 import struct
 
@@ -13,7 +14,7 @@ import hesim_render as hr
 from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events
-from hesim_render.recording.exports import import_events
+from hesim_render.recording.exports import SUFFIXES, import_events
 
 READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
 
@@ -188,8 +189,7 @@ def test_arrays_with_the_other_names_are_read(tmp_path):
 def test_nothing_is_overwritten_unless_asked(tmp_path):
     recording = recordings.make("davis346", tmp_path / "r")
     before = (tmp_path / "r" / "events.h5").read_bytes()
-    for name in ("evt3", "dsec"):
-        out = tmp_path / "out.file"
+    for name, out in (("evt3", tmp_path / "out.raw"), ("dsec", tmp_path / "out.h5")):
         out.write_bytes(b"precious")
         with pytest.raises(OutputError, match="exists; give another name, or overwrite it"):
             recording.export(name, out)
@@ -202,8 +202,9 @@ def test_nothing_is_overwritten_unless_asked(tmp_path):
     assert (tmp_path / "r" / "events.h5").read_bytes() == before
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "mine").touch()
+    (tmp_path / "folder.raw").mkdir()
     with pytest.raises(OutputError, match="is a folder"):
-        recording.export("evt2", tmp_path / "folder", overwrite=True)
+        recording.export("evt2", tmp_path / "folder.raw", overwrite=True)
     with pytest.raises(OutputError, match="holds other things"):
         recording.export("tiff", tmp_path / "folder", overwrite=True)
     # an error on the way leaves the old file, and no other
@@ -211,7 +212,38 @@ def test_nothing_is_overwritten_unless_asked(tmp_path):
         source = written(made((0, 0, 0, 1), (1 << 33, 0, 0, 1)), "evt2", tmp_path)
         import_events(source, out, overwrite=True)
     assert read_all(out) == 20_000
-    assert sorted(os.listdir(tmp_path)) == ["events.raw", "folder", "out.file", "r"]
+    assert sorted(os.listdir(tmp_path)) == ["events.raw", "folder", "folder.raw", "out.h5", "out.raw", "r"]
+
+
+def test_a_name_that_says_another_format_is_refused(tmp_path, capsys):
+    """Of every format: one file has its own end, a folder has the end of no file."""
+    recording = recordings.make("davis346", tmp_path / "r")
+    files = {"evt2": ".raw", "evt3": ".raw", "aedat4": ".aedat4", "dsec": ".h5 or .hdf5", "npz": ".npz", "txt": ".txt",
+             "nmnist": ".bin", "mcap": ".mcap", "mp4": ".mp4", "mp4-colour": ".mp4", "mp4-events": ".mp4"}  # fmt: skip
+    for name, end in files.items():
+        for given in ("out", "out.tiff", "out.raw" if end != ".raw" else "out.h5"):
+            with pytest.raises(OutputError, match=rf"{given}: {name} is a file; give a name that ends in {end}$"):
+                recording.export(name, tmp_path / given)
+    for name in ("tiff", "png", "npy", "mipi", "raw-npz", "exr", "tum", "kalibr", "opencv", "dsec-flow"):
+        for given in (".png", ".raw", ".exr"):
+            with pytest.raises(OutputError, match=rf"out\{given}: {name} is a folder of files; give a name without"):
+                recording.export(name, tmp_path / f"out{given}")
+    assert set(files) == set(SUFFIXES) and os.listdir(tmp_path) == ["r"]
+    for more in (["tum", "out.csv"], ["evt3", "out.RAW.gz"]):
+        status, _, err = command(capsys, "export", tmp_path / "r", "--format", more[0], "--out", tmp_path / more[1])
+        assert status == 2 and err.count("\n") == 1 and "give a name" in err
+    source = recording.export("evt3", tmp_path / "e.RAW")  # in capitals as well
+    with pytest.raises(OutputError, match=r"e\.raw2: dsec is a file"):
+        import_events(source, tmp_path / "e.raw2")
+
+
+def test_an_import_says_how_many_events_it_has(tmp_path, capsys):
+    source = written(made((3, 1, 0, 1), (5, 2, 1, -1), (9, 0, 3, 1)), "evt3", tmp_path)
+    status, told, _ = command(capsys, "import", source, "--out", tmp_path / "e.h5", "--size", "7x5")
+    assert status == 0 and "3 events (2 ON, 1 OFF) of 7x5 px in" in told
+    told = json.loads(command(capsys, "import", source, "--out", tmp_path / "f.h5", "--size", "7x5", "--json")[1])
+    assert (told["events"], told["events_on"], told["events_off"]) == (3, 2, 1)
+    assert told["event_grid"] == {"width": 7, "height": 5}
 
 
 def test_what_a_recording_does_not_have(tmp_path):
@@ -262,7 +294,11 @@ def test_the_commands(capsys, tmp_path):
     status, told, _ = command(capsys, "export", tmp_path / "r", "--format", "evt3", "--out", tmp_path / "e.raw")
     assert (status, told) == (0, f"20000 events in {tmp_path / 'e.raw'}\n")
     status, told, _ = command(capsys, "import", tmp_path / "e.raw", "--out", tmp_path / "e.h5")
-    assert (status, told) == (0, f"events in {tmp_path / 'e.h5'}\n")
+    counts, (rows, cols) = recording.manifest["counts"], recording.event_shape
+    told_counts = (
+        f"{counts['events']} events ({counts['events_on']} ON, {counts['events_off']} OFF) of {cols}x{rows} px"
+    )
+    assert (status, told) == (0, f"{told_counts} in {tmp_path / 'e.h5'}\n")
     np.testing.assert_array_equal(np.concatenate(list(open_events(tmp_path / "e.h5"))), recording.events)
     status, told, error = command(capsys, "import", tmp_path / "e.raw", "--format", "evt2", "--out", tmp_path / "f.h5")
     assert (status, told) == (2, "") and error.count("\n") == 1 and "which is evt3" in error

@@ -1,5 +1,7 @@
 """Events and frames in one file: MCAP read by libraries of others, the npz of H-ESIM, and videos."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from test_round_trips import lists_of_events
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.exchange import EventStream, mcap_file, open_events
+from hesim_render.recording import movie
 from hesim_render.recording.imports import import_recording
 
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -134,7 +137,7 @@ def test_what_is_damaged_or_too_late(tmp_path):
 def test_without_the_package_it_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)
     recording = recordings.make("davis346")
-    with pytest.raises(SpecError, match=r"pip install 'hesim_render\[ros\]'"):
+    with pytest.raises(SpecError, match=r"pip install 'mcap>="):
         recording.export("mcap", tmp_path / "e.mcap")
     assert not any(tmp_path.iterdir())
 
@@ -180,8 +183,9 @@ def test_videos_are_read_by_opencv(name, tmp_path):
         path = recording.export(kind, tmp_path / f"{kind}.mp4")
         capture = cv2.VideoCapture(str(path))
         pictures = [picture for ok, picture in iter(capture.read, (False, None)) if ok]
-        assert len(pictures) == len(recording.frames) and round(capture.get(cv2.CAP_PROP_FPS)) == 25
-        assert pictures[0].shape[:2] == tuple(size // 2 * 2 for size in recording.frames[0].raw.shape)
+        # two frames alone would be gone in 0.08 s: each has 25 pictures
+        assert len(pictures) == 50 and round(capture.get(cv2.CAP_PROP_FPS)) == 25
+        assert pictures[0].shape[:2] == tuple(5 * size for size in recording.frames[0].raw.shape)
         strongest = pictures[-1].astype(int).max(axis=(0, 1))
         assert strongest.max() > 60
     with pytest.raises(RangeError, match="there are no events"):
@@ -189,6 +193,31 @@ def test_videos_are_read_by_opencv(name, tmp_path):
     with pytest.raises(RangeError, match="there are no frames"):
         recordings.make("davis346", frames=0).export("mp4-colour", tmp_path / "x.mp4")
     assert not (tmp_path / "x.mp4").exists()
+
+
+def test_a_picture_of_a_video_has_the_events_of_its_own_time():
+    """Steps of a short recording share its frames; together they show every event once, a long one has one a frame."""
+    recording = recordings.make("davis346", frames=3, duration_us=45_000)
+    shown = []
+
+    class Watched:
+        def __getattr__(self, name):
+            return getattr(recording, name)
+
+        def event_slice(self, first, last):
+            shown.append((first, last))
+            return recording.event_slice(first, last)
+
+    ends = [0, *(entry["t_us"] for entry in recording.manifest["frames"])]
+    assert len(list(movie._pictures(Watched(), "mp4"))) == 51  # 17 for each frame
+    assert shown[0][0] == 1 and shown[-1][1] == ends[-1] + 1
+    assert all(before[1] == after[0] for before, after in pairwise(shown))
+    assert {end + 1 for end in ends[1:]} <= {last for _, last in shown}
+    long = recordings.make("davis346", frames=0, duration_us=600_001)
+    assert len(list(movie._pictures(long, "mp4-events"))) == 61  # of 10 ms each, and the rest
+    colour = list(movie._pictures(recording, "mp4-colour"))
+    assert len(colour) == 51 and all(picture is colour[0] for picture in colour[:17])
+    assert not np.array_equal(colour[16], colour[17])
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
+from hesim_render.core.errors import RangeError
 from hesim_render.isp import Camera, Pipeline, chart, colour, develop
 from hesim_render.spectral import spectrum as spectra
 
@@ -52,3 +53,19 @@ def test_rendered_chart_comes_out_within_two_delta_e(light):
     assert fitted.mean() < 1.5
     np.testing.assert_allclose(fit.delta_e_2000, fitted, atol=0.1)
     assert fit.mean_delta_e <= colour.delta_e_2000(own, reference).mean()
+
+
+def test_wrong_corners_of_a_chart_are_told_as_corners():
+    """Outside of the image, out of order, and the same place twice."""
+    image = np.zeros((60, 90, 3))
+    with pytest.raises(RangeError) as caught:
+        chart.patch_means(image, [(10, 10), (10, 150), (50, 150), (50, 10)])
+    assert str(caught.value) == (
+        "chart corners is [[10.0, 10.0], [10.0, 150.0], [50.0, 150.0], [50.0, 10.0]]; expected corners inside the "
+        "image of 60 rows and 90 columns: the patch around row 10, column 94 would lie outside"
+    )
+    crossed, twice = [(10, 10), (50, 80), (10, 80), (50, 10)], [(10, 10), (10, 10), (50, 80), (50, 10)]
+    for corners in (crossed, twice, [(10, 10), (20, 20), (30, 30), (50, 10)]):
+        with pytest.raises(RangeError, match="top right, bottom right and bottom left patch, in this order around the"):
+            chart.patch_means(image, corners)
+    assert chart.patch_means(image, [(10, 80), (10, 10), (50, 10), (50, 80)]).shape == (24, 3)  # seen in a mirror

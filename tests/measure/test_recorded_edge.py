@@ -79,7 +79,7 @@ def test_one_filter_of_a_mosaic_is_measured_in_a_part_of_a_frame(recording):
     raw = measure_mtf(loaded, region=(10, 0, 100, 96), filter_name=known[1])
     assert not raw.clipped
     assert abs(raw.mtf[10] - expected[10]) < 0.05
-    with pytest.raises(RangeError, match="filter_name is None; expected one of"):
+    with pytest.raises(RangeError, match="say on which to measure"):
         measure_mtf(loaded)
     with pytest.raises(RangeError, match=r"region is \(100, 0, 30, 30\)"):
         measure_mtf(loaded, region=(100, 0, 30, 30), filter_name=known[0])
@@ -154,3 +154,22 @@ def test_the_commands_of_the_docs_measure_an_edge(page, tmp_path, monkeypatch, c
     for command in commands:
         assert run(*command.split()[1:]) in (0, None), capsys.readouterr().err
     assert "MTF50: 0.60" in capsys.readouterr().out and (tmp_path / "mtf.csv").is_file()
+
+
+def test_the_command_names_its_own_options(capsys, tmp_path):
+    """Errors of functions name arguments; the command line has options for them, whose names differ at times."""
+    import recordings
+
+    recordings.make("reference-bayer", tmp_path / "r")
+    given = ["measure", "mtf", str(tmp_path / "r")]
+    for more, told in (
+        (
+            [],
+            "this mosaic has 3 filters: say on which to measure, --filter NAME (filter_name), one of blue, green, red",
+        ),
+        (["--filter", "rde"], "--filter is 'rde'; expected one of blue, green, red (did you mean 'red'?)"),
+        (["--frame", "9"], "--frame is 9; expected 0 to 1"),
+    ):
+        with pytest.raises(SystemExit):
+            cli.main([*given, *more])
+        assert capsys.readouterr().err == f"hesim-render: {told}\n"

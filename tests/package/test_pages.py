@@ -55,6 +55,15 @@ def test_commands_and_options_exist(page):
                     assert parsed(words), words
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_tables_are_whole(page):
+    """Every block of rows has its head: an empty line inside of a table ends it, and the rest is shown as text."""
+    text = re.sub(r"(?ms)^```.*?^```", "", page.read_text(encoding="utf-8"))
+    for block in re.split(r"\n(?!\|)", text):
+        rows = [row for row in block.splitlines() if row.startswith("|")]
+        assert not rows or (len(rows) > 1 and re.fullmatch(r"\|(\s*:?-+:?\s*\|)+", rows[1])), rows[0]
+
+
 def test_the_commands_are_found_and_a_wrong_one_is_told():
     lines = "for x in a; do hesim-render list scenes; done\n.venv/bin/hesim-render demo --out demo\n"
     lines += "hesim-render isp a \\\n  --x"

@@ -19,7 +19,7 @@ from hesim_render.recording.recording import Recording
 def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page") / "recording"
     sensor = hr.load_sensor("gen2", {"evs.contrast_threshold_on": 0.03}).crop(64, 48)
-    hr.simulate(hr.load_scene("colorchecker"), sensor, duration_s=0.06, out=folder, exact=True, samples=4)
+    hr.simulate(hr.load_scene("colorchecker"), sensor, duration_s=0.06, out=folder, exact=True, samples=512)
     return Recording.load(folder)
 
 
@@ -53,9 +53,27 @@ def test_the_page_is_whole_and_names_only_files_of_the_recording(recording, caps
     for _, value in parameters(recording):
         assert value in text
     assert text.count("<svg") == 2 and "colorchecker" in text and "contrast_threshold_on" in text
+    assert "max-width:none" in text and "grid-template-columns" in text  # the whole window, with parts side by side
     # twice the same bytes
     write_page(recording, recording.path)
     assert (recording.path / "recording.html").read_text(encoding="utf-8") == text
+
+
+def test_the_page_has_the_audit_in_the_words_of_the_commands(tmp_path):
+    made = recordings.make("davis346", tmp_path / "r")
+    part = {"deviation_noise": {"rms": 0.4}, "off": 0.03, "off_at_most": 0.041}
+    audit = {"tolerance_noise": 1.5, "verdict": "not met", "quality_needed": 0.21, "frames": part}
+    render = {"error_noise": {"frames": {"rms": 0.3, "p95": 0.6, "p99": 0.8}}, "quality": 0.5, "audit": audit}
+    for given, told in (
+        (
+            render,
+            ["audit, frames: true deviation rms 0.4; 3 % of values are off", "<p class=findings>NOT MET: this run is"],
+        ),
+        ({**render, "audit": {}}, ["No audit: nothing was rendered again"]),
+    ):
+        made.manifest["settings"]["render"] = given
+        text = write_page(made, made.path).read_text(encoding="utf-8")
+        assert all(words in text for words in told)
 
 
 def test_plots_hold_all_events_and_all_pixels(recording):
@@ -109,4 +127,4 @@ def test_without_rerun_a_view_is_as_before_and_its_file_is_refused(recording, ca
         with pytest.raises(SystemExit) as ended:
             main(["view", str(recording.path), *more])
         assert ended.value.code == status
-    assert "pip install 'hesim_render[view]'" in capsys.readouterr().err and not any(tmp_path.iterdir())
+    assert "pip install 'rerun-sdk>=" in capsys.readouterr().err and not any(tmp_path.iterdir())

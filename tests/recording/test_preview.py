@@ -154,7 +154,7 @@ def test_moving_scene_gets_an_animation(tmp_path):
     recording.manifest["scene"] = {"name": "s", "sha256": 64 * "0", "spec": {"motion": [{"object": "target"}]}}
     recording.save(tmp_path / "r")
     with Image.open(tmp_path / "r" / "preview.gif") as picture:
-        assert picture.n_frames >= 20 and picture.size == (128, 96)
+        assert picture.n_frames >= 20 and picture.size == (640, 480)  # five times the frames
     assert showcase.moves(Recording.load(tmp_path / "r"))
 
 

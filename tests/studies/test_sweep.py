@@ -11,6 +11,7 @@ import hesim_render as hr
 from hesim_render import cli
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.isp import Pipeline, process
+from hesim_render.sources.render.audit.audit import Audit
 from hesim_render.specs.files import data_folder, list_names
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
@@ -194,12 +195,27 @@ def test_ranges_and_files(tmp_path, capsys):
     for name in list_names("sweep_specs"):
         assert read_sweep(name).vary
     file = tmp_path / "sweep.yaml"
-    file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True}))
+    file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
         cli.main(["sweep", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0 and "1 runs in" in capsys.readouterr().out
     (kept,) = (tmp_path / "out" / "recordings").iterdir()
     assert hr.Recording.load(kept).manifest["seed"] == 5
+
+
+def test_runs_that_miss_their_quality_are_told(tmp_path, capsys, monkeypatch):
+    """What the audits found is a column, which a sweep that goes on still has."""
+    plain, lux = Audit.run, {"light.illuminance_lux": [20, 90]}
+    monkeypatch.setattr(Audit, "run", lambda self: plain(self) | {"verdict": "not met", "quality_needed": 1.5})
+    file, out = tmp_path / "sweep.yaml", tmp_path / "out"
+    changes = {"vary": lux, "seeds": [5], "roi": "8x8", "metrics": ["electrons"], "duration_s": 0.02}
+    file.write_text(json.dumps({**BASE, **changes, "options": {"quality": 8}}))
+    for _ in range(2):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["sweep", str(file), "--out", str(out)])
+        told = capsys.readouterr().out
+        assert stop.value.code == 3 and "  NOT MET: 2 of 2 runs are worse than asked for (row 1, row 2)" in told
+    assert [row["audit"] for row in json.loads((out / "results.json").read_text())["rows"]] == ["not met"] * 2
 
 
 @pytest.mark.parametrize(("changes", "message"), [

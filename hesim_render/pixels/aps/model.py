@@ -29,7 +29,7 @@ from hesim_render.specs.sensor import ApsSpec
 APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk", "telegraph")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ApsNoise(PlainState):
     """Noise model of a sensor's frame pixels over one read-out region.
 
@@ -55,6 +55,10 @@ class ApsNoise(PlainState):
         bad = self._refused(self.spec.exposure_us)
         if bad:
             raise SpecError(bad, key="aps.beta")
+
+    def __repr__(self) -> str:
+        off = f"; off: {', '.join(sorted(self.off))}" if self.off else ""
+        return f"<ApsNoise of the frame pixels of {self.layout!r}{off}>"
 
     def without(self, *terms: str) -> ApsNoise:
         """The same model with terms of `APS_TERMS` switched off.

@@ -72,7 +72,7 @@ class LabelBlock:
         return cls(none, np.empty(0, np.int64), none, no_events(), none, no_events())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EventLabels:
     """Labels of all events of a run.
 
@@ -88,6 +88,9 @@ class EventLabels:
     lost: NDArray[np.void]
     lost_in: NDArray[np.uint8]
     clean: NDArray[np.void]
+
+    def __repr__(self) -> str:
+        return f"<EventLabels of {self.label.size} events; {self.lost.size} lost, {self.clean.size} without noise>"
 
     @classmethod
     def of(cls, blocks: Sequence[LabelBlock]) -> EventLabels:

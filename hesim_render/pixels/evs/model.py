@@ -42,7 +42,7 @@ EVS_TERMS = (
 LEAST_NOISE_THETA = 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class EvsNoise(PlainState):
     """Noise model of a sensor's event pixels over one read-out region.
 
@@ -60,6 +60,10 @@ class EvsNoise(PlainState):
     device_seed: int
     signal_scale: NDArray[np.float64]
     off: frozenset[str] = field(default=frozenset())
+
+    def __repr__(self) -> str:
+        off = f"; off: {', '.join(sorted(self.off))}" if self.off else ""
+        return f"<EvsNoise of the event pixels of {self.layout!r}{off}>"
 
     def without(self, *terms: str) -> EvsNoise:
         """The same model with terms of `EVS_TERMS` switched off.

@@ -28,7 +28,7 @@ from hesim_render.sources.render.exact import timeline_of
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.render.scene.builder import named_spectra
 from hesim_render.sources.render.tracer import PixelTracer
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, scene_and_sensor
 from hesim_render.specs.sensor import read_sensor
 from hesim_render.spectral.spectrum import RENDERABLE_NM
 from hesim_render.spectral.waveform import Waveform
@@ -64,8 +64,8 @@ def _check_bands(scene: Scene, bands: NDArray[np.float64]) -> None:
 
 
 def render_cube(
-    scene: Scene,
-    sensor: Sensor | tuple[int, int],
+    scene: Scene | str | Path,
+    sensor: Sensor | str | Path | tuple[int, int],
     bands_nm: ArrayLike,
     samples: int = 64,
     t_us: float = 0.0,
@@ -80,8 +80,9 @@ def render_cube(
 
     Parameters
     ----------
-    scene : the scene; lights with a waveform have their power of the instant, or their mean over the window.
-    sensor : sensor whose pixel grid is used, or (rows, cols) of an ideal camera.
+    scene : the scene, or its name or path; lights with a waveform have their power of the instant, or their mean over
+        the window.
+    sensor : sensor whose pixel grid is used, or its name or path, or (rows, cols) of an ideal camera.
     bands_nm : [band], wavelengths in nm, increasing, 360 to 830.
     samples : rays per pixel, group of four bands and slice of time in which objects stand still, even.
     t_us : instant, or begin of the window, µs.
@@ -109,10 +110,11 @@ def render_cube(
         If `bands_nm` or `samples` is out of range, or the window ends before it begins.
     """
     bands = np.atleast_1d(np.asarray(bands_nm, dtype=np.float64))
+    chosen = _camera_of_size(*sensor) if isinstance(sensor, tuple | list) else sensor
+    scene, chosen = scene_and_sensor(scene, chosen)
     _check_bands(scene, bands)
     if end_us is not None and not end_us > t_us:
         raise RangeError("end_us", end_us, f"a time after the begin of the window, {t_us:g} µs")
-    chosen = sensor if isinstance(sensor, Sensor) else _camera_of_size(*sensor)
     lit, _ = in_absolute_light(scene)
     halves = np.zeros((2, *chosen.layout.shape, bands.size), np.float32)
     for waveform, part in light_parts(lit):

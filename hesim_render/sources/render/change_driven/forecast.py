@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.distinct import distinct_pixels
+from hesim_render.core.progress import Progress
 from hesim_render.mosaic.schedule import BlockSample, Exposure
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
@@ -25,7 +26,7 @@ class Estimate:
 
     Parameters
     ----------
-    seconds : time of rendering, s.
+    seconds : time of the rays, or of the whole run (`hesim_render.capture.overheads`), s.
     peak_bytes : peak memory, bytes.
     rays : total number of rays.
     """
@@ -50,14 +51,16 @@ def forecast(
     blocks: BlockSample,
     frame_pixel: NDArray[np.uint32],
     exposures: Sequence[Exposure],
+    progress: Progress | None = None,
 ) -> Estimate:
-    """Forecast the time and memory of a run.
+    """Forecast the time of the rays of a run, and its memory.
 
     Parameters
     ----------
     sources : renderers of one scene; the whole run is asked of each.
     event_pixel, blocks : [n] mosaic indices of event pixels, and a sample of the run's blocks of windows.
     frame_pixel, exposures : [n] mosaic indices of frame pixels, and the exposures of the run.
+    progress : called with (done, total, what).
 
     Returns
     -------
@@ -67,7 +70,9 @@ def forecast(
     rng = np.random.default_rng(sources[0].seed)
     rays = rate = 0.0
     windows = 0
-    for source in sources:
+    for number, source in enumerate(sources):
+        if progress is not None:
+            progress(number, len(sources), "estimate")
         if event_pixel.size and blocks.blocks:
             every = blocks.blocks
             windows = max(block.wanted.size for block in every)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.guard import leads_out, reading, require_file_size, require_memory, require_plain
 from hesim_render.sources.render.scene.deformation import Deformation, read_deformation
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, make_mesh, transform
@@ -132,7 +133,7 @@ def _load(path: Path, kind: str, root: Path | None, key: str) -> list[Any]:
         import trimesh
         from trimesh.resolvers import FilePathResolver
     except ImportError:
-        told = f"{kind.upper()} files are read by trimesh, which is not installed: pip install 'hesim_render[meshes]'"
+        told = f"{kind.upper()} files are read by trimesh, which is not installed: {how_to_install('meshes')}"
         raise SpecError(told, file=path, key=key) from None
 
     class Beside(FilePathResolver):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +13,7 @@ from hesim_render.core.units import MM_PER_M
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.truth.poses import VISION_AXES
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, scene_and_sensor
 from hesim_render.specs.geometry import LARGEST_M
 from hesim_render.specs.scene import CameraSpec
 
@@ -20,7 +21,9 @@ from hesim_render.specs.scene import CameraSpec
 _RIGID = 1e-6
 
 
-def rig_scenes(scene: Scene, sensor: Sensor, poses: Mapping[str, ArrayLike]) -> dict[str, Scene]:
+def rig_scenes(
+    scene: Scene | str | Path, sensor: Sensor | str | Path, poses: Mapping[str, ArrayLike]
+) -> dict[str, Scene]:
     """The same scene for each camera of a rig.
 
     The rig moves as the camera of the scene does. All cameras have the lens that the scene gives this sensor; simulate
@@ -28,8 +31,8 @@ def rig_scenes(scene: Scene, sensor: Sensor, poses: Mapping[str, ArrayLike]) -> 
 
     Parameters
     ----------
-    scene : the scene; its camera is the origin of the rig.
-    sensor : the sensor for which a scene with ``fit`` or a field of view places its camera.
+    scene : the scene, or its name or path; its camera is the origin of the rig.
+    sensor : the sensor, or its name or path, for which a scene with ``fit`` or a field of view places its camera.
     poses : for each camera, its pose in the rig, 4×4 rigid, m: from its axes to those of the scene's camera. Axes are x
         to the right of the image, y downwards, z along the view.
 
@@ -58,6 +61,7 @@ def rig_scenes(scene: Scene, sensor: Sensor, poses: Mapping[str, ArrayLike]) -> 
     SpecError
         If the scene takes its camera from a Mitsuba scene.
     """
+    scene, sensor = scene_and_sensor(scene, sensor)
     if not poses:
         raise RangeError("poses", "{}", "one camera or more")
     if scene.spec.camera is None:

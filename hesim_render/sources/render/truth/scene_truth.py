@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,10 @@ from hesim_render.sources.render.truth.names import Names
 from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid, Raster, row_times_us
 from hesim_render.sources.render.truth.surfaces import Surfaces, mixed_pixels, surfaces_at
-from hesim_render.sources.scene import Scene
+from hesim_render.sources.scene import Scene, scene_and_sensor
+
+#: Largest number of objects that the short text of a truth names.
+_MOST_NAMES = 6
 
 
 class Ids(NamedTuple):
@@ -42,7 +46,7 @@ class SceneTruth:
 
     Parameters
     ----------
-    scene, sensor : from `load_scene` and `load_sensor` (crop the sensor for a region of interest).
+    scene, sensor : from `load_scene` and `load_sensor` (crop the sensor for a region of interest), or names or paths.
 
     Raises
     ------
@@ -59,13 +63,20 @@ class SceneTruth:
     ((48, 64), (12, 16, 2))
     """
 
-    def __init__(self, scene: Scene, sensor: Sensor) -> None:
-        self.scene = scene
-        self._rays = ChiefRays(scene, sensor)
+    def __init__(self, scene: Scene | str | Path, sensor: Sensor | str | Path) -> None:
+        self.scene, sensor = scene_and_sensor(scene, sensor)
+        self._rays = ChiefRays(self.scene, sensor)
         #: The sensor, with the lens in use.
         self.sensor = self._rays.sensor
         self._rasters: dict[str, Raster] = {}
         self._last: tuple[Any, Surfaces] | None = None
+
+    def __repr__(self) -> str:
+        shown = [name for name in self.names.objects if name != "background"]
+        objects = ", ".join(shown[:_MOST_NAMES]) + (
+            f" and {len(shown) - _MOST_NAMES} more" * (len(shown) > _MOST_NAMES)
+        )
+        return f"<SceneTruth of {self.scene.name!r} seen by {self.sensor.name!r}: {objects or 'no objects'}>"
 
     @property
     def names(self) -> Names:

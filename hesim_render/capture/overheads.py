@@ -1,0 +1,76 @@
+"""Estimated time of what a run does besides its rays: kernels, windows, noise of event pixels, frames, the audit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hesim_render.core.units import S_PER_US
+from hesim_render.pixels.evs.photoreceptor import NODES_PER_CORNER_PERIOD
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.change_driven.forecast import Estimate
+
+# Processor time of one thread of an AVX-512 server (`time.process_time`), of runs of `rotating-star`, `fan` and
+# `colorchecker` on `eiger`, `davis346` and `imx636` at 64x48 px, and of event stages of 3,000 to 49,000 pixels.
+#: Start of a run after its estimate, kernels that are on the disk included, s.
+_START_S = 1.0
+#: A window of the event pixels: planning and bookkeeping of the renderer, s.
+_WINDOW_S = 5e-3
+#: A step of the event stage, and a step of a photoreceptor that follows the light, of which a corner period has 32: s,
+#: and s for each event pixel.
+_STEP_S, _STEP_PIXEL_S = 0.4e-3, 0.035e-6
+_NODE_S, _NODE_PIXEL_S = 0.9e-3, 0.02e-6
+#: A frame, and a pixel of a frame, through noise and into its file, s.
+_FRAME_S, _FRAME_PIXEL_S = 2e-2, 60e-9
+#: Rays of an audit: a multiple of the run's own, and at most so many for pixels with a tick and for asynchronous ones,
+#: whose units have ten windows, or this part of the run's own; and its start, s.
+_AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8.0, 8e6, 24e6, 0.125, 0.5
+
+
+def with_overheads(
+    rays: Estimate, sensor: Sensor, duration_us: int, windows: float, frames: int, *, audited: bool, rests: bool
+) -> Estimate:
+    """The estimate of a whole run from that of its rays.
+
+    Parameters
+    ----------
+    rays : time and number of the rays alone.
+    sensor : region read out, with its event and frame pixels.
+    duration_us : length of the run, µs.
+    windows : number of windows in which event pixels are sampled; 0 where nothing moves.
+    frames : number of frames.
+    audited : the run has an audit.
+    rests : the light never changes, so that photoreceptors rest and windows are not rendered.
+
+    Returns
+    -------
+    The estimate, right to about a factor of two where the rays are.
+    """
+    seconds = rays.seconds + _START_S + noise_seconds(sensor, duration_us, windows, rests=rests)
+    seconds += frames * (_FRAME_S + _FRAME_PIXEL_S * sensor.layout.rows * sensor.layout.cols)
+    if not rests:
+        seconds += _WINDOW_S * windows
+    if audited and rays.seconds > 0:
+        evs = sensor.spec.evs
+        most = _MOST_TICK_RAYS if evs is None or evs.reference == "previous_sample" else _MOST_ASYNCHRONOUS_RAYS
+        again = min(rays.rays if rests else _AUDIT_RAYS * rays.rays, max(most, _AUDIT_PART * rays.rays))
+        seconds += _AUDIT_S + again * rays.seconds / rays.rays
+    return replace(rays, seconds=seconds)
+
+
+def noise_seconds(sensor: Sensor, duration_us: int, windows: float, *, rests: bool) -> float:
+    """Time of the event stage: its steps, and those of photoreceptors whose corner follows the light.
+
+    Parameters
+    ----------
+    sensor, duration_us, windows, rests : as for `with_overheads`.
+    """
+    evs = sensor.spec.evs
+    if evs is None:
+        return 0.0
+    pixels = sensor.layout.evs_pixel.size
+    steps = max(windows, duration_us / evs.tick_us if evs.tick_us is not None else 0.0)
+    seconds = steps * (_STEP_S + _STEP_PIXEL_S * pixels)
+    if evs.photoreceptor is not None and evs.photoreceptor.follows_light and not rests:
+        nodes = NODES_PER_CORNER_PERIOD * evs.photoreceptor.cutoff_hz * duration_us * S_PER_US
+        seconds += nodes * (_NODE_S + _NODE_PIXEL_S * pixels)
+    return seconds

@@ -1,0 +1,70 @@
+"""The estimate of a run counts start, noise, frames and audit, not its rays alone; a dry run shows what it does."""
+
+import numpy as np
+import pytest
+
+import hesim_render as hr
+from hesim_render.capture import overheads
+from hesim_render.capture.overheads import noise_seconds, with_overheads
+from hesim_render.sources.render.change_driven.forecast import Estimate
+
+RAYS = Estimate(seconds=3.0, peak_bytes=7e8, rays=6e6)
+RUN = {"duration_us": 50_000, "windows": 130.0, "frames": 0, "audited": False, "rests": False}
+
+
+def told(name, rays=RAYS, size=(64, 48), **changes):
+    found = with_overheads(rays, hr.load_sensor(name).crop(*size), **RUN | changes)
+    assert (found.rays, found.peak_bytes) == (rays.rays, rays.peak_bytes)
+    return found.seconds
+
+
+def test_a_photoreceptor_that_follows_the_light_takes_its_own_steps():
+    """32 of each period of its corner, however few windows there are."""
+    sensor = hr.load_sensor("imx636").crop(64, 48)
+    nodes = 32 * sensor.spec.evs.photoreceptor.cutoff_hz * 0.05
+    assert nodes > 10 * RUN["windows"]
+    more = told("imx636") - told("imx636", rests=True) - RUN["windows"] * overheads._WINDOW_S
+    assert more == pytest.approx(nodes * (0.9e-3 + 0.02e-6 * 64 * 48), rel=1e-9)
+    assert noise_seconds(sensor, 50_000, 130.0, rests=True) == pytest.approx(130 * (0.4e-3 + 0.035e-6 * 64 * 48))
+    # ticks are steps, whatever is rendered
+    assert noise_seconds(hr.load_sensor("eiger").crop(64, 48), 123_900, 0.0, rests=True) == pytest.approx(
+        100 * (0.4e-3 + 0.035e-6 * 32 * 24)
+    )
+    assert noise_seconds(hr.load_sensor("reference-bayer"), 50_000, 0.0, rests=False) == 0
+
+
+def test_an_audit_costs_rays_at_the_speed_of_the_run():
+    for name, most in (("imx636", 24e6), ("eiger", 8e6), ("reference-bayer", 8e6)):
+        for rays in (Estimate(0.5, 7e8, 4e5), RAYS, Estimate(900.0, 7e8, 3e9)):
+            again = min(8 * rays.rays, max(most, rays.rays / 8)) / rays.rays * rays.seconds
+            assert told(name, rays, audited=True) - told(name, rays) == pytest.approx(0.5 + again)
+    # what stands still has few values to look at again
+    still = told("eiger", audited=True, rests=True) - told("eiger", rests=True)
+    assert still == pytest.approx(0.5 + RAYS.seconds)
+    nothing = Estimate(0.0, 7e8, 0.0)
+    assert told("eiger", nothing, audited=True) == told("eiger", nothing)
+
+
+def test_frames_and_the_start_count():
+    assert told("reference-bayer", frames=7) - told("reference-bayer") == pytest.approx(7 * (0.02 + 60e-9 * 64 * 48))
+    assert told("reference-bayer", windows=0.0) == pytest.approx(RAYS.seconds + 1.0)
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_what_comes_before_the_estimate_is_shown_as_progress():
+    """A dry run ends at its estimate: until then it says what it does."""
+    seen = []
+
+    def stop(expected):
+        seen.append(expected)
+        raise Stopped
+
+    sensor = hr.load_sensor("reference-mono").crop(16, 12)
+    with pytest.raises(Stopped):
+        hr.simulate("flat-field", sensor, duration_s=0.02, on_estimate=stop, progress=lambda *given: seen.append(given))
+    assert [given[2] for given in seen[:-1]] == ["preparation", "estimate"]
+    assert all(0 <= done < total for done, total, _ in seen[:-1])
+    assert isinstance(seen[-1], Estimate) and np.isfinite(seen[-1].seconds) and seen[-1].seconds > 1.0
