@@ -10,7 +10,7 @@ import pytest
 
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Closer, Pilot, allocate
-from hesim_render.sources.render.change_driven.plan import changes, fill_in, longer, plan
+from hesim_render.sources.render.change_driven.plan import Plan, changes, fill_in, longer, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
 
 
@@ -99,6 +99,11 @@ def pilot_of(flux, scatter, unshadowed=None, closer=()):
 
 
 def rays_of(pilot, quality=0.5, unit=0.03):
+    """Rays, choice of the estimator, and expected error."""
+    return allocated(pilot, quality, unit)[:3]
+
+
+def allocated(pilot, quality=0.5, unit=0.03):
     count = pilot.lit.shape[1]
     sites = Sites.around(np.arange(count, dtype=np.uint32), 1, count)
     units = unit * np.ones(pilot.lit.shape, np.float32)
@@ -138,6 +143,32 @@ def test_the_estimate_of_less_scatter_is_taken_but_hidden_light_is_added_up():
     assert not rays_of(Pilot(flux, flux, 0.2 * flux, 0.1 * flux, flux))[1].any()
     # what is hidden for the most part is the sum of what is seen, not the whole less what is hidden
     assert not rays_of(Pilot(flux, flux, 0.1 * flux, 0.2 * flux, 3 * flux))[1].any()
+
+
+def test_knowledge_of_an_edge_leaves_the_rays_for_what_stays_unseen():
+    """Light hidden from all pilot rays: (4.5 − 1.5)/(0.5 · 0.03) = 200 rays bring one wanted error each; and as many as
+    a closer look had.
+    """
+    hidden, flux = np.full(9, 1.5), np.full(9, 1.5)
+    hidden[3] = 4.5
+    nothing = np.zeros(1, np.float32)
+    looks = [Closer(np.array([7]), np.array([256]), nothing, nothing)]
+    floor = allocated(pilot_of(flux, np.zeros(9), hidden, looks))[3]
+    np.testing.assert_allclose(floor, [0, 0, 0, 200, 0, 0, 0, 256, 0], atol=1)
+
+
+def test_a_plan_ends_at_the_first_window_after_the_run():
+    """Two pixels; windows after the second are beyond the end."""
+    rendered = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [1, 1]], bool)
+    shape = rendered.shape
+    one = Plan(rendered, np.ones(shape, np.int16), rendered, *(np.ones(shape, np.float32) for _ in range(2)),
+               np.ones(shape, np.int16))  # fmt: skip
+    cut = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [0, 0]], bool)
+    np.testing.assert_array_equal(one.until(2).rendered, cut)
+    np.testing.assert_array_equal(one.until(5).rendered, rendered)
+    values = np.where(cut, [[2.0, 8.0], [0, 7], [0, 0], [8, 0], [0, 1], [0, 0]], 0).astype(np.float32)
+    fill_in(values, cut, np.arange(6.0) * 3)
+    np.testing.assert_allclose(values, [[2, 8], [4, 7], [6, 5], [8, 3], [0, 1], [0, 0]])
 
 
 def test_every_tuning_constant_says_its_unit_its_origin_and_what_it_is_for():

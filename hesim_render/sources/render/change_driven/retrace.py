@@ -128,9 +128,12 @@ def traced_again(
     edges: PairEdges | None = None
     if tracer.rays.is_box:
         law, floor = rays, np.full(rays.size, tuning.least_audit_rays)
+        tried = law >= tuning.edge_least_audit_rays
+        if aims is not None:
+            tried &= aims.count == 0
         rays, edges = about_edges(
             *(tracer, (pixel, window, windows), law, lit, wanted_error, floor, gain, tuning),
-            tried=None if aims is None else aims.count == 0, flat_part=1.0, stream=Stream.AUDIT_EDGE,
+            tried=tried, flat_part=1.0, stream=Stream.AUDIT_EDGE,
         )  # fmt: skip
         wanted_times = np.where(rays < law, 1, wanted_times)
     times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)

@@ -81,8 +81,8 @@ class Tuning:
         interpolated from there carry its error.
     edge_least_rays : rays, C. Pairs that the law gives at least as many rays get decision rays for a line. Without
         (0): decision rays of cheap pairs cost more than they save.
-    edge_rays : rays, F. Decision rays of a pair. Fewer: the strip about a line is wider. More: they cost more than
-        they save.
+    edge_rays : rays, F. Decision rays of a pair. Half as many: the strip about a line is wider. Larger: they cost more
+        than they save.
     edge_footprint_px : px, F. Width of the area in which the first half of the decision rays start. Without (1): a
         line that only just enters a pixel, or passes beside it, is not seen.
     edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
@@ -94,6 +94,8 @@ class Tuning:
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
     audit_ray_weight : wanted errors of the audit, C. As `ray_weight`. Without (as large): the reference is no better
         than the values it judges.
+    edge_least_audit_rays : rays, C. As `edge_least_rays`, in the audit. Without (0): most pairs of an audit hold no
+        edge, and their decision rays cost more than edges save.
     most_audit_times : traces, C. Largest number of traces of one value. Without: a few values take the time of the
         whole audit.
     """
@@ -133,6 +135,7 @@ class Tuning:
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 0.4
+    edge_least_audit_rays: int = 1024
     most_audit_times: int = 8
 
 
