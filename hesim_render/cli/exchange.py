@@ -13,11 +13,14 @@ from hesim_render.cli.terminal import parse_size
 from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.errors import ConflictError
 
-_EXPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "txt", "nmnist", "tiff", "png", "npy", "mipi")
+_EXPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "dsec-gzip", "npz", "txt", "nmnist", "tiff", "png",
+            "npy", "mipi")  # fmt: skip
+#: How many of them are of events.
+_EVENTS = 10
 #: Of events and frames together.
-_WHOLE = ("mcap", "raw-npz", "mp4", "mp4-colour", "mp4-events")
+_WHOLE = ("mcap", "mcap-evt3", "raw-npz", "mp4", "mp4-colour", "mp4-events")
 _GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv")
-_IMPORTS = ("evt2", "evt3", "aedat4", "dsec", "npz", "mcap")
+_IMPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
 
 
 def _complete_export(incomplete: str) -> list[str]:
@@ -32,7 +35,7 @@ def export(
     recording: Annotated[Path, typer.Argument(help="folder of a recording")],
     format: Annotated[
         str,
-        typer.Option(help=f"events: {', '.join(_EXPORTS[:7])}; frames: {', '.join(_EXPORTS[7:])}; "
+        typer.Option(help=f"events: {', '.join(_EXPORTS[:_EVENTS])}; frames: {', '.join(_EXPORTS[_EVENTS:])}; "
                      f"both: {', '.join(_WHOLE)}; "
                      f"geometric truth: {', '.join(_GEOMETRY)}", autocompletion=_complete_export),
     ],
@@ -83,7 +86,8 @@ def import_(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="an event file (EVT2, EVT3 RAW, AEDAT4, DSEC HDF5, .npz); with --sensor also frames",
+            help="an event file (EVT2, EVT3 RAW, DAT, AEDAT4, HDF5 of DSEC or Prophesee, .npz, MCAP); with --sensor "
+            "also frames",
         ),
     ],
     out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
@@ -97,6 +101,10 @@ def import_(
         typer.Option(help=f"make a recording of this sensor: {SENSOR_HELP}", autocompletion=names_of("sensors")),
     ] = None,
     roi: Region = None,
+    trigger_channel: Annotated[
+        int | None,
+        typer.Option(min=0, help="line of the event file whose triggers are the exposures of the frames"),
+    ] = None,
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
@@ -108,8 +116,8 @@ def import_(
     if sensor is None:
         from hesim_render.recording.exports import import_events
 
-        if len(sources) > 1 or roi is not None:
-            raise ConflictError("FILE", len(sources), "more than one file, or --roi, needs --sensor")
+        if len(sources) > 1 or roi is not None or trigger_channel is not None:
+            raise ConflictError("FILE", len(sources), "more than one file, --roi or --trigger-channel needs --sensor")
         shape = None if size is None else parse_size(size)
         written = import_events(sources[0], out, format=format, shape=shape, overwrite=overwrite)
         stream = open_events(written)
@@ -134,5 +142,8 @@ def import_(
     from hesim_render.recording.imports import import_recording
 
     loaded = cropped(hr.load_sensor(sensor), roi)
-    made = import_recording(out, loaded, events=events[0] if events else None, frames=frames, overwrite=overwrite)
+    made = import_recording(
+        out, loaded, events=events[0] if events else None, frames=frames, trigger_channel=trigger_channel,
+        overwrite=overwrite,
+    )  # fmt: skip
     tell_recording(told, made)

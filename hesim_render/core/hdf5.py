@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+import mmap
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ LARGEST_CHUNK_BYTES = 1 << 26
 _LARGEST_CHUNK = 1 << 28
 #: How data sets are packed.
 COMPRESSION = hdf5plugin.Blosc(cname="lz4", clevel=5, shuffle=hdf5plugin.Blosc.SHUFFLE)
-_KINDS = {"ui": "whole numbers"}
+#: The same for readers that have no plugin of Blosc.
+PLAIN_COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+_KINDS = {"ui": "whole numbers", "V": "records"}
 
 
 class Disk:
@@ -100,9 +103,41 @@ def new_file(path: Path) -> Iterator[h5py.File]:
         raise
 
 
-def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui") -> Any:
+#: Begin of a global heap, which holds texts of variable length: signature, version 1 and three zeros.
+_HEAP = b"GCOL\x01\0\0\0"
+
+
+def require_sound_heaps(path: Path) -> None:
+    """Refuse a file whose heaps are damaged, before a text of variable length is read: HDF5 may walk along such a heap
+    without end.
+
+    Parameters
+    ----------
+    path : the file.
+
+    Raises
+    ------
+    SpecError
+        If the entries of a heap do not fill it.
+    """
+    with reading(path), path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        at = -1
+        while (at := data.find(_HEAP, at + 1)) >= 0:
+            end = at + int.from_bytes(data[at + 8 : at + 16], "little")
+            place = at + 16
+            while place + 16 <= end <= len(data):
+                size = int.from_bytes(data[place + 8 : place + 16], "little")
+                is_free = data[place : place + 2] == b"\0\0"
+                if is_free and size < 16:
+                    break
+                place += size if is_free else 16 + -(-size // 8) * 8
+            if not end - 16 < place <= end <= len(data):
+                raise SpecError(f"has a damaged heap of texts at byte {at}", file=path)
+
+
+def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui", also: Collection[int] = ()) -> Any:
     """A data set of numbers that is stored in this file itself; `kinds` are NumPy's letters of the kinds that it may
-    hold.
+    hold, and `also` filters that the caller unpacks by itself.
     """
     parts = name.split("/")
     for k in range(len(parts)):
@@ -118,7 +153,7 @@ def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui") -> Any:
     if found.chunks is not None:  # one is read whole, whatever part of it is asked for
         require_memory(math.prod(found.chunks) * found.dtype.itemsize, f"a chunk of {name}", path, _LARGEST_CHUNK)
     for k in range(layout.get_nfilters()):
-        if (used := layout.get_filter(k)[0]) not in _FILTERS:
+        if (used := layout.get_filter(k)[0]) not in {*_FILTERS, *also}:
             raise SpecError(f"{name} is packed by filter {used}; expected one of {sorted(_FILTERS)}", file=path)
     return found
 

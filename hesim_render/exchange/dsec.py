@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import reading, require_memory
 from hesim_render.core.hdf5 import LARGEST_CHUNK_BYTES, dataset_of
-from hesim_render.exchange.dsec_writer import COLUMNS, LONGEST_US, EventFileWriter, write
+from hesim_render.exchange.dsec_writer import COLUMNS, LONGEST_US, EventFileWriter, write, write_plain
 from hesim_render.exchange.stream import BLOCK
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
 
-__all__ = ["EventFileWriter", "read_events", "read_shape", "stream_events", "write"]
+__all__ = ["EventFileWriter", "read_events", "read_shape", "stream_events", "write", "write_plain"]
 
 _LATEST_US = 2**53  # 285 years
 _BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event, and its columns while they are read

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.hdf5 import COMPRESSION, Disk
+from hesim_render.core.hdf5 import COMPRESSION, PLAIN_COMPRESSION, Disk
 from hesim_render.exchange.stream import EventStream
 
 _CHUNK = 1 << 16
@@ -28,6 +29,7 @@ class EventFileWriter:
     path : the file.
     shape : rows and columns of the event grid.
     begin_us, end_us : time range of the recording, µs; `begin_us` becomes ``t_offset``.
+    packing : how data sets are packed, as h5py has it; None: Blosc LZ4.
 
     Raises
     ------
@@ -35,7 +37,15 @@ class EventFileWriter:
         If the range does not fit the format's 32 bits (71 minutes).
     """
 
-    def __init__(self, path: Path, shape: tuple[int, int], begin_us: int, end_us: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        shape: tuple[int, int],
+        begin_us: int,
+        end_us: int,
+        packing: Mapping[str, Any] | None = None,
+    ) -> None:
+        packed = {"compression": COMPRESSION} if packing is None else packing
         if end_us - begin_us > LONGEST_US:
             raise SpecError(f"a recording of events holds at most {LONGEST_US} µs, not {end_us - begin_us}")
         self._begin_us, self._duration_us = begin_us, end_us - begin_us
@@ -48,7 +58,7 @@ class EventFileWriter:
         self._file = h5py.File(self._disk, "w")
         for name, kind in COLUMNS.items():
             self._file.create_dataset(
-                f"events/{name}", shape=(0,), maxshape=(None,), chunks=(_CHUNK,), dtype=kind, compression=COMPRESSION
+                f"events/{name}", shape=(0,), maxshape=(None,), chunks=(_CHUNK,), dtype=kind, **packed
             )
         self._file["t_offset"] = np.int64(begin_us)
         self._file.attrs.update({"height": shape[0], "width": shape[1], "time_unit": "µs", "begin_us": begin_us})
@@ -116,7 +126,16 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     SpecError
         If the events do not fit into 32 bits (71 minutes).
     """
-    writer = EventFileWriter(Path(file.name), stream.shape, *stream.span_us())
+    _write(stream, file, None)
+
+
+def write_plain(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
+    """As `write`, packed with deflate, which every reader of HDF5 unpacks without a plugin; it takes longer."""
+    _write(stream, file, PLAIN_COMPRESSION)
+
+
+def _write(stream: EventStream, file: IO[bytes], packing: Mapping[str, Any] | None) -> None:
+    writer = EventFileWriter(Path(file.name), stream.shape, *stream.span_us(), packing)
     try:
         for events in stream:
             writer.append(events)

@@ -1,7 +1,8 @@
 """Prophesee EVT2: words of 32 bits, little endian.
 
 An event: type 0 (OFF) or 1 (ON) in bits 31 to 28, time 27 to 22, x 21 to 11, y 10 to 0. TIME_HIGH (type 8) has the time
-above its lowest 6 bits in 28 bits, which start again after 2³⁴ µs.
+above its lowest 6 bits in 28 bits, which start again after 2³⁴ µs. EXT_TRIGGER (type 10): time as above, number of the
+line in bits 12 to 8, and 1 in bit 0 where the edge rises.
 """
 
 from __future__ import annotations
@@ -16,15 +17,18 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange import raw_file
 from hesim_render.exchange.stream import EventStream
+from hesim_render.exchange.triggers import TRIGGER_DTYPE, joined
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 _LOW_BITS = 6
 _HIGH_BITS = 28
 _LAST_HIGH = (1 << _HIGH_BITS) - 1
-_OFF, _ON, _TIME_HIGH = 0x0, 0x1, 0x8
+_OFF, _ON, _TIME_HIGH, _TRIGGER = 0x0, 0x1, 0x8, 0xA
+#: Bits of the number of a trigger line, above bit 8.
+_LINE_BITS = 5
 #: With TIME_HIGH of 10 steps before its end and after its begin: so far a decrease is a new start.
 _NEAR_THE_END = 10
-_KNOWN = np.isin(np.arange(16), (_OFF, _ON, _TIME_HIGH, 0xA, 0xE, 0xF))  # trigger, other, continued
+_KNOWN = np.isin(np.arange(16), (_OFF, _ON, _TIME_HIGH, _TRIGGER, 0xE, 0xF))  # other, continued
 
 
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
@@ -41,11 +45,11 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     SpecError
         If the sensor has more than 2048 rows or columns.
     """
-    raw_file.write(stream, file, target, "EVT2", _encoded)
+    raw_file.write(stream, file, target, "EVT2", _encoded, 1 << _LINE_BITS)
 
 
-def _encoded(events: NDArray, before: NDArray | None) -> NDArray[np.uint32]:
-    """Words of events; `before` is the event before them."""
+def _encoded(events: NDArray, before: NDArray | None, is_trigger: NDArray[np.bool_] | None) -> NDArray[np.uint32]:
+    """Words of events and triggers, as `raw_file.write` has them; `before` is the entry before them."""
     high_before = -1 if before is None else int(before["t_us"] >> _LOW_BITS)
     high = events["t_us"] >> _LOW_BITS
     step = np.diff(high, prepend=high_before)
@@ -65,6 +69,10 @@ def _encoded(events: NDArray, before: NDArray | None) -> NDArray[np.uint32]:
     word |= (events["polarity"] > 0).astype(np.uint32) << np.uint32(28)
     word |= events["x"].astype(np.uint32) << np.uint32(11)
     word |= events["y"]
+    if is_trigger is not None:
+        edge = word & np.uint32(63 << 22 | 1 << 28)
+        edge = (edge & np.uint32(63 << 22)) | edge >> np.uint32(28) | np.uint32(_TRIGGER << 28)
+        word = np.where(is_trigger, edge | events["x"].astype(np.uint32) << np.uint32(8), word)
     words[place] = word
     return words
 
@@ -77,6 +85,16 @@ def read(path: Path, begin: int) -> Iterator[NDArray]:
     SpecError
         If the file ends within a word, or holds words that EVT2 does not have.
     """
+    return (events for events, _ in _decoded(path, begin))
+
+
+def read_triggers(path: Path, begin: int) -> NDArray:
+    """All triggers of a RAW file, [edge] of `TRIGGER_DTYPE`; parameters and errors as for `read`."""
+    return joined((triggers for _, triggers in _decoded(path, begin)), path)
+
+
+def _decoded(path: Path, begin: int) -> Iterator[tuple[NDArray, NDArray]]:
+    """Events and triggers, piece by piece."""
     high, loops = -1, 0
     for piece in raw_file.words(path, begin, "<u4"):
         kind = (piece >> np.uint32(28)).astype(np.uint8)
@@ -93,15 +111,20 @@ def read(path: Path, begin: int) -> Iterator[NDArray]:
         highs = (piece[is_high] & np.uint32(_LAST_HIGH)).astype(np.int64)
         times, loops = unwrapped(highs, loops, _LAST_HIGH + 1, _NEAR_THE_END, path)
         high = int(highs[-1])
+        number = np.cumsum(is_high) - 1
         is_event = kind <= _ON
         word = piece[is_event]
         events = np.empty(word.size, dtype=EVENT_DTYPE)
-        number = np.cumsum(is_high)[is_event] - 1
-        events["t_us"] = (times[number] << _LOW_BITS) | (word >> np.uint32(22) & np.uint32(63))
+        events["t_us"] = (times[number[is_event]] << _LOW_BITS) | (word >> np.uint32(22) & np.uint32(63))
         events["x"] = word >> np.uint32(11) & np.uint32(0x7FF)
         events["y"] = word & np.uint32(0x7FF)
         events["polarity"] = np.where(kind[is_event] == _ON, 1, -1)
-        yield events
+        at = np.flatnonzero(kind == _TRIGGER)
+        triggers = np.empty(at.size, dtype=TRIGGER_DTYPE)
+        triggers["t_us"] = (times[number[at]] << _LOW_BITS) | (piece[at] >> np.uint32(22) & np.uint32(63))
+        triggers["channel"] = piece[at] >> np.uint32(8) & np.uint32((1 << _LINE_BITS) - 1)
+        triggers["edge"] = np.where(piece[at] & np.uint32(1), 1, -1)
+        yield events, triggers
 
 
 def unwrapped(

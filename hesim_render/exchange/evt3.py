@@ -7,6 +7,7 @@
 | 3 | VECT_BASE_X | first column of the next vector, and its polarity |
 | 4, 5 | VECT_12, VECT_8 | a bit for each of the next 12 or 8 columns, which has an event where it is 1 |
 | 6, 8 | TIME_LOW, TIME_HIGH | lower and upper 12 bits of the time, which starts again after 2²⁴ µs |
+| 10 | EXT_TRIGGER | an edge of a trigger line: number of the line, bits 11 to 8; 1 in bit 0 where it rises |
 
 A word is left out where it would repeat the one before. The writer uses no vectors: they hold events of one polarity,
 and would change the order of events whose time is the same.
@@ -14,7 +15,7 @@ and would change the order of events whose time is the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -25,19 +26,24 @@ from hesim_render.core.errors import SpecError
 from hesim_render.exchange import raw_file
 from hesim_render.exchange.evt2 import unwrapped
 from hesim_render.exchange.stream import EventStream
+from hesim_render.exchange.triggers import TRIGGER_DTYPE, joined
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 _LOW_BITS = 12
 _PART = (1 << _LOW_BITS) - 1
 _PERIOD_BITS = 24
 #: The words that say that time has started again would take more than 4 MB.
-_LATEST_US = 1 << 44
-_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
+LATEST_US = 1 << 44
+_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, _TRIGGER = 0, 2, 3, 4, 5, 6, 8, 10
+#: Number of trigger lines.
+CHANNELS = 16
 _COLUMN = 0x7FF
 #: With TIME_HIGH of 10 steps before its end and after its begin: so far a decrease is a new start.
 _NEAR_THE_END = 10
-# besides: continued (4 and 12 bits), trigger, other
-_KNOWN = np.isin(np.arange(16), (_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, 7, 0xA, 0xE, 0xF))
+# besides: continued (4 and 12 bits), other
+_KNOWN = np.isin(
+    np.arange(16), (_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH, _TRIGGER, 7, 0xE, 0xF)
+)
 
 
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
@@ -54,17 +60,28 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     SpecError
         If the sensor has more than 2048 rows or columns, or an event lies after 2⁴⁴ µs (203 days).
     """
-    raw_file.write(stream, file, target, "EVT3", _encoded, _LATEST_US)
+    raw_file.write(stream, file, target, "EVT3", encoded, CHANNELS, LATEST_US)
 
 
-def _encoded(events: NDArray, before: NDArray | None) -> NDArray[np.uint16]:
-    """Words of events; `before` is the event before them."""
+def encoded(
+    events: NDArray, before: NDArray | None, is_trigger: NDArray[np.bool_] | None = None, *, is_whole: bool = False
+) -> NDArray[np.uint16]:
+    """Words of events and triggers.
+
+    Parameters
+    ----------
+    events, is_trigger : entries of `triggers.merged`.
+    before : the entry before them; None before the first.
+    is_whole : begin with time and row, also where they repeat the entry before, so that a reader can start here.
+    """
     time_before, row_before = (-1, -1) if before is None else (int(before["t_us"]), int(before["y"]))
     times, rows = events["t_us"], events["y"]
     high = times >> _LOW_BITS
     new_high = np.diff(high, prepend=-1 if time_before < 0 else time_before >> _LOW_BITS) > 0
     new_low = new_high | (np.diff(times, prepend=time_before) > 0)
     new_row = np.diff(rows.astype(np.int32), prepend=row_before) != 0
+    if is_whole:
+        new_high[0] = new_low[0] = new_row[0] = True
     # all ones and then 0 tell a reader that TIME_HIGH starts again
     starts = np.diff(times >> _PERIOD_BITS, prepend=max(time_before, 0) >> _PERIOD_BITS)
     size = new_high.astype(np.int8) + new_low + new_row + np.int8(1)
@@ -77,7 +94,10 @@ def _encoded(events: NDArray, before: NDArray | None) -> NDArray[np.uint16]:
             np.array([_PART, 0], dtype=np.uint16) | np.uint16(_TIME_HIGH << 12), starts[k]
         )
     x_word = events["x"] | np.uint16(_ADDR_X << 12)
-    x_word |= (events["polarity"] > 0).astype(np.uint16) << np.uint16(11)
+    is_on = (events["polarity"] > 0).astype(np.uint16)
+    x_word |= is_on << np.uint16(11)
+    if is_trigger is not None:
+        x_word = np.where(is_trigger, np.uint16(_TRIGGER << 12) | events["x"] << np.uint16(8) | is_on, x_word)
     words[place] = x_word
     before = place - new_row
     words[place[new_row] - 1] = rows[new_row]
@@ -94,9 +114,30 @@ def read(path: Path, begin: int) -> Iterator[NDArray]:
     SpecError
         If the file ends within a word, or holds words that EVT3 does not have.
     """
+    return (events for events, _ in decoded(raw_file.words(path, begin, "<u2"), path))
+
+
+def read_triggers(path: Path, begin: int) -> NDArray:
+    """All triggers of a RAW file, [edge] of `TRIGGER_DTYPE`; parameters and errors as for `read`."""
+    return joined((triggers for _, triggers in decoded(raw_file.words(path, begin, "<u2"), path)), path)
+
+
+def decoded(pieces: Iterable[NDArray[np.uint16]], path: Path) -> Iterator[tuple[NDArray, NDArray]]:
+    """Events and triggers of words, piece by piece, without those before the first TIME_HIGH.
+
+    Parameters
+    ----------
+    pieces : the words; pieces may begin and end anywhere.
+    path : file, for errors.
+
+    Raises
+    ------
+    SpecError
+        If there are words that EVT3 does not have, or time goes back.
+    """
     state: NDArray[np.uint16] | None = None
     loops = 0
-    for piece in raw_file.words(path, begin, "<u2"):
+    for piece in pieces:
         raw_file.require_types((piece >> np.uint16(12)).astype(np.uint8), _KNOWN, "EVT3", path)
         if state is None:
             first = np.flatnonzero(piece >> np.uint16(12) == _TIME_HIGH)
@@ -105,12 +146,14 @@ def read(path: Path, begin: int) -> Iterator[NDArray]:
             piece = piece[first[0] :]
             state = np.array([piece[0], _TIME_LOW << 12, _ADDR_Y << 12, _BASE_X << 12], dtype=np.uint16)
         # the state of the decoder as words before the piece: one code for the begin and for all other pieces
-        events, state, loops = _decoded(np.concatenate([state, piece]), loops, path)
-        yield events
+        events, triggers, state, loops = _decoded(np.concatenate([state, piece]), loops, path)
+        yield events, triggers
 
 
-def _decoded(words: NDArray[np.uint16], loops: int, path: Path) -> tuple[NDArray, NDArray[np.uint16], int]:
-    """Events of words that begin with the state; the state after them, and how often time has started again."""
+def _decoded(words: NDArray[np.uint16], loops: int, path: Path) -> tuple[NDArray, NDArray, NDArray[np.uint16], int]:
+    """Events and triggers of words that begin with the state; the state after them, and how often time has started
+    again.
+    """
     kind = (words >> np.uint16(12)).astype(np.uint8)
     is_high = kind == _TIME_HIGH
     highs, loops = unwrapped((words[is_high] & _PART).astype(np.int64), loops, _PART + 1, _NEAR_THE_END, path)
@@ -130,8 +173,14 @@ def _decoded(words: NDArray[np.uint16], loops: int, path: Path) -> tuple[NDArray
     count[vectors] = bits.sum(axis=1)
     source = np.repeat(np.arange(kind.size), count)
 
-    events = np.empty(source.size, dtype=EVENT_DTYPE)
     number = np.cumsum(is_high) - 1
+    at = np.flatnonzero(kind == _TRIGGER)
+    triggers = np.empty(at.size, dtype=TRIGGER_DTYPE)
+    triggers["t_us"] = (highs[number[at]] << _LOW_BITS) | low[low_at[at]]
+    triggers["channel"] = words[at] >> np.uint16(8) & np.uint16(CHANNELS - 1)
+    triggers["edge"] = np.where(words[at] & np.uint16(1), 1, -1)
+
+    events = np.empty(source.size, dtype=EVENT_DTYPE)
     events["t_us"] = (highs[number[source]] << _LOW_BITS) | low[low_at[source]]
     events["y"] = words[y_at[source]] & np.uint16(_COLUMN)
     single = kind[source] == _ADDR_X
@@ -157,4 +206,4 @@ def _decoded(words: NDArray[np.uint16], loops: int, path: Path) -> tuple[NDArray
         ],
         dtype=np.uint16,
     )
-    return events, state, loops
+    return events, triggers, state, loops

@@ -12,7 +12,20 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading
-from hesim_render.exchange import aedat4, dsec, e2vid, evt2, evt3, frame_files, mcap_file, nmnist, raw_file
+from hesim_render.exchange import (
+    aedat4,
+    dat,
+    dsec,
+    e2vid,
+    event_packets,
+    evt2,
+    evt3,
+    frame_files,
+    mcap_file,
+    nmnist,
+    prophesee_hdf5,
+    raw_file,
+)
 from hesim_render.exchange.stream import EventStream
 
 
@@ -35,8 +48,11 @@ class FrameFormat:
 EVENT_FORMATS = {
     "evt2": EventFormat(".raw", evt2.write),
     "evt3": EventFormat(".raw", evt3.write),
+    "dat": EventFormat(".dat", dat.write),
+    "prophesee": EventFormat(".hdf5", prophesee_hdf5.write),
     "aedat4": EventFormat(".aedat4", aedat4.write),
     "dsec": EventFormat(".h5", dsec.write),
+    "dsec-gzip": EventFormat(".h5", dsec.write_plain),
     "npz": EventFormat(".npz", e2vid.write_arrays),
     "txt": EventFormat(".txt", e2vid.write_text),
     "nmnist": EventFormat(".bin", nmnist.write),
@@ -49,7 +65,7 @@ FRAME_FORMATS = {
 }
 #: Formats that can be read, by the first bytes of their files.
 _BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz", mcap_file.BEGIN: "mcap"}
-READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz", "mcap")
+READABLE = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
 
 
 def open_events(
@@ -59,9 +75,10 @@ def open_events(
 
     Parameters
     ----------
-    path : the file: EVT2 or EVT3 RAW, AEDAT4, HDF5 in the layout of DSEC, ``.npz`` with t, x, y and p, or
-        MCAP with messages of type EventArray.
-    format : ``evt2``, ``evt3``, ``aedat4``, ``dsec``, ``npz`` or ``mcap``; default: what the begin of the file says.
+    path : the file: EVT2 or EVT3 RAW, DAT, AEDAT4, HDF5 in the layout of DSEC or of Prophesee, ``.npz`` with t, x, y
+        and p, or MCAP with messages of type EventArray or EventPacket.
+    format : ``evt2``, ``evt3``, ``dat``, ``prophesee``, ``aedat4``, ``dsec``, ``npz`` or ``mcap``; default: what the
+        begin of the file says.
     shape : rows and columns of the event grid, px; needed if the file does not state them.
     keep_stated : let the shape that the file states, if it does, come before `shape`.
 
@@ -115,13 +132,28 @@ def _detect(file: Path) -> str | None:
     with reading(file), file.open("rb") as opened:
         begin = opened.read(16)
     found = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
-    return raw_file.read_header(file)[0].lower() if found == "raw" else found
+    if found == "raw":
+        return "dat" if dat.is_dat(file) else raw_file.read_header(file)[0].lower()
+    return "prophesee" if found == "dsec" and prophesee_hdf5.holds(file) else found
 
 
 def _open_raw(file: Path) -> EventStream:
     name, shape, begin = raw_file.read_header(file)
-    read = {"EVT2": evt2.read, "EVT3": evt3.read}[name]
-    return EventStream(lambda: read(file, begin), shape or (0, 0), file)
+    kind = {"EVT2": evt2, "EVT3": evt3}[name]
+    return EventStream(
+        lambda: kind.read(file, begin), shape or (0, 0), file, triggers=lambda: kind.read_triggers(file, begin)
+    )
+
+
+def _open_dat(file: Path) -> EventStream:
+    shape, begin = dat.read_header(file)
+    return EventStream(lambda: dat.read(file, begin), shape or (0, 0), file)
+
+
+def _open_prophesee(file: Path) -> EventStream:
+    shape = prophesee_hdf5.read_shape(file) or (0, 0)
+    triggers = lambda: prophesee_hdf5.read_triggers(file)  # noqa: E731
+    return EventStream(lambda: prophesee_hdf5.read(file), shape, file, triggers=triggers)
 
 
 def _open_aedat4(file: Path) -> EventStream:
@@ -139,6 +171,10 @@ def _open_npz(file: Path) -> EventStream:
 
 
 def _open_mcap(file: Path) -> EventStream:
+    if (packets := event_packets.read_header(file)) is not None:
+        shape, topic = packets
+        triggers = lambda: event_packets.read_triggers(file, topic)  # noqa: E731
+        return EventStream(lambda: event_packets.read(file, topic), shape, file, triggers=triggers)
     shape, topic = mcap_file.read_header(file)
     return EventStream(lambda: mcap_file.read(file, topic), shape, file)
 
@@ -146,6 +182,8 @@ def _open_mcap(file: Path) -> EventStream:
 _OPENERS: dict[str, Callable[[Path], EventStream]] = {
     "evt2": _open_raw,
     "evt3": _open_raw,
+    "dat": _open_dat,
+    "prophesee": _open_prophesee,
     "aedat4": _open_aedat4,
     "dsec": _open_dsec,
     "npz": _open_npz,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -37,19 +37,23 @@ _BLOCK = np.dtype([("sec", "<i4"), ("nanosec", "<u4"), ("p", "u1"), ("pad", "u1"
                    ("pad2", "<u2")])  # fmt: skip
 _BEHIND_LAST = 7  # bytes of the last block that are not there
 _RULE = "=" * 80
-_HEADER = (
+HEADER = (
     f"{_RULE}\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     f"{_RULE}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 )
 #: Ends of the names of types, of whichever package.
-_EVENT_TYPES, _FRAME_TYPES = "/EventArray", "/Image"
+_EVENT_TYPES, PACKET_TYPES, _FRAME_TYPES = "/EventArray", "/EventPacket", "/Image"
 EVENT_TYPE, FRAME_TYPE = "dvs_msgs/msg/EventArray", "sensor_msgs/msg/Image"
 _TYPES = {
     EVENT_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n"
-    f"{_RULE}\nMSG: dvs_msgs/Event\nuint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n{_HEADER}",
+    f"{_RULE}\nMSG: dvs_msgs/Event\nuint16 x\nuint16 y\nbuiltin_interfaces/Time ts\nbool polarity\n{HEADER}",
     FRAME_TYPE: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
-    f"uint32 step\nuint8[] data\n{_HEADER}",
+    f"uint32 step\nuint8[] data\n{HEADER}",
 }
+
+
+#: Name and definition of a type of messages, and the function that makes them of events and the name of the file.
+Packed = tuple[str, str, Callable[[EventStream, "str | Path"], Iterator[tuple[int, bytes]]]]
 
 
 def write(
@@ -58,6 +62,7 @@ def write(
     encoding: str,
     file: IO[bytes],
     target: str | Path,
+    packed: Packed | None = None,
 ) -> None:
     """Write events and frames in order of time.
 
@@ -68,20 +73,24 @@ def write(
     encoding : name of the mosaic, of ``sensor_msgs/image_encodings``: ``mono16``, ``bayer_rggb16``, …
     file : where to write.
     target : name of the file, for errors.
+    packed : messages of the events of another type; default: EventArray.
 
     Raises
     ------
     SpecError
         If the package mcap is not installed, or an event lies at 2³¹ s or later.
     """
+    event_type, definition, packets = packed or (EVENT_TYPE, _TYPES[EVENT_TYPE], _event_arrays)
     _require(target)
     from mcap.writer import Writer
 
     writer = Writer(file)
     writer.start(profile="ros2", library="hesim_render")
     channels = {}
-    for topic, kind in ((EVENT_TOPIC, EVENT_TYPE), (FRAME_TOPIC, FRAME_TYPE)):
-        schema = writer.register_schema(kind, "ros2msg", _TYPES[kind].encode())
+    for topic, kind, text in (
+        (EVENT_TOPIC, event_type, definition), (FRAME_TOPIC, FRAME_TYPE, _TYPES[FRAME_TYPE]),
+    ):  # fmt: skip
+        schema = writer.register_schema(kind, "ros2msg", text.encode())
         channels[topic] = writer.register_channel(topic, "cdr", schema)
 
     def send(topic: str, t_us: int, data: bytes) -> None:
@@ -89,32 +98,36 @@ def write(
 
     waiting = iter(frames)
     frame = next(waiting, None)
-    for packet in () if events is None else _packets(events, target):
-        t_us = int(packet["t_us"][-1])
+    for t_us, data in () if events is None else packets(events, target):
         while frame is not None and frame[0] <= t_us:
             send(FRAME_TOPIC, frame[0], _image(*frame, encoding))
             frame = next(waiting, None)
-        assert events is not None
-        send(EVENT_TOPIC, t_us, _event_array(packet, events.shape))
+        send(EVENT_TOPIC, t_us, data)
     while frame is not None:
         send(FRAME_TOPIC, frame[0], _image(*frame, encoding))
         frame = next(waiting, None)
     writer.finish()
 
 
-def _packets(events: EventStream, target: str | Path) -> Iterator[NDArray]:
-    """The events in parts of at most `_PACKET_US`."""
+def _event_arrays(events: EventStream, target: str | Path) -> Iterator[tuple[int, bytes]]:
+    """Time of the last event, µs, and content of each message."""
     for block in events:
         if block["t_us"][-1] >= _LATEST_US:
             raise SpecError(f"ROS ends at {_LATEST_US} µs; an event is at {block['t_us'][-1]} µs", file=target)
-        period = block["t_us"] // _PACKET_US
-        starts = np.flatnonzero(np.diff(period, prepend=period[0] - 1))
-        for first, last in zip(starts, [*starts[1:], block.size], strict=True):
-            for k in range(first, last, _PACKET_EVENTS):
-                yield block[k : min(k + _PACKET_EVENTS, last)]
+        for part in packet_slices(block["t_us"]):
+            yield int(block["t_us"][part][-1]), _event_array(block[part], events.shape)
 
 
-def _head(t_us: int) -> bytes:
+def packet_slices(times_us: NDArray[np.int64]) -> Iterator[slice]:
+    """Parts of at most `_PACKET_US` and `_PACKET_EVENTS` of events in order of time."""
+    period = times_us // _PACKET_US
+    starts = np.flatnonzero(np.diff(period, prepend=period[0] - 1))
+    for first, last in zip(starts, [*starts[1:], times_us.size], strict=True):
+        for k in range(first, last, _PACKET_EVENTS):
+            yield slice(k, min(k + _PACKET_EVENTS, last))
+
+
+def head(t_us: int) -> bytes:
     """Byte order, time and frame of a message, up to a multiple of 4 bytes."""
     name = FRAME_ID.encode() + b"\0"
     text = struct.pack("<iII", t_us // 1_000_000, t_us % 1_000_000 * 1000, len(name)) + name
@@ -128,7 +141,7 @@ def _event_array(events: NDArray, shape: tuple[int, int]) -> bytes:
     made["p"] = events["polarity"] > 0
     made["x"][:-1], made["y"][:-1] = events["x"][1:], events["y"][1:]
     sizes = struct.pack("<IIIHH", *shape, events.size, events["x"][0], events["y"][0])
-    return _head(int(events["t_us"][0])) + sizes + made.tobytes()[:-_BEHIND_LAST]
+    return head(int(events["t_us"][0])) + sizes + made.tobytes()[:-_BEHIND_LAST]
 
 
 def _image(t_us: int, raw: NDArray[np.uint16], encoding: str) -> bytes:
@@ -136,7 +149,7 @@ def _image(t_us: int, raw: NDArray[np.uint16], encoding: str) -> bytes:
     name = encoding.encode() + b"\0"
     body = struct.pack("<III", rows, cols, len(name)) + name + b"\0"  # the last is is_bigendian
     body += bytes(-len(body) % 4) + struct.pack("<II", 2 * cols, raw.size * 2)
-    return _head(t_us) + body + raw.astype("<u2").tobytes()
+    return head(t_us) + body + raw.astype("<u2").tobytes()
 
 
 def read_header(path: Path) -> tuple[tuple[int, int], str]:
@@ -147,10 +160,13 @@ def read_header(path: Path) -> tuple[tuple[int, int], str]:
     SpecError
         If the file is no MCAP file, is damaged, has a part that unpacks to more than it says, or has no events.
     """
-    for topic, data in _messages(path, None, _EVENT_TYPES):
+    for topic, data in messages(path, None, _EVENT_TYPES):
         rows, cols, _, _ = _parts(data, path)
         return (rows, cols), topic
-    raise SpecError("has no messages of type EventArray (dvs_msgs, prophesee_event_msgs)", file=path)
+    raise SpecError(
+        "has no messages of type EventArray (dvs_msgs, prophesee_event_msgs) or EventPacket (event_camera_msgs)",
+        file=path,
+    )
 
 
 def read(path: Path, topic: str) -> Iterator[NDArray]:
@@ -161,7 +177,7 @@ def read(path: Path, topic: str) -> Iterator[NDArray]:
     SpecError
         If the file is damaged.
     """
-    for _, data in _messages(path, topic, _EVENT_TYPES):
+    for _, data in messages(path, topic, _EVENT_TYPES):
         _, _, count, begin = _parts(data, path)
         if not count:
             continue
@@ -185,7 +201,8 @@ def holds(path: Path) -> tuple[bool, bool]:
     SpecError
         If the file is no MCAP file, or is damaged.
     """
-    return tuple(next(_messages(path, None, kind), None) is not None for kind in (_EVENT_TYPES, _FRAME_TYPES))  # type: ignore[return-value]
+    events: Any = (_EVENT_TYPES, PACKET_TYPES)
+    return tuple(next(messages(path, None, kind), None) is not None for kind in (events, _FRAME_TYPES))  # type: ignore[return-value]
 
 
 def read_frames(path: Path) -> Iterator[tuple[int, NDArray[np.uint16], str]]:
@@ -197,14 +214,14 @@ def read_frames(path: Path) -> Iterator[tuple[int, NDArray[np.uint16], str]]:
         If the file is damaged, or an image is not of one grey or Bayer mosaic of 8 or 16 bits.
     """
     first: str | None = None
-    for topic, data in _messages(path, None, _FRAME_TYPES):
+    for topic, data in messages(path, None, _FRAME_TYPES):
         first = first or topic
         if topic == first:
             yield _frame(data, path)
 
 
 def _frame(data: bytes, path: Path) -> tuple[int, NDArray[np.uint16], str]:
-    place = _behind_header(data, path)
+    place = behind_header(data, path)
     try:
         sec, nanosec = struct.unpack_from("<iI", data, 4)
         rows, cols, length = struct.unpack_from("<III", data, place)
@@ -226,7 +243,7 @@ def _frame(data: bytes, path: Path) -> tuple[int, NDArray[np.uint16], str]:
     return sec * 1_000_000 + nanosec // 1000, lines[:, :cols].astype(np.uint16), encoding
 
 
-def _behind_header(data: bytes, path: Path) -> int:
+def behind_header(data: bytes, path: Path) -> int:
     """Place behind the header of a message."""
     if data[:2] != _LITTLE_ENDIAN[:2]:
         raise SpecError("has messages that are not little-endian CDR", file=path)
@@ -240,7 +257,7 @@ def _behind_header(data: bytes, path: Path) -> int:
 
 def _parts(data: bytes, path: Path) -> tuple[int, int, int, int]:
     """Rows, columns and number of events of a message, and where they begin."""
-    place = _behind_header(data, path)
+    place = behind_header(data, path)
     try:
         rows, cols, count = struct.unpack_from("<III", data, place)
     except struct.error:
@@ -248,7 +265,7 @@ def _parts(data: bytes, path: Path) -> tuple[int, int, int, int]:
     return rows, cols, count, place + 12
 
 
-def _messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, bytes]]:
+def messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, bytes]]:
     """Topic and content of the messages of a topic, or of all, whose type ends with `kind`, in the order of the file.
 
     One part of the file is in memory at a time. The reader of the package sorts messages by their times, for which it

@@ -17,6 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading
 from hesim_render.exchange.stream import EventStream
+from hesim_render.exchange.triggers import merged
 
 #: Coordinates have 11 bits in EVT2 and EVT3.
 LARGEST_SIDE = 1 << 11
@@ -33,12 +34,34 @@ def write(
     file: IO[bytes],
     target: str | Path,
     name: str,
-    encode: Callable[[NDArray, NDArray | None], NDArray],
+    encode: Callable[[NDArray, NDArray | None, NDArray[np.bool_] | None], NDArray],
+    channels: int,
     latest_us: int | None = None,
 ) -> None:
-    """Write the header of a format, and the words of events; parameters as for `write_header` and `encode_into`."""
+    """Write the header of a format, and the words of events and triggers.
+
+    Parameters
+    ----------
+    stream, file, target : the events, where to write them, and its name for errors.
+    name : the format, ``EVT2`` or ``EVT3``.
+    encode : turns entries of `merged`, the entry before them (None before the first), and what of them are triggers
+        into words.
+    channels : number of trigger lines that the format has.
+    latest_us : last time that the format has, µs; None for no limit.
+
+    Raises
+    ------
+    SpecError
+        If events or triggers do not fit the format.
+    """
     write_header(file, name, stream.shape, target)
-    stream.encode_into(file, name, encode, latest_us)
+    before = None
+    for entries, is_trigger in merged(stream, stream.triggers(), stream.source, channels):
+        last_us = int(entries["t_us"][-1])
+        if latest_us is not None and last_us > latest_us:
+            raise SpecError(f"{name} ends at {latest_us} µs; an event is at {last_us} µs", file=stream.source)
+        file.write(encode(entries, before, is_trigger).data)
+        before = entries[-1]
 
 
 def write_header(file: IO[bytes], name: str, shape: tuple[int, int], target: str | Path) -> None:
@@ -72,13 +95,13 @@ def write_header(file: IO[bytes], name: str, shape: tuple[int, int], target: str
     file.write("".join(f"% {line}\n" for line in lines).encode("ascii"))
 
 
-def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
-    """Format (``EVT2``, ``EVT3``), shape (rows, columns; None if the header has none), and first byte of the words.
+def read_lines(path: Path) -> tuple[dict[str, str], int]:
+    """Keys and values of the lines with % at the begin of a file, and the byte behind them.
 
     Raises
     ------
     SpecError
-        If the file has no such header, or states a format that cannot be read.
+        If the file cannot be read.
     """
     keys: dict[str, str] = {}
     with reading(path, "as a Prophesee RAW file"), path.open("rb") as file:
@@ -92,6 +115,18 @@ def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
             if key == "end":
                 break
             keys[key] = value
+    return keys, begin
+
+
+def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
+    """Format (``EVT2``, ``EVT3``), shape (rows, columns; None if the header has none), and first byte of the words.
+
+    Raises
+    ------
+    SpecError
+        If the file has no such header, or states a format that cannot be read.
+    """
+    keys, begin = read_lines(path)
     if not keys:
         raise SpecError("is not a Prophesee RAW file (no header of lines with %)", file=path)
     stated, *details = keys.get("format", "").split(";")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
+from hesim_render.exchange.triggers import no_triggers
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 #: Events of one block; with all copies that a format makes of it, a block takes less than 100 MB.
@@ -29,6 +30,8 @@ class EventStream:
     shape : rows and columns of the event grid, px.
     source : file or folder of the events, for errors.
     interval_us : begin and end of the recording, µs; None if only its events are known.
+    triggers : function that returns the edges of trigger lines, [edge] of `TRIGGER_DTYPE`, in order of time; formats
+        that have none leave them out.
 
     Examples
     --------
@@ -45,6 +48,7 @@ class EventStream:
     shape: tuple[int, int]
     source: str | Path = "events"
     interval_us: tuple[int, int] | None = None
+    triggers: Callable[[], NDArray] = no_triggers
 
     @classmethod
     def of(cls, events: NDArray, shape: tuple[int, int], source: str | Path = "events") -> EventStream:

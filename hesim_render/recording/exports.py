@@ -7,10 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, check_place, free_place, output_errors, replacing
-from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, mcap_file, open_events
+from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, event_packets, mcap_file, open_events
 from hesim_render.exchange.dsec import stream_events
+from hesim_render.exchange.triggers import exposure_triggers
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.recording.tick_files import write_tick_files
 
@@ -20,7 +24,7 @@ if TYPE_CHECKING:
 #: File that says what the frames of a folder are, and marks the folder for `overwrite`.
 FRAMES_NAME = "frames.json"
 #: Formats of events and frames together.
-WHOLE_FORMATS = ("mcap", "raw-npz", "mp4", "mp4-colour", "mp4-events")
+WHOLE_FORMATS = ("mcap", "mcap-evt3", "raw-npz", "mp4", "mp4-colour", "mp4-events")
 #: Writers of the formats that are drawn. The package adds them, as recordings do not know their pictures.
 DRAWN: dict[str, Callable[[Recording, Path], object]] = {}
 #: Ends of the names of formats that are one file; all others are folders.
@@ -35,13 +39,23 @@ _NEED_FRAMES = (*FRAME_FORMATS, "mp4-colour")
 
 
 def event_stream(recording: Recording) -> EventStream:
-    """The events of a recording; from disk, one block at a time."""
+    """The events of a recording; from disk, one block at a time. Its triggers are the exposures of the frames' first
+    rows.
+    """
     grid, time = recording.event_shape, recording.manifest["time"]
     interval = time["begin_us"], time["end_us"]
     if recording.path is None:
-        return EventStream(lambda: EventStream.of(recording.events, grid), grid, "recording", interval)
+        return EventStream(
+            lambda: EventStream.of(recording.events, grid), grid, "recording", interval, lambda: _triggers(recording)
+        )
     file, count = recording.path / "events.h5", recording.manifest["counts"]["events"]
-    return EventStream(lambda: stream_events(file, count), grid, file, interval)
+    return EventStream(lambda: stream_events(file, count), grid, file, interval, lambda: _triggers(recording))
+
+
+def _triggers(recording: Recording) -> NDArray:
+    """Edges at the begin and the end of the exposure of each frame's first row."""
+    begin = np.array([frame["exposure_start_us"] for frame in recording.manifest["frames"]], np.int64)
+    return exposure_triggers(begin, begin + [frame["exposure_us"] for frame in recording.manifest["frames"]])
 
 
 def export(recording: Recording, format: str, path: str | Path, overwrite: bool = False) -> Path:
@@ -62,8 +76,11 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
     if format in WHOLE_FORMATS:
         target = free_place(path, overwrite)
         with replacing(target) as temporary:
-            if format == "mcap":
-                _write_mcap(recording, temporary, target)
+            if format in ("mcap", "mcap-evt3"):
+                packed = None if format == "mcap" else (
+                    event_packets.TYPE, event_packets.DEFINITION, event_packets.packets,
+                )  # fmt: skip
+                _write_mcap(recording, temporary, target, packed)
             else:
                 DRAWN[format](recording, temporary)
         return target
@@ -157,12 +174,12 @@ def import_events(
     return write_events(open_events(source, format, shape), "dsec", path, overwrite)
 
 
-def _write_mcap(recording: Recording, path: Path, target: Path) -> None:
+def _write_mcap(recording: Recording, path: Path, target: Path, packed: mcap_file.Packed | None) -> None:
     """Events and frames as messages of ROS 2."""
     events = event_stream(recording) if min(recording.event_shape) > 0 else None
     frames = ((frame.t_us, frame.raw) for frame in recording.frames)
     with path.open("wb") as file:
-        mcap_file.write(events, frames, mosaic_encoding(recording.mosaic), file, target)
+        mcap_file.write(events, frames, mosaic_encoding(recording.mosaic), file, target, packed)
 
 
 def mosaic_encoding(mosaic: Mosaic) -> str:

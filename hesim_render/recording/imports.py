@@ -13,6 +13,7 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.guard import reading, require_memory
 from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.exchange import EventStream, mcap_file, open_events
+from hesim_render.exchange.triggers import exposures
 from hesim_render.mosaic.description import describe
 from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw
 from hesim_render.recording.dng import is_packed, read_dng
@@ -31,6 +32,7 @@ def import_recording(
     *,
     events: str | Path | None = None,
     frames: Sequence[str | Path] = (),
+    trigger_channel: int | None = None,
     overwrite: bool = False,
 ) -> Recording:
     """Write a capture as a recording, for the ISP and the viewers. Its truth is unknown: the maps of frames are NaN.
@@ -45,6 +47,9 @@ def import_recording(
         NPY, npz of H-ESIM and RGB-Event-ISP, or RAW files of cameras, through rawpy, as DNG of cameras. Frame k begins
         at k / frame rate of the sensor file, and has the exposure of that file. Or one MCAP file, whose images are
         taken with their own times, which are those of the ends of their first rows' exposures.
+    trigger_channel : line of the event file whose triggers are the exposures of the frames' first rows: a rising edge
+        at the begin and a falling one at the end of each, so that frames and events have one clock. None: the times
+        above.
     overwrite : replace an existing recording.
 
     Returns
@@ -56,9 +61,9 @@ def import_recording(
     OutputError
         If `path` exists (and `overwrite` is not set) or cannot be written.
     RangeError
-        If neither events nor frames are given, or frames of a sensor that has none.
+        If neither events nor frames are given, frames of a sensor that has none, or a line of triggers without both.
     SpecError
-        If a file is damaged, or does not fit the sensor.
+        If a file is damaged, does not fit the sensor, or has other triggers than a pulse for each frame.
     """
     aps, layout = sensor.spec.aps, sensor.layout
     if events is not None and Path(events).suffix.lower() == ".mcap":
@@ -71,22 +76,30 @@ def import_recording(
     if frames and aps is None:
         raise RangeError("frames", len(frames), f"none, because {sensor.spec.name} has no frame pixels")
     stream = None if events is None else _events(events, sensor)
+    if trigger_channel is not None and (stream is None or not frames):
+        raise RangeError("trigger_channel", trigger_channel, "nothing, unless both events and frames are given")
     end_us = 0 if stream is None else stream.span_us()[1]
-    starts: list[int] = []
+    times: list[tuple[int, int]] = []
     if aps is not None and frames:
-        starts = _starts_us(frames, aps.frame_rate_hz, aps.exposure_us)
-        end_us = max(end_us, starts[-1] + aps.exposure_us + round((layout.rows - 1) * aps.line_time_us))
+        if stream is not None and trigger_channel is not None:
+            images = _images_of(frames)
+            count = len(frames) if images is None else sum(1 for _ in mcap_file.read_frames(images))
+            times = _triggered(stream, trigger_channel, count)
+        else:
+            starts = _starts_us(frames, aps.frame_rate_hz, aps.exposure_us)
+            times = [(start, aps.exposure_us) for start in starts]
+        end_us = max(end_us, sum(times[-1]) + round((layout.rows - 1) * aps.line_time_us))
     settings = {"imported": {"events": _name(events), "frames": [_name(file) for file in frames]}}
     with RecordingWriter(path, sensor, seed=0, duration_us=end_us, settings=settings, overwrite=overwrite) as writer:
         valid = layout.aps_mask
         unknown = np.full(layout.shape, np.nan, dtype=np.float32)
-        for index, (raw, start_us) in enumerate(zip(_frames(frames, sensor), starts, strict=True)):
+        for index, (raw, (start_us, exposure_us)) in enumerate(zip(_frames(frames, sensor), times, strict=True)):
             assert aps is not None
             writer.add_frame(
                 Frame(
                     raw=np.where(valid, raw, 0).astype(np.uint16), valid=valid, electrons_mean=unknown,
-                    electrons_stderr=unknown, t_us=start_us + aps.exposure_us, exposure_start_us=start_us,
-                    exposure_us=aps.exposure_us, line_time_us=aps.line_time_us, index=index,
+                    electrons_stderr=unknown, t_us=start_us + exposure_us, exposure_start_us=start_us,
+                    exposure_us=exposure_us, line_time_us=aps.line_time_us, index=index,
                 )
             )  # fmt: skip
         for block in stream or ():
@@ -107,6 +120,14 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
         told = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"
         raise SpecError(told, file=file)
     return stream
+
+
+def _triggered(stream: EventStream, channel: int, count: int) -> list[tuple[int, int]]:
+    """Begin and length of each exposure, µs, by the triggers of a line."""
+    begin, end = exposures(stream.triggers(), channel, count, stream.source)
+    if np.any(end <= begin):
+        raise SpecError(f"has pulses of triggers on line {channel} without length", file=stream.source)
+    return list(zip(begin.tolist(), (end - begin).tolist(), strict=True))
 
 
 def _images_of(frames: Sequence[str | Path]) -> Path | None:

@@ -300,9 +300,10 @@ class Recording:
 
         Parameters
         ----------
-        format : of events ``evt2``, ``evt3``, ``aedat4``, ``dsec``, ``npz``, ``txt`` or ``nmnist``; of frames ``tiff``,
-            ``png``, ``npy`` or ``mipi``; of both ``mcap``, ``raw-npz``, and as videos ``mp4``, ``mp4-colour`` and
-            ``mp4-events``; of the truth ``exr``, ``dsec-flow``, ``tum`` or ``kalibr``.
+        format : of events ``evt2``, ``evt3``, ``dat``, ``prophesee``, ``aedat4``, ``dsec``, ``dsec-gzip``, ``npz``,
+            ``txt`` or ``nmnist``; of frames ``tiff``, ``png``, ``npy`` or ``mipi``; of both ``mcap``, ``mcap-evt3``,
+            ``raw-npz``, and as videos ``mp4``, ``mp4-colour`` and ``mp4-events``; of the truth ``exr``, ``dsec-flow``,
+            ``tum``, ``kalibr`` or ``opencv``, and boxes and masks of it ``prophesee-boxes``, ``dsec-det`` or ``coco``.
         path : file of the events, or folder of the frames or of the truth.
         overwrite : replace an existing file, or an existing folder of exported frames.
 

@@ -16,7 +16,7 @@ from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecEr
 from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events
 from hesim_render.recording.exports import SUFFIXES, import_events
 
-READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
+READABLE = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz")
 
 
 def read_all(path, *options):
@@ -35,7 +35,7 @@ def test_a_file_cut_anywhere_is_one_error_or_fewer_events(name, tmp_path):
         except HesimError as error:
             assert str(error).startswith(str(cut)) and "\n" not in str(error)
         else:
-            assert name in ("evt2", "evt3") and found < 3000
+            assert name in ("evt2", "evt3", "dat") and found < 3000
 
 
 @pytest.mark.parametrize("name", READABLE)

@@ -70,7 +70,7 @@ def test_the_command_makes_a_recording(capsys, tmp_path):
     assert (status, error) == (0, "") and "RAW frames: 1 of 128x96 px" in told and "events: 20000" in told
     np.testing.assert_array_equal(Recording.load(tmp_path / "new").events, given.events)
     status, _, error = command(capsys, "import", events, events, "--out", tmp_path / "x")
-    assert (status, error) == (2, "hesim-render: more than one file, or --roi, needs --sensor\n")
+    assert (status, error) == (2, "hesim-render: more than one file, --roi or --trigger-channel needs --sensor\n")
 
 
 @pytest.mark.parametrize("name", ["davis346", "reference-bayer", "eiger"])

@@ -24,7 +24,7 @@ from hesim_render.exchange import aedat4, open_events, stream
 from hesim_render.exchange.dsec import read_events as read_dsec
 from hesim_render.exchange.flatbuffer import Table
 
-READABLE = ("evt2", "evt3", "aedat4", "dsec", "npz")
+READABLE = ("evt2", "evt3", "dat", "aedat4", "dsec", "dsec-gzip", "npz")
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 #: Times at which the counters of EVT3 (2^12, 2^24) and EVT2 (2^6, 2^34) start again, and one of days.
 TURNS = [0, 1 << 6, 1 << 12, 1 << 24, 1 << 25, 1 << 32, 1 << 34, 1 << 40]
@@ -54,7 +54,7 @@ def aedat4_by_others(path):
 
 def read_by_others(path, name):
     """Events by a library that is not ours; of the simple forms, by their definition."""
-    if name == "evt2":
+    if name in ("evt2", "dat"):
         parts = faery.events_stream_from_file(path)
         return joined(columns(*(part[key] for key in ("t", "x", "y", "on"))) for part in parts)
     if name == "evt3":
@@ -63,7 +63,7 @@ def read_by_others(path, name):
         return columns(found.timestamp.astype(np.int64), found.x, found.y, found.polarity)
     if name == "aedat4":
         return joined(aedat4_by_others(path))
-    if name == "dsec":
+    if name in ("dsec", "dsec-gzip"):
         with h5py.File(path) as file:
             t = file["events/t"][:].astype(np.int64) + file["t_offset"][()]
             return columns(t, *(file[f"events/{key}"][:] for key in "xyp"))
@@ -83,7 +83,10 @@ def read_by_others(path, name):
     return columns((data[:, 2] & 127) << 16 | data[:, 3] << 8 | data[:, 4], data[:, 0], data[:, 1], data[:, 2] >> 7)
 
 
-LATEST = {"evt2": 1 << 40, "evt3": 1 << 40, "aedat4": 1 << 40, "dsec": (1 << 32) - 1, "npz": 1 << 40, "txt": 1 << 42}
+LATEST = {
+    "evt2": 1 << 40, "evt3": 1 << 40, "dat": (1 << 32) - 1, "aedat4": 1 << 40, "dsec": (1 << 32) - 1,
+    "dsec-gzip": (1 << 32) - 1, "npz": 1 << 40, "txt": 1 << 42,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LATEST)
@@ -96,7 +99,7 @@ def test_events_come_back_exactly(name, tmp_path):
     def check(events):
         path = written(events, name, tmp_path)
         # the readers of other programs refuse files without events, or stop at them
-        if events.size or name in ("dsec", "npz", "txt"):
+        if events.size or name in ("dsec", "dsec-gzip", "npz", "txt"):
             found = read_by_others(path, name)
             np.testing.assert_array_equal(found, events)
         if name in READABLE:
@@ -122,7 +125,7 @@ def test_many_events_in_several_blocks_come_back_exactly(name, tmp_path, monkeyp
         np.testing.assert_array_equal(joined(open_events(path)), events)
 
 
-@pytest.mark.parametrize("name", ["evt2", "evt3", "dsec", "npz", "txt"])
+@pytest.mark.parametrize("name", ["evt2", "evt3", "dat", "prophesee", "dsec", "npz", "txt"])
 def test_the_bytes_do_not_depend_on_the_blocks(name, tmp_path, monkeypatch):
     """State that is carried wrongly, a row say, would cost words that repeat what is known."""
     events = many(5000, 1 << 20, (4, 4))
@@ -168,6 +171,9 @@ def test_evt2_words_are_those_of_the_definition(tmp_path):
     ("evt3", made(((1 << 44) + 1, 0, 0, 1)), SHAPE, "ends at 17592186044416"),
     ("nmnist", made(), (34, 257), "at most 256 rows and columns"),
     ("nmnist", made((1 << 23, 0, 0, 1)), (34, 34), "ends at 8388607"),
+    ("dat", made(), (720, 16385), "at most 16384 rows and columns"),
+    ("dat", made((1 << 32, 0, 0, 1)), SHAPE, "ends at 4294967295"),
+    ("prophesee", made(), (2049, 10), "at most 2048 rows and columns"),
     ("dsec", made((0, 0, 0, 1), (1 << 32, 0, 0, 1)), SHAPE, "at most 4294967295"),
     ("aedat4", made(), (1 << 16, 10), "at most 32768"),
 ])  # fmt: skip
@@ -276,7 +282,7 @@ def test_an_interval_of_a_file_of_dsec_is_read_by_its_index(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evt2", "evt3", "aedat4", "dsec"])
+@pytest.mark.parametrize("name", ["evt2", "evt3", "dat", "prophesee", "aedat4", "dsec"])
 def test_a_hundred_million_events_take_bounded_memory(name, tmp_path):
     """Peak memory of a process that writes and reads them; as one array they would take 1.3 GB.
 
