@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -15,7 +16,7 @@ from hesim_render.capture.noise_terms import TERMS, noise_models
 from hesim_render.capture.overheads import with_overheads
 from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core import backend
-from hesim_render.core.errors import ConflictError, RangeError, TooLongError
+from hesim_render.core.errors import ConflictError, RangeError, SpecError, TooLongError
 from hesim_render.core.journal import Journal
 from hesim_render.core.progress import Progress, ProgressReport, shown
 from hesim_render.core.units import US_PER_S
@@ -225,6 +226,11 @@ def simulate(
             if set(kinds) - {EVENTS}:
                 step = None if told is None else lambda done, total: told(done, total, "truth")
                 writer.write_truth(SceneTruth(scene, sensor), step)
+            if labels:
+                try:
+                    writer.write_event_objects(SceneTruth(scene, sensor))
+                except SpecError as error:  # its events have causes all the same
+                    warnings.warn(f"objects of events are not written: {error}", stacklevel=2)
             return warn_of_exposure(writer.finish())
 
 

@@ -19,7 +19,7 @@ _EXPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "dsec-gzip", "
 _EVENTS = 10
 #: Of events and frames together.
 _WHOLE = ("mcap", "mcap-evt3", "raw-npz", "mp4", "mp4-colour", "mp4-events")
-_GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv")
+_GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv", "prophesee-boxes", "dsec-det", "coco")
 _IMPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
 
 
@@ -41,7 +41,7 @@ def export(
     ],
     out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],
     every_us: Annotated[
-        int | None, typer.Option(help="interval of flow (default 100000) or of poses (default 1000), µs")
+        int | None, typer.Option(help="interval of flow (default 100000), poses (1000) or boxes (50000), µs")
     ] = None,
     scene: Annotated[
         str | None, typer.Option(help="for truth, the scene file, if it needs files that the recording does not hold")

@@ -18,7 +18,7 @@ from hesim_render.recording import manifest as manifests
 from hesim_render.recording.colour_view import thumbnail
 from hesim_render.recording.dng import write_dng
 from hesim_render.recording.frame import EventTruth, Frame
-from hesim_render.recording.label_file import LabelFileWriter
+from hesim_render.recording.label_file import LabelFileWriter, write_objects
 
 #: Functions called with each complete folder before it gets its name. A module that draws pictures of recordings
 #: appends its function here, so that the writer does not need to import it.
@@ -42,6 +42,7 @@ class FolderWriter:
         self._mosaic = Mosaic.model_validate(manifest["mosaic"])
         self._finished = False
         self._labels: LabelFileWriter | None = None
+        self._objects_at: Callable[[NDArray, NDArray, NDArray], NDArray[np.uint16]] | None = None
         time, grid = manifest["time"], manifest["event_grid"]
         try:
             with output_errors(self._folder.target):
@@ -104,6 +105,10 @@ class FolderWriter:
                 self._labels = LabelFileWriter(self._folder.path, shape, time["begin_us"], time["end_us"])
             self._labels.append(block)
 
+    def set_event_objects(self, objects_at: Callable[[NDArray, NDArray, NDArray], NDArray[np.uint16]]) -> None:
+        """Have the object of each event written when all events are there, as `write_objects` does."""
+        self._objects_at = objects_at
+
     def set_events_dropped(self, count: int) -> None:
         self._dropped = int(count)
 
@@ -122,6 +127,8 @@ class FolderWriter:
             self._events.close()
             if self._labels is not None:
                 self._labels.close()
+            if self._objects_at is not None:
+                write_objects(self._folder.path, self._objects_at)
             self.manifest["counts"] = {
                 "frames": len(self.manifest["frames"]),
                 "events": self._on + self._off,

@@ -1,9 +1,12 @@
-"""Labels of events: one file of labels and lost events, and the noise-free events in the layout of events.h5."""
+"""Labels of events: one file of labels and lost events, the noise-free events in the layout of events.h5, and the
+object that each event's pixel shows.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,10 +17,11 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, reading, require_memory
 from hesim_render.core.hdf5 import COMPRESSION, dataset_of, new_file
-from hesim_render.exchange.dsec import EventFileWriter, read_events
+from hesim_render.exchange.dsec import EventFileWriter, read_events, stream_events
 from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, Label, LabelBlock, Lost
 
 LABEL_FILE, CLEAN_FILE = "truth/event_labels.h5", "truth/clean_events.h5"
+OBJECT_FILE = "truth/event_objects.h5"
 _COLUMNS = {"t_us": "i8", "x": "u2", "y": "u2", "polarity": "i1"}
 #: A lost event while it waits.
 _LOST = np.dtype([*_COLUMNS.items(), ("in", "u1")])
@@ -126,6 +130,53 @@ def _read(file: IO[bytes], size: int) -> bytes:
         parts.append(file.read(size))
         size -= len(parts[-1])
     return b"".join(parts)
+
+
+def write_objects(folder: Path, objects_at: Callable[[NDArray, NDArray, NDArray], NDArray[np.uint16]]) -> None:
+    """Write the object of each event, block by block.
+
+    Parameters
+    ----------
+    folder : of the recording, whose ``events.h5`` is complete.
+    objects_at : numbers of the objects at times, columns and rows of events.
+    """
+    with new_file(folder / OBJECT_FILE) as file:
+        made = file.create_dataset(
+            "object", (0,), np.uint16, maxshape=(None,), chunks=(_PIECE,), compression=COMPRESSION
+        )
+        waiting, done = np.empty(0, np.uint16), 0
+        for events in stream_events(folder / "events.h5"):
+            waiting = np.concatenate([waiting, objects_at(events["t_us"], events["x"], events["y"])])
+            whole = waiting.size // _PIECE * _PIECE
+            if whole:
+                made.resize((done + whole,))
+                made[done:] = waiting[:whole]
+                made.flush()
+                waiting, done = waiting[whole:], done + whole
+        made.resize((done + waiting.size,))
+        made[done:] = waiting
+        made.flush()
+
+
+def read_objects(folder: Path, count: int) -> NDArray[np.uint16]:
+    """The object of each event of a recording, [event].
+
+    Parameters
+    ----------
+    folder : of the recording.
+    count : number of its events.
+
+    Raises
+    ------
+    SpecError
+        If the file is damaged, or does not fit the recording.
+    """
+    path = inside(folder, OBJECT_FILE)
+    with reading(path, "as objects of events"), h5py.File(path, "r") as file:
+        found = _column(file, "object", path, np.uint16)
+    if found.size != count:
+        raise SpecError(f"holds {found.size} objects; the recording has {count} events", file=path)
+    return found
 
 
 def read_labels(folder: Path, shape: tuple[int, int], count: int) -> EventLabels:

@@ -14,6 +14,7 @@ Frames are written as they come and read back one at a time: a long recording is
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from importlib import import_module
@@ -33,7 +34,7 @@ from hesim_render.recording import manifest as manifests
 from hesim_render.recording.dng import read_dng
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
-from hesim_render.recording.label_file import LABEL_FILE, read_labels
+from hesim_render.recording.label_file import LABEL_FILE, OBJECT_FILE, read_labels, read_objects
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -196,6 +197,23 @@ class Recording:
         return self._labels
 
     @cached_property
+    def event_objects(self) -> NDArray[np.uint16]:
+        """The object that the pixel of each event shows at the event's time, uint16 [event]: that of the chief ray
+        through the pixel's centre. 0 is the background; `SceneTruth.names` of `truth` has the names.
+
+        Read where ``--truth events`` has written it, else computed from the scene.
+
+        Raises
+        ------
+        SpecError
+            If the file is damaged, or the scene is not known.
+        """
+        if self.path is not None and (self.path / OBJECT_FILE).is_file():
+            return read_objects(self.path, self.manifest["counts"]["events"])
+        events = self.events
+        return self.truth.objects_at(events["t_us"], events["x"], events["y"])
+
+    @cached_property
     def truth(self) -> SceneTruth:
         """Geometric truth at any time: depth, flow, poses and more, computed from the scene when it is asked for.
 
@@ -288,10 +306,15 @@ class Recording:
         from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
 
         if self.path is not None:
+            if (self.path / OBJECT_FILE).is_file():
+                writer.copy_in(inside(self.path, OBJECT_FILE), OBJECT_FILE)
             if (self.path / TRUTH_FILE).is_file():
                 writer.copy_in(inside(self.path, TRUTH_FILE), TRUTH_FILE)
             return
         request = TruthRequest.of(self.manifest)
+        if self._labels is not None and self._scene is not None:
+            with contextlib.suppress(SpecError):  # of a scene without geometric truth
+                writer.set_event_objects(self.truth.objects_at)
         if request.geometry:
             writer.write_in(TRUTH_FILE, lambda path: write_truth(path, self.truth, request))
 

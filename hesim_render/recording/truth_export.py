@@ -1,4 +1,4 @@
-"""Geometric truth in formats that others read: EXR, flow of DSEC, trajectories of TUM, cameras for Kalibr and OpenCV.
+"""Geometric truth in formats that others read: EXR, flow of DSEC, trajectories of TUM, cameras, boxes and masks.
 
 Every format is a folder with ``export.json``, which states what was written. docs/ground-truth.md has the conventions.
 """
@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
+from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
 from hesim_render.recording.camera_files import write_kalibr_camchain, write_opencv_camera, write_yaml
 from hesim_render.recording.truth_file import POSE_STEP_US, images_at
 from hesim_render.recording.truth_kinds import IMAGES
@@ -43,9 +44,10 @@ def export_truth(
     ----------
     recording : the recording.
     format_ : ``exr``: images of every frame; ``dsec-flow``: forward flow of the event pixels; ``tum``: trajectories of
-        camera and objects; ``kalibr``: cameras and the inertial unit; ``opencv``: cameras for `cv2.FileStorage`.
+        camera and objects; ``kalibr``: cameras and the inertial unit; ``opencv``: cameras for `cv2.FileStorage`;
+        ``prophesee-boxes`` and ``dsec-det``: boxes and tracks on the event grid; ``coco``: boxes and masks of frames.
     out : folder to write.
-    every_us : interval of flow (default 100 000) or of poses (default 1000), µs.
+    every_us : interval of flow (default 100 000), of poses (default 1000) or of boxes (default 50 000), µs.
     overwrite : replace an existing export.
 
     Returns
@@ -64,7 +66,7 @@ def export_truth(
     write = FORMATS.get(format_)
     if write is None:
         raise RangeError("format", format_, f"one of {', '.join(FORMATS)}{did_you_mean(format_, FORMATS)}")
-    if every_us is not None and format_ not in ("dsec-flow", "tum"):
+    if every_us is not None and format_ not in _TIMED:
         raise RangeError("every_us", every_us, f"no interval: {format_} has none")
     if every_us is not None and not 1 <= every_us <= recording.duration_us:
         raise RangeError("every_us", every_us, f"1 to {recording.duration_us} µs, the length of the recording")
@@ -244,4 +246,9 @@ FORMATS: dict[str, Callable[[Recording, SceneTruth, Path, int | None], dict[str,
     "tum": _tum,
     "kalibr": _kalibr,
     "opencv": _opencv,
+    "prophesee-boxes": write_prophesee_boxes,
+    "dsec-det": write_dsec_det,
+    "coco": write_coco,
 }
+#: Formats with an interval.
+_TIMED = ("dsec-flow", "tum", "prophesee-boxes", "dsec-det")

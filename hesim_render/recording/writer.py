@@ -138,6 +138,17 @@ class RecordingWriter:
         else:
             self._labels.append(block)
 
+    def write_event_objects(self, truth: SceneTruth) -> None:
+        """Have the object that each event's pixel shows written at the end; nothing in memory, where
+        `Recording.event_objects` computes it.
+
+        Parameters
+        ----------
+        truth : the scene that was rendered, and its sensor.
+        """
+        if self._folder is not None:
+            self._folder.set_event_objects(truth.objects_at)
+
     def set_events_dropped(self, count: int) -> None:
         """Set how many events were lost in the read-out. No other count includes them.
 

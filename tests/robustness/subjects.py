@@ -293,6 +293,7 @@ def read_labelled(folder):
             stored.read(name)
     if (labels := loaded.event_labels) is not None:
         labels.counts()
+    assert loaded.event_objects.size == loaded.events.size
 
 
 #: name: (makes valid files in a folder, reads them, files that are damaged)

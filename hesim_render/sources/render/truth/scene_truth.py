@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.truth import poses
 from hesim_render.sources.render.truth.boxes import Boxes, ObjectShapes
-from hesim_render.sources.render.truth.chief_rays import ChiefRays
+from hesim_render.sources.render.truth.chief_rays import ChiefRays, Placed
 from hesim_render.sources.render.truth.flow import Flow, flow_between
 from hesim_render.sources.render.truth.imu import ImuModel, ImuSamples, imu_samples
 from hesim_render.sources.render.truth.light import LightLevels, light_levels
 from hesim_render.sources.render.truth.names import Names
 from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid, Raster, row_times_us
-from hesim_render.sources.render.truth.surfaces import Surfaces, mixed_pixels, surfaces_at
+from hesim_render.sources.render.truth.surfaces import BAND, Surfaces, mixed_pixels, surfaces_at
 from hesim_render.sources.scene import Scene, scene_and_sensor
 
 #: Largest number of objects that the short text of a truth names.
@@ -182,6 +182,28 @@ class SceneTruth:
         found, names = self.surfaces(when, grid), self.names
         instance = names.instance(found.shape)
         return Ids(names.object_of[instance], instance, names.material(found.material))
+
+    def objects_at(self, t_us: ArrayLike, x: ArrayLike, y: ArrayLike) -> NDArray[np.uint16]:
+        """Numbers of the objects that event pixels show, each at a time of its own.
+
+        Parameters
+        ----------
+        t_us : [event], times, µs.
+        x, y : [event], columns and rows of the event grid.
+
+        Returns
+        -------
+        uint16 [event]; 0 is the background, and `names` has the names.
+        """
+        raster, times = self.raster("events"), np.asarray(t_us, np.float64)
+        place = np.asarray(y, np.intp), np.asarray(x, np.intp)
+        found = np.empty(times.size, np.uint16)
+        for first in range(0, times.size, BAND):
+            part = slice(first, first + BAND)
+            here = place[0][part], place[1][part]
+            placed = Placed(raster.col[here].astype(np.float64), raster.row[here].astype(np.float64), times[part])
+            found[part] = self.names.object_of[self.names.instance(self._rays.trace(placed).shape)]
+        return found
 
     def mixed(self, when: Any, grid: Grid = "mosaic") -> NDArray[np.bool_]:
         """Pixels whose footprint shows more than one surface, or an edge of one.
