@@ -13,6 +13,7 @@ from typing import Any
 from hesim_render import __version__
 from hesim_render.benchmark.card import write_card
 from hesim_render.benchmark.clip import CLIP_FILE, Clip, clip_folder, is_complete
+from hesim_render.benchmark.croissant import CROISSANT_FILE, croissant
 from hesim_render.benchmark.folder import CARD_FILE, MANIFEST_FILE, PLAN_FILE, SCHEMA, Benchmark, read_clip
 from hesim_render.benchmark.forecast import BuildEstimate, estimate_build
 from hesim_render.benchmark.generator import file_hash
@@ -288,7 +289,9 @@ def _finish(plan: Plan, root: Path) -> None:
             for clip, content in zip(plan.clips, contents, strict=True)
         ],
     }  # fmt: skip
+    text = json.dumps(manifest, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
     write_card(root / CARD_FILE, manifest, contents)
+    with replacing(root / CROISSANT_FILE) as unfinished:
+        unfinished.write_text(croissant(manifest, text), encoding="utf-8")
     with replacing(root / MANIFEST_FILE) as unfinished:  # last: its presence says that all is there
-        text = json.dumps(manifest, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
         unfinished.write_text(text, encoding="utf-8")

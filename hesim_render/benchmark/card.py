@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.benchmark.croissant import card_header
 from hesim_render.benchmark.statistics import FIGURES
 from hesim_render.core.guard import printable
 from hesim_render.specs.benchmark import SPLITS
@@ -136,7 +137,7 @@ def _limits(values: list[float | None]) -> str:
 
 
 def write_card(path: Path, manifest: dict[str, Any], clips: list[dict[str, Any]]) -> None:
-    """Write the card and its histograms.
+    """Write the card, with the header that hubs read, and its histograms.
 
     Parameters
     ----------
@@ -148,4 +149,4 @@ def write_card(path: Path, manifest: dict[str, Any], clips: list[dict[str, Any]]
     with replacing(path.with_name(HISTOGRAM_FILE)) as unfinished:
         unfinished.write_bytes(histograms(clips))
     with replacing(path) as unfinished:
-        unfinished.write_text(card(manifest, clips), encoding="utf-8")
+        unfinished.write_text(card_header(manifest) + "\n" + card(manifest, clips), encoding="utf-8")

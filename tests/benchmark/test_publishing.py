@@ -1,0 +1,124 @@
+"""What others read of a benchmark: Croissant metadata, the header of the card, and data sets in the form of tonic's."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+import hesim_render as hr
+from benchmarks import small
+from hesim_render.benchmark import build_benchmark
+from hesim_render.benchmark.croissant import card_header, tasks
+from hesim_render.benchmark.tonic_dataset import EventDataset
+from hesim_render.core.errors import RangeError, SpecError
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Two hybrid clips whose event pixels leak: events without a long render."""
+    keys = {"aps.frame_rate_hz": 60, "evs.leak_rate_hz": 300}
+    scenes = [{"scene": "flat-field", "split": "test"}, {"scene": "step-wedge", "split": "train"}]
+    spec = small(
+        scenes={"given": scenes}, duration_s=0.048, sensors=[{"sensor": "gen2", "roi": "24x16", "set": keys}],
+        exposures_us=[12_000], sharp={"times_us": [6250, 22500], "window_us": 500}, truth=["events", "depth"],
+        description='A "quoted" description: with a colon.\nAnd a second line.',
+    )  # fmt: skip
+    return build_benchmark(spec, tmp_path_factory.mktemp("published") / "b", estimate=False)
+
+
+def test_croissant_names_every_clip_and_the_bytes_of_the_manifest(built):
+    content = json.loads((built.root / "croissant.json").read_text())
+    assert content["conformsTo"] == "http://mlcommons.org/croissant/1.1" and content["name"] == "small"
+    manifest, *sets = content["distribution"]
+    assert manifest["sha256"] == hashlib.sha256((built.root / "benchmark.json").read_bytes()).hexdigest()
+    assert [entry["name"] for entry in sets] == ["frames", "events", "truth", "recordings", "sharp"]
+    for entry in sets:
+        assert list(built.root.glob(entry["includes"])), entry["includes"]
+    splits, clips = content["recordSet"]
+    assert splits["data"] == [{"splits/name": "train"}, {"splits/name": "test"}]
+    first = built.manifest["clips"][0]
+    for field in clips["field"]:
+        assert field["name"] in first
+        kind = {"sc:Text": str, "sc:Integer": int}[field["dataType"]]
+        assert isinstance(first[field["name"]], kind)
+
+
+def test_croissant_is_valid_and_its_records_are_the_clips(built):
+    mlc = pytest.importorskip("mlcroissant")
+    found = mlc.Dataset(jsonld=str(built.root / "croissant.json"))
+    assert not found.metadata.ctx.issues.errors
+    records = list(found.records("clips"))
+    for record, clip in zip(records, built.manifest["clips"], strict=True):
+        for name in ("name", "split", "scene", "sensor", "noise", "seed", "sha256"):
+            value = record[f"clips/{name}"]
+            assert (value.decode() if isinstance(value, bytes) else value) == clip[name]
+
+
+def test_the_card_begins_with_the_header_that_hubs_read(built):
+    text = (built.root / "README.md").read_text()
+    _, header, body = text.split("---\n", 2)
+    values = YAML(typ="safe").load(header)
+    assert values["pretty_name"] == "small" and values["size_categories"] == ["n<1K"]
+    assert values["task_categories"] == ["image-to-image", "depth-estimation"]
+    assert "event-camera" in values["tags"] and body.startswith("\n# small\n")
+
+
+def test_sizes_and_tasks_of_other_benchmarks():
+    spec = {"truth": ["all"], "sharp": None}
+    assert tasks(spec) == ["depth-estimation", "image-segmentation", "object-detection"]
+    for count, size in ((999, "n<1K"), (1000, "1K<n<10K"), (99_999, "10K<n<100K"), (1_000_000, "n>1M")):
+        manifest = {"clips": [None] * count, "name": "no: \n---\nname", "spec": {"truth": [], "sharp": None}}
+        header = card_header(manifest)
+        values = YAML(typ="safe").load(header.split("---\n")[1])
+        assert values["size_categories"] == [size] and "task_categories" not in values
+        assert values["pretty_name"] == "no: \n---\nname" and header.count("\n---\n") == 1
+
+
+def test_items_are_the_events_of_a_clip_with_their_target(built):
+    clip = next(built.clips("train"))
+    recording = clip.recording
+    data = EventDataset(built.root, "train")
+    assert len(data) == 1 and data.sensor_size == (6, 4, 2) and data.ordering == ("x", "y", "t", "p")
+    events, cause = data[0]
+    assert events.size == cause.size == recording.events.size > 20
+    for name, values in zip("xyt", (recording.events[k] for k in ("x", "y", "t_us")), strict=True):
+        np.testing.assert_array_equal(events[name], values)
+    np.testing.assert_array_equal(events["p"], recording.events["polarity"] > 0)
+    np.testing.assert_array_equal(cause, recording.event_labels.label)
+    np.testing.assert_array_equal(EventDataset(built.root, "train", "object")[0][1], recording.event_objects)
+    frames = EventDataset(built.root, "train", "frames")[0][1]
+    np.testing.assert_array_equal(frames["images"], [frame.raw for frame in recording.frames])
+    assert frames["t_us"].tolist() == [frame.t_us for frame in recording.frames]
+    sharp = EventDataset(built.root, "train", "sharp")[0][1]
+    np.testing.assert_array_equal(sharp["images"][1], clip.sharp.raw_dn(1))
+    assert sharp["t_us"].tolist() == [6250, 22500] and len(EventDataset(built.root, None)) == 2
+
+
+def test_transforms_get_events_and_target(built):
+    counted = EventDataset(built.root, "test", transform=len, target_transform=lambda cause: int(cause.max()))
+    count, most = counted[0]
+    recording = next(built.clips("test")).recording
+    assert (count, most) == (recording.events.size, recording.event_labels.label.max())
+    both = EventDataset(built.root, "test", transforms=lambda events, cause: (cause, events))
+    assert both[0][1].dtype == EventDataset.dtype
+    with pytest.raises(RangeError, match="nothing beside transform"):
+        EventDataset(built.root, "test", transform=len, transforms=lambda a, b: (a, b))
+    with pytest.raises(RangeError, match=r"target is 'casue'; expected one of cause.*did you mean 'cause'"):
+        EventDataset(built.root, target="casue")
+    with pytest.raises(SpecError, match="no clip of the split val"):
+        EventDataset(built.root, "val")
+
+
+def test_transforms_of_tonic_take_the_items(built):
+    transforms = pytest.importorskip("tonic.transforms")
+    plain = EventDataset(built.root, "train")
+    data = EventDataset(built.root, "train", transform=transforms.ToFrame(plain.sensor_size, n_time_bins=3))
+    frames, _ = data[0]
+    assert frames.shape == (3, 2, 4, 6) and 0 < frames.sum() <= plain[0][0].size
+    recording = next(built.clips("train")).recording
+    frames, _ = EventDataset(built.root, "train", transform=transforms.ToFrame(plain.sensor_size, event_count=1))[0]
+    on = hr.events.event_frame(recording.events, recording.event_shape, kind="counts")
+    assert frames.shape[0] == recording.events.size
+    np.testing.assert_array_equal(frames.sum(axis=0).astype(int).sum(axis=0), on.sum(axis=0))
