@@ -16,6 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_round_trips import lists_of_events
 
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.hdf5 import require_sound_heaps
 from hesim_render.exchange import EVENT_FORMATS, EventStream, ecf, event_packets, mcap_file, open_events
 from hesim_render.exchange.triggers import TRIGGER_DTYPE, exposure_triggers, exposures
 from hesim_render.pixels.evs.events import EVENT_DTYPE
@@ -381,6 +382,22 @@ def test_damaged_files_are_one_clear_error(change, told, tmp_path):
     path = damaged(file_of(many(50, 1 << 20), EDGES[:0], "prophesee", tmp_path), change)
     with pytest.raises(SpecError, match=told):
         open_events(path).count()
+
+
+@pytest.mark.parametrize(("place", "value"), [(921, 15), (920, 0), (904, 255), (905, 1)])
+def test_a_heap_that_hdf5_would_walk_without_end_is_refused(place, value, tmp_path):
+    """Its first entry reaches beyond it, or into zeros, or it is longer than its entries or than the file."""
+    path = file_of(many(50, 1 << 20), EDGES[:0], "prophesee", tmp_path)
+    data = bytearray(path.read_bytes())
+    heap = data.index(b"GCOL")
+    require_sound_heaps(path)
+    data[place - 896 + heap] = value
+    path.write_bytes(data)
+    if place == 920:  # a shorter entry: the next ones begin within it
+        data[heap + 16 : heap + 32] = bytes(16)
+        path.write_bytes(data)
+    with pytest.raises(SpecError, match=f"has a damaged heap of texts at byte {heap}"):
+        open_events(path)
 
 
 def test_damaged_chunks_never_raise_another_error():

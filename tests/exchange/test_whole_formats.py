@@ -263,7 +263,7 @@ def test_parts_of_the_same_time_are_not_all_held(tmp_path, compression):
         schema = writer.register_schema(mcap_file.EVENT_TYPE, "ros2msg", b"")
         channel = writer.register_channel("/e", "cdr", schema)
         for k in range(30):
-            data = mcap_file._head(0) + struct.pack("<III", 4, 6, 1) + struct.pack("<HHiIB", 5, 3, k, 7000, 1)
+            data = mcap_file.head(0) + struct.pack("<III", 4, 6, 1) + struct.pack("<HHiIB", 5, 3, k, 7000, 1)
             writer.add_message(channel, 10**9, data + bytes(4 << 20), 10**9)
         writer.finish()
     tracemalloc.start()
