@@ -52,6 +52,7 @@ TAGS = ["event-camera", "raw-image", "synthetic", "hesim_render"]
 #: Tasks of hubs by what a benchmark must have for them.
 _TASKS = {"sharp": "image-to-image", "depth": "depth-estimation", "ids": "image-segmentation",
           "boxes": "object-detection"}  # fmt: skip
+_SPLIT_NAMES = {"val": "validation"}
 _SIZES = ((1000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 
 
@@ -118,13 +119,22 @@ def tasks(spec: dict[str, Any]) -> list[str]:
     return [task for name, task in _TASKS.items() if name in has]
 
 
-def card_header(manifest: dict[str, Any]) -> str:
-    """The YAML block with which a card begins; each value is JSON, which is YAML."""
+def card_header(manifest: dict[str, Any], files: dict[str, str] | None = None) -> str:
+    """The YAML block with which a card begins; each value is JSON, which is YAML.
+
+    Parameters
+    ----------
+    manifest : content of ``benchmark.json``.
+    files : pattern of the files of each split, where hubs can load them.
+    """
     count = len(manifest["clips"])
     size = next((name for most, name in _SIZES if count < most), "n>1M")
     values = {
         "pretty_name": manifest["name"], "tags": TAGS, "task_categories": tasks(manifest["spec"]),
         "size_categories": [size], "annotations_creators": ["machine-generated"],
     }  # fmt: skip
+    if files:
+        splits = [{"split": _SPLIT_NAMES.get(split, split), "path": pattern} for split, pattern in files.items()]
+        values["configs"] = [{"config_name": "default", "data_files": splits}]
     lines = [f"{key}: {json.dumps(value, ensure_ascii=True)}" for key, value in values.items() if value]
     return "\n".join(["---", *lines, "---", ""])

@@ -30,12 +30,13 @@ def samples(clip: BenchmarkClip) -> Iterator[tuple[str, dict[str, NDArray], dict
     Yields
     ------
     Name, arrays and figures. Arrays: ``raw`` (uint16, DN) and ``sharp`` (uint16, DN, of the sharp image nearest to the
-    middle of the exposure), ``events`` (`EVENT_DTYPE`) with ``label`` (uint8), and the geometric truth of the frame, as
-    far as the clip has them. Figures: split, times, levels and shapes.
+    middle of the exposure), ``events`` (`EVENT_DTYPE`) with ``label`` (uint8) and ``event_object`` (uint16), and the
+    geometric truth of the frame, as far as the clip has them. Figures: split, times, levels and shapes.
     """
     recording, sharp, stored = clip.recording, clip.sharp, clip.recording.stored_truth
     frames, mosaic = recording.frames, recording.mosaic
     labels = recording.event_labels
+    objects = recording.event_objects if recording.has_event_objects else None
     when = recording.events["t_us"]
     begins = [frame.exposure_start_us for frame in frames][1:]
     edges = np.searchsorted(when, begins, side="right") if begins else np.empty(0, np.int64)
@@ -53,6 +54,8 @@ def samples(clip: BenchmarkClip) -> Iterator[tuple[str, dict[str, NDArray], dict
             arrays["events"] = recording.events[part]
             if labels is not None:
                 arrays["label"] = labels.label[part]
+            if objects is not None:
+                arrays["event_object"] = objects[part]
         if len(frames):
             frame = frames[number]
             arrays["raw"] = frame.raw

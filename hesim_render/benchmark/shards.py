@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from hesim_render.benchmark.folder import Benchmark, parsed_json
+from hesim_render.benchmark.croissant import card_header
+from hesim_render.benchmark.folder import CARD_FILE, Benchmark, parsed_json
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.samples import samples
 from hesim_render.benchmark.store import Put, store_of
@@ -104,7 +105,8 @@ def pack_benchmark(
     """Write all samples of a benchmark (`samples`) into shards of each split: ``train-000000.tar``, …
 
     A folder appears whole or not at all. At an address a shard appears when all of it is written, and ``index.json``
-    comes last: with it the set is whole. After an error no shard is left there.
+    comes last: with it the set is whole. ``README.md`` has the header that hubs read. After an error no shard is left
+    there.
 
     Parameters
     ----------
@@ -152,10 +154,20 @@ def pack_benchmark(
             "schema_version": _SCHEMA, "benchmark": benchmark.manifest["name"], "digest": digest_of(benchmark),
             "format": format, "shards": shards,
         }  # fmt: skip
+        card = Path(folder) / CARD_FILE
+        card.write_text(_card(benchmark.manifest, shards, format), encoding="utf-8")
+        put(CARD_FILE, card)
         file = Path(folder) / INDEX_FILE
         file.write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
         put(INDEX_FILE, file)
     return sum(shard["samples"] for shard in shards)
+
+
+def _card(manifest: dict[str, Any], shards: list[dict[str, Any]], format: str) -> str:
+    """The header that hubs read, and where the card of the benchmark is."""
+    splits = [split for split in SPLITS if any(shard["split"] == split for shard in shards)]
+    header = card_header(manifest, {split: f"{split}-*.{FORMATS[format]}" for split in splits})
+    return f"{header}\nShards of a benchmark of hesim_render; `{INDEX_FILE}` has their SHA-256 and its digest.\n"
 
 
 def _write_split(

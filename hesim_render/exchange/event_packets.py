@@ -64,19 +64,19 @@ def _message(t_us: int, shape: tuple[int, int], number: int, words: NDArray[np.u
     return data + bytes(-len(data) % 4) + struct.pack("<I", words.nbytes) + words.tobytes()
 
 
-def read_header(path: Path) -> tuple[tuple[int, int], str] | None:
-    """Shape (rows, columns) and topic of the packets, of the first topic if there are several; None without any.
+def read_header(path: Path) -> tuple[tuple[int, int], str]:
+    """Shape (rows, columns) and topic of the packets, of the first topic if there are several.
 
     Raises
     ------
     SpecError
-        If the file is no MCAP file, or is damaged.
+        If the file is no MCAP file, is damaged, or has no packets.
     """
     mcap_file.holds(path)
     for topic, data in mcap_file.messages(path, None, mcap_file.PACKET_TYPES):
         shape, _ = _parts(data, path)
         return shape, topic
-    return None
+    raise SpecError("has no messages of type EventPacket (event_camera_msgs)", file=path)
 
 
 def read(path: Path, topic: str) -> Iterator[NDArray]:

@@ -171,8 +171,8 @@ def _open_npz(file: Path) -> EventStream:
 
 
 def _open_mcap(file: Path) -> EventStream:
-    if (packets := event_packets.read_header(file)) is not None:
-        shape, topic = packets
+    if mcap_file.first_type(file) == mcap_file.PACKET_TYPES:
+        shape, topic = event_packets.read_header(file)
         triggers = lambda: event_packets.read_triggers(file, topic)  # noqa: E731
         return EventStream(lambda: event_packets.read(file, topic), shape, file, triggers=triggers)
     shape, topic = mcap_file.read_header(file)

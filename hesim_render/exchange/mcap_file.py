@@ -288,6 +288,28 @@ def messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, by
             yield topics[record.channel_id], record.data
 
 
+def first_type(path: Path) -> str | None:
+    """The end of the type's name of the first message of events, ``/EventArray`` or ``/EventPacket``; None without any.
+
+    Raises
+    ------
+    SpecError
+        If the file is no MCAP file, or is damaged.
+    """
+    from mcap.records import Channel, Message, Schema
+
+    ends: dict[int, str] = {}
+    channels: dict[int, str] = {}
+    for record in _records(path):
+        if isinstance(record, Schema) and record.name.endswith((_EVENT_TYPES, PACKET_TYPES)):
+            ends[record.id] = "/" + record.name.rpartition("/")[2]
+        elif isinstance(record, Channel) and record.schema_id in ends:
+            channels[record.id] = ends[record.schema_id]
+        elif isinstance(record, Message) and record.channel_id in channels:
+            return channels[record.channel_id]
+    return None
+
+
 def _records(path: Path) -> Iterator[Any]:
     """Schemas, channels and messages of a file, from its parts as well."""
     _require(path)

@@ -196,6 +196,11 @@ class Recording:
             self._labels = read_labels(self.path, self.event_shape, self.manifest["counts"]["events"])
         return self._labels
 
+    @property
+    def has_event_objects(self) -> bool:
+        """True if the run has written the object of each event."""
+        return self.path is not None and (self.path / OBJECT_FILE).is_file()
+
     @cached_property
     def event_objects(self) -> NDArray[np.uint16]:
         """The object that the pixel of each event shows at the event's time, uint16 [event]: that of the chief ray
@@ -208,7 +213,7 @@ class Recording:
         SpecError
             If the file is damaged, or the scene is not known.
         """
-        if self.path is not None and (self.path / OBJECT_FILE).is_file():
+        if self.path is not None and self.has_event_objects:
             return read_objects(self.path, self.manifest["counts"]["events"])
         events = self.events
         return self.truth.objects_at(events["t_us"], events["x"], events["y"])
@@ -306,7 +311,7 @@ class Recording:
         from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
 
         if self.path is not None:
-            if (self.path / OBJECT_FILE).is_file():
+            if self.has_event_objects:
                 writer.copy_in(inside(self.path, OBJECT_FILE), OBJECT_FILE)
             if (self.path / TRUTH_FILE).is_file():
                 writer.copy_in(inside(self.path, TRUTH_FILE), TRUTH_FILE)

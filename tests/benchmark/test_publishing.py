@@ -11,6 +11,7 @@ import hesim_render as hr
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark
 from hesim_render.benchmark.croissant import card_header, tasks
+from hesim_render.benchmark.shards import pack_benchmark
 from hesim_render.benchmark.tonic_dataset import EventDataset
 from hesim_render.core.errors import RangeError, SpecError
 
@@ -63,6 +64,17 @@ def test_the_card_begins_with_the_header_that_hubs_read(built):
     assert values["pretty_name"] == "small" and values["size_categories"] == ["n<1K"]
     assert values["task_categories"] == ["image-to-image", "depth-estimation"]
     assert "event-camera" in values["tags"] and body.startswith("\n# small\n")
+
+
+def test_shards_tell_hubs_the_files_of_each_split(built, tmp_path):
+    pack_benchmark(built.root, tmp_path / "x")
+    _, header, body = (tmp_path / "x" / "README.md").read_text().split("---\n", 2)
+    files = YAML(typ="safe").load(header)["configs"][0]["data_files"]
+    assert files == [{"split": "train", "path": "train-*.tar"}, {"split": "test", "path": "test-*.tar"}]
+    assert all(list((tmp_path / "x").glob(entry["path"])) for entry in files) and "index.json" in body
+    given = {"clips": [], "name": "n", "spec": {"truth": [], "sharp": None}}
+    values = YAML(typ="safe").load(card_header(given, {"val": "val-*.h5"}).split("---\n")[1])
+    assert values["configs"][0]["data_files"] == [{"split": "validation", "path": "val-*.h5"}]
 
 
 def test_sizes_and_tasks_of_other_benchmarks():

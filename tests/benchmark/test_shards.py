@@ -56,6 +56,8 @@ def same_as(clip, found):
     labels = np.concatenate([sample["label.npy"] for sample in found.values()])
     assert np.array_equal(events, recording.events) and len(events) > 20
     assert np.array_equal(labels, recording.event_labels.label)
+    objects = np.concatenate([sample["event_object.npy"] for sample in found.values()])
+    assert np.array_equal(objects, recording.event_objects) and recording.has_event_objects
     for number, (name, sample) in enumerate(found.items()):
         frame = recording.frames[number]
         assert name == f"{clip.name}-{number:06d}" and sample["json"]["index"] == number
@@ -187,7 +189,7 @@ def test_an_error_leaves_no_shards_and_no_half_of_two_sets(built, tmp_path, kind
             pack_benchmark(built.root, target, shard_mb=1e-6)
         assert verify_shards(target) == []
     if kind != "memory":
-        assert len(list(tmp_path.iterdir())) == 1 and len(list(next(tmp_path.iterdir()).iterdir())) == 7
+        assert len(list(tmp_path.iterdir())) == 1 and len(list(next(tmp_path.iterdir()).iterdir())) == 8
 
 
 @pytest.mark.parametrize("name", ["../../outside", "..", "/etc/x", "a/b", "other", "x\n"])
