@@ -30,8 +30,8 @@ DRAWN: dict[str, Callable[[Recording, Path], object]] = {}
 #: Ends of the names of formats that are one file; all others are folders.
 SUFFIXES: dict[str, tuple[str, ...]] = {
     **{name: (kind.suffix,) for name, kind in EVENT_FORMATS.items()},
-    "dsec": (".h5", ".hdf5"),
-    **{name: (".mcap" if name == "mcap" else ".mp4",) for name in WHOLE_FORMATS if name != "raw-npz"},
+    **{name: (".h5", ".hdf5") for name in ("dsec", "dsec-gzip", "prophesee")},
+    **{name: (".mcap" if name.startswith("mcap") else ".mp4",) for name in WHOLE_FORMATS if name != "raw-npz"},
 }
 _FILES = {end for ends in SUFFIXES.values() for end in ends} | {kind.suffix for kind in FRAME_FORMATS.values()}
 _FILES |= {".tif", ".exr", ".yaml", ".csv", ".json"}
