@@ -220,13 +220,14 @@ def test_a_name_that_says_another_format_is_refused(tmp_path, capsys):
     recording = recordings.make("davis346", tmp_path / "r")
     files = {"evt2": ".raw", "evt3": ".raw", "dat": ".dat", "prophesee": ".h5 or .hdf5", "aedat4": ".aedat4",
              "dsec": ".h5 or .hdf5", "dsec-gzip": ".h5 or .hdf5", "npz": ".npz", "txt": ".txt", "nmnist": ".bin",
-             "mcap": ".mcap", "mcap-evt3": ".mcap", "mp4": ".mp4", "mp4-colour": ".mp4", "mp4-events": ".mp4"}  # fmt: skip
+             "mcap": ".mcap", "mcap-evt3": ".mcap", "mp4": ".mp4", "mp4-colour": ".mp4",
+             "mp4-events": ".mp4"}  # fmt: skip
     for name, end in files.items():
         for given in ("out", "out.tiff", "out.raw" if end != ".raw" else "out.h5"):
             with pytest.raises(OutputError, match=rf"{given}: {name} is a file; give a name that ends in {end}$"):
                 recording.export(name, tmp_path / given)
-    for name in ("tiff", "png", "npy", "mipi", "raw-npz", "exr", "tum", "kalibr", "opencv", "dsec-flow", "prophesee-boxes",
-                 "dsec-det", "coco"):  # fmt: skip
+    for name in ("tiff", "png", "npy", "mipi", "raw-npz", "exr", "tum", "kalibr", "opencv", "dsec-flow",
+                 "prophesee-boxes", "dsec-det", "coco"):  # fmt: skip
         for given in (".png", ".raw", ".exr"):
             with pytest.raises(OutputError, match=rf"out\{given}: {name} is a folder of files; give a name without"):
                 recording.export(name, tmp_path / f"out{given}")
