@@ -442,7 +442,7 @@ def test_samples_ask_for_the_exact_mode_and_have_no_sharp_images(tmp_path):
     recording = next(built.clips()).recording
     assert recording.manifest["settings"]["mode"] == "exact" and recording.manifest["settings"]["samples"] == 8
     text = (built.root / "README.md").read_text()
-    assert "8 rays per pixel" in text and "1 not audited" in text
+    assert "8 rays per pixel" in text and "1 met" in text
 
 
 def test_a_fault_of_ours_in_one_clip_does_not_stop_the_others(monkeypatch):
