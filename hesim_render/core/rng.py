@@ -49,6 +49,8 @@ class Stream(IntEnum):
     RENDER_GLARE = 61
     RENDER_EDGE = 62
     AUDIT_EDGE = 63
+    COLUMN_OFFSET = 70
+    COLUMN_NOISE = 71
 
 
 def stream_key(seed: int, stream: Stream) -> int:

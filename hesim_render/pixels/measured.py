@@ -14,7 +14,7 @@ from hesim_render.specs.calibration_rates import PER_INTERVAL, PER_SECOND, per_s
 from hesim_render.specs.calibration_spec import Defect
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
-_EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "bad_pixels": ("b", 1.0)}
+_EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "response": ("f", 1e3), "bad_pixels": ("b", 1.0)}
 _EXPECTED |= {
     "defect": ("u", 255.0), "defect_on_per_trial": ("f", 1.0), "defect_off_per_trial": ("f", 1.0),
     "defect_firing_share": ("f", 1.0), "defect_correlation": ("f", 1.0),
@@ -24,7 +24,7 @@ _EXPECTED |= {
 }  # fmt: skip
 _THRESHOLD = ("fiu", 1e3)  # relative to the mean
 #: Maps that a calibration may lack: thresholds if no steps were shown; the others in older calibrations.
-_MAY_LACK = ("threshold_", "defect", "telegraph_")
+_MAY_LACK = ("threshold_", "defect", "telegraph_", "response")
 
 
 def require_region(layout: Layout) -> None:
@@ -50,13 +50,16 @@ def measured_part(layout: Layout) -> Layout:
 
 
 def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
-    """``n_row`` [row, 1], ``n_blc`` and ``n_dp`` [row, col] over the region: DN, DN and DN/s; None if not measured."""
-    found = _read(layout, "aps", ("n_row", "n_blc", "n_dp"))
+    """``n_row`` [row, 1], ``n_blc`` and ``n_dp`` [row, col] over the region: DN, DN and DN/s; None if not measured.
+
+    ``response`` [row, col], 1 + PRNU, is there if a flat field was captured.
+    """
+    found = _read(layout, "aps", ("n_row", "n_blc", "n_dp", "response"))
     if found is None:
         return None
     maps, (row, _) = found
     rows = slice(row, row + layout.rows)
-    cut = _frame_region(layout, found, ("n_blc", "n_dp"))
+    cut = _frame_region(layout, found, tuple(name for name in ("n_blc", "n_dp", "response") if name in maps))
     return {name: values.astype(np.float32) for name, values in (cut | {"n_row": maps["n_row"][rows, None]}).items()}
 
 

@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.guard import reading, require_memory
-from hesim_render.core.npz import read_array, read_arrays
 from hesim_render.exchange import EventStream, mcap_file, open_events
 from hesim_render.exchange.triggers import exposures
 from hesim_render.mosaic.description import describe
 from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw
-from hesim_render.recording.dng import is_packed, read_dng
+from hesim_render.recording.dng import is_packed
 from hesim_render.recording.exports import mosaic_encoding
 from hesim_render.recording.frame import Frame
+from hesim_render.recording.raw_file import read_raw
 from hesim_render.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -173,18 +172,8 @@ def _frame(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
     suffix, shape = file.suffix.lower(), sensor.layout.shape
     if suffix in CAMERA_SUFFIXES or (suffix == ".dng" and is_packed(file)):
         raw = read_camera_raw(file, sensor)
-    elif suffix in (".dng", ".tif", ".tiff"):
-        raw = read_dng(file, shape)
-    elif suffix == ".png":
-        raw = _png(file, shape)
-    elif suffix == ".npy":
-        raw = read_array(file, shape, "u")
-    elif suffix == ".npz":
-        raw = _array_of(file, shape)
     else:
-        raise SpecError(
-            "is no frame; expected .dng, .tif, .tiff, .png, .npy, .npz or a RAW file of a camera", file=file
-        )
+        raw = read_raw(file, shape)
     return _checked(raw, sensor, file)
 
 
@@ -195,23 +184,3 @@ def _checked(raw: NDArray[np.uint16], sensor: Sensor, file: Path) -> NDArray[np.
     if raw.max() >= 1 << bit_depth:
         raise SpecError(f"holds {raw.max()} DN; the sensor has {bit_depth} bit", file=file)
     return raw
-
-
-def _array_of(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
-    """A frame of H-ESIM (``raw``) or RGB-Event-ISP (``aps_raw``)."""
-    with reading(file, "as arrays"), np.load(file) as arrays:
-        names = [name for name in ("aps_raw", "raw") if name in arrays.files]
-    if not names:
-        raise SpecError("holds no array 'raw' or 'aps_raw'", file=file)
-    return read_arrays(file, names, only=names[:1], shapes={names[0]: shape}, kinds="u")[names[0]].astype(np.uint16)
-
-
-def _png(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
-    from PIL import Image
-
-    with reading(file, "as a PNG file"), Image.open(file, formats=["PNG"]) as image:
-        if image.size != shape[::-1] or image.mode not in ("L", "I;16"):
-            told = f"is a {image.mode} picture of {image.size[0]}x{image.size[1]} px"
-            raise SpecError(f"{told}; expected a grey one of {shape[1]}x{shape[0]} px", file=file)
-        require_memory(2 * shape[0] * shape[1], "the picture", file)
-        return np.asarray(image).astype(np.uint16)

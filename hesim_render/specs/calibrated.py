@@ -91,6 +91,11 @@ def _aps_values(own: Mapping[str, Any], data: CalibrationSpec, aps: FrameSection
         "row_noise_dn": 0.0 if aps.row_noise_dn is None else aps.row_noise_dn.value or 0.0,
         "beta": [[[b or 0.0 for b in cell] for cell in row] for row in aps.beta],
     }
+    if aps.column_noise_dn is not None:
+        values["column_noise_dn"] = aps.column_noise_dn.value or 0.0
+    for key in ("column_offset_std_dn", "nonlinearity"):
+        if getattr(aps, key) is not None:
+            values[key] = getattr(aps, key)
     if aps.full_well_e.limited_by == "full well":
         values["full_well_e"] = aps.full_well_e.value
     for key, item, scale in (

@@ -77,7 +77,7 @@ def _checked(path: Path, data: Any) -> CalibrationSpec:
 SENSOR_MAPS = {
     section: tuple(dict.fromkeys((*names, *PER_SECOND[section], *PER_INTERVAL[section])))
     for section, names in (
-        ("aps", ("n_row", "n_blc", "n_dp")),
+        ("aps", ("n_row", "n_blc", "n_dp", "response")),
         ("evs", ("bad_pixels", "threshold_on_relative", "threshold_off_relative")),
     )
 }

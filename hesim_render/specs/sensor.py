@@ -33,6 +33,8 @@ Role = Literal["aps", "evs"]
 
 #: Smallest threshold if a change gives one event per threshold that it contains.
 _LEAST_THRESHOLD = 1e-4
+#: Smallest slope of a bent signal up to full scale; the light could not be told from the signal below.
+_LEAST_SLOPE = 0.05
 
 
 class GeometrySpec(Strict):
@@ -84,6 +86,16 @@ class ApsSpec(Strict):
     dsnu_e: float = Field(0.0, ge=0, le=1e6, description="std over pixels of the fixed offset N_BLC, in electrons")
     row_offset_std_dn: float = Field(0.0, ge=0, le=65_535, description="std over rows of the fixed offset N_row")
     row_noise_dn: float = Field(0.0, ge=0, le=65_535, description="temporal: std of what a row gets anew in each frame")
+    column_offset_std_dn: float = Field(0.0, ge=0, le=65_535, description="std over columns of the fixed offset N_col")
+    column_noise_dn: float = Field(
+        0.0, ge=0, le=65_535, description="temporal: std of what a column gets anew in each frame"
+    )
+    nonlinearity: list[float] | None = Field(
+        None,
+        min_length=1,
+        max_length=3,
+        description="n0, n1, n2: the signal E = K·electrons becomes E (1 + n0 + n1 u + n2 u²), u = E/full scale",
+    )
     residual_noise_dn: float = Field(0.0, ge=0, le=65_535, description="N_res: extra Gaussian temporal noise")
     telegraph: TelegraphSpec | None = Field(None, description="pixels that jump between two levels; default none")
     law: Literal["poisson", "gaussian"] = "poisson"
@@ -107,6 +119,15 @@ class ApsSpec(Strict):
             raise ValueError(
                 f"exposure_us {self.exposure_us} is longer than a frame period of {1e6 / self.frame_rate_hz:.0f} µs"
             )
+        if self.nonlinearity is not None:
+            n0, n1, n2 = (*self.nonlinearity, 0.0, 0.0)[:3]
+            # slope 1 + n0 + 2 n1 u + 3 n2 u² at both ends and at its extreme between them
+            places = [0.0, 1.0] + ([-n1 / (3 * n2)] if n2 != 0 and 0 < -n1 / (3 * n2) < 1 else [])
+            if not min(1 + n0 + 2 * n1 * u + 3 * n2 * u * u for u in places) >= _LEAST_SLOPE:
+                raise ValueError(
+                    f"nonlinearity {self.nonlinearity}: the signal must rise with the light up to full scale, with a "
+                    f"slope of at least {_LEAST_SLOPE:g}"
+                )
         if self.excess_temperature_c != 0:
             if self.dark_current_doubling_c is None:
                 raise ValueError(

@@ -15,6 +15,7 @@ from hesim_render.calibrate.aps.composite import Composite, clear_of_clipping, c
 from hesim_render.calibrate.aps.dark import DarkModel, fit_dark
 from hesim_render.calibrate.aps.fitted import ApsCalibration, Position
 from hesim_render.calibrate.aps.output import content, maps
+from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.photon_transfer import linearity, photon_transfer
 from hesim_render.calibrate.aps.telegraph import TelegraphMaps, find_telegraph
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance, join, pool, variance_map
@@ -23,6 +24,7 @@ from hesim_render.calibrate.result import check_calibration, check_report, write
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet, FrameStack, read_captures
+from hesim_render.recording.pair_set import is_pair_set
 
 _POOR_FIT_SIGMAS = 8.0
 
@@ -38,7 +40,8 @@ def calibrate_aps(
 
     Parameters
     ----------
-    folder : capture set with ``capture.yaml``, ``aps_dark.npz`` and ``aps_lit.npz``.
+    folder : capture set with ``capture.yaml``, ``aps_dark.npz`` and ``aps_lit.npz``; or captures of EMVA 1288, in the
+        layout of the standard's own data sets (``EMVA1288_Data.txt``) or as pairs by name.
     out : the calibration; its section ``aps`` is written, others are kept.
     report : HTML file, if wanted; it covers every section of `out`, and an earlier report of `out` is replaced.
     progress : called with a text that names the current work and the fraction done.
@@ -55,6 +58,9 @@ def calibrate_aps(
     OutputError
         If a result cannot be written.
     """
+    if is_pair_set(folder):
+        calibrate_pairs(folder, out, report, progress, overwrite)
+        return Path(out)
     captures = read_captures(folder)
     check_calibration(out, describe(captures))
     if report is not None:

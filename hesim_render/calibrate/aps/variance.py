@@ -9,6 +9,7 @@ into bins of brightness that keep their moments: only the weight is constant wit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
 
@@ -179,12 +180,17 @@ class VarianceFit:
     hidden_pixels: int
 
 
-def fit_variance(bins: Pooled) -> VarianceFit:
+def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
     """Iteratively reweighted least squares, corrected for the noise of the signal.
 
     A signal estimated with error variance τ² inflates Σ I², Σ I³ and Σ I⁴ by known amounts (corrected
     score, Carroll et al., *Measurement Error in Nonlinear Models*, ch. 7); these are taken off, so noise
     neither biases β nor lets a flat scene pass for one of many brightnesses.
+
+    Parameters
+    ----------
+    bins : pooled variances.
+    without : numbers of terms that are not fitted.
     """
     everything = bins.pixels.sum()
     seen = bins.variance_dn2 >= HIDDEN_VARIANCE_DN2
@@ -197,7 +203,7 @@ def fit_variance(bins: Pooled) -> VarianceFit:
     scale[2] = float(bins.exposure_s.max())
     units = np.prod(scale[1:] ** np.stack([_LIGHT, _TIME], axis=1), axis=1)
     equations = _normal_equations(bins, scale)
-    dropped: list[int] = []
+    dropped = list(without)
     limit = _USELESS * float(bins.variance_dn2[bins.pixels >= np.median(bins.pixels)].max())
     while True:
         solved = beta, keep, covariance, chi2, dof = _solve(bins, units, equations, dropped)

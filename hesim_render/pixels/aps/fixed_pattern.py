@@ -31,7 +31,7 @@ class FixedPattern(PlainState):
     spec : the ``aps`` section of the sensor file.
     layout : region read out.
     device_seed : which device of this kind.
-    off : names of terms left out (``prnu``, ``dsnu``, ``row``, ``dark_current``).
+    off : names of terms left out (``prnu``, ``dsnu``, ``row``, ``column``, ``dark_current``).
     """
 
     spec: ApsSpec
@@ -50,15 +50,20 @@ class FixedPattern(PlainState):
     @cached_property
     def response(self) -> Map:
         """1 + PRNU, [row, col]; the number 1 where there is no spread. Never below 0."""
-        if "prnu" in self.off or self.spec.prnu_rel == 0:
+        if "prnu" in self.off:
+            return 1.0
+        if self._measured is not None and "response" in self._measured:
+            return np.maximum(self._measured["response"], np.float32(0.0))
+        if self.spec.prnu_rel == 0:
             return 1.0
         return np.maximum(1.0 + np.float32(self.spec.prnu_rel) * self._deviates(Stream.PRNU), np.float32(0.0))
 
     @cached_property
     def offset_dn(self) -> Map:
-        """N_FP = black + N_row + N_BLC in DN, [row, col]; a number where there is no spread.
+        """N_FP = black + N_row + N_col + N_BLC in DN, [row, col]; a number where there is no spread.
 
-        N_BLC = K·dsnu_e·z is drawn per pixel, N_row per row of the full sensor. The draws are independent. A
+        N_BLC = K·dsnu_e·z is drawn per pixel, N_row per row and N_col per column of the full sensor. The draws are
+        independent. Measured N_BLC has the columns in it. A
         calibration uses the gauge in which the row means of N_BLC are 0, so it splits the same sum slightly
         differently. Measured maps replace both draws.
         """
@@ -73,6 +78,10 @@ class FixedPattern(PlainState):
             offset = np.broadcast_to(
                 np.float32(spec.black_level_dn) + np.float32(spec.row_offset_std_dn) * deviates, self.layout.shape
             )
+        if "column" not in self.off and spec.column_offset_std_dn > 0:
+            cols = np.arange(self.layout.col0, self.layout.col0 + self.layout.cols, dtype=np.uint32)[None]
+            deviates = device_normal(self.device_seed, Stream.COLUMN_OFFSET, cols)
+            offset = np.broadcast_to(offset + np.float32(spec.column_offset_std_dn) * deviates, self.layout.shape)
         if "dsnu" not in self.off and spec.dsnu_e > 0:
             offset = offset + np.float32(spec.system_gain_dn_per_e * spec.dsnu_e) * self._deviates(Stream.DSNU)
         return offset

@@ -3,16 +3,17 @@
 Physical form, per pixel, I_e light electrons, D dark current in e⁻/s, t exposure in s, K gain in DN/e⁻::
 
     N_e = min( Poisson( (1 + PRNU)·I_e + D·t ), full well ) + N(0, σ_r²)
-    DN  = clip( round( K·N_e + N_FP + N_tr + N_res ), 0, 2^bits − 1 )
+    DN  = clip( round( f(K·N_e) + N_FP + N_tr + N_tc + N_res ), 0, 2^bits − 1 )
 
-Polynomial form (``aps.beta`` given), I = K·(1 + PRNU)·I_e in DN, per tile position::
+Polynomial form (``aps.beta`` given), I = f(K·(1 + PRNU)·I_e) in DN, per tile position::
 
     mean = I + t·N_DP + N_FP
-    Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC, without N_tr
+    Var  = β0 + β1 I + β2 t + β3 I² + β4 I·t + β5 t²        before the ADC, without N_tr, N_tc
 
 Both forms are cases of one model (`PixelValue`). A count with mean m is Poisson, or Gaussian with variance m. It is
-multiplied by a gain in DN and added to fixed DN and a Gaussian. N_FP = black + N_row + N_BLC. N_tr is one Gaussian
-number per row of a frame, shared by the pixels of the row (temporal row noise). The ADC rounds once: no uniform noise
+multiplied by a gain in DN and added to fixed DN and a Gaussian. N_FP = black + N_row + N_col + N_BLC. N_tr is one
+Gaussian number per row of a frame, shared by the pixels of the row (temporal row noise), N_tc likewise one per column.
+f is the identity, or a smooth curve (`Curve`). The ADC rounds once: no uniform noise
 is added, and every variance here excludes its q²/12.
 
 Arrays are NumPy's or Dr.Jit's (`hesim_render.core.namespace`); nothing here draws a random number.
@@ -83,6 +84,38 @@ class PixelValue:
     def variance_dn2(self) -> Values:
         """Temporal variance, DN²."""
         return self.gain_dn * self.gain_dn * self.count + self.gaussian_dn2
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Smooth non-linearity of the signal: f(E) = E (1 + n₀ + n₁ u + n₂ u²), u = E/full scale, E = K·electrons in DN.
+
+    Beyond full scale f goes on as a straight line through the origin. n₀ is 0 where K is the gain at no light; a K that is
+    a mean over a range, as of EMVA 1288, is less than that.
+    """
+
+    terms: tuple[float, float, float]
+    full_scale_dn: float
+
+    @classmethod
+    def of(cls, terms: Sequence[float] | None, full_scale_dn: float) -> Curve | None:
+        """The curve of a sensor file; None where there is none."""
+        if terms is None:
+            return None
+        n0, n1, n2 = (*terms, 0.0, 0.0)[:3]
+        return cls((n0, n1, n2), full_scale_dn)
+
+    def factor(self, signal_dn: Values, xp: Namespace) -> Values:
+        """f(E)/E."""
+        n0, n1, n2 = self.terms
+        u = xp.minimum(signal_dn, self.full_scale_dn) / self.full_scale_dn
+        return 1.0 + n0 + u * (n1 + u * n2)
+
+    def slope(self, signal_dn: Values, xp: Namespace) -> Values:
+        """df/dE up to full scale, and its value there beyond."""
+        n0, n1, n2 = self.terms
+        u = xp.minimum(signal_dn, self.full_scale_dn) / self.full_scale_dn
+        return 1.0 + n0 + u * (2.0 * n1 + u * (3.0 * n2))
 
 
 def light_gain_dn(beta: Sequence[Values] | NDArray, signal_dn: Values, exposure_s: Values) -> Values:
@@ -182,6 +215,7 @@ def calibrated_value(
     system_gain_dn_per_e: float,
     full_scale_dn: float,
     xp: Namespace,
+    curve: Curve | None = None,
 ) -> PixelValue:
     """Value of a pixel in the polynomial form. The light is a count of g = β1 + β3 I + β4 t DN per unit.
 
@@ -196,6 +230,7 @@ def calibrated_value(
     system_gain_dn_per_e : K, DN/e⁻.
     full_scale_dn : largest value of the ADC, DN.
     xp : functions of the arrays' library.
+    curve : non-linearity of the signal. The polynomial is one in the signal that comes out of it.
 
     Returns
     -------
@@ -203,11 +238,36 @@ def calibrated_value(
     """
     assert pixels.beta is not None
     signal = system_gain_dn_per_e * (pixels.response * electrons)
+    if curve is not None:
+        signal = signal * curve.factor(signal, xp)
     gain = light_gain_dn(pixels.beta, xp.minimum(signal, full_scale_dn), exposure_s)
     noisy = gain > 0.0
     count = xp.where(noisy, signal / xp.where(noisy, gain, 1.0), 0.0)
     fixed = system_gain_dn_per_e * (pixels.dark_e_per_s * exposure_s) + xp.where(noisy, 0.0, signal)
     return PixelValue(fixed, gain, count, xp.maximum(dark_variance_dn2(pixels.beta, exposure_s), 0.0))
+
+
+def bent_value(value: PixelValue, system_gain_dn_per_e: float, curve: Curve, xp: Namespace) -> PixelValue:
+    """Value of a pixel in the physical form whose signal passes a curve.
+
+    The signal becomes f(E) and its variance f'(E)² K E, which is that of a count of f(E)/g with g = K E f'(E)²/f(E) DN each.
+
+    Parameters
+    ----------
+    value : the law without the curve, whose count has K DN per electron.
+    system_gain_dn_per_e : K, DN/e⁻.
+    curve : the non-linearity.
+    xp : functions of the arrays' library.
+
+    Returns
+    -------
+    Law of the value.
+    """
+    whole = value.fixed_dn + system_gain_dn_per_e * value.count
+    factor, slope = curve.factor(whole, xp), curve.slope(whole, xp)
+    gain = system_gain_dn_per_e * slope * slope / factor
+    # the noisy part of the signal keeps its part of the mean
+    return PixelValue(value.fixed_dn * factor, gain, value.count * (system_gain_dn_per_e * factor / gain), value.gaussian_dn2)
 
 
 def noise_equivalent_e(

@@ -26,7 +26,10 @@ from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
 from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.sensor import ApsSpec
 
-APS_TERMS = ("shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk", "telegraph")
+APS_TERMS = (
+    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "column", "column_noise", "residual", "crosstalk",
+    "telegraph",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,8 +67,8 @@ class ApsNoise(PlainState):
         """The same model with terms of `APS_TERMS` switched off.
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
-        ``read`` is σ_r (β0), ``prnu``, ``dsnu`` and ``row`` are the fixed maps, ``row_noise`` is N_tr, ``residual``
-        is N_res, ``crosstalk`` is the light that these pixels get from their neighbours, ``telegraph`` is the random
+        ``read`` is σ_r (β0), ``prnu``, ``dsnu``, ``row`` and ``column`` are the fixed maps, ``row_noise`` is N_tr,
+        ``column_noise`` is N_tc, ``residual`` is N_res, ``crosstalk`` is the light that these pixels get from their neighbours, ``telegraph`` is the random
         telegraph noise.
 
         Raises
@@ -88,6 +91,11 @@ class ApsNoise(PlainState):
     def row_noise_dn(self) -> float:
         """Standard deviation of N_tr, DN."""
         return 0.0 if "row_noise" in self.off else self.spec.row_noise_dn
+
+    @property
+    def column_noise_dn(self) -> float:
+        """Standard deviation of N_tc, DN."""
+        return 0.0 if "column_noise" in self.off else self.spec.column_noise_dn
 
     @cached_property
     def telegraph(self) -> TelegraphPixels | None:
@@ -161,13 +169,16 @@ class ApsNoise(PlainState):
         -------
         Law of the values, DN.
         """
-        gain = self.spec.system_gain_dn_per_e
+        gain, full_scale = self.spec.system_gain_dn_per_e, float(self.full_scale_dn)
+        curve = formulas.Curve.of(self.spec.nonlinearity, full_scale)
         if pixels.beta is None:
             read_noise_e = 0.0 if "read" in self.off else self.spec.read_noise_e
             shot = "shot" not in self.off
             value = formulas.physical_value(electrons, exposure_s, pixels, gain, read_noise_e, shot)
+            if curve is not None:
+                value = formulas.bent_value(value, gain, curve, xp)
         else:
-            value = formulas.calibrated_value(electrons, exposure_s, pixels, gain, float(self.full_scale_dn), xp)
+            value = formulas.calibrated_value(electrons, exposure_s, pixels, gain, full_scale, xp, curve)
         residual_dn2 = 0.0 if "residual" in self.off else self.spec.residual_noise_dn**2
         return replace(value, gaussian_dn2=value.gaussian_dn2 + residual_dn2)
 
@@ -230,13 +241,13 @@ class ApsNoise(PlainState):
     ) -> NDArray[np.float64]:
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
-        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr². An image also has telegraph
+        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr² + N_tc². An image also has telegraph
         noise. Near full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, which
         is accurate where the variance itself is above 0.24 DN².
         """
         values = self._checked(electrons, exposure_us)
         value, _ = self._on_host(values, exposure_us, position)
-        shared = self.row_noise_dn**2 + (ADC_VARIANCE_DN2 if adc else 0.0)
+        shared = self.row_noise_dn**2 + self.column_noise_dn**2 + (ADC_VARIANCE_DN2 if adc else 0.0)
         variance = np.asarray(value.variance_dn2 + shared, dtype=np.float64)
         if values.ndim and self.telegraph is not None:
             variance = np.broadcast_to(variance, values.shape).copy()
@@ -259,15 +270,15 @@ class ApsNoise(PlainState):
         """
         signal = np.maximum(np.asarray(electrons, dtype=np.float64), 0.0)
         value = self.value(signal, exposure_us * S_PER_US, self._nominal_pixel(None), NUMPY)
-        variance = value.variance_dn2 + self.row_noise_dn**2 + ADC_VARIANCE_DN2
+        variance = value.variance_dn2 + self.row_noise_dn**2 + self.column_noise_dn**2 + ADC_VARIANCE_DN2
         spec = self.spec
         return formulas.noise_equivalent_e(variance, spec.system_gain_dn_per_e, spec.prnu_rel, signal, NUMPY)
 
     def to_polynomial(self) -> list[list[list[float]]]:
         """The variance as [tile_row][tile_col][β0 … β5] in DN and s; exact for the physical form.
 
-        β0 = K²σ_r², β1 = K, β2 = K²D, the others are 0: PRNU is spatial and does not contribute to β3. N_res and N_tr
-        are not included.
+        β0 = K²σ_r², β1 = K, β2 = K²D, the others are 0: PRNU is spatial and does not contribute to β3. N_res, N_tr and
+        N_tc are not included.
         """
         if self.beta is not None:
             return self.beta.tolist()

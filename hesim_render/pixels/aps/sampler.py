@@ -117,5 +117,9 @@ def draw_dn(
         row = key // dr.opaque(types.UInt32, noise.layout.spec.geometry.cols)
         word = philox(seed, Stream.ROW_NOISE, row, frame).next_uint32x4()
         level = dr.fma(dr.opaque(types.Float, noise.row_noise_dn), normal_pair(word[0], word[1])[0], level)
+    if noise.column_noise_dn > 0:
+        columns = dr.opaque(types.UInt32, noise.layout.spec.geometry.cols)
+        word = philox(seed, Stream.COLUMN_NOISE, key % columns, frame).next_uint32x4()
+        level = dr.fma(dr.opaque(types.Float, noise.column_noise_dn), normal_pair(word[0], word[1])[0], level)
     # not clip: it would turn NaN into the largest integer, which is above the full scale of the ADC
     return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(noise.full_scale_dn)), 0.0))

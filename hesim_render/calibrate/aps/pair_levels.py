@@ -1,0 +1,187 @@
+"""Mean and temporal variance of each light and exposure of an EMVA 1288 set, from the difference of its two frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.moments import Progress
+from hesim_render.recording.pair_set import PairSet, Series
+
+#: Grey values within so many standard deviations of the mean are expected to occur.
+_CENTRAL = 1.5
+#: Fewest pixels that a grey value is expected to have before its absence tells something.
+_EXPECTED = 50.0
+#: Share of absent grey values from which frames were scaled after the ADC.
+_GAPS = 0.1
+#: Part of the pixels at an end of the ADC's range from which a variance is not that of the light.
+CLIPPED_SHARE = 1e-4
+#: Change of the light between frames of one series that is refused.
+MOST_CHANGE = 0.02
+_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Statistics of pairs, one entry a series.
+
+    Attributes
+    ----------
+    exposure_s, photons : of the series; photons are 0 in the dark and NaN where they are not stated.
+    mean : mean of both frames, DN.
+    change : mean of the first less that of the second frame, DN.
+    variance : temporal variance of a pixel, DN²: half the mean squared difference, less what the frames, rows and
+        columns share; the ADC's 1/12 is in it.
+    error : its standard error, from its scatter over rows.
+    row, col : variance of what rows and columns get anew in each frame, DN²; unbiased, hence possibly negative.
+    row_error, col_error : their standard errors.
+    squares : mean over pixels of the squared variance of one pixel, DN⁴.
+    low, high : part of the pixels at 0 and at full scale.
+    """
+
+    exposure_s: NDArray[np.float64]
+    photons: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    change: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    error: NDArray[np.float64]
+    row: NDArray[np.float64]
+    row_error: NDArray[np.float64]
+    col: NDArray[np.float64]
+    col_error: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @property
+    def clear(self) -> NDArray[np.bool_]:
+        """Series clear of both ends of the ADC's range."""
+        return (self.low <= CLIPPED_SHARE) & (self.high <= CLIPPED_SHARE)
+
+
+def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress | None = None) -> Levels:
+    """Read pairs, two at a time: decoding takes most of the time and releases Python's lock.
+
+    Raises
+    ------
+    SpecError
+        With file and line: if the two frames are one and the same, their light differs, or grey values are missing.
+    """
+    full = pairs.spec.full_scale_dn
+    different = list(dict.fromkeys(series))
+
+    def one(entry: Series) -> tuple[float, ...]:
+        first, second = pairs.frames(entry)
+        found = pair_statistics(first, second, full)
+        _check(entry, found, first, second, full)
+        return found
+
+    with ThreadPoolExecutor(2) as two:
+        results = []
+        for number, found in enumerate(two.map(one, different)):
+            results.append(found)
+            if progress is not None:
+                progress("reading pairs", (number + 1) / len(different))
+    found = dict(zip(different, results, strict=True))
+    photons = [0.0 if not s.lit else np.nan if s.photons is None else s.photons for s in series]
+    return levels([s.exposure_s for s in series], photons, [found[s] for s in series])
+
+
+def levels(exposure_s: Iterable[float], photons: Iterable[float], found: list[tuple[float, ...]]) -> Levels:
+    """`pair_statistics` of several pairs as one table."""
+    table = np.array(found, np.float64).T
+    return Levels(np.array(list(exposure_s)), np.array(list(photons)), *table)
+
+
+def pair_statistics(first: NDArray, second: NDArray, full_scale_dn: int) -> tuple[float, ...]:
+    """The statistics of `Levels` of one pair, from `mean` on.
+
+    The difference of the frames is free of every fixed pattern. Its variance is twice that of a frame [emva2021]. Row
+    means and column means of the difference have what rows and columns share; the pixels' part is that of the
+    residuals.
+    """
+    rows, cols = first.shape
+    difference = first.astype(np.float32) - second
+    mean = float(first.mean(dtype=np.float64) + second.mean(dtype=np.float64)) / 2
+    change = float(difference.mean(dtype=np.float64))
+    by_row = difference.mean(axis=1, dtype=np.float64) - change
+    by_col = difference.mean(axis=0, dtype=np.float64) - change
+    difference -= (by_row + change)[:, None].astype(np.float32)
+    difference -= by_col.astype(np.float32)
+    np.multiply(difference, difference, out=difference)
+    # the residuals have (rows − 1)(cols − 1) degrees of freedom
+    freedom = (1 - 1 / rows) * (1 - 1 / cols)
+    per_row = difference.mean(axis=1, dtype=np.float64) / (2 * freedom)
+    variance = float(per_row.mean())
+    squares = float(np.mean(difference.astype(np.float64) ** 2)) / (2 * freedom) ** 2
+    shared = []
+    for means, across in ((by_row, cols), (by_col, rows)):
+        whole = float(np.sum(means**2)) / (2 * (means.size - 1))
+        shared += [whole - variance / across, whole * np.sqrt(2 / (means.size - 1))]
+    ends = [float(np.mean((first == end) | (second == end))) for end in (0, full_scale_dn)]
+    return mean, change, variance, float(per_row.std(ddof=1)) / np.sqrt(rows), *shared, squares, *ends
+
+
+def _check(entry: Series, found: tuple[float, ...], first: NDArray, second: NDArray, full: int) -> None:
+    mean, change, variance = found[:3]
+    low, high = found[-2:]
+    if max(low, high) > 0.5:
+        return
+    if np.array_equal(first, second):
+        raise entry.error("both frames are the same; a pair has two exposures")
+    noise = np.sqrt(2 * variance / first.size + 2 * max(found[4], 0.0) / first.shape[0])
+    if entry.lit and abs(change) > MOST_CHANGE * mean and abs(change) > _SIGMAS * noise:
+        raise entry.error(
+            f"the light drifts: the second frame is {100 * abs(change) / mean:.2g} % "
+            f"{'darker' if change > 0 else 'brighter'} than the first; warm the light up and keep it steady"
+        )
+    absent, expected = _gaps(first, second, full)
+    if expected >= 4 and absent > _GAPS * expected:
+        raise entry.error(
+            f"{absent} of {expected} grey values around the mean never occur: the frames were scaled, or stretched to "
+            "more bits, after the ADC; capture RAW frames"
+        )
+
+
+def _gaps(first: NDArray, second: NDArray, full: int) -> tuple[int, int]:
+    """Grey values near the mean that no pixel has, and how many were expected."""
+    counts = np.bincount(first.ravel(), minlength=full + 1) + np.bincount(second.ravel(), minlength=full + 1)
+    value = np.arange(counts.size)
+    mean = float(counts @ value) / counts.sum()
+    spread = max(float(np.sqrt(counts @ (value - mean) ** 2 / counts.sum())), 0.5)
+    low, high = max(0, round(mean - _CENTRAL * spread)), min(full, round(mean + _CENTRAL * spread))
+    if counts.sum() * 0.13 / spread < _EXPECTED:
+        return 0, 0
+    return int(np.sum(counts[low : high + 1] == 0)), high - low + 1
+
+
+def spatial_frames(pairs: PairSet, series: Series, progress: Progress | None = None) -> SpatialStack:
+    """The long series, to be measured by `hesim_render.calibrate.moments.measure`."""
+    return SpatialStack(pairs, series, progress)
+
+
+class SpatialStack:
+    """Frames of one series in the form that `measure` reads: a stack of one exposure.
+
+    Attributes
+    ----------
+    file : of messages.
+    shape : (1, frames, rows, cols).
+    exposures_us : int64 [1], rounded.
+    """
+
+    def __init__(self, pairs: PairSet, series: Series, progress: Progress | None = None) -> None:
+        self._pairs, self._series, self._progress = pairs, series, progress
+        self.file = series.where
+        self.shape = (1, len(series.files), *pairs.shape)
+        self.exposures_us = np.array([round(series.exposure_s * 1e6)], np.int64)
+
+    def __iter__(self):  # noqa: ANN204
+        for number, frame in enumerate(self._pairs.frames(self._series)):
+            if self._progress is not None:
+                self._progress("reading the long series", (number + 1) / self.shape[1])
+            yield frame

@@ -1,0 +1,331 @@
+"""Calibration from captures of EMVA 1288, in the order of the standard (Release 4.0 linear) [emva2021].
+
+Mean and variance of the pairs give gain, responsivity, quantum efficiency, dark noise and linearity; the long series give
+DSNU, PRNU, defects and the fixed maps. Beyond the standard, the curve of the mean and what rows, columns and whole frames
+get anew in each frame are measured, because a twin of the sensor needs them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.aps.light_curve import (
+    Intercept,
+    Line,
+    MeanCurve,
+    linearity_error,
+    mean_curve,
+    straight,
+    through_origin,
+)
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, SpatialStack, pair_levels
+from hesim_render.calibrate.aps.spatial import (
+    Pattern,
+    SpatialVariance,
+    Temporal,
+    outliers,
+    pattern_of,
+    spatial_variance,
+    temporal_of,
+)
+from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
+from hesim_render.calibrate.moments import Moments, Progress, measure
+from hesim_render.core.errors import SpecError
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2, polynomial
+from hesim_render.recording.pair_set import PairSet
+
+#: EMVA 1288 fits from 0 to this part of saturation.
+_FIT_TOP = 0.7
+#: Scatter of the light from exposure to exposure that is refused.
+_MOST_SCATTER = MOST_CHANGE
+_FEWEST_CLEAR = 5
+#: Terms of the variance polynomial that flat fields of one light at many exposures do not tell: I t and t².
+_NO_TERMS = (4, 5)
+
+
+@dataclass(frozen=True)
+class Long:
+    """One long series: mean of its frames, temporal variances and spatial ones.
+
+    Attributes
+    ----------
+    mean : [row, col], DN.
+    variance : float32 [row, col], temporal, DN².
+    first : the first frame.
+    frames : number of frames.
+    levels : [frame], mean of each frame, DN.
+    """
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float32]
+    first: NDArray[np.uint16]
+    frames: int
+    levels: NDArray[np.float64]
+    temporal: Temporal
+    spatial: SpatialVariance
+
+
+@dataclass(frozen=True)
+class PairCalibration:
+    """What captures of EMVA 1288 tell, before it is written.
+
+    Attributes
+    ----------
+    lit, dark : statistics of the pairs, `dark[k]` of the exposure of `lit[k]`.
+    signal : lit less dark mean, DN.
+    saturation : number of the level of the largest variance; as many as there are levels where none saturates.
+    clear : levels that the curve and the variance are fitted to.
+    gain, responsivity : K in DN/e⁻ and R in DN per photon (or per s of exposure), as the standard fits them.
+    black, noise : mean and variance of the dark against exposure.
+    curve : mean signal against light.
+    fit : variance polynomial, without what rows and columns share.
+    level_chi2 : of the variances of single levels about the polynomial, per degree of freedom.
+    level_rms : their relative scatter beyond their own errors.
+    row, col : temporal variance of rows and columns, and standard errors, DN².
+    linearity : the levels used, and their deviations, %.
+    long_dark, long_lit : the long series.
+    dark_pattern, light_pattern : offset, DN, and relative response, without noise.
+    defects : [row, col], pixels unlike the others in the dark or in the light.
+    """
+
+    pairs: PairSet
+    lit: Levels
+    dark: Levels
+    signal: NDArray[np.float64]
+    saturation: int
+    clear: NDArray[np.bool_]
+    gain: Line
+    responsivity: Line
+    black: Intercept
+    noise: Intercept
+    curve: MeanCurve
+    fit: VarianceFit
+    bins: Pooled
+    level_chi2: float
+    level_rms: float
+    row: tuple[float, float]
+    col: tuple[float, float]
+    linearity: tuple[NDArray[np.bool_], NDArray[np.float64]]
+    long_dark: Long
+    long_lit: Long
+    dark_pattern: Pattern
+    light_pattern: Pattern
+    defects: NDArray[np.bool_]
+
+    @property
+    def light(self) -> NDArray[np.float64]:
+        """Light of each level: photons per pixel, or the exposure in s where photons are not stated."""
+        return light_of(self.pairs, self.lit)
+
+    @property
+    def top_dn(self) -> float:
+        """Signal at saturation, DN: of the largest variance, or the largest seen."""
+        return float(self.signal[min(self.saturation, self.signal.size - 1)])
+
+
+def light_of(pairs: PairSet, levels: Levels) -> NDArray[np.float64]:
+    """Photons per pixel of each level, or its exposure in s where photons are not stated."""
+    return levels.photons if pairs.has_photons else levels.exposure_s
+
+
+def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibration:
+    """Read and evaluate captures of EMVA 1288.
+
+    Raises
+    ------
+    SpecError
+        With file and line, if the captures are saturated, clipped at 0, or lit by light that drifts.
+    """
+    lit, dark = pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress)
+    long_dark, long_lit = (_long(pairs, which, progress) for which in (False, True))
+    _check_dark(pairs, dark, long_dark)
+    signal, light = lit.mean - dark.mean, light_of(pairs, lit)
+    saturation = _saturation(lit)
+    top = float(signal[min(saturation, signal.size - 1)])
+    clear = lit.clear & (np.arange(signal.size) < saturation) & (signal > 0)
+    if clear.sum() < _FEWEST_CLEAR:
+        last = pairs.lit[min(int(clear.sum()), signal.size - 1)]
+        raise last.error(
+            f"saturated from here on: only {int(clear.sum())} of {signal.size} lit exposures are clear of saturation; "
+            "capture shorter exposures or less light"
+        )
+    if light[clear].min() == light[clear].max():
+        raise pairs.lit[0].error("all lit pairs have one light; EMVA 1288 needs many, up to saturation")
+    row, col = _shared(dark, long_dark)
+    use = clear & (signal <= _FIT_TOP * top)
+    difference = lit.variance - dark.variance
+    gain = through_origin(signal[use], difference[use], _difference_covariance(pairs, lit, dark, use))
+    if not gain.slope > 5 * gain.error:
+        raise SpecError("the variance does not rise with the light; no gain follows from these captures", file=pairs.file)
+    responsivity = through_origin(light[use], signal[use], None)
+    rows, _ = pairs.shape
+    shared_error = np.sqrt((max(row[0], 0.0) + long_dark.temporal.pixel / pairs.shape[1]) / rows / 2)
+    distinct = np.unique(dark.exposure_s, return_index=True)[1]
+    black = straight(
+        dark.exposure_s[distinct], dark.mean[distinct], np.full(distinct.size, max(shared_error, 1e-6))
+    )
+    noise = straight(dark.exposure_s[distinct], dark.variance[distinct], dark.error[distinct])
+    curve = mean_curve(light[clear], signal[clear], np.full(int(clear.sum()), np.hypot(shared_error, black.rms)))
+    _check_light(pairs, curve, light, signal, clear)
+    bins = _bins(pairs, lit, dark, signal, clear, distinct)
+    fit = _variance_fit(bins)
+    level_chi2, level_rms = _scatter(lit, signal, clear, fit)
+    fit = _widened(fit, level_chi2)
+    dark_pattern = pattern_of(long_dark.mean, long_dark.spatial.noise)
+    relative, relative_noise = _relative(long_lit, long_dark, curve, light[clear])
+    light_pattern = pattern_of(relative, relative_noise)
+    defects = outliers(long_dark.mean, long_dark.spatial.noise) | outliers(relative, relative_noise)
+    return PairCalibration(
+        pairs, lit, dark, signal, saturation, clear, gain, responsivity, black, noise, curve, fit, bins, level_chi2,
+        level_rms, row, col, linearity_error(light[clear], signal[clear], top), long_dark, long_lit, dark_pattern,
+        light_pattern, defects,
+    )  # fmt: skip
+
+
+def _long(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long:
+    series = pairs.spatial_lit if is_lit else pairs.spatial_dark
+    used = np.ones(pairs.shape, bool)
+    full = pairs.spec.full_scale_dn
+    moments: Moments = measure(SpatialStack(pairs, series, progress), used, full)
+    clipped = float(np.mean(moments.highest[0] >= full))
+    if clipped > CLIPPED_SHARE and float(np.mean(moments.mean[0] >= full - 0.5)) > CLIPPED_SHARE:
+        raise series.error(
+            f"{100 * clipped:.3g} % of the pixels of the long series are saturated; EMVA 1288 takes it at 50 % of "
+            "saturation"
+        )
+    temporal, levels = temporal_of(moments)
+    mean = moments.mean[0].astype(np.float64)
+    if is_lit and np.ptp(levels) > MOST_CHANGE * mean.mean():
+        raise series.error(
+            f"the light drifts: the frames of the long series differ by {100 * np.ptp(levels) / mean.mean():.2g} %; warm "
+            "the light up and keep it steady"
+        )
+    spatial = spatial_variance(mean, temporal, moments.frames)
+    return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial)
+
+
+def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
+    for k, entry in enumerate(pairs.dark):
+        if dark.low[k] > 0.01:
+            raise entry.error(
+                f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the black "
+                "level (offset)"
+            )
+        if dark.variance[k] - ADC_VARIANCE_DN2 < HIDDEN_VARIANCE_DN2:
+            raise entry.error(
+                f"the dark variance is {dark.variance[k]:.3f} DN², below {HIDDEN_VARIANCE_DN2 + ADC_VARIANCE_DN2:.2f}: "
+                "rounding hides the noise; capture with more bits or a higher gain"
+            )
+    if long_dark.temporal.pixel <= 0:
+        raise pairs.spatial_dark.error("the frames do not differ")
+
+
+def _saturation(lit: Levels) -> int:
+    """Number of the level whose variance is largest; the number of levels where it rises to the end."""
+    whole = lit.variance + np.maximum(lit.row, 0.0)
+    k = int(np.argmax(whole))
+    return whole.size if k == whole.size - 1 and lit.high[k] <= CLIPPED_SHARE else k
+
+
+def _check_light(
+    pairs: PairSet, curve: MeanCurve, light: NDArray, signal: NDArray, clear: NDArray[np.bool_]
+) -> None:
+    expected = curve.at(light)
+    deviation = np.where(clear, np.abs(signal / expected - 1), 0.0)
+    deviation[signal < 0.02 * signal.max()] = 0.0  # offsets and dark drift weigh more than light there
+    k = int(np.argmax(deviation))
+    if deviation[k] > _MOST_SCATTER:
+        raise pairs.lit[k].error(
+            f"the light drifts between exposures: this pair is {100 * deviation[k]:.2g} % off the curve of all others"
+        )
+
+
+def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Temporal row and column variance with standard errors, DN², from all dark pairs and the long dark series.
+
+    Lit frames are not used: a lamp that flickers changes rows of a rolling shutter.
+    """
+    of_pairs = np.unique(dark.exposure_s, return_index=True)[1]
+    found = []
+    for values, errors in ((dark.row, dark.row_error), (dark.col, dark.col_error)):
+        scatter = float(values[of_pairs].std(ddof=1)) if of_pairs.size > 2 else float(errors[of_pairs].mean())
+        found.append((float(values[of_pairs].mean()), scatter / np.sqrt(of_pairs.size)))
+    row, row_error = found[0]
+    series, series_error = long_dark.temporal.row, max(long_dark.temporal.row_error, 1e-30)
+    weight = np.array([1 / max(row_error, 1e-30) ** 2, 1 / series_error**2])
+    pooled = float(weight @ (row, series) / weight.sum())
+    return (pooled, float(1 / np.sqrt(weight.sum()))), found[1]
+
+
+def _difference_covariance(pairs: PairSet, lit: Levels, dark: Levels, use: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Covariance of lit less dark variances; levels that have one dark pair share its error."""
+    numbers = np.flatnonzero(use)
+    same = np.array([[pairs.dark[i] is pairs.dark[j] for j in numbers] for i in numbers])
+    return np.diag(lit.error[use] ** 2) + same * np.outer(dark.error[use], dark.error[use])
+
+
+def _bins(
+    pairs: PairSet, lit: Levels, dark: Levels, signal: NDArray, clear: NDArray[np.bool_], distinct: NDArray
+) -> Pooled:
+    """One bin a pair for the fit of the variance polynomial."""
+    pixels = float(pairs.shape[0] * pairs.shape[1])
+    light = np.concatenate([np.zeros(distinct.size), signal[clear]])
+    variance = np.concatenate([dark.variance[distinct], lit.variance[clear]]) - ADC_VARIANCE_DN2
+    raw = np.concatenate([dark.squares[distinct], lit.squares[clear]])
+    squares = raw - 2 * ADC_VARIANCE_DN2 * (variance + ADC_VARIANCE_DN2) + ADC_VARIANCE_DN2**2
+    exposure = np.concatenate([dark.exposure_s[distinct], lit.exposure_s[clear]])
+    is_lit = np.arange(light.size) >= distinct.size
+    zero = np.zeros(light.size)
+    return Pooled(
+        exposure, zero, pixels * light[:, None] ** np.arange(7), pixels * (variance * light ** np.arange(4)[:, None]).T,
+        pixels * squares, zero, np.ones(light.size), is_lit,
+    )  # fmt: skip
+
+
+def _variance_fit(bins: Pooled) -> VarianceFit:
+    """The polynomial in 1, I, t and I²: one light at many exposures, or many at one, tells no more.
+
+    Where dark current makes no visible noise, the term in t is left out too: its sign would be chance.
+    """
+    fit = fit_variance(bins, _NO_TERMS)
+    if fit.beta[2] > 2 * np.sqrt(fit.covariance[2, 2]):
+        return fit
+    return fit_variance(bins, (2, *_NO_TERMS))
+
+
+def _scatter(lit: Levels, signal: NDArray, clear: NDArray[np.bool_], fit: VarianceFit) -> tuple[float, float]:
+    """χ² per degree of freedom of the lit levels' variances, and their relative scatter beyond their errors."""
+    expected = polynomial(fit.beta, signal[clear], lit.exposure_s[clear]) + ADC_VARIANCE_DN2
+    residual, error = lit.variance[clear] - expected, lit.error[clear]
+    dof = max(int(clear.sum() - fit.identified.sum()), 1)
+    chi2 = float(np.sum((residual / error) ** 2)) / dof
+    excess = float(np.mean(((residual**2) * clear.sum() / dof - error**2) / expected**2))
+    return chi2, float(np.sqrt(max(excess, 0.0)))
+
+
+def _widened(fit: VarianceFit, level_chi2: float) -> VarianceFit:
+    """The fit with errors that include that whole levels, not only pixels, scatter about the polynomial."""
+    values = {name: getattr(fit, name) for name in VarianceFit.__dataclass_fields__}
+    return VarianceFit(**{**values, "covariance": fit.covariance * max(level_chi2, 1.0)})
+
+
+def _relative(
+    lit: Long, dark: Long, curve: MeanCurve, light: NDArray
+) -> tuple[NDArray[np.float64], tuple[float, float, float]]:
+    """Response of each pixel relative to the mean, less 1, and the noise of its row, column and pixel means.
+
+    Where the curve bends, a pixel with 1 % more light has less than 1 % more signal; this is taken back.
+    """
+    signal = lit.mean - dark.mean
+    level = float(signal.mean())
+    places = np.linspace(float(light.min()), float(light.max()), 512)
+    here = float(np.interp(level, curve.at(places), places))
+    shifted = here + curve.offset
+    exponent = float(curve.gradient(np.array([here]))[0, 0]) * shifted / float(curve.at(np.array([here]))[0])
+    scale = level * exponent
+    noise = np.add(lit.spatial.noise, dark.spatial.noise) / scale**2
+    return (signal / level - 1) / exponent, (float(noise[0]), float(noise[1]), float(noise[2]))
+

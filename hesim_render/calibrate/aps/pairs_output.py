@@ -1,0 +1,294 @@
+"""Output of a calibration from EMVA 1288 captures: its section of ``calibration.yaml`` and its maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from hesim_render.calibrate.aps.pairs import Long, PairCalibration, evaluate
+from hesim_render.calibrate.aps.variance import TERMS
+from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
+from hesim_render.calibrate.finding import Finding
+from hesim_render.calibrate.moments import Progress
+from hesim_render.calibrate.result import check_calibration, check_report, write_section
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
+from hesim_render.recording.pair_set import PairSet, read_pair_set
+
+_FIGURE_PX = 320
+#: Relative changes of signal and variance from which a finding names them.
+_LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
+
+
+def calibrate_pairs(
+    captures: str | Path | PairSet,
+    out: str | Path,
+    report: str | Path | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> PairCalibration:
+    """Calibrate the frames of EMVA 1288 captures and write (or update) a ``calibration.yaml``.
+
+    Parameters
+    ----------
+    captures : folder with ``EMVA1288_Data.txt`` or with pairs by name, or a set that was opened.
+    out : the calibration; its section ``aps`` is written, others are kept.
+    report : HTML file, if wanted.
+    progress : called with a text that names the current work and the fraction done.
+    overwrite : replace a report of another calibration.
+
+    Returns
+    -------
+    What the captures told.
+
+    Raises
+    ------
+    SpecError
+        If the captures cannot be used; the message names file and line.
+    OutputError
+        If a result cannot be written.
+    """
+    pairs = captures if isinstance(captures, PairSet) else read_pair_set(captures)
+    about = pairs.spec.model_dump(exclude_none=True, mode="json")
+    check_calibration(out, about)
+    if report is not None:
+        check_report(out, report, overwrite)
+    result = evaluate(pairs, progress)
+    write_section(out, "aps", about, content(result), maps(result))
+    if report is not None:
+        from hesim_render.calibrate.report.page import write_report
+
+        write_report(out, report, overwrite)
+    return result
+
+
+def content(result: PairCalibration) -> dict[str, Any]:
+    """The section ``aps``."""
+    fit, curve = result.fit, result.curve
+    k, relative = result.gain.slope, result.gain.error / result.gain.slope
+    row, col = (np.sqrt(max(value, 0.0)) for value, _ in (result.row, result.col))
+    beta = [float(b) if ok else None for b, ok in zip(fit.beta, fit.identified, strict=True)]
+    errors = [
+        float(e) if ok else None for e, ok in zip(np.sqrt(np.diag(fit.covariance)), fit.identified, strict=True)
+    ]
+    return {
+        "method": "EMVA 1288 R4.0 linear, from pairs of frames and two long series",
+        "findings": [finding.described() for finding in findings(result)],
+        "terms": list(TERMS),
+        "units": "DN (light above black) and seconds; the ADC's 1/12 DN², rows and columns are taken out",
+        "beta": [[beta]],
+        "beta_standard_error": [[errors]],
+        "goodness": {
+            "chi2_per_dof": [[fit.chi2_per_dof]],
+            "p_value": [[None]],
+            "cubic_per_dn": [[None if fit.cubic is None else list(fit.cubic)]],
+            "dof": [[fit.dof]],
+            "levels_chi2_per_dof": result.level_chi2,
+            "levels_relative_rms": result.level_rms,
+            "light_relative_rms": curve.light_rms,
+        },
+        "range": {
+            "exposures_us": [1e6 * t for t in (result.lit.exposure_s.min(), result.lit.exposure_s.max())],
+            "signal_dn": [0.0, float(result.signal[result.clear].max())],
+        },
+        "black_dn": result.black.value,
+        "n_row_std_dn": float(result.dark_pattern.row.std()),
+        "column_offset_std_dn": float(result.dark_pattern.col.std()),
+        "row_noise_dn": _shared(*result.row, row),
+        "column_noise_dn": _shared(*result.col, col),
+        "nonlinearity": curve.nonlinearity(result.responsivity.slope, result.pairs.spec.full_scale_dn),
+        "light_offset": {
+            **estimated(curve.offset, curve.offset_error, "photons" if result.pairs.has_photons else "s"),
+            "note": "light beyond that of the stated exposures",
+        },
+        "hot_pixels": 0,
+        "bad_pixels": int(result.defects.sum()),
+        "K": estimated(k, result.gain.error, "DN/e-"),
+        "responsivity": estimated(
+            result.responsivity.slope, result.responsivity.error, "DN/photon" if result.pairs.has_photons else "DN/s"
+        ),
+        "quantum_efficiency": _quantum_efficiency(result, relative),
+        "read_noise_e": _read_noise(result, k, relative),
+        "temporal_dark_noise_e": _dark_noise(result, k, relative),
+        "dark_current_e_per_s": _dark_current(result, k, relative),
+        "full_well_e": _full_well(result, k, relative),
+        "dsnu_e": _dsnu(result, k, relative),
+        "prnu_percent": _prnu(result),
+        "linearity_error": _linearity(result),
+        "notes": [],
+    }
+
+
+def _shared(variance: float, error: float, std: float) -> dict[str, Any]:
+    """Temporal noise of rows or columns; 0 with a limit where it is not significant."""
+    if variance > 3.9 * error and std > 0:  # a chance of 1e-4
+        return estimated(std, error / (2 * std), "DN")
+    limit = float(np.sqrt(max(variance, 0.0) + Z_95 * error))
+    return {"value": 0.0, "upper_limit": limit, "unit": "DN", "note": "they share no more than chance makes them"}
+
+
+def _quantum_efficiency(result: PairCalibration, relative: float) -> dict[str, Any]:
+    if not result.pairs.has_photons:
+        return not_identifiable("the captures do not state photons per pixel")
+    value = result.responsivity.slope / result.gain.slope
+    error = value * float(np.hypot(relative, result.responsivity.error / result.responsivity.slope))
+    return estimated(value, error, "e-/photon")
+
+
+def _read_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
+    """Of pixels alone, at no exposure: without the ADC and without what rows and columns share."""
+    variance = result.noise.value - ADC_VARIANCE_DN2
+    noise = float(np.sqrt(variance))
+    error = float(np.hypot(result.noise.error / (2 * variance), relative))
+    return estimated(noise / k, noise / k * error, "e-") | {"value_dn": noise}
+
+
+def _dark_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
+    """The standard's σ_d, with what rows and columns share."""
+    variance = result.noise.value - ADC_VARIANCE_DN2 + max(result.row[0], 0.0) + max(result.col[0], 0.0)
+    error = float(np.sqrt(result.noise.error**2 + result.row[1] ** 2 + result.col[1] ** 2)) / (2 * variance)
+    noise = float(np.sqrt(variance)) / k
+    return estimated(noise, noise * float(np.hypot(error, relative)), "e-")
+
+
+def _dark_current(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
+    if not np.isfinite(result.black.slope_error):
+        return not_identifiable("one exposure tells no dark current; capture dark pairs at several exposures")
+    value = result.black.slope / k
+    found = estimated(value, float(np.hypot(result.black.slope_error / k, value * relative)), "e-/s")
+    found["from_variance"] = result.noise.slope / k**2
+    found["value_dn_per_s"] = result.black.slope
+    return found
+
+
+def _full_well(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
+    """Electrons at the largest variance; between two levels its place is not known better than their distance."""
+    if result.saturation >= result.signal.size:
+        return not_identifiable(f"no level saturates: it is at least {result.signal.max() / k:.0f} e-; capture more light")
+    here = result.saturation
+    light = result.light
+    electrons = result.responsivity.slope * light[here] / k
+    step = float(light[min(here + 1, light.size - 1)] - light[here - 1]) / 2
+    error = electrons * float(np.hypot(relative, step / np.sqrt(3) / light[here]))
+    above = result.lit.high[here:].max()
+    return estimated(float(electrons), error, "e-") | {
+        "limited_by": "ADC full scale" if above > 0.01 else "full well", "photons": float(light[here]),
+    }  # fmt: skip
+
+
+def _std(variance: float, error: float) -> tuple[float, float]:
+    """Standard deviation and its error; NaN where the variance is not above 0."""
+    if variance <= 0:
+        return float("nan"), float("nan")
+    return float(np.sqrt(variance)), error / (2 * float(np.sqrt(variance)))
+
+
+def _dsnu(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
+    spatial = result.long_dark.spatial
+    errors = spatial.errors(fixed=False)
+    value, error = _std(spatial.total, float(errors[3]))
+    parts = {
+        f"{name}_e": max(0.0, part) ** 0.5 / k for name, part in zip(("row", "column", "pixel"), spatial.parts, strict=True)
+    }
+    if not np.isfinite(value) or spatial.total < Z_95 * errors[3]:
+        limit = float(np.sqrt(max(spatial.total, 0.0) + Z_95 * errors[3])) / k
+        return {"value": 0.0, "upper_limit": limit, "unit": "e-", "note": "below the noise of the mean"} | parts
+    return estimated(value / k, value / k * float(np.hypot(error / value, relative)), "e-") | parts
+
+
+def _prnu(result: PairCalibration) -> dict[str, Any]:
+    lit, dark = result.long_lit, result.long_dark
+    level = float(lit.mean.mean() - dark.mean.mean())
+    differences = [a - b for a, b in zip(lit.spatial.parts, dark.spatial.parts, strict=True)]
+    errors = np.hypot(lit.spatial.errors(fixed=False), dark.spatial.errors(fixed=False))
+    value, error = _std(sum(differences), float(errors[3]))
+    if not np.isfinite(value):
+        return not_identifiable("the spread over pixels is below the noise of the means; capture a longer series")
+    names = ("row_percent", "column_percent", "pixel_percent")
+    parts = {name: 100 * max(0.0, part) ** 0.5 / level for name, part in zip(names, differences, strict=True)}
+    return estimated(100 * value / level, 100 * error / level, "%") | parts | {"note": "shading of the light is included"}
+
+
+def _linearity(result: PairCalibration) -> dict[str, Any]:
+    used, deviations = result.linearity
+    if deviations.size < 3:
+        return not_identifiable("fewer than three levels lie between 5 and 95 % of saturation")
+    return {
+        "value": float(np.mean(np.abs(deviations))), "unit": "%", "largest": float(np.abs(deviations).max()),
+        "levels": int(used.sum()),
+    }  # fmt: skip
+
+
+def findings(result: PairCalibration) -> list[Finding]:
+    """What the sensor, or the bench, has beyond the standard's linear model, with its size."""
+    found = []
+    curve, k = result.curve, result.gain.slope
+    top = float(result.light[result.clear].max())
+    bend = float(curve.at(np.array([top]))[0] / (curve.terms[0] * (top + curve.offset)) - 1)
+    if curve.bends and abs(bend) > _LEAST_BEND:
+        found.append(("linearity", f"the mean bends: {100 * bend:+.2g} % at the brightest clear level. The sensor file has "
+                      "the curve (aps.nonlinearity); K and the quantum efficiency are means over 0 to 70 % of saturation"))  # fmt: skip
+    if abs(curve.offset) > 4 * curve.offset_error > 0:
+        unit = "photons" if result.pairs.has_photons else "s of exposure"
+        found.append(("light offset", f"every lit frame has {curve.offset:.3g} {unit} more than stated: an exposure that is "
+                      "longer than stated by a constant, or light during the read-out (smear)"))  # fmt: skip
+    if curve.light_rms > _LEAST_SCATTER / 4:
+        found.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
+    if result.level_rms > _LEAST_SCATTER and result.level_chi2 > 2:
+        found.append(("variance", f"the variances of single levels scatter by {100 * result.level_rms:.2g} % about the "
+                      f"polynomial, more than chance (χ²/dof {result.level_chi2:.1f}): steps of the ADC that are not even, or "
+                      "noise that comes and goes"))  # fmt: skip
+    for name, (variance, error) in (("row noise", result.row), ("column noise", result.col)):
+        if variance > 3.9 * error:
+            found.append((name, f"{name[:-6]}s change together from frame to frame by {np.sqrt(variance):.3g} DN "
+                          f"({np.sqrt(variance) / k:.2g} e-)"))  # fmt: skip
+    columns = result.long_dark.spatial.col
+    if columns > 4 * result.long_dark.spatial.errors(fixed=True)[1]:
+        found.append(("column pattern", f"columns have offsets of their own, {np.sqrt(columns):.2g} DN rms"))
+    if result.black.rms > 3 * np.sqrt(max(result.row[0], 0.0) / (2 * result.pairs.shape[0])) + 0.01:
+        found.append(("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure"))
+    return [Finding(check, text, None) for check, text in found]
+
+
+def maps(result: PairCalibration) -> dict[str, NDArray]:
+    """Fixed maps without the noise of their estimate, and what the report draws."""
+    shape = result.pairs.shape
+    shading = result.light_pattern.shading()
+    step = max(1, -(-max(shape) // _FIGURE_PX))
+    lit, dark = result.lit, result.dark
+    points = [
+        (0, 0, t, is_lit, x, v - ADC_VARIANCE_DN2, shape[0] * shape[1])
+        for is_lit, levels, light in (
+            (0.0, dark, np.zeros(dark.mean.size)), (1.0, lit, np.where(result.clear, result.signal, np.nan)),
+        )
+        for t, x, v in zip(np.full(light.size, np.median(lit.exposure_s)), light, levels.variance, strict=True)
+        if np.isfinite(x)
+    ]  # fmt: skip
+    return {
+        "n_row": result.dark_pattern.row,
+        "n_blc": (result.dark_pattern.col + result.dark_pattern.pixel).astype(np.float32),
+        "n_dp": np.full(shape, max(result.black.slope, 0.0), np.float32),
+        "response": (1 + result.light_pattern.whole - shading).astype(np.float32),
+        "light_relative": (1 + shading).astype(np.float32),
+        "bad_pixels": result.defects,
+        "figure_variance_map": result.long_lit.variance[::step, ::step],
+        "figure_variance_exposure_us": np.array(1e6 * result.pairs.spatial_lit.exposure_s),
+        "figure_variance_points": np.array(points),
+        "figure_noise_dark": _histogram(result, result.long_dark, 0.0),
+        "figure_noise_lit": _histogram(result, result.long_lit, float(result.long_lit.mean.mean()) - result.black.value),
+    }
+
+
+def _histogram(result: PairCalibration, series: Long, signal: float) -> NDArray[np.float64]:
+    """Distribution of single values about their mean: rows of (deviation DN, measured, predicted density)."""
+    deviation = (series.first - series.mean) * np.sqrt(series.frames / (series.frames - 1))
+    exposure_s = result.pairs.spatial_lit.exposure_s
+    variance = float(polynomial(result.fit.beta, signal, exposure_s)) + ADC_VARIANCE_DN2 + max(result.row[0], 0.0)
+    reach = 5 * float(np.sqrt(variance))
+    edges = np.linspace(-reach, reach, 2 * min(60, max(12, int(reach))) + 1)
+    counts = np.histogram(deviation, edges)[0] / (deviation.size * np.diff(edges))
+    predicted = np.diff(ndtr(edges / np.sqrt(variance))) / np.diff(edges)
+    return np.stack([(edges[1:] + edges[:-1]) / 2, counts, predicted], axis=1)

@@ -1,0 +1,193 @@
+"""Spatial variances of the mean of a long series: rows, columns and pixels, and their maps without temporal noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, uniform_filter
+
+from hesim_render.calibrate.moments import Moments
+
+#: Deviation, in standard deviations, from which a pixel is an individual and no part of the spread of the others.
+_INDIVIDUAL = 5.0
+#: Box that separates shading from pixels, px.
+_BOX = 15
+#: The light's shading varies over more than this part of the picture; finer structure is the sensor's.
+_SHADING_PART = 1 / 24
+#: Chance that the noise of a profile makes a peak in its spectrum that counts as a pattern.
+_PEAK_CHANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Temporal:
+    """Temporal variances of single frames of a series, DN².
+
+    Attributes
+    ----------
+    pixel : of pixels, without what rows, columns and frames share; the ADC's 1/12 is in it.
+    row, col : of what rows and columns get anew in each frame.
+    frame : of what whole frames get.
+    row_error, col_error : standard errors.
+    """
+
+    pixel: float
+    row: float
+    col: float
+    frame: float
+    row_error: float
+    col_error: float
+
+
+@dataclass(frozen=True)
+class SpatialVariance:
+    """Spatial variances of the mean of a series, DN²; unbiased, so that noise may make them negative.
+
+    Attributes
+    ----------
+    row, col, pixel : parts; their sum is `total`.
+    noise : temporal variance of the mean that each part had: row, column, pixel.
+    freedom : degrees of freedom of each part.
+    """
+
+    row: float
+    col: float
+    pixel: float
+    noise: tuple[float, float, float]
+    freedom: tuple[int, int, int]
+
+    @property
+    def total(self) -> float:
+        return self.row + self.col + self.pixel
+
+    @property
+    def parts(self) -> tuple[float, float, float]:
+        return self.row, self.col, self.pixel
+
+    def errors(self, fixed: bool) -> NDArray[np.float64]:
+        """Standard errors of row, col, pixel and total, DN².
+
+        Parameters
+        ----------
+        fixed : of this very device, whose pattern is a given one and only noise differs; otherwise of the law that
+            the pattern was drawn from, with the scatter of the draw.
+        """
+        values = np.maximum(self.parts, 0.0)
+        noise, freedom = np.array(self.noise), np.array(self.freedom)
+        scatter = (4 * values * noise + 2 * noise**2) if fixed else 2 * (values + noise) ** 2
+        each = np.sqrt(scatter / freedom)
+        return np.append(each, np.sqrt(np.sum(each**2)))
+
+
+def temporal_of(moments: Moments) -> tuple[Temporal, NDArray[np.float64]]:
+    """Temporal variances of a series, and the mean of each frame, DN."""
+    _, rows, cols = moments.variance.shape
+    frames = moments.frames
+    whole = float(moments.variance[0].mean(dtype=np.float64))
+    levels = moments.row_means[0].mean(axis=1)
+    change = moments.row_means[0] - moments.row_means[0].mean(axis=0)
+    change = change - change.mean(axis=1)[:, None]
+    of_rows = float(np.sum(change**2)) / ((frames - 1) * (rows - 1))
+    row = max((of_rows - (whole - of_rows) / cols) * cols / (cols - 1), -whole / cols)
+    own = whole - max(row, 0.0)
+    frame = float(levels.var(ddof=1)) - own / (rows * cols) - max(row, 0.0) / rows
+    own -= max(frame, 0.0)
+    freedom = (frames - 1) * (rows - 1)
+    return Temporal(own, row, 0.0, frame, of_rows * float(np.sqrt(2 / freedom)), 0.0), levels
+
+
+def spatial_variance(mean: NDArray, temporal: Temporal, frames: int) -> SpatialVariance:
+    """Row, column and pixel variance of a mean image.
+
+    EMVA 1288 R4.0 solves the three equations of the variances of row means, of column means and of all pixels; this is
+    the same with degrees of freedom in place of numbers, and with what rows and columns share from frame to frame.
+    """
+    rows, cols = mean.shape
+    by_row, by_col = mean.mean(axis=1), mean.mean(axis=0)
+    rest = mean - by_row[:, None] - by_col + mean.mean()
+    freedom = (rows - 1, cols - 1, (rows - 1) * (cols - 1))
+    pixel = float(np.sum(rest**2)) / freedom[2]
+    noise_pixel = temporal.pixel / frames
+    noise = (noise_pixel / cols + temporal.row / frames, noise_pixel / rows + temporal.col / frames, noise_pixel)
+    row = float(by_row.var(ddof=1)) - max(pixel - noise_pixel, 0.0) / cols - noise[0]
+    col = float(by_col.var(ddof=1)) - max(pixel - noise_pixel, 0.0) / rows - noise[1]
+    return SpatialVariance(row, col, pixel - noise_pixel, noise, freedom)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A fixed pattern without the noise of its estimate.
+
+    Attributes
+    ----------
+    row, col : profiles, mean 0.
+    pixel : [row, col], the rest.
+    """
+
+    row: NDArray[np.float64]
+    col: NDArray[np.float64]
+    pixel: NDArray[np.float64]
+
+    @property
+    def whole(self) -> NDArray[np.float64]:
+        return self.row[:, None] + self.col + self.pixel
+
+    def shading(self) -> NDArray[np.float64]:
+        """The part that varies slowly over the picture."""
+        width = max(self.pixel.shape) * _SHADING_PART
+        return np.asarray(gaussian_filter(self.whole, width, mode="nearest"))
+
+
+def pattern_of(image: NDArray, noise: tuple[float, float, float]) -> Pattern:
+    """The pattern of a mean image.
+
+    The spread that the noise of the estimate adds is taken off by scaling, so that the pattern's variance is unbiased.
+    Pixels and spatial frequencies that stand out of the noise keep their values: they are known.
+
+    Parameters
+    ----------
+    image : [row, col], a mean over frames.
+    noise : variance of the noise of row means, column means and pixels.
+    """
+    level = float(image.mean())
+    by_row, by_col = image.mean(axis=1) - level, image.mean(axis=0) - level
+    rest = image - level - by_row[:, None] - by_col
+    spread = 1.4826 * float(np.median(np.abs(rest)))
+    plain = np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread)
+    smooth = uniform_filter(plain, _BOX, mode="nearest")
+    part = 1 / _BOX**2
+    fine = _scaled(rest - smooth, noise[2] * (1 - part))
+    power = float(np.mean(smooth**2))
+    smooth *= np.sqrt(max(0.0, power - noise[2] * part) / max(power, 1e-300))
+    return Pattern(_profile(by_row, noise[0]), _profile(by_col, noise[1]), smooth + fine)
+
+
+def _scaled(values: NDArray, noise: float) -> NDArray[np.float64]:
+    """Pixels scaled to the variance that they have without noise; individuals lose only what noise adds on average."""
+    power = values**2
+    spread = 1.4826 * float(np.median(np.abs(values)))
+    alone = power > (_INDIVIDUAL * max(spread, float(np.sqrt(noise)))) ** 2
+    common = float(power[~alone].mean()) if not alone.all() else 0.0
+    factor = np.sqrt(max(0.0, common - noise) / max(common, 1e-300))
+    own = np.sqrt(np.maximum(0.0, 1 - noise / np.maximum(power, 1e-300)))
+    return values * np.where(alone, own, factor)
+
+
+def _profile(values: NDArray, noise: float) -> NDArray[np.float64]:
+    """A profile, scaled frequency by frequency; frequencies that stand out keep their power less that of the noise."""
+    spectrum = np.fft.rfft(values)
+    power = np.abs(spectrum) ** 2 / values.size
+    peak = power > max(noise, 1e-300) * np.log(power.size / _PEAK_CHANCE)
+    common = float(power[~peak].mean()) if not peak.all() else 0.0
+    factor = np.sqrt(max(0.0, common - noise) / max(common, 1e-300))
+    own = np.sqrt(np.maximum(0.0, 1 - noise / np.maximum(power, 1e-300)))
+    return np.asarray(np.fft.irfft(spectrum * np.where(peak, own, factor), values.size))
+
+
+def outliers(image: NDArray, noise: tuple[float, float, float], sigmas: float = 8.0) -> NDArray[np.bool_]:
+    """Pixels [row, col] that lie so many robust standard deviations from the pixels around them."""
+    rest = image - image.mean(axis=1, keepdims=True) - image.mean(axis=0) + image.mean()
+    spread = max(1.4826 * float(np.median(np.abs(rest))), float(np.sqrt(max(noise[2], 0.0))), 1e-12)
+    rest -= uniform_filter(np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread), _BOX, mode="nearest")
+    return np.abs(rest) > sigmas * spread
