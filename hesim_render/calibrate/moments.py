@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.recording.capture_set import FrameStack
-
 Progress = Callable[[str, float], None]
 #: Fraction of full scale below which the first frame's value assigns a pixel to the dim or to the bright half.
 _CLEAR = 0.9
+
+
+class Frames(Protocol):
+    """A stack of frames that is read one at a time, such as `hesim_render.recording.capture_set.FrameStack`.
+
+    Attributes
+    ----------
+    file : of messages.
+    exposures_us : int64 [exposure].
+    shape : (exposures, frames, rows, cols).
+    """
+
+    file: Path
+    exposures_us: NDArray[np.int64]
+    shape: tuple[int, int, int, int]
+
+    def __iter__(self) -> Iterator[NDArray]: ...
 
 
 @dataclass(frozen=True)
@@ -48,9 +65,7 @@ class Moments:
         return self.exposures_us.astype(np.float64) * 1e-6
 
 
-def measure(
-    stack: FrameStack, used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None = None
-) -> Moments:
+def measure(stack: Frames, used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None = None) -> Moments:
     """Read a stack once. Sums of differences from the first frame are whole numbers, hence exact.
 
     Parameters

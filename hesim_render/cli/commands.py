@@ -22,6 +22,7 @@ from hesim_render.cli import (
     simulate,
     study,
     sweep,
+    twin,
     video,
 )
 from hesim_render.cli.terminal import say
@@ -49,7 +50,7 @@ def _app(
 
 for _command in (
     doctor.doctor, doctor.list_, simulate.simulate, video.video, expose.expose, run.run, simulate.rerun, simulate.demo,
-    calibrate.lab, calibrate.calibrate, look.isp, look.view, exchange.export, exchange.import_, cube.cube,
+    calibrate.lab, calibrate.calibrate, twin.twin, look.isp, look.view, exchange.export, exchange.import_, cube.cube,
     measure.measure, study.study, sweep.sweep,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)

@@ -51,6 +51,7 @@ class Stream(IntEnum):
     AUDIT_EDGE = 63
     COLUMN_OFFSET = 70
     COLUMN_NOISE = 71
+    INTERFERENCE = 72
 
 
 def stream_key(seed: int, stream: Stream) -> int:

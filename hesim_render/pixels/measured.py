@@ -14,7 +14,13 @@ from hesim_render.specs.calibration_rates import PER_INTERVAL, PER_SECOND, per_s
 from hesim_render.specs.calibration_spec import Defect
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
-_EXPECTED = {"n_row": ("fiu", 65535.0), "n_blc": ("fiu", 65535.0), "n_dp": ("fiu", 1e9), "response": ("f", 1e3), "bad_pixels": ("b", 1.0)}
+_EXPECTED = {
+    "n_row": ("fiu", 65535.0),
+    "n_blc": ("fiu", 65535.0),
+    "n_dp": ("fiu", 1e9),
+    "response": ("f", 1e3),
+    "bad_pixels": ("b", 1.0),
+}
 _EXPECTED |= {
     "defect": ("u", 255.0), "defect_on_per_trial": ("f", 1.0), "defect_off_per_trial": ("f", 1.0),
     "defect_firing_share": ("f", 1.0), "defect_correlation": ("f", 1.0),

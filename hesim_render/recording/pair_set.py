@@ -191,7 +191,9 @@ def _listed(folder: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
                 raise SpecError(f"{picture.name} is twice in one series", file=file, line=line)
             series[-1] = replace(series[-1], files=(*series[-1].files, picture))
         else:
-            raise SpecError(f"{printable(kind[:20])!r} begins no line of such a file (v, n, b, d, i)", file=file, line=line)
+            raise SpecError(
+                f"{printable(kind[:20])!r} begins no line of such a file (v, n, b, d, i)", file=file, line=line
+            )
     if shape is None or bit_depth is None:
         raise SpecError("has no line 'n <bits> <width> <height>'", file=file)
     return _capture_spec(folder, bit_depth), shape, series
@@ -259,7 +261,9 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
     for entry in series:
         if len(entry.files) < 2:
             raise entry.error(f"{len(entry.files)} frame; a pair has two, and a variance follows from their difference")
-    pairs = {lit: sorted((s for s in series if s.lit == lit and len(s.files) == 2), key=_order) for lit in (True, False)}
+    pairs = {
+        lit: sorted((s for s in series if s.lit == lit and len(s.files) == 2), key=_order) for lit in (True, False)
+    }
     dark = {entry.exposure_s: entry for entry in pairs[False]}
     for entry in pairs[True]:
         if entry.exposure_s not in dark:
@@ -273,11 +277,14 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
         if len(found) != 1:
             where = f", at {' and '.join(s.told for s in found)}" if found else ""
             raise SpecError(
-                f"{len(found)} {name} series of more than two frames{where}; one is needed, for DSNU and PRNU", file=file
+                f"{len(found)} {name} series of more than two frames{where}; one is needed, for DSNU and PRNU",
+                file=file,
             )
         spatial[lit] = found[0]
     if spatial[True].exposure_s != spatial[False].exposure_s:
-        raise spatial[True].error(f"the dark series is of {spatial[False].exposure_s * 1e6:g} µs; both need one exposure")
+        raise spatial[True].error(
+            f"the dark series is of {spatial[False].exposure_s * 1e6:g} µs; both need one exposure"
+        )
     return PairSet(
         file, spec, shape, tuple(pairs[True]), tuple(dark[s.exposure_s] for s in pairs[True]), spatial[True],
         spatial[False],

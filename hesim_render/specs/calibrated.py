@@ -91,9 +91,13 @@ def _aps_values(own: Mapping[str, Any], data: CalibrationSpec, aps: FrameSection
         "row_noise_dn": 0.0 if aps.row_noise_dn is None else aps.row_noise_dn.value or 0.0,
         "beta": [[[b or 0.0 for b in cell] for cell in row] for row in aps.beta],
     }
-    if aps.column_noise_dn is not None:
-        values["column_noise_dn"] = aps.column_noise_dn.value or 0.0
-    for key in ("column_offset_std_dn", "nonlinearity"):
+    for key, item in (
+        ("column_noise_dn", aps.column_noise_dn),
+        ("read_noise_correlation", aps.read_noise_correlation),
+    ):
+        if item is not None:
+            values[key] = item.value or 0.0
+    for key in ("column_offset_std_dn", "nonlinearity", "interference"):
         if getattr(aps, key) is not None:
             values[key] = getattr(aps, key)
     if aps.full_well_e.limited_by == "full well":

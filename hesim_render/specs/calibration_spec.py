@@ -106,9 +106,11 @@ class FrameSection(_Section):
     black_dn: float
     n_row_std_dn: float = Field(ge=0)
     row_noise_dn: Estimate | None = Field(None, description="calibrations of before it was measured lack it")
-    column_noise_dn: Estimate | None = Field(None, description="of captures of EMVA 1288 alone, as the next four")
+    column_noise_dn: Estimate | None = Field(None, description="of captures of EMVA 1288 alone, as the next six")
     column_offset_std_dn: float | None = Field(None, ge=0)
     nonlinearity: list[float] | None = Field(None, min_length=3, max_length=3)
+    read_noise_correlation: Estimate | None = None
+    interference: list[dict[str, float]] | None = None
     responsivity: Estimate | None = None
     quantum_efficiency: Estimate | None = None
     bad_pixels: NonNegativeInt

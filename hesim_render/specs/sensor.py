@@ -63,6 +63,14 @@ class EvsGridSpec(Strict):
     cols_per_tile: PositiveInt
 
 
+class InterferenceSpec(Strict):
+    """A sine over the picture with a new phase in each frame, such as the pick-up of a clock."""
+
+    cycles_per_row: float = Field(ge=-0.5, le=0.5, description="periods from row to row")
+    cycles_per_col: float = Field(ge=-0.5, le=0.5, description="periods from column to column")
+    rms_dn: float = Field(ge=0, le=65_535)
+
+
 class ApsSpec(Strict):
     """Frames: N_e = min(Poisson((1 + PRNU) I_e + D Δt), full well) + N(0, σ_r²); DN = clip(round(K N_e + N_FP))."""
 
@@ -71,6 +79,9 @@ class ApsSpec(Strict):
     bit_depth: int = Field(ge=1, le=16)
     black_level_dn: float = Field(ge=0)
     read_noise_e: float = Field(ge=0, le=1e6)
+    read_noise_correlation: float = Field(
+        0.0, ge=-0.45, le=0.45, description="of a pixel's read noise with that of the next one in its row"
+    )
     dark_current_e_per_s: float = Field(ge=0, le=1e9)
     dark_current_nonuniformity_rel: float = Field(
         0.0, ge=0, le=100, description="std / mean of a gamma law over pixels"
@@ -96,6 +107,7 @@ class ApsSpec(Strict):
         max_length=3,
         description="n0, n1, n2: the signal E = K·electrons becomes E (1 + n0 + n1 u + n2 u²), u = E/full scale",
     )
+    interference: list[InterferenceSpec] = Field([], max_length=64, description="periodic patterns of the read-out")
     residual_noise_dn: float = Field(0.0, ge=0, le=65_535, description="N_res: extra Gaussian temporal noise")
     telegraph: TelegraphSpec | None = Field(None, description="pixels that jump between two levels; default none")
     law: Literal["poisson", "gaussian"] = "poisson"

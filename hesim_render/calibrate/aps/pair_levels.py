@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -159,11 +159,6 @@ def _gaps(first: NDArray, second: NDArray, full: int) -> tuple[int, int]:
     return int(np.sum(counts[low : high + 1] == 0)), high - low + 1
 
 
-def spatial_frames(pairs: PairSet, series: Series, progress: Progress | None = None) -> SpatialStack:
-    """The long series, to be measured by `hesim_render.calibrate.moments.measure`."""
-    return SpatialStack(pairs, series, progress)
-
-
 class SpatialStack:
     """Frames of one series in the form that `measure` reads: a stack of one exposure.
 
@@ -177,10 +172,10 @@ class SpatialStack:
     def __init__(self, pairs: PairSet, series: Series, progress: Progress | None = None) -> None:
         self._pairs, self._series, self._progress = pairs, series, progress
         self.file = series.where
-        self.shape = (1, len(series.files), *pairs.shape)
+        self.shape: tuple[int, int, int, int] = (1, len(series.files), *pairs.shape)
         self.exposures_us = np.array([round(series.exposure_s * 1e6)], np.int64)
 
-    def __iter__(self):  # noqa: ANN204
+    def __iter__(self) -> Iterator[NDArray]:
         for number, frame in enumerate(self._pairs.frames(self._series)):
             if self._progress is not None:
                 self._progress("reading the long series", (number + 1) / self.shape[1])

@@ -21,6 +21,7 @@ from hesim_render.calibrate.aps.light_curve import (
     straight,
     through_origin,
 )
+from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum, noise_spectrum
 from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, SpatialStack, pair_levels
 from hesim_render.calibrate.aps.spatial import (
     Pattern,
@@ -57,6 +58,7 @@ class Long:
     first : the first frame.
     frames : number of frames.
     levels : [frame], mean of each frame, DN.
+    spectrum : of the temporal noise; None in the light.
     """
 
     mean: NDArray[np.float64]
@@ -66,6 +68,7 @@ class Long:
     levels: NDArray[np.float64]
     temporal: Temporal
     spatial: SpatialVariance
+    spectrum: NoiseSpectrum | None
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,17 @@ class PairCalibration:
     defects: NDArray[np.bool_]
 
     @property
+    def lines_dn2(self) -> float:
+        """Mean variance of the interference, DN²."""
+        return sum(line.rms_dn**2 for line in self.noise_spectrum.lines)
+
+    @property
+    def noise_spectrum(self) -> NoiseSpectrum:
+        """Spectrum of the dark noise."""
+        assert self.long_dark.spectrum is not None
+        return self.long_dark.spectrum
+
+    @property
     def light(self) -> NDArray[np.float64]:
         """Light of each level: photons per pixel, or the exposure in s where photons are not stated."""
         return light_of(self.pairs, self.lit)
@@ -140,7 +154,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
         With file and line, if the captures are saturated, clipped at 0, or lit by light that drifts.
     """
     lit, dark = pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress)
-    long_dark, long_lit = (_long(pairs, which, progress) for which in (False, True))
+    long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
     _check_dark(pairs, dark, long_dark)
     signal, light = lit.mean - dark.mean, light_of(pairs, lit)
     saturation = _saturation(lit)
@@ -159,14 +173,14 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     difference = lit.variance - dark.variance
     gain = through_origin(signal[use], difference[use], _difference_covariance(pairs, lit, dark, use))
     if not gain.slope > 5 * gain.error:
-        raise SpecError("the variance does not rise with the light; no gain follows from these captures", file=pairs.file)
+        raise SpecError(
+            "the variance does not rise with the light; no gain follows from these captures", file=pairs.file
+        )
     responsivity = through_origin(light[use], signal[use], None)
     rows, _ = pairs.shape
     shared_error = np.sqrt((max(row[0], 0.0) + long_dark.temporal.pixel / pairs.shape[1]) / rows / 2)
     distinct = np.unique(dark.exposure_s, return_index=True)[1]
-    black = straight(
-        dark.exposure_s[distinct], dark.mean[distinct], np.full(distinct.size, max(shared_error, 1e-6))
-    )
+    black = straight(dark.exposure_s[distinct], dark.mean[distinct], np.full(distinct.size, max(shared_error, 1e-6)))
     noise = straight(dark.exposure_s[distinct], dark.variance[distinct], dark.error[distinct])
     curve = mean_curve(light[clear], signal[clear], np.full(int(clear.sum()), np.hypot(shared_error, black.rms)))
     _check_light(pairs, curve, light, signal, clear)
@@ -174,7 +188,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     fit = _variance_fit(bins)
     level_chi2, level_rms = _scatter(lit, signal, clear, fit)
     fit = _widened(fit, level_chi2)
-    dark_pattern = pattern_of(long_dark.mean, long_dark.spatial.noise)
+    dark_pattern = pattern_of(long_dark.mean, long_dark.spatial.noise, long_dark.spectrum, long_dark.frames)
     relative, relative_noise = _relative(long_lit, long_dark, curve, light[clear])
     light_pattern = pattern_of(relative, relative_noise)
     defects = outliers(long_dark.mean, long_dark.spatial.noise) | outliers(relative, relative_noise)
@@ -185,26 +199,35 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     )  # fmt: skip
 
 
-def _long(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long:
+def long_series(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long:
+    """Read and check the long series of a set, lit or dark."""
     series = pairs.spatial_lit if is_lit else pairs.spatial_dark
     used = np.ones(pairs.shape, bool)
     full = pairs.spec.full_scale_dn
-    moments: Moments = measure(SpatialStack(pairs, series, progress), used, full)
+    stack = SpatialStack(pairs, series, progress)
+    moments = measure(stack, used, full)
     clipped = float(np.mean(moments.highest[0] >= full))
     if clipped > CLIPPED_SHARE and float(np.mean(moments.mean[0] >= full - 0.5)) > CLIPPED_SHARE:
         raise series.error(
             f"{100 * clipped:.3g} % of the pixels of the long series are saturated; EMVA 1288 takes it at 50 % of "
             "saturation"
         )
-    temporal, levels = temporal_of(moments)
     mean = moments.mean[0].astype(np.float64)
+    levels = moments.row_means[0].mean(axis=1)
     if is_lit and np.ptp(levels) > MOST_CHANGE * mean.mean():
         raise series.error(
             f"the light drifts: the frames of the long series differ by {100 * np.ptp(levels) / mean.mean():.2g} %; warm "
             "the light up and keep it steady"
         )
+    return long_of(moments, None if is_lit else noise_spectrum(stack, mean))
+
+
+def long_of(moments: Moments, spectrum: NoiseSpectrum | None) -> Long:
+    """A long series from the moments of its frames."""
+    mean = moments.mean[0].astype(np.float64)
+    temporal, levels = temporal_of(moments)
     spatial = spatial_variance(mean, temporal, moments.frames)
-    return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial)
+    return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial, spectrum)
 
 
 def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
@@ -230,9 +253,7 @@ def _saturation(lit: Levels) -> int:
     return whole.size if k == whole.size - 1 and lit.high[k] <= CLIPPED_SHARE else k
 
 
-def _check_light(
-    pairs: PairSet, curve: MeanCurve, light: NDArray, signal: NDArray, clear: NDArray[np.bool_]
-) -> None:
+def _check_light(pairs: PairSet, curve: MeanCurve, light: NDArray, signal: NDArray, clear: NDArray[np.bool_]) -> None:
     expected = curve.at(light)
     deviation = np.where(clear, np.abs(signal / expected - 1), 0.0)
     deviation[signal < 0.02 * signal.max()] = 0.0  # offsets and dark drift weigh more than light there
@@ -328,4 +349,3 @@ def _relative(
     scale = level * exponent
     noise = np.add(lit.spatial.noise, dark.spatial.noise) / scale**2
     return (signal / level - 1) / exponent, (float(noise[0]), float(noise[1]), float(noise[2]))
-

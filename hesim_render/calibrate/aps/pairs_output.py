@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -71,14 +72,14 @@ def content(result: PairCalibration) -> dict[str, Any]:
     k, relative = result.gain.slope, result.gain.error / result.gain.slope
     row, col = (np.sqrt(max(value, 0.0)) for value, _ in (result.row, result.col))
     beta = [float(b) if ok else None for b, ok in zip(fit.beta, fit.identified, strict=True)]
-    errors = [
-        float(e) if ok else None for e, ok in zip(np.sqrt(np.diag(fit.covariance)), fit.identified, strict=True)
-    ]
+    if beta[0] is not None:
+        beta[0] -= result.lines_dn2
+    errors = [float(e) if ok else None for e, ok in zip(np.sqrt(np.diag(fit.covariance)), fit.identified, strict=True)]
     return {
         "method": "EMVA 1288 R4.0 linear, from pairs of frames and two long series",
         "findings": [finding.described() for finding in findings(result)],
         "terms": list(TERMS),
-        "units": "DN (light above black) and seconds; the ADC's 1/12 DN², rows and columns are taken out",
+        "units": "DN (light above black) and seconds; the ADC's 1/12 DN², rows, columns and interference are taken out",
         "beta": [[beta]],
         "beta_standard_error": [[errors]],
         "goodness": {
@@ -99,6 +100,8 @@ def content(result: PairCalibration) -> dict[str, Any]:
         "column_offset_std_dn": float(result.dark_pattern.col.std()),
         "row_noise_dn": _shared(*result.row, row),
         "column_noise_dn": _shared(*result.col, col),
+        "read_noise_correlation": _correlation(result),
+        "interference": [asdict(line) for line in result.noise_spectrum.lines],
         "nonlinearity": curve.nonlinearity(result.responsivity.slope, result.pairs.spec.full_scale_dn),
         "light_offset": {
             **estimated(curve.offset, curve.offset_error, "photons" if result.pairs.has_photons else "s"),
@@ -130,6 +133,14 @@ def _shared(variance: float, error: float, std: float) -> dict[str, Any]:
     return {"value": 0.0, "upper_limit": limit, "unit": "DN", "note": "they share no more than chance makes them"}
 
 
+def _correlation(result: PairCalibration) -> dict[str, Any]:
+    spectrum = result.noise_spectrum
+    if spectrum.correlated:
+        return estimated(spectrum.correlation, spectrum.correlation_error)
+    limit = abs(spectrum.correlation) + Z_95 * spectrum.correlation_error
+    return {"value": 0.0, "upper_limit": limit, "unit": "", "note": "no more than chance makes it"}
+
+
 def _quantum_efficiency(result: PairCalibration, relative: float) -> dict[str, Any]:
     if not result.pairs.has_photons:
         return not_identifiable("the captures do not state photons per pixel")
@@ -139,8 +150,8 @@ def _quantum_efficiency(result: PairCalibration, relative: float) -> dict[str, A
 
 
 def _read_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
-    """Of pixels alone, at no exposure: without the ADC and without what rows and columns share."""
-    variance = result.noise.value - ADC_VARIANCE_DN2
+    """Of pixels alone, at no exposure: without the ADC and without what rows, columns and lines share."""
+    variance = result.noise.value - result.lines_dn2 - ADC_VARIANCE_DN2
     noise = float(np.sqrt(variance))
     error = float(np.hypot(result.noise.error / (2 * variance), relative))
     return estimated(noise / k, noise / k * error, "e-") | {"value_dn": noise}
@@ -167,7 +178,9 @@ def _dark_current(result: PairCalibration, k: float, relative: float) -> dict[st
 def _full_well(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
     """Electrons at the largest variance; between two levels its place is not known better than their distance."""
     if result.saturation >= result.signal.size:
-        return not_identifiable(f"no level saturates: it is at least {result.signal.max() / k:.0f} e-; capture more light")
+        return not_identifiable(
+            f"no level saturates: it is at least {result.signal.max() / k:.0f} e-; capture more light"
+        )
     here = result.saturation
     light = result.light
     electrons = result.responsivity.slope * light[here] / k
@@ -191,7 +204,8 @@ def _dsnu(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
     errors = spatial.errors(fixed=False)
     value, error = _std(spatial.total, float(errors[3]))
     parts = {
-        f"{name}_e": max(0.0, part) ** 0.5 / k for name, part in zip(("row", "column", "pixel"), spatial.parts, strict=True)
+        f"{name}_e": max(0.0, part) ** 0.5 / k
+        for name, part in zip(("row", "column", "pixel"), spatial.parts, strict=True)
     }
     if not np.isfinite(value) or spatial.total < Z_95 * errors[3]:
         limit = float(np.sqrt(max(spatial.total, 0.0) + Z_95 * errors[3])) / k
@@ -209,7 +223,9 @@ def _prnu(result: PairCalibration) -> dict[str, Any]:
         return not_identifiable("the spread over pixels is below the noise of the means; capture a longer series")
     names = ("row_percent", "column_percent", "pixel_percent")
     parts = {name: 100 * max(0.0, part) ** 0.5 / level for name, part in zip(names, differences, strict=True)}
-    return estimated(100 * value / level, 100 * error / level, "%") | parts | {"note": "shading of the light is included"}
+    return (
+        estimated(100 * value / level, 100 * error / level, "%") | parts | {"note": "shading of the light is included"}
+    )
 
 
 def _linearity(result: PairCalibration) -> dict[str, Any]:
@@ -245,6 +261,12 @@ def findings(result: PairCalibration) -> list[Finding]:
         if variance > 3.9 * error:
             found.append((name, f"{name[:-6]}s change together from frame to frame by {np.sqrt(variance):.3g} DN "
                           f"({np.sqrt(variance) / k:.2g} e-)"))  # fmt: skip
+    for line in result.noise_spectrum.lines[:3]:
+        found.append(("interference", f"a pattern with {line.cycles_per_row:.3g} periods a row and {line.cycles_per_col:.3g} a "
+                      f"column has a new phase in each frame, {line.rms_dn:.2g} DN rms"))  # fmt: skip
+    if result.noise_spectrum.correlated:
+        found.append(("read noise", f"the dark noise of neighbours in a row has a correlation of "
+                      f"{result.noise_spectrum.correlation:+.3f}: a filter of the read-out"))  # fmt: skip
     columns = result.long_dark.spatial.col
     if columns > 4 * result.long_dark.spatial.errors(fixed=True)[1]:
         found.append(("column pattern", f"columns have offsets of their own, {np.sqrt(columns):.2g} DN rms"))
@@ -278,7 +300,9 @@ def maps(result: PairCalibration) -> dict[str, NDArray]:
         "figure_variance_exposure_us": np.array(1e6 * result.pairs.spatial_lit.exposure_s),
         "figure_variance_points": np.array(points),
         "figure_noise_dark": _histogram(result, result.long_dark, 0.0),
-        "figure_noise_lit": _histogram(result, result.long_lit, float(result.long_lit.mean.mean()) - result.black.value),
+        "figure_noise_lit": _histogram(
+            result, result.long_lit, float(result.long_lit.mean.mean()) - result.black.value
+        ),
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
 from hesim_render.calibrate.moments import Moments
 
 #: Deviation, in standard deviations, from which a pixel is an individual and no part of the spread of the others.
@@ -139,7 +140,9 @@ class Pattern:
         return np.asarray(gaussian_filter(self.whole, width, mode="nearest"))
 
 
-def pattern_of(image: NDArray, noise: tuple[float, float, float]) -> Pattern:
+def pattern_of(
+    image: NDArray, noise: tuple[float, float, float], spectrum: NoiseSpectrum | None = None, frames: int = 1
+) -> Pattern:
     """The pattern of a mean image.
 
     The spread that the noise of the estimate adds is taken off by scaling, so that the pattern's variance is unbiased.
@@ -149,18 +152,39 @@ def pattern_of(image: NDArray, noise: tuple[float, float, float]) -> Pattern:
     ----------
     image : [row, col], a mean over frames.
     noise : variance of the noise of row means, column means and pixels.
+    spectrum : of the temporal noise; at the frequency of an interference, the mean has more noise.
+    frames : frames of the mean.
     """
     level = float(image.mean())
     by_row, by_col = image.mean(axis=1) - level, image.mean(axis=0) - level
     rest = image - level - by_row[:, None] - by_col
     spread = 1.4826 * float(np.median(np.abs(rest)))
     plain = np.clip(rest, -_INDIVIDUAL * spread, _INDIVIDUAL * spread)
-    smooth = uniform_filter(plain, _BOX, mode="nearest")
+    waves = _waves(plain, noise[2], spectrum, frames)
+    rest = rest - waves
+    smooth = uniform_filter(plain - waves, _BOX, mode="nearest")
     part = 1 / _BOX**2
     fine = _scaled(rest - smooth, noise[2] * (1 - part))
     power = float(np.mean(smooth**2))
     smooth *= np.sqrt(max(0.0, power - noise[2] * part) / max(power, 1e-300))
-    return Pattern(_profile(by_row, noise[0]), _profile(by_col, noise[1]), smooth + fine)
+    return Pattern(_profile(by_row, noise[0]), _profile(by_col, noise[1]), waves + smooth + fine)
+
+
+def _waves(
+    values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames: int
+) -> NDArray[np.float64]:
+    """The frequencies of an image that stand out of its white part and of interference: shading, periodic patterns."""
+    spectrum = np.fft.rfft2(values)
+    power = np.abs(spectrum) ** 2 / values.size
+    noises = np.full(power.shape, noise)
+    rows, cols = values.shape
+    for line in [] if temporal is None else temporal.lines:
+        row, col = round(line.cycles_per_row * rows), round(line.cycles_per_col * cols)
+        noises[[row % rows, -row % rows], [col, col if 2 * col == cols else 0]] += line.power(values.shape) / frames
+    white = np.maximum(noises, max(float(np.median(power)) / np.log(2.0), 1e-300))
+    peak = power > white * np.log(power.size / _PEAK_CHANCE)
+    own = np.sqrt(np.maximum(0.0, 1 - noises / np.maximum(power, 1e-300)))
+    return np.asarray(np.fft.irfft2(np.where(peak, spectrum * own, 0.0), values.shape))
 
 
 def _scaled(values: NDArray, noise: float) -> NDArray[np.float64]:

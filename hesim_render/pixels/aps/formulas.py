@@ -267,7 +267,9 @@ def bent_value(value: PixelValue, system_gain_dn_per_e: float, curve: Curve, xp:
     factor, slope = curve.factor(whole, xp), curve.slope(whole, xp)
     gain = system_gain_dn_per_e * slope * slope / factor
     # the noisy part of the signal keeps its part of the mean
-    return PixelValue(value.fixed_dn * factor, gain, value.count * (system_gain_dn_per_e * factor / gain), value.gaussian_dn2)
+    return PixelValue(
+        value.fixed_dn * factor, gain, value.count * (system_gain_dn_per_e * factor / gain), value.gaussian_dn2
+    )
 
 
 def noise_equivalent_e(

@@ -24,11 +24,11 @@ from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, Pixel
 from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
 from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
 from hesim_render.pixels.terms import switched_off
-from hesim_render.specs.sensor import ApsSpec
+from hesim_render.specs.sensor import ApsSpec, InterferenceSpec
 
 APS_TERMS = (
-    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "column", "column_noise", "residual", "crosstalk",
-    "telegraph",
+    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "column", "column_noise", "interference", "residual",
+    "crosstalk", "telegraph",
 )  # fmt: skip
 
 
@@ -68,7 +68,7 @@ class ApsNoise(PlainState):
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
         ``read`` is σ_r (β0), ``prnu``, ``dsnu``, ``row`` and ``column`` are the fixed maps, ``row_noise`` is N_tr,
-        ``column_noise`` is N_tc, ``residual`` is N_res, ``crosstalk`` is the light that these pixels get from their neighbours, ``telegraph`` is the random
+        ``column_noise`` is N_tc, ``interference`` are periodic patterns, ``residual`` is N_res, ``crosstalk`` is the light that these pixels get from their neighbours, ``telegraph`` is the random
         telegraph noise.
 
         Raises
@@ -96,6 +96,22 @@ class ApsNoise(PlainState):
     def column_noise_dn(self) -> float:
         """Standard deviation of N_tc, DN."""
         return 0.0 if "column_noise" in self.off else self.spec.column_noise_dn
+
+    @property
+    def read_noise_correlation(self) -> float:
+        """Correlation of a pixel's read noise with that of the next pixel in its row."""
+        return 0.0 if "read" in self.off else self.spec.read_noise_correlation
+
+    @property
+    def interference(self) -> list[InterferenceSpec]:
+        """Periodic patterns of the read-out."""
+        return [] if "interference" in self.off else self.spec.interference
+
+    @property
+    def _shared_dn2(self) -> float:
+        """Variance of what rows, columns and interference add, DN²."""
+        lines = sum(line.rms_dn**2 for line in self.interference)
+        return self.row_noise_dn**2 + self.column_noise_dn**2 + lines
 
     @cached_property
     def telegraph(self) -> TelegraphPixels | None:
@@ -241,13 +257,13 @@ class ApsNoise(PlainState):
     ) -> NDArray[np.float64]:
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
-        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr² + N_tc². An image also has telegraph
+        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr² + N_tc², and the interference. An image also has telegraph
         noise. Near full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, which
         is accurate where the variance itself is above 0.24 DN².
         """
         values = self._checked(electrons, exposure_us)
         value, _ = self._on_host(values, exposure_us, position)
-        shared = self.row_noise_dn**2 + self.column_noise_dn**2 + (ADC_VARIANCE_DN2 if adc else 0.0)
+        shared = self._shared_dn2 + (ADC_VARIANCE_DN2 if adc else 0.0)
         variance = np.asarray(value.variance_dn2 + shared, dtype=np.float64)
         if values.ndim and self.telegraph is not None:
             variance = np.broadcast_to(variance, values.shape).copy()
@@ -270,7 +286,7 @@ class ApsNoise(PlainState):
         """
         signal = np.maximum(np.asarray(electrons, dtype=np.float64), 0.0)
         value = self.value(signal, exposure_us * S_PER_US, self._nominal_pixel(None), NUMPY)
-        variance = value.variance_dn2 + self.row_noise_dn**2 + self.column_noise_dn**2 + ADC_VARIANCE_DN2
+        variance = value.variance_dn2 + self._shared_dn2 + ADC_VARIANCE_DN2
         spec = self.spec
         return formulas.noise_equivalent_e(variance, spec.system_gain_dn_per_e, spec.prnu_rel, signal, NUMPY)
 

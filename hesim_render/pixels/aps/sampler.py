@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, UInt32
+from hesim_render.core.device_types import Float, Generator, UInt32
 from hesim_render.core.namespace import device_namespace
 from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
@@ -19,6 +20,7 @@ from hesim_render.pixels.aps.formulas import Pixels
 from hesim_render.pixels.aps.poisson import poisson
 from hesim_render.pixels.arrays import take, to_device
 from hesim_render.pixels.normal import normal_pair
+from hesim_render.specs.sensor import InterferenceSpec
 
 if TYPE_CHECKING:
     from hesim_render.pixels.aps.model import ApsNoise
@@ -107,6 +109,13 @@ def draw_dn(
     else:
         shot, deviate = normal_pair(word[0], word[1])
         counts = dr.fma(dr.sqrt(value.count), shot, value.count)
+    if noise.read_noise_correlation != 0:
+        before = philox(seed, Stream.APS, key - 1, frame).next_uint32x4()
+        earlier = (
+            normal_pair(before[2], before[3])[0] if spec.law == "poisson" else normal_pair(before[0], before[1])[1]
+        )
+        own, other = _weights(noise.read_noise_correlation)
+        deviate = dr.fma(dr.opaque(types.Float, own), deviate, dr.opaque(types.Float, other) * earlier)
     full_well_dn = spec.full_well_e * spec.system_gain_dn_per_e
     level: Float = dr.minimum(dr.fma(value.gain_dn, counts, value.fixed_dn), full_well_dn) + pixels.offset_dn
     level = dr.fma(dr.sqrt(types.Float(value.gaussian_dn2)), deviate, level)
@@ -121,5 +130,31 @@ def draw_dn(
         columns = dr.opaque(types.UInt32, noise.layout.spec.geometry.cols)
         word = philox(seed, Stream.COLUMN_NOISE, key % columns, frame).next_uint32x4()
         level = dr.fma(dr.opaque(types.Float, noise.column_noise_dn), normal_pair(word[0], word[1])[0], level)
+    for number, line in enumerate(noise.interference):
+        level += _sine(
+            noise.layout.spec.geometry.cols, line, key, philox(seed, Stream.INTERFERENCE, 0 * key + number, frame)
+        )
     # not clip: it would turn NaN into the largest integer, which is above the full scale of the ADC
     return types.UInt32(dr.select(level >= 0.0, dr.minimum(dr.round(level), float(noise.full_scale_dn)), 0.0))
+
+
+def _sine(cols: int, line: InterferenceSpec, key: UInt32, generator: Generator) -> Float:
+    """Value of an interference at pixels of the full sensor, DN; its phase is the generator's next number."""
+    import drjit as dr
+
+    types = jit()
+    word = generator.next_uint32x4()[0]
+    width = dr.opaque(types.UInt32, cols)
+    row, col = types.Float(key // width), types.Float(key % width)
+    turns = dr.fma(dr.opaque(types.Float, line.cycles_per_row), row, dr.opaque(types.Float, line.cycles_per_col) * col)
+    turns = turns - dr.floor(turns) + types.Float(word) * 2.0**-32
+    return dr.opaque(types.Float, line.rms_dn * math.sqrt(2.0)) * dr.cos(math.tau * turns)
+
+
+def _weights(correlation: float) -> tuple[float, float]:
+    """Weights of a deviate and of the one before it whose sum has unit variance and the correlation with the next sum.
+
+    a² + b² = 1 and a b = ρ: the squares are (1 ± √(1 − 4ρ²))/2.
+    """
+    root = math.sqrt(1.0 - 4.0 * correlation * correlation)
+    return math.sqrt((1.0 + root) / 2.0), math.copysign(math.sqrt((1.0 - root) / 2.0), correlation)

@@ -1,0 +1,36 @@
+"""A calibrated sensor beside captures that it was not fitted on: ``twin``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.cli.options import Overwrite
+from hesim_render.cli.told import Json, Quiet, Told
+
+
+def twin(
+    captures: Annotated[Path, typer.Argument(help="folder of EMVA 1288 captures")],
+    out: Annotated[Path, typer.Option(help="folder to write: calibration, sensor file, page and figures of the twin")],
+    seed: Annotated[int, typer.Option(help="of the simulated noise")] = 7,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate on half of EMVA 1288 captures, simulate the other half, and compare: pass or fail for each statistic."""
+    from hesim_render.twin import make_twin
+    from hesim_render.twin.page import check_line
+
+    told = Told(json_, quiet)
+    with told.progress("twin") as move:
+        found = make_twin(
+            captures, out, seed=seed, overwrite=overwrite, progress=lambda what, fraction: move(fraction, 1.0, what)
+        )
+    lines = [check_line(check) for check in found.checks]
+    passed = sum(check.passed for check in found.checks)
+    text = "\n".join([*lines, f"{passed} of {len(lines)} pass", f"in {out}"])
+    facts = {"twin": found.folder, "passed": found.passed, "checks": {c.name: c.passed for c in found.checks}}
+    told.result(text, facts, ExitStatus.DONE if found.passed else ExitStatus.NOT_MET)

@@ -1,0 +1,194 @@
+"""A twin against captures that it was not fitted on: one z-score a figure, with the errors of both.
+
+An error has the noise of the captures, that of the simulated frames, and that of the fitted parameters. What the bench
+does between exposures (light, black level) and the ADC's uneven steps scatter by the amount that the fitted half shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from hesim_render.calibrate.aps.pair_levels import Levels
+from hesim_render.calibrate.aps.pairs import Long, PairCalibration, light_of
+from hesim_render.pixels.aps.formulas import polynomial
+from hesim_render.recording.pair_set import PairSet
+from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra
+
+#: Probability that one check fails for a twin that is right.
+ALARM = 1e-3
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statistic of the captures and of the twin, at one or more places.
+
+    Attributes
+    ----------
+    name : of the statistic.
+    unit, place : unit of the values, and what `places` are.
+    places, real, twin, error : [n]; the error is that of the difference.
+    """
+
+    name: str
+    unit: str
+    place: str
+    places: NDArray[np.float64]
+    real: NDArray[np.float64]
+    twin: NDArray[np.float64]
+    error: NDArray[np.float64]
+
+    @property
+    def z(self) -> NDArray[np.float64]:
+        """Difference over its error."""
+        return (self.twin - self.real) / np.maximum(self.error, 1e-300)
+
+    @property
+    def limit(self) -> float:
+        """Largest |z| that passes: all places of a right twin pass with a probability of 1 − `ALARM`."""
+        return float(norm.isf(ALARM / (2 * max(self.z.size, 1))))
+
+    @property
+    def worst(self) -> float:
+        """The z of the largest size."""
+        return float(self.z[np.argmax(np.abs(self.z))])
+
+    @property
+    def passed(self) -> bool:
+        return bool(np.all(np.abs(self.z) <= self.limit))
+
+
+@dataclass(frozen=True)
+class Half:
+    """Figures of one half of the captures, real or simulated."""
+
+    lit: Levels
+    dark: Levels
+    long_dark: Long
+    long_lit: Long
+
+    @property
+    def signal(self) -> float:
+        """Mean signal of the lit long series, DN."""
+        return float(self.long_lit.mean.mean() - self.long_dark.mean.mean())
+
+
+def compare(result: PairCalibration, held: PairSet, real: Half, twin: Half) -> list[Check]:
+    """All checks.
+
+    Parameters
+    ----------
+    result : what was fitted, to the other half.
+    held : the captures that were held out.
+    real, twin : their figures and those of the twin.
+    """
+    return [
+        *_temporal(result, held, real, twin),
+        *_shared(result, real, twin),
+        *_spatial(result, real, twin),
+    ]
+
+
+def _temporal(result: PairCalibration, held: PairSet, real: Half, twin: Half) -> list[Check]:
+    """Mean and temporal variance of the pairs, in the light and in the dark."""
+    light = light_of(held, real.lit)
+    rows, cols = held.shape
+    clear = real.lit.clear & twin.lit.clear & (light <= result.light[result.clear].max() * 1.05)
+    signal = result.curve.at(light)
+    mean_error = np.sqrt(
+        (result.curve.light_rms * signal) ** 2 + result.curve.error(light) ** 2 + result.black.rms**2
+        + result.black.error**2 + 2 * (real.lit.variance / (2 * rows * cols)) + max(result.row[0], 0.0) / rows
+    )  # fmt: skip
+    fit = result.fit.covariance
+    design = np.stack([
+        np.ones_like(signal), signal, real.lit.exposure_s, signal**2, signal * real.lit.exposure_s,
+        real.lit.exposure_s**2,
+    ])  # fmt: skip
+    of_fit = np.einsum("il,ij,jl->l", design, fit, design)
+    expected = polynomial(result.fit.beta, signal, real.lit.exposure_s)
+    variance_error = np.sqrt(
+        real.lit.error**2 + twin.lit.error**2 + of_fit + (result.level_rms * expected) ** 2
+        + 2 * result.noise.rms**2
+    )  # fmt: skip
+    t = np.unique(real.dark.exposure_s, return_index=True)[1]
+    dark_error = np.sqrt(2 * result.black.rms**2 + result.black.error**2)
+    dark_variance_error = np.sqrt(
+        real.dark.error[t] ** 2 + twin.dark.error[t] ** 2 + 2 * result.noise.rms**2 + result.noise.error**2
+    )
+    place = "photons per pixel" if held.has_photons else "exposure, s"
+    ms = 1e3 * real.dark.exposure_s[t]
+    here = light[clear]
+
+    def lit(name: str, unit: str, key: str, error: NDArray) -> Check:
+        return Check(
+            name, unit, place, here, getattr(real.lit, key)[clear], getattr(twin.lit, key)[clear], error[clear]
+        )
+
+    return [
+        lit("mean, lit", "DN", "mean", mean_error),
+        Check("mean, dark", "DN", "exposure, ms", ms, real.dark.mean[t], twin.dark.mean[t], np.full(t.size, dark_error)),
+        lit("temporal variance, lit", "DN²", "variance", variance_error),
+        Check(
+            "temporal variance, dark", "DN²", "exposure, ms", ms, real.dark.variance[t], twin.dark.variance[t],
+            dark_variance_error,
+        ),
+    ]  # fmt: skip
+
+
+def _shared(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
+    """What rows and columns get anew in each frame: the mean over all dark pairs."""
+    t = np.unique(real.dark.exposure_s, return_index=True)[1]
+    checks = []
+    for name, key, fitted in (("row", "row", result.row[1]), ("column", "col", result.col[1])):
+        values = [getattr(half.dark, key)[t] for half in (real, twin)]
+        error = np.sqrt(sum(float(v.var(ddof=1)) / v.size for v in values) + fitted**2) if t.size > 2 else fitted * 2
+        checks.append(
+            Check(f"temporal {name} variance, dark", "DN²", "", np.zeros(1), *(np.array([v.mean()]) for v in values),
+                  np.array([error]))
+        )  # fmt: skip
+    return checks
+
+
+def _spatial(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
+    """Spatial variances, defects and spectra of the long series."""
+    checks = []
+    own = Half(result.lit, result.dark, result.long_dark, result.long_lit)
+    for name, unit in (("dark", "DN²"), ("lit", "relative²")):
+        key = f"long_{name}"
+        scale = [1.0 if name == "dark" else half.signal for half in (real, twin, own)]
+        series: list[Long] = [getattr(half, key) for half in (real, twin, own)]
+        values = [np.array([*s.spatial.parts, s.spatial.total]) / f**2 for s, f in zip(series, scale, strict=True)]
+        errors = [s.spatial.errors(fixed=True) / f**2 for s, f in zip(series, scale, strict=True)]
+        error = np.sqrt(np.sum(np.square(errors), axis=0))
+        for number, part in enumerate(("row", "column", "pixel", "total")):
+            cut = slice(number, number + 1)
+            checks.append(
+                Check(
+                    f"spatial variance, {part}, {name}",
+                    unit,
+                    "",
+                    np.zeros(1),
+                    values[0][cut],
+                    values[1][cut],
+                    error[cut],
+                )
+            )
+        images = [deviations(s.mean / f) for s, f in zip(series[:2], scale, strict=False)]
+        edges = bin_edges(*images)
+        counts = [counts_in(image, edges) for image in images]
+        checks.append(
+            Check(f"defects, histogram, {name}", "pixels", "deviation, " + ("DN" if name == "dark" else "relative"),
+                  edges[:-1], *counts, np.sqrt(np.maximum(counts[0] + counts[1], 1.0)))
+        )  # fmt: skip
+        found = [spectra(s, f, result.noise_spectrum) for s, f in zip(series, scale, strict=True)]
+        for direction in ("rows", "columns"):
+            here = [f[direction] for f in found]
+            error = np.sqrt(sum(s.error**2 for s in here))
+            checks.append(
+                Check(f"spectrum of {direction}, {name}", unit, "periods per pixel", here[0].cycles, here[0].power,
+                      here[1].power, error)
+            )  # fmt: skip
+    return checks

@@ -1,0 +1,72 @@
+"""The page of a twin: what was found, pass or fail of each check, and both curves over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from hesim_render.core.drawing import COLOURS, legend_below, new_figure, points, report_style, svg
+from hesim_render.core.html import PAGE_STYLE, number, row_of, table
+from hesim_render.twin.comparison import Check
+
+_SIZE_PX = (440, 340)
+
+
+def check_line(check: Check) -> str:
+    """A check in one line."""
+    told = "pass" if check.passed else "FAIL"
+    if check.z.size == 1:
+        real, twin = float(check.real[0]), float(check.twin[0])
+        return f"{told}  {check.name:<34} z {check.worst:+.1f} (limit {check.limit:.1f}); {real:.4g} and {twin:.4g} {check.unit}"
+    where = check.places[np.argmax(np.abs(check.z))]
+    return (
+        f"{told}  {check.name:<34} worst z {check.worst:+.1f} (limit {check.limit:.1f}) of {check.z.size}, at {where:.4g} "
+        f"{check.place}; rms z {float(np.sqrt(np.mean(check.z**2))):.2f}"
+    )
+
+
+def page(checks: Sequence[Check], findings: Sequence[str]) -> str:
+    """The HTML page; it needs no other file."""
+    rows = [
+        (
+            check.name, "pass" if check.passed else "FAIL", str(check.z.size), f"{check.worst:+.2f}", f"{check.limit:.2f}",
+            f"{float(np.sqrt(np.mean(check.z**2))):.2f}",
+            *((number(float(check.real[0])), number(float(check.twin[0]))) if check.z.size == 1 else ("", "")), check.unit,
+        )
+        for check in checks
+    ]  # fmt: skip
+    head = ("statistic", "", "values", "worst z", "limit", "rms z", "captures", "twin", "unit")
+    passed = sum(check.passed for check in checks)
+    with report_style():
+        drawn = row_of(*(_overlay(check) for check in checks if check.z.size > 1))
+    listed = "".join(f"<li>{escape(text)}</li>" for text in findings)
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Twin</title>'
+        f"<style>{PAGE_STYLE}</style></head><body><h1>Twin of a sensor</h1>"
+        "<p>Calibrated on every second exposure and half of the long series; compared with the rest, which it was not "
+        "fitted on. z is the difference over its error, which has the noise of both, of the fit, and what the fitted half "
+        f"shows of changes between exposures. {passed} of {len(checks)} statistics pass.</p>{table(head, rows)}"
+        f"<h2>What the sensor has beyond a linear model</h2><ul>{listed}</ul><h2>Captures and twin</h2>{drawn}"
+        "</body></html>\n"
+    )
+
+
+def _overlay(check: Check) -> str:
+    """Both over each other, and the z-scores below."""
+    figure = new_figure(_SIZE_PX)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    upper.set(title=check.name, ylabel=check.unit)
+    points(upper, check.places, check.real, COLOURS[0], "captures", 5.0)
+    upper.plot(check.places, check.twin, color=COLOURS[1], label="twin")
+    lower.set(xlabel=check.place, ylabel="z")
+    points(lower, check.places, check.z, COLOURS[6], size=3.4)
+    for side in (-1, 1):
+        lower.axhline(side * check.limit, color=COLOURS[1], linewidth=0.8, linestyle="--")
+    reach = max(check.limit, abs(check.worst)) * 1.15
+    lower.set_ylim(-reach, reach)
+    if check.unit == "pixels" or check.name.startswith("spectrum"):
+        upper.set_yscale("log")
+    legend_below(figure, upper, 2)
+    return svg(figure)

@@ -1,0 +1,112 @@
+"""A twin: calibrated on half of EMVA 1288 captures, tested on the other half."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from hesim_render.calibrate.aps.pair_levels import pair_levels
+from hesim_render.calibrate.aps.pairs import long_series
+from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, findings
+from hesim_render.calibrate.aps.sensor_file import write_sensor
+from hesim_render.calibrate.moments import Progress
+from hesim_render.calibrate.result import plain
+from hesim_render.core.errors import RangeError
+from hesim_render.core.output import OutputFolder, output_errors
+from hesim_render.recording.pair_set import read_pair_set
+from hesim_render.sensor.sensor import load_sensor
+from hesim_render.specs.calibration import read_maps
+from hesim_render.twin.comparison import ALARM, Check, Half, compare
+from hesim_render.twin.page import page
+from hesim_render.twin.simulated import Bench
+
+RESULT_NAME = "twin.json"
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A twin and how it did.
+
+    Attributes
+    ----------
+    folder : holds ``calibration.yaml``, ``sensor.yaml``, ``twin.json`` and ``twin.html``.
+    checks : one a statistic.
+    """
+
+    folder: Path
+    checks: list[Check]
+
+    @property
+    def passed(self) -> bool:
+        return all(check.passed for check in self.checks)
+
+
+def make_twin(
+    captures: str | Path, out: str | Path, *, seed: int = 7, overwrite: bool = False, progress: Progress | None = None
+) -> Twin:
+    """Calibrate a sensor on every second exposure and half of the long series, simulate the rest, and compare.
+
+    Parameters
+    ----------
+    captures : folder of EMVA 1288 captures.
+    out : folder to write.
+    seed : of the simulated noise.
+    overwrite : replace an existing twin.
+    progress : called with a text that names the current work and the fraction done.
+
+    Returns
+    -------
+    The twin.
+
+    Raises
+    ------
+    RangeError
+        If the seed is out of range.
+    SpecError
+        If the captures cannot be used, or are too few for two halves.
+    OutputError
+        If `out` exists or cannot be written.
+    """
+    if not 0 <= seed < 2**64:
+        raise RangeError("seed", seed, "0 to 2^64 - 1")
+    pairs = read_pair_set(captures)
+    if min(len(pairs.spatial_lit.files), len(pairs.spatial_dark.files)) < 8:
+        raise pairs.spatial_lit.error("a series of fewer than 8 frames has no two halves")
+    fitted, held = pairs.half(0), pairs.half(1)
+    folder = OutputFolder(out, RESULT_NAME, overwrite)
+    try:
+        with output_errors(folder.target):
+            calibration = folder.path / "calibration.yaml"
+            result = calibrate_pairs(fitted, calibration, progress=progress)
+            sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
+            bench = Bench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_relative"], seed)
+            real = Half(
+                pair_levels(held, held.lit, progress), pair_levels(held, held.dark, progress),
+                long_series(held, False, progress), long_series(held, True, progress),
+            )  # fmt: skip
+            twin = Half(
+                bench.pairs(held, True, progress), bench.pairs(held, False, progress), bench.long(held, False),
+                bench.long(held, True),
+            )  # fmt: skip
+            checks = compare(result, held, real, twin)
+            told = [finding.text for finding in findings(result)]
+            (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
+            (folder.path / "twin.html").write_text(page(checks, told), encoding="utf-8")
+        return Twin(folder.commit(), checks)
+    except BaseException:
+        folder.discard()
+        raise
+
+
+def _json(checks: list[Check], seed: int) -> str:
+    """The result for programs."""
+    listed = [
+        {
+            "name": check.name, "passed": check.passed, "unit": check.unit, "place": check.place, "limit": check.limit,
+            "places": check.places, "captures": check.real, "twin": check.twin, "error": check.error, "z": check.z,
+        }
+        for check in checks
+    ]  # fmt: skip
+    whole = {"passed": all(check.passed for check in checks), "seed": seed, "false_alarm": ALARM, "checks": listed}
+    return json.dumps(plain(whole), indent=1, ensure_ascii=False) + "\n"
