@@ -20,7 +20,7 @@ def twin(
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate on half of EMVA 1288 captures, simulate the other half, and compare: pass or fail for each statistic."""
+    """Calibrate on half of EMVA 1288 captures, simulate the rest, compare: pass or fail for each statistic."""
     from hesim_render.twin import make_twin
     from hesim_render.twin.page import check_line
 

@@ -1,7 +1,7 @@
 """Captures of EMVA 1288: pairs of frames at many exposures, and one series of many frames, dark and lit.
 
 Two layouts are read: that of the standard's own data sets (``EMVA1288_Data.txt``), and a plain folder whose file names
-state light and exposure (``lit_5160us_15508ph_01.png``). Only the lists of files are read here, and frames one at a time.
+state light and exposure (``lit_5160us_15508ph_01.png``). Frames are read one at a time.
 """
 
 from __future__ import annotations
@@ -232,10 +232,12 @@ def _named(folder: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
             continue
         light, exposure, photons, number, _ = match.groups()
         texts = exposure if photons is None else f"{exposure} {photons}"
-        values = (*_numbers(path, 1, texts, 1 if photons is None else 2, _NAME_TOLD), None)
+        stated = _numbers(path, 1, texts, 1 if photons is None else 2, _NAME_TOLD)
         if leads_out(folder, path.name):
             raise SpecError("leads out of its folder", file=path)
-        found.setdefault((light == "lit", values[0] * S_PER_US, values[1]), []).append((int(number), path))
+        found.setdefault((light == "lit", stated[0] * S_PER_US, None if photons is None else stated[1]), []).append(
+            (int(number), path)
+        )
     spec = _capture_spec(folder, None)
     series = [Series(*key, tuple(p for _, p in sorted(files)), folder, None) for key, files in found.items()]
     return spec, _size(series[0].files[0]), series

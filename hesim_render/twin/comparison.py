@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.pair_levels import Levels
-from hesim_render.calibrate.aps.pairs import Long, PairCalibration, light_of
+from hesim_render.calibrate.aps.pairs import PairCalibration, light_of
 from hesim_render.pixels.aps.formulas import polynomial
 from hesim_render.recording.pair_set import PairSet
 from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra
@@ -55,6 +56,11 @@ class Check:
     def worst(self) -> float:
         """The z of the largest size."""
         return float(self.z[np.argmax(np.abs(self.z))])
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean of z²; about 1 for a twin that is right."""
+        return float(np.sqrt(np.mean(self.z**2)))
 
     @property
     def passed(self) -> bool:
@@ -129,7 +135,9 @@ def _temporal(result: PairCalibration, held: PairSet, real: Half, twin: Half) ->
 
     return [
         lit("mean, lit", "DN", "mean", mean_error),
-        Check("mean, dark", "DN", "exposure, ms", ms, real.dark.mean[t], twin.dark.mean[t], np.full(t.size, dark_error)),
+        Check(
+            "mean, dark", "DN", "exposure, ms", ms, real.dark.mean[t], twin.dark.mean[t], np.full(t.size, dark_error)
+        ),
         lit("temporal variance, lit", "DN²", "variance", variance_error),
         Check(
             "temporal variance, dark", "DN²", "exposure, ms", ms, real.dark.variance[t], twin.dark.variance[t],
@@ -145,10 +153,9 @@ def _shared(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
     for name, key, fitted in (("row", "row", result.row[1]), ("column", "col", result.col[1])):
         values = [getattr(half.dark, key)[t] for half in (real, twin)]
         error = np.sqrt(sum(float(v.var(ddof=1)) / v.size for v in values) + fitted**2) if t.size > 2 else fitted * 2
-        checks.append(
-            Check(f"temporal {name} variance, dark", "DN²", "", np.zeros(1), *(np.array([v.mean()]) for v in values),
-                  np.array([error]))
-        )  # fmt: skip
+        means = [np.array([v.mean()]) for v in values]
+        name = f"temporal {name} variance, dark"
+        checks.append(Check(name, "DN²", "", np.zeros(1), means[0], means[1], np.array([error])))
     return checks
 
 
@@ -181,7 +188,7 @@ def _spatial(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
         counts = [counts_in(image, edges) for image in images]
         checks.append(
             Check(f"defects, histogram, {name}", "pixels", "deviation, " + ("DN" if name == "dark" else "relative"),
-                  edges[:-1], *counts, np.sqrt(np.maximum(counts[0] + counts[1], 1.0)))
+                  edges[:-1], counts[0], counts[1], np.sqrt(np.maximum(counts[0] + counts[1], 1.0)))
         )  # fmt: skip
         found = [spectra(s, f, result.noise_spectrum) for s, f in zip(series, scale, strict=True)]
         for direction in ("rows", "columns"):

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.aps.pairs import Long
 
 #: Bands of spatial frequency, of equal numbers of frequencies.
 _BANDS = 20
@@ -36,9 +36,12 @@ class Spectrum:
     error: NDArray[np.float64]
 
 
-def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int, sines: Sequence[tuple[float, float]] = ()) -> Spectrum:
-    """Spectrum along rows (axis 1) or columns (axis 0) of a mean image, as EMVA 1288 takes it: a transform of each line, and
-    the mean of their powers.
+def spectrum(
+    image: NDArray, noise_pixel: float, noise_shared: float, axis: int, sines: Sequence[tuple[float, float]] = ()
+) -> Spectrum:
+    """Spectrum along rows (axis 1) or columns (axis 0) of a mean image, as EMVA 1288 takes it.
+
+    Each line is transformed, and the mean of their powers is taken.
 
     Parameters
     ----------
@@ -61,7 +64,9 @@ def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int,
     shared = (2 * pattern * noise_shared + noise_shared**2 + 2 * noise_pixel * noise_shared / count) / number
     for frequency, expected in sines:
         # frames of any phase add up to an exponential law, or a squared normal one at half a period a pixel
-        band = next(k for k, group in enumerate(groups) if group[-1] + 1 >= round(frequency * size) > 0 or k == number.size - 1)
+        band = next(
+            k for k, group in enumerate(groups) if group[-1] + 1 >= round(frequency * size) > 0 or k == number.size - 1
+        )
         shared[band] += ((2 if frequency == 0.5 else 1) * expected**2 + 2 * expected * noise) / number[band] ** 2
     cycles = np.array([(group.mean() + 1) / size for group in groups])
     return Spectrum(cycles, banded, np.sqrt(own + shared))

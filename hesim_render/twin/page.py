@@ -16,27 +16,26 @@ _SIZE_PX = (440, 340)
 
 def check_line(check: Check) -> str:
     """A check in one line."""
-    told = "pass" if check.passed else "FAIL"
+    told = f"{'pass' if check.passed else 'FAIL'}  {check.name:<34}"
+    limit = f"(limit {check.limit:.1f})"
     if check.z.size == 1:
-        real, twin = float(check.real[0]), float(check.twin[0])
-        return f"{told}  {check.name:<34} z {check.worst:+.1f} (limit {check.limit:.1f}); {real:.4g} and {twin:.4g} {check.unit}"
-    where = check.places[np.argmax(np.abs(check.z))]
-    return (
-        f"{told}  {check.name:<34} worst z {check.worst:+.1f} (limit {check.limit:.1f}) of {check.z.size}, at {where:.4g} "
-        f"{check.place}; rms z {float(np.sqrt(np.mean(check.z**2))):.2f}"
-    )
+        values = f"{float(check.real[0]):.4g} and {float(check.twin[0]):.4g} {check.unit}"
+        return f"{told} z {check.worst:+.1f} {limit}; {values}"
+    place = f"{check.places[np.argmax(np.abs(check.z))]:.4g} {check.place}"
+    return f"{told} worst z {check.worst:+.1f} {limit} of {check.z.size}, at {place}; rms z {check.rms:.2f}"
+
+
+def _row(check: Check) -> tuple[str, ...]:
+    told = "pass" if check.passed else "FAIL"
+    alone = check.z.size == 1
+    values = (number(float(check.real[0])), number(float(check.twin[0]))) if alone else ("", "")
+    scores = f"{check.worst:+.2f}", f"{check.limit:.2f}", f"{check.rms:.2f}"
+    return check.name, told, str(check.z.size), *scores, *values, check.unit
 
 
 def page(checks: Sequence[Check], findings: Sequence[str]) -> str:
     """The HTML page; it needs no other file."""
-    rows = [
-        (
-            check.name, "pass" if check.passed else "FAIL", str(check.z.size), f"{check.worst:+.2f}", f"{check.limit:.2f}",
-            f"{float(np.sqrt(np.mean(check.z**2))):.2f}",
-            *((number(float(check.real[0])), number(float(check.twin[0]))) if check.z.size == 1 else ("", "")), check.unit,
-        )
-        for check in checks
-    ]  # fmt: skip
+    rows = [_row(check) for check in checks]
     head = ("statistic", "", "values", "worst z", "limit", "rms z", "captures", "twin", "unit")
     passed = sum(check.passed for check in checks)
     with report_style():
@@ -46,8 +45,8 @@ def page(checks: Sequence[Check], findings: Sequence[str]) -> str:
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Twin</title>'
         f"<style>{PAGE_STYLE}</style></head><body><h1>Twin of a sensor</h1>"
         "<p>Calibrated on every second exposure and half of the long series; compared with the rest, which it was not "
-        "fitted on. z is the difference over its error, which has the noise of both, of the fit, and what the fitted half "
-        f"shows of changes between exposures. {passed} of {len(checks)} statistics pass.</p>{table(head, rows)}"
+        "fitted on. z is the difference over its error, which has the noise of both and of the fit, and what the "
+        f"fitted half shows of changes between exposures. {passed} of {len(checks)} statistics pass.</p>{table(head, rows)}"
         f"<h2>What the sensor has beyond a linear model</h2><ul>{listed}</ul><h2>Captures and twin</h2>{drawn}"
         "</body></html>\n"
     )

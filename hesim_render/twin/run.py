@@ -6,9 +6,10 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from hesim_render.calibrate.aps.long_series import long_series
 from hesim_render.calibrate.aps.pair_levels import pair_levels
-from hesim_render.calibrate.aps.pairs import long_series
-from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, findings
+from hesim_render.calibrate.aps.pairs_findings import findings
+from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.sensor_file import write_sensor
 from hesim_render.calibrate.moments import Progress
 from hesim_render.calibrate.result import plain

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibrate.aps.long_series import Long, long_of
 from hesim_render.calibrate.aps.noise_spectrum import noise_spectrum
 from hesim_render.calibrate.aps.pair_levels import Levels, levels, pair_statistics
-from hesim_render.calibrate.aps.pairs import Long, PairCalibration, long_of
+from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.calibrate.moments import Progress, measure
 from hesim_render.recording.pair_set import PairSet, Series
 from hesim_render.sensor.sensor import Sensor

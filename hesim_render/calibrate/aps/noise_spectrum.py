@@ -24,7 +24,8 @@ class InterferenceLine:
 
     Attributes
     ----------
-    cycles_per_row, cycles_per_col : periods per pixel, from row to row (−0.5 to 0.5) and from column to column (0 to 0.5).
+    cycles_per_row, cycles_per_col : periods per pixel, from row to row (−0.5 to 0.5) and from column to column (0 to
+        0.5).
     rms_dn : its standard deviation over frames and pixels, DN.
     """
 
@@ -62,8 +63,8 @@ class NoiseSpectrum:
 def noise_spectrum(stack: Frames, mean: NDArray) -> NoiseSpectrum:
     """Spectrum of the frames of a series about their mean.
 
-    The power of white noise, averaged over n frames, has a gamma law of shape n. A frequency is a line if its power has a
-    chance of `ALARM` for the whole spectrum. Changes that rows or columns share are no lines.
+    The power of white noise, averaged over n frames, has a gamma law of shape n. A frequency is a line if its power has
+    a chance of `ALARM` for the whole spectrum. Changes that rows or columns share are no lines.
 
     Parameters
     ----------

@@ -82,8 +82,8 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
 
     with ThreadPoolExecutor(2) as two:
         results = []
-        for number, found in enumerate(two.map(one, different)):
-            results.append(found)
+        for number, measured in enumerate(two.map(one, different)):
+            results.append(measured)
             if progress is not None:
                 progress("reading pairs", (number + 1) / len(different))
     found = dict(zip(different, results, strict=True))

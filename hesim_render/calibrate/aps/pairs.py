@@ -1,8 +1,8 @@
 """Calibration from captures of EMVA 1288, in the order of the standard (Release 4.0 linear) [emva2021].
 
-Mean and variance of the pairs give gain, responsivity, quantum efficiency, dark noise and linearity; the long series give
-DSNU, PRNU, defects and the fixed maps. Beyond the standard, the curve of the mean and what rows, columns and whole frames
-get anew in each frame are measured, because a twin of the sensor needs them.
+Mean and variance of the pairs give gain, responsivity, quantum efficiency, dark noise and linearity. The long series
+give DSNU, PRNU, defects and the fixed maps. Beyond the standard, the curve of the mean is measured, and what rows and
+columns get anew in each frame, because a twin of the sensor needs them.
 """
 
 from __future__ import annotations
@@ -21,19 +21,16 @@ from hesim_render.calibrate.aps.light_curve import (
     straight,
     through_origin,
 )
-from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum, noise_spectrum
-from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, SpatialStack, pair_levels
+from hesim_render.calibrate.aps.long_series import Long, long_series
+from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, Levels, pair_levels
 from hesim_render.calibrate.aps.spatial import (
     Pattern,
-    SpatialVariance,
-    Temporal,
     outliers,
     pattern_of,
-    spatial_variance,
-    temporal_of,
 )
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
-from hesim_render.calibrate.moments import Moments, Progress, measure
+from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet
@@ -45,30 +42,6 @@ _MOST_SCATTER = MOST_CHANGE
 _FEWEST_CLEAR = 5
 #: Terms of the variance polynomial that flat fields of one light at many exposures do not tell: I t and t².
 _NO_TERMS = (4, 5)
-
-
-@dataclass(frozen=True)
-class Long:
-    """One long series: mean of its frames, temporal variances and spatial ones.
-
-    Attributes
-    ----------
-    mean : [row, col], DN.
-    variance : float32 [row, col], temporal, DN².
-    first : the first frame.
-    frames : number of frames.
-    levels : [frame], mean of each frame, DN.
-    spectrum : of the temporal noise; None in the light.
-    """
-
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float32]
-    first: NDArray[np.uint16]
-    frames: int
-    levels: NDArray[np.float64]
-    temporal: Temporal
-    spatial: SpatialVariance
-    spectrum: NoiseSpectrum | None
 
 
 @dataclass(frozen=True)
@@ -199,43 +172,12 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     )  # fmt: skip
 
 
-def long_series(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long:
-    """Read and check the long series of a set, lit or dark."""
-    series = pairs.spatial_lit if is_lit else pairs.spatial_dark
-    used = np.ones(pairs.shape, bool)
-    full = pairs.spec.full_scale_dn
-    stack = SpatialStack(pairs, series, progress)
-    moments = measure(stack, used, full)
-    clipped = float(np.mean(moments.highest[0] >= full))
-    if clipped > CLIPPED_SHARE and float(np.mean(moments.mean[0] >= full - 0.5)) > CLIPPED_SHARE:
-        raise series.error(
-            f"{100 * clipped:.3g} % of the pixels of the long series are saturated; EMVA 1288 takes it at 50 % of "
-            "saturation"
-        )
-    mean = moments.mean[0].astype(np.float64)
-    levels = moments.row_means[0].mean(axis=1)
-    if is_lit and np.ptp(levels) > MOST_CHANGE * mean.mean():
-        raise series.error(
-            f"the light drifts: the frames of the long series differ by {100 * np.ptp(levels) / mean.mean():.2g} %; warm "
-            "the light up and keep it steady"
-        )
-    return long_of(moments, None if is_lit else noise_spectrum(stack, mean))
-
-
-def long_of(moments: Moments, spectrum: NoiseSpectrum | None) -> Long:
-    """A long series from the moments of its frames."""
-    mean = moments.mean[0].astype(np.float64)
-    temporal, levels = temporal_of(moments)
-    spatial = spatial_variance(mean, temporal, moments.frames)
-    return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial, spectrum)
-
-
 def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
     for k, entry in enumerate(pairs.dark):
         if dark.low[k] > 0.01:
             raise entry.error(
-                f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the black "
-                "level (offset)"
+                f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the "
+                "black level (offset)"
             )
         if dark.variance[k] - ADC_VARIANCE_DN2 < HIDDEN_VARIANCE_DN2:
             raise entry.error(
@@ -301,7 +243,7 @@ def _bins(
     is_lit = np.arange(light.size) >= distinct.size
     zero = np.zeros(light.size)
     return Pooled(
-        exposure, zero, pixels * light[:, None] ** np.arange(7), pixels * (variance * light ** np.arange(4)[:, None]).T,
+        exposure, zero, np.asarray(pixels * light[:, None] ** np.arange(7), np.float64), pixels * (variance * light ** np.arange(4)[:, None]).T,
         pixels * squares, zero, np.ones(light.size), is_lit,
     )  # fmt: skip
 

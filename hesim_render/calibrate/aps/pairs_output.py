@@ -10,18 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from hesim_render.calibrate.aps.pairs import Long, PairCalibration, evaluate
+from hesim_render.calibrate.aps.long_series import Long
+from hesim_render.calibrate.aps.pairs import PairCalibration, evaluate
+from hesim_render.calibrate.aps.pairs_findings import SIGNIFICANT, findings
 from hesim_render.calibrate.aps.variance import TERMS
 from hesim_render.calibrate.estimate import Z_95, estimated, not_identifiable
-from hesim_render.calibrate.finding import Finding
 from hesim_render.calibrate.moments import Progress
 from hesim_render.calibrate.result import check_calibration, check_report, write_section
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet, read_pair_set
 
 _FIGURE_PX = 320
-#: Relative changes of signal and variance from which a finding names them.
-_LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
 
 
 def calibrate_pairs(
@@ -127,7 +126,7 @@ def content(result: PairCalibration) -> dict[str, Any]:
 
 def _shared(variance: float, error: float, std: float) -> dict[str, Any]:
     """Temporal noise of rows or columns; 0 with a limit where it is not significant."""
-    if variance > 3.9 * error and std > 0:  # a chance of 1e-4
+    if variance > SIGNIFICANT * error and std > 0:
         return estimated(std, error / (2 * std), "DN")
     limit = float(np.sqrt(max(variance, 0.0) + Z_95 * error))
     return {"value": 0.0, "upper_limit": limit, "unit": "DN", "note": "they share no more than chance makes them"}
@@ -236,43 +235,6 @@ def _linearity(result: PairCalibration) -> dict[str, Any]:
         "value": float(np.mean(np.abs(deviations))), "unit": "%", "largest": float(np.abs(deviations).max()),
         "levels": int(used.sum()),
     }  # fmt: skip
-
-
-def findings(result: PairCalibration) -> list[Finding]:
-    """What the sensor, or the bench, has beyond the standard's linear model, with its size."""
-    found = []
-    curve, k = result.curve, result.gain.slope
-    top = float(result.light[result.clear].max())
-    bend = float(curve.at(np.array([top]))[0] / (curve.terms[0] * (top + curve.offset)) - 1)
-    if curve.bends and abs(bend) > _LEAST_BEND:
-        found.append(("linearity", f"the mean bends: {100 * bend:+.2g} % at the brightest clear level. The sensor file has "
-                      "the curve (aps.nonlinearity); K and the quantum efficiency are means over 0 to 70 % of saturation"))  # fmt: skip
-    if abs(curve.offset) > 4 * curve.offset_error > 0:
-        unit = "photons" if result.pairs.has_photons else "s of exposure"
-        found.append(("light offset", f"every lit frame has {curve.offset:.3g} {unit} more than stated: an exposure that is "
-                      "longer than stated by a constant, or light during the read-out (smear)"))  # fmt: skip
-    if curve.light_rms > _LEAST_SCATTER / 4:
-        found.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
-    if result.level_rms > _LEAST_SCATTER and result.level_chi2 > 2:
-        found.append(("variance", f"the variances of single levels scatter by {100 * result.level_rms:.2g} % about the "
-                      f"polynomial, more than chance (χ²/dof {result.level_chi2:.1f}): steps of the ADC that are not even, or "
-                      "noise that comes and goes"))  # fmt: skip
-    for name, (variance, error) in (("row noise", result.row), ("column noise", result.col)):
-        if variance > 3.9 * error:
-            found.append((name, f"{name[:-6]}s change together from frame to frame by {np.sqrt(variance):.3g} DN "
-                          f"({np.sqrt(variance) / k:.2g} e-)"))  # fmt: skip
-    for line in result.noise_spectrum.lines[:3]:
-        found.append(("interference", f"a pattern with {line.cycles_per_row:.3g} periods a row and {line.cycles_per_col:.3g} a "
-                      f"column has a new phase in each frame, {line.rms_dn:.2g} DN rms"))  # fmt: skip
-    if result.noise_spectrum.correlated:
-        found.append(("read noise", f"the dark noise of neighbours in a row has a correlation of "
-                      f"{result.noise_spectrum.correlation:+.3f}: a filter of the read-out"))  # fmt: skip
-    columns = result.long_dark.spatial.col
-    if columns > 4 * result.long_dark.spatial.errors(fixed=True)[1]:
-        found.append(("column pattern", f"columns have offsets of their own, {np.sqrt(columns):.2g} DN rms"))
-    if result.black.rms > 3 * np.sqrt(max(result.row[0], 0.0) / (2 * result.pairs.shape[0])) + 0.01:
-        found.append(("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure"))
-    return [Finding(check, text, None) for check, text in found]
 
 
 def maps(result: PairCalibration) -> dict[str, NDArray]:

@@ -9,8 +9,8 @@ from hesim_render.calibrate.aps.pairs import PairCalibration
 from hesim_render.core.output import output_errors, replacing
 
 _TEXT = """\
-# Written by `hesim-render calibrate` beside {calibration}. Its noise replaces the figures of `aps` below; what the captures
-# do not tell is a placeholder, under `assumptions`. docs/sensors.md has all keys.
+# Written by `hesim-render calibrate` with {calibration}, whose noise replaces the figures of `aps` below. What the
+# captures do not tell is a placeholder, under `assumptions`. docs/sensors.md has all keys.
 schema_version: 1
 name: {name}
 description: "{cols}x{rows} px, {bits} bit, monochrome, from captures of EMVA 1288"
@@ -43,7 +43,7 @@ sources:
   aps: "measured: {calibration}"
 assumptions:
   geometry.pitch_um: not told by the captures; a placeholder
-  filters: the captures tell the efficiency at their own wavelength alone; clear, with cuts in the ultraviolet and infrared
+  filters: the captures tell the efficiency at their own wavelength alone; clear between ultraviolet and infrared
   lens: user's choice; a placeholder
   aps.full_well_e: "{well_note}"
   aps.exposure_us: that of the long series

@@ -170,9 +170,7 @@ def pattern_of(
     return Pattern(_profile(by_row, noise[0]), _profile(by_col, noise[1]), waves + smooth + fine)
 
 
-def _waves(
-    values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames: int
-) -> NDArray[np.float64]:
+def _waves(values: NDArray, noise: float, temporal: NoiseSpectrum | None, frames: int) -> NDArray[np.float64]:
     """The frequencies of an image that stand out of its white part and of interference: shading, periodic patterns."""
     spectrum = np.fft.rfft2(values)
     power = np.abs(spectrum) ** 2 / values.size

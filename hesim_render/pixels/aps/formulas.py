@@ -90,8 +90,8 @@ class PixelValue:
 class Curve:
     """Smooth non-linearity of the signal: f(E) = E (1 + n₀ + n₁ u + n₂ u²), u = E/full scale, E = K·electrons in DN.
 
-    Beyond full scale f goes on as a straight line through the origin. n₀ is 0 where K is the gain at no light; a K that is
-    a mean over a range, as of EMVA 1288, is less than that.
+    Beyond full scale f goes on as a straight line through the origin. n₀ is 0 where K is the gain at no light; a K that
+    is a mean over a range, as of EMVA 1288, is less than that.
     """
 
     terms: tuple[float, float, float]
@@ -250,7 +250,8 @@ def calibrated_value(
 def bent_value(value: PixelValue, system_gain_dn_per_e: float, curve: Curve, xp: Namespace) -> PixelValue:
     """Value of a pixel in the physical form whose signal passes a curve.
 
-    The signal becomes f(E) and its variance f'(E)² K E, which is that of a count of f(E)/g with g = K E f'(E)²/f(E) DN each.
+    The signal becomes f(E) and its variance f'(E)² K E, which is that of a count of f(E)/g with g = K E f'(E)²/f(E) DN
+    each.
 
     Parameters
     ----------

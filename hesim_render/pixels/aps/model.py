@@ -27,8 +27,8 @@ from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.sensor import ApsSpec, InterferenceSpec
 
 APS_TERMS = (
-    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "column", "column_noise", "interference", "residual",
-    "crosstalk", "telegraph",
+    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "column", "column_noise", "interference",
+    "residual", "crosstalk", "telegraph",
 )  # fmt: skip
 
 
@@ -68,8 +68,8 @@ class ApsNoise(PlainState):
 
         ``shot`` is the noise of the light (β1, β3, β4), ``dark_current`` its mean and its noise (β2, β5),
         ``read`` is σ_r (β0), ``prnu``, ``dsnu``, ``row`` and ``column`` are the fixed maps, ``row_noise`` is N_tr,
-        ``column_noise`` is N_tc, ``interference`` are periodic patterns, ``residual`` is N_res, ``crosstalk`` is the light that these pixels get from their neighbours, ``telegraph`` is the random
-        telegraph noise.
+        ``column_noise`` is N_tc, ``interference`` are the periodic patterns, ``residual`` is N_res, ``crosstalk`` is
+        the light that these pixels get from their neighbours, ``telegraph`` is the random telegraph noise.
 
         Raises
         ------
@@ -257,9 +257,9 @@ class ApsNoise(PlainState):
     ) -> NDArray[np.float64]:
         """Temporal variance in DN² before the ADC, of the unclipped signal; parameters as in `mean_dn`.
 
-        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr² + N_tc², and the interference. An image also has telegraph
-        noise. Near full well and full scale the variance of samples is lower. `adc` adds the q²/12 of rounding, which
-        is accurate where the variance itself is above 0.24 DN².
+        In the physical form it is K²((1 + PRNU)·I_e + D·t + σ_r²) + N_res² + N_tr² + N_tc², and that of the
+        interference. An image also has telegraph noise. Near full well and full scale the variance of samples is lower.
+        `adc` adds the q²/12 of rounding, which is accurate where the variance itself is above 0.24 DN².
         """
         values = self._checked(electrons, exposure_us)
         value, _ = self._on_host(values, exposure_us, position)

@@ -1,0 +1,69 @@
+"""The two long series of EMVA 1288 captures: their mean, temporal and spatial variances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum, noise_spectrum
+from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, SpatialStack
+from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal, spatial_variance, temporal_of
+from hesim_render.calibrate.moments import Moments, Progress, measure
+from hesim_render.recording.pair_set import PairSet
+
+
+@dataclass(frozen=True)
+class Long:
+    """One long series: mean of its frames, temporal variances and spatial ones.
+
+    Attributes
+    ----------
+    mean : [row, col], DN.
+    variance : float32 [row, col], temporal, DN².
+    first : the first frame.
+    frames : number of frames.
+    levels : [frame], mean of each frame, DN.
+    spectrum : of the temporal noise; None in the light.
+    """
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float32]
+    first: NDArray[np.uint16]
+    frames: int
+    levels: NDArray[np.float64]
+    temporal: Temporal
+    spatial: SpatialVariance
+    spectrum: NoiseSpectrum | None
+
+
+def long_series(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long:
+    """Read and check the long series of a set, lit or dark."""
+    series = pairs.spatial_lit if is_lit else pairs.spatial_dark
+    used = np.ones(pairs.shape, bool)
+    full = pairs.spec.full_scale_dn
+    stack = SpatialStack(pairs, series, progress)
+    moments = measure(stack, used, full)
+    clipped = float(np.mean(moments.highest[0] >= full))
+    if clipped > CLIPPED_SHARE and float(np.mean(moments.mean[0] >= full - 0.5)) > CLIPPED_SHARE:
+        raise series.error(
+            f"{100 * clipped:.3g} % of the pixels of the long series are saturated; EMVA 1288 takes it at 50 % of "
+            "saturation"
+        )
+    mean = moments.mean[0].astype(np.float64)
+    levels = moments.row_means[0].mean(axis=1)
+    if is_lit and np.ptp(levels) > MOST_CHANGE * mean.mean():
+        raise series.error(
+            f"the light drifts: the frames of the long series differ by {100 * np.ptp(levels) / mean.mean():.2g} %; "
+            "warm the light up and keep it steady"
+        )
+    return long_of(moments, None if is_lit else noise_spectrum(stack, mean))
+
+
+def long_of(moments: Moments, spectrum: NoiseSpectrum | None) -> Long:
+    """A long series from the moments of its frames."""
+    mean = moments.mean[0].astype(np.float64)
+    temporal, levels = temporal_of(moments)
+    spatial = spatial_variance(mean, temporal, moments.frames)
+    return Long(mean, moments.variance[0], moments.first[0], moments.frames, levels, temporal, spatial, spectrum)
