@@ -46,7 +46,8 @@ def page(checks: Sequence[Check], findings: Sequence[str]) -> str:
         f"<style>{PAGE_STYLE}</style></head><body><h1>Twin of a sensor</h1>"
         "<p>Calibrated on every second exposure and half of the long series; compared with the rest, which it was not "
         "fitted on. z is the difference over its error, which has the noise of both and of the fit, and what the "
-        f"fitted half shows of changes between exposures. {passed} of {len(checks)} statistics pass.</p>{table(head, rows)}"
+        f"fitted half shows of changes between exposures. {passed} of {len(checks)} statistics pass.</p>"
+        f"{table(head, rows)}"
         f"<h2>What the sensor has beyond a linear model</h2><ul>{listed}</ul><h2>Captures and twin</h2>{drawn}"
         "</body></html>\n"
     )

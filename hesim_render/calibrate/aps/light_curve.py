@@ -6,10 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_law
 from scipy.stats import f as f_law
 
 from hesim_render.calibrate.finding import ALARM
+
+#: Gauss–Newton steps of a fit that is nearly linear.
+_STEPS = 6
+#: Degrees of freedom from which the scatter of points about a line tells their errors better than what is known.
+_ENOUGH = 8
+#: Chance of a larger χ² below which points do not lie on a line, and their scatter counts as error.
+_MISFIT = 0.01
 
 
 @dataclass(frozen=True)
@@ -20,11 +27,13 @@ class Line:
     ----------
     slope, error : the error includes that the points do not lie on the line.
     chi2_per_dof : of the points, with their own errors; NaN where those are unknown.
+    groups : number of points where the error follows from their scatter; None where it is known.
     """
 
     slope: float
     error: float
     chi2_per_dof: float
+    groups: int | None
 
 
 def through_origin(x: NDArray, y: NDArray, covariance: NDArray | None) -> Line:
@@ -41,10 +50,17 @@ def through_origin(x: NDArray, y: NDArray, covariance: NDArray | None) -> Line:
     if covariance is None:
         leverage = x**2 / total
         error = float(np.sqrt(np.sum((x * residual / (1 - leverage)) ** 2))) / total
-        return Line(slope, error, float("nan"))
+        return Line(slope, error, float("nan"), x.size)
     chi2 = float(np.sum(residual**2 / np.diag(covariance))) / max(x.size - 1, 1)
     error = float(np.sqrt(x @ covariance @ x)) / total
-    return Line(slope, error * np.sqrt(max(chi2, 1.0)), chi2)
+    if chi2_law.sf(chi2 * (x.size - 1), x.size - 1) < _MISFIT:
+        error *= float(np.sqrt(chi2))
+    return Line(slope, error, chi2, None)
+
+
+def _scale(chi2: float, dof: int) -> float:
+    """Factor of variances that are known but for a factor: χ² per degree of freedom, if there are enough of them."""
+    return chi2 if dof >= _ENOUGH else max(chi2, 1.0)
 
 
 @dataclass(frozen=True)
@@ -56,6 +72,7 @@ class Intercept:
     value, error : constant and its standard error.
     slope, slope_error : likewise.
     rms : of the residuals.
+    groups : degrees of freedom and one.
     """
 
     value: float
@@ -63,22 +80,23 @@ class Intercept:
     slope: float
     slope_error: float
     rms: float
+    groups: int
 
 
 def straight(x: NDArray, y: NDArray, error: NDArray) -> Intercept:
-    """Weighted line; errors are scaled by the residuals where these are larger. One x alone gives a constant."""
+    """Weighted line; errors are scaled by the residuals. One x alone gives a constant."""
     design = np.stack([np.ones_like(x), x] if np.ptp(x) > 0 else [np.ones_like(x)])
     weight = 1 / error**2
     inverse = np.linalg.inv((design * weight) @ design.T)
     found = inverse @ (design * weight) @ y
     residual = y - found @ design
     dof = max(x.size - design.shape[0], 1)
-    scale = max(float(np.sum(weight * residual**2)) / dof, 1.0)
+    scale = _scale(float(np.sum(weight * residual**2)) / dof, dof)
     errors = np.sqrt(np.diag(inverse) * scale)
     rms = float(np.sqrt(np.sum(residual**2) / dof))
     if found.size == 1:
-        return Intercept(float(found[0]), float(errors[0]), 0.0, float("nan"), rms)
-    return Intercept(float(found[0]), float(errors[0]), float(found[1]), float(errors[1]), rms)
+        return Intercept(float(found[0]), float(errors[0]), 0.0, float("nan"), rms, dof + 1)
+    return Intercept(float(found[0]), float(errors[0]), float(found[1]), float(errors[1]), rms, dof + 1)
 
 
 def linearity_error(light: NDArray, signal: NDArray, top: float) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
@@ -199,18 +217,8 @@ def _gradient(p: NDArray, h: NDArray) -> NDArray[np.float64]:
 
 def _fit(h: NDArray, y: NDArray, weight: NDArray, free: NDArray) -> tuple[NDArray[np.float64], float]:
     """Parameters (offset, b₁, b₂, b₃) and the weighted sum of squares."""
-    start = np.zeros(4)
-    start[1] = float(np.sum(weight**2 * h * y) / np.sum(weight**2 * h * h))
-
-    def whole(values: NDArray) -> NDArray[np.float64]:
-        p = start.copy()
-        p[free] = values
-        return p
-
-    found = least_squares(
-        lambda v: weight * (_value(whole(v), h) - y),
-        start[free],
-        jac=lambda v: (_gradient(whole(v), h)[free] * weight).T,
-        x_scale="jac",
-    )
-    return whole(found.x), 2 * float(found.cost)
+    p = np.zeros(4)
+    p[1] = float(np.sum(weight**2 * h * y) / np.sum(weight**2 * h * h))
+    for _ in range(_STEPS):
+        p[free] += np.linalg.lstsq((_gradient(p, h)[free] * weight).T, weight * (y - _value(p, h)), rcond=None)[0]
+    return p, float(np.sum((weight * (y - _value(p, h))) ** 2))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import f as f_law
 
 from hesim_render.calibrate.aps.light_curve import (
     Intercept,
@@ -59,6 +60,7 @@ class PairCalibration:
     curve : mean signal against light.
     fit : variance polynomial, without what rows and columns share.
     level_chi2 : of the variances of single levels about the polynomial, per degree of freedom.
+    level_chance : of a larger one.
     level_rms : their relative scatter beyond their own errors.
     row, col : temporal variance of rows and columns, and standard errors, DN².
     linearity : the levels used, and their deviations, %.
@@ -81,6 +83,7 @@ class PairCalibration:
     fit: VarianceFit
     bins: Pooled
     level_chi2: float
+    level_chance: float
     level_rms: float
     row: tuple[float, float]
     col: tuple[float, float]
@@ -159,7 +162,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     _check_light(pairs, curve, light, signal, clear)
     bins = _bins(pairs, lit, dark, signal, clear, distinct)
     fit = _variance_fit(bins)
-    level_chi2, level_rms = _scatter(lit, signal, clear, fit)
+    level_chi2, level_chance, level_rms = _scatter(pairs, lit, signal, clear, fit)
     fit = _widened(fit, level_chi2)
     dark_pattern = pattern_of(long_dark.mean, long_dark.spatial.noise, long_dark.spectrum, long_dark.frames)
     relative, relative_noise = _relative(long_lit, long_dark, curve, light[clear])
@@ -167,8 +170,8 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     defects = outliers(long_dark.mean, long_dark.spatial.noise) | outliers(relative, relative_noise)
     return PairCalibration(
         pairs, lit, dark, signal, saturation, clear, gain, responsivity, black, noise, curve, fit, bins, level_chi2,
-        level_rms, row, col, linearity_error(light[clear], signal[clear], top), long_dark, long_lit, dark_pattern,
-        light_pattern, defects,
+        level_chance, level_rms, row, col, linearity_error(light[clear], signal[clear], top), long_dark, long_lit,
+        dark_pattern, light_pattern, defects,
     )  # fmt: skip
 
 
@@ -214,8 +217,8 @@ def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[f
     of_pairs = np.unique(dark.exposure_s, return_index=True)[1]
     found = []
     for values, errors in ((dark.row, dark.row_error), (dark.col, dark.col_error)):
-        scatter = float(values[of_pairs].std(ddof=1)) if of_pairs.size > 2 else float(errors[of_pairs].mean())
-        found.append((float(values[of_pairs].mean()), scatter / np.sqrt(of_pairs.size)))
+        error = float(np.sqrt(np.mean(errors[of_pairs] ** 2) / of_pairs.size))
+        found.append((float(values[of_pairs].mean()), error))
     row, row_error = found[0]
     series, series_error = long_dark.temporal.row, max(long_dark.temporal.row_error, 1e-30)
     weight = np.array([1 / max(row_error, 1e-30) ** 2, 1 / series_error**2])
@@ -243,7 +246,8 @@ def _bins(
     is_lit = np.arange(light.size) >= distinct.size
     zero = np.zeros(light.size)
     return Pooled(
-        exposure, zero, np.asarray(pixels * light[:, None] ** np.arange(7), np.float64), pixels * (variance * light ** np.arange(4)[:, None]).T,
+        exposure, zero, np.asarray(pixels * light[:, None] ** np.arange(7), np.float64),
+        pixels * (variance * light ** np.arange(4)[:, None]).T,
         pixels * squares, zero, np.ones(light.size), is_lit,
     )  # fmt: skip
 
@@ -259,14 +263,19 @@ def _variance_fit(bins: Pooled) -> VarianceFit:
     return fit_variance(bins, (2, *_NO_TERMS))
 
 
-def _scatter(lit: Levels, signal: NDArray, clear: NDArray[np.bool_], fit: VarianceFit) -> tuple[float, float]:
-    """χ² per degree of freedom of the lit levels' variances, and their relative scatter beyond their errors."""
+def _scatter(
+    pairs: PairSet, lit: Levels, signal: NDArray, clear: NDArray[np.bool_], fit: VarianceFit
+) -> tuple[float, float, float]:
+    """χ² per degree of freedom of the lit levels' variances, its chance, and their relative scatter beyond errors.
+
+    The errors are from the scatter of rows, so that the ratio has an F law.
+    """
     expected = polynomial(fit.beta, signal[clear], lit.exposure_s[clear]) + ADC_VARIANCE_DN2
     residual, error = lit.variance[clear] - expected, lit.error[clear]
     dof = max(int(clear.sum() - fit.identified.sum()), 1)
     chi2 = float(np.sum((residual / error) ** 2)) / dof
     excess = float(np.mean(((residual**2) * clear.sum() / dof - error**2) / expected**2))
-    return chi2, float(np.sqrt(max(excess, 0.0)))
+    return chi2, float(f_law.sf(chi2, dof, pairs.shape[0] - 1)), float(np.sqrt(max(excess, 0.0)))
 
 
 def _widened(fit: VarianceFit, level_chi2: float) -> VarianceFit:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hesim_render.calibrate.aps.pairs import PairCalibration
-from hesim_render.calibrate.finding import Finding
+from hesim_render.calibrate.finding import ALARM, Finding
 
 #: Relative changes of signal and variance from which a finding names them.
 _LEAST_BEND, _LEAST_SCATTER = 2e-3, 2e-3
@@ -34,7 +34,7 @@ def findings(result: PairCalibration) -> list[Finding]:
         found.append(("light offset", text))
     if curve.light_rms > _LEAST_SCATTER / 4:
         found.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
-    if result.level_rms > _LEAST_SCATTER and result.level_chi2 > 2:
+    if result.level_rms > _LEAST_SCATTER and result.level_chance < ALARM:
         text = (
             f"the variances of single levels scatter by {100 * result.level_rms:.2g} % about the polynomial, more than "
             f"chance (χ²/dof {result.level_chi2:.1f}): steps of the ADC that are not even, or noise that comes and goes"

@@ -108,9 +108,12 @@ def content(result: PairCalibration) -> dict[str, Any]:
         },
         "hot_pixels": 0,
         "bad_pixels": int(result.defects.sum()),
-        "K": estimated(k, result.gain.error, "DN/e-"),
+        "K": estimated(k, result.gain.error, "DN/e-", result.gain.groups),
         "responsivity": estimated(
-            result.responsivity.slope, result.responsivity.error, "DN/photon" if result.pairs.has_photons else "DN/s"
+            result.responsivity.slope,
+            result.responsivity.error,
+            "DN/photon" if result.pairs.has_photons else "DN/s",
+            result.responsivity.groups,
         ),
         "quantum_efficiency": _quantum_efficiency(result, relative),
         "read_noise_e": _read_noise(result, k, relative),
@@ -145,7 +148,7 @@ def _quantum_efficiency(result: PairCalibration, relative: float) -> dict[str, A
         return not_identifiable("the captures do not state photons per pixel")
     value = result.responsivity.slope / result.gain.slope
     error = value * float(np.hypot(relative, result.responsivity.error / result.responsivity.slope))
-    return estimated(value, error, "e-/photon")
+    return estimated(value, error, "e-/photon", result.gain.groups)
 
 
 def _read_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
@@ -153,7 +156,7 @@ def _read_noise(result: PairCalibration, k: float, relative: float) -> dict[str,
     variance = result.noise.value - result.lines_dn2 - ADC_VARIANCE_DN2
     noise = float(np.sqrt(variance))
     error = float(np.hypot(result.noise.error / (2 * variance), relative))
-    return estimated(noise / k, noise / k * error, "e-") | {"value_dn": noise}
+    return estimated(noise / k, noise / k * error, "e-", result.noise.groups) | {"value_dn": noise}
 
 
 def _dark_noise(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:
@@ -168,7 +171,9 @@ def _dark_current(result: PairCalibration, k: float, relative: float) -> dict[st
     if not np.isfinite(result.black.slope_error):
         return not_identifiable("one exposure tells no dark current; capture dark pairs at several exposures")
     value = result.black.slope / k
-    found = estimated(value, float(np.hypot(result.black.slope_error / k, value * relative)), "e-/s")
+    found = estimated(
+        value, float(np.hypot(result.black.slope_error / k, value * relative)), "e-/s", result.black.groups
+    )
     found["from_variance"] = result.noise.slope / k**2
     found["value_dn_per_s"] = result.black.slope
     return found

@@ -75,6 +75,8 @@ class SpatialVariance:
             the pattern was drawn from, with the scatter of the draw.
         """
         values = np.maximum(self.parts, 0.0)
+        values[0] += values[2] / (self.freedom[1] + 1)  # what the pixels of a row add to its mean
+        values[1] += values[2] / (self.freedom[0] + 1)
         noise, freedom = np.array(self.noise), np.array(self.freedom)
         scatter = (4 * values * noise + 2 * noise**2) if fixed else 2 * (values + noise) ** 2
         each = np.sqrt(scatter / freedom)
@@ -90,7 +92,8 @@ def temporal_of(moments: Moments) -> tuple[Temporal, NDArray[np.float64]]:
     change = moments.row_means[0] - moments.row_means[0].mean(axis=0)
     change = change - change.mean(axis=1)[:, None]
     of_rows = float(np.sum(change**2)) / ((frames - 1) * (rows - 1))
-    row = max((of_rows - (whole - of_rows) / cols) * cols / (cols - 1), -whole / cols)
+    # of_rows = R + σ²/cols, and the mean variance of a pixel about its own row is σ² (1 − 1/cols)
+    row = of_rows - (whole - float(levels.var(ddof=1)) - of_rows) / (cols - 1)
     own = whole - max(row, 0.0)
     frame = float(levels.var(ddof=1)) - own / (rows * cols) - max(row, 0.0) / rows
     own -= max(frame, 0.0)
