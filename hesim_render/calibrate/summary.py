@@ -14,6 +14,8 @@ _APS = {
     "prnu_percent": "PRNU",
     "linearity_error": "linearity error",
     "row_noise_dn": "temporal row noise",
+    "column_noise_dn": "temporal column noise",
+    "quantum_efficiency": "quantum efficiency",
 }
 _EVS = {
     **{name: name for name in "ABCD"},

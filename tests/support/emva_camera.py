@@ -83,7 +83,8 @@ class Camera:
         from PIL import Image
 
         pairs, long = self.set(seed)
-        series = [(lit, t, f) for (lit, t), f in pairs.items()] + [(lit, self.long_us + 0.5, f) for lit, f in long.items()]
+        series = [(lit, t, stack) for (lit, t), stack in pairs.items()]
+        series += [(lit, self.long_us + 0.5, stack) for lit, stack in long.items()]
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "images").mkdir(exist_ok=True)
         lines = ["# a camera of NumPy", "v 4.0", f"n {self.bits} {self.cols} {self.rows}"]
@@ -93,7 +94,7 @@ class Camera:
             for number, image in enumerate(stack):
                 name = f"images/{'bd'[not lit]}_{k:03}_{number:02}.png"
                 if not listed:
-                    light = f"lit_{t:g}us_{photons:g}ph" if lit else f"dark_{t:g}us"
+                    light = f"lit_{t}us_{photons}ph" if lit else f"dark_{t}us"
                     name = f"{light}_{number:02}.png"
                 lines.append("i " + name.replace("/", "\\"))
                 Image.fromarray(image if self.bits > 8 else image.astype(np.uint8)).save(folder / name)

@@ -12,7 +12,7 @@ from scipy.stats import f as f_law
 from hesim_render.calibrate.finding import ALARM
 
 #: Gauss–Newton steps of a fit that is nearly linear.
-_STEPS = 6
+_STEPS = 4
 #: Degrees of freedom from which the scatter of points about a line tells their errors better than what is known.
 _ENOUGH = 8
 #: Chance of a larger χ² below which points do not lie on a line, and their scatter counts as error.
@@ -171,7 +171,7 @@ def mean_curve(light: NDArray, signal: NDArray, error_dn: NDArray) -> MeanCurve:
     h = light / scale
     relative = 1e-4
     free = np.array([False, True, False, False])
-    for _ in range(4):
+    for _ in range(3):
         weight = 1 / np.hypot(error_dn, relative * signal)
         free = np.array([False, True, False, False])
         best, squares = _fit(h, signal, weight, free)

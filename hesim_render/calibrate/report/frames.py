@@ -102,6 +102,9 @@ def _transfer_table(section: dict[str, Any]) -> str:
         "K": "K, system gain (EMVA 1288)", "read_noise_e": "read noise", "dark_current_e_per_s": "dark current",
         "full_well_e": "saturation capacity", "dsnu_e": "DSNU (without rows)", "prnu_percent": "PRNU",
         "linearity_error": "linearity error", "row_noise_dn": "temporal row noise",
+        "quantum_efficiency": "quantum efficiency", "responsivity": "responsivity",
+        "temporal_dark_noise_e": "temporal dark noise (EMVA 1288)", "column_noise_dn": "temporal column noise",
+        "read_noise_correlation": "correlation of dark noise along rows",
     }  # fmt: skip
     rows = [parameter_row(text, section[key]) for key, text in names.items() if key in section]
     rows += [
