@@ -11,7 +11,8 @@ import typer
 from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, Without, cropped, names_of, sensor_keys_only
 from hesim_render.cli.terminal import parse_exposures, split_overrides
 from hesim_render.cli.told import DryRun, Json, Quiet, Told
-from hesim_render.core.output import check_target
+from hesim_render.core.errors import RangeError
+from hesim_render.core.output import check_target, free_place
 
 
 class Part(StrEnum):
@@ -69,23 +70,45 @@ def lab(
 
 def calibrate(
     part: Annotated[Part, typer.Argument(help="aps (frames) or evs (events)")],
-    captures: Annotated[Path, typer.Argument(help="folder of a capture set")],
+    captures: Annotated[Path, typer.Argument(help="folder of a capture set, or of EMVA 1288 captures")],
     out: Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")],
     report: Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace a report of another calibration")] = False,
+    sensor_file: Annotated[
+        Path | None, typer.Option(help="sensor file that goes with the calibration (of EMVA 1288 captures)")
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="replace a report of another calibration, or a sensor file")
+    ] = False,
     json_: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Noise parameters from captures, into a file that a sensor file can point at."""
     from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
     from hesim_render.calibrate.summary import summary_lines
+    from hesim_render.recording.pair_set import is_pair_set
 
+    if sensor_file is not None:
+        if part is not Part.aps or not is_pair_set(captures):
+            raise RangeError("--sensor-file", str(sensor_file), "none: captures of EMVA 1288 alone tell a whole sensor")
+        free_place(sensor_file, overwrite)
     run = calibrate_aps if part is Part.aps else calibrate_evs
     told = Told(json_, quiet)
     with told.progress(f"calibrate {part.value}") as move:
-        run(captures, out, report, lambda what, fraction: move(fraction, 1.0, what), overwrite=overwrite)
+
+        def show(what: str, fraction: float) -> None:
+            move(fraction, 1.0, what)
+
+        if sensor_file is None:
+            run(captures, out, report, show, overwrite=overwrite)
+        else:
+            from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
+            from hesim_render.calibrate.aps.sensor_file import write_sensor
+
+            write_sensor(sensor_file, out, calibrate_pairs(captures, out, report, show, overwrite))
     lines = summary_lines(read_calibration(out), part.value)
-    where = [f"in {out}"] if report is None else [f"in {out}", f"report: {report}"]
-    told.result(
-        "\n".join([*lines, *where]), {"calibration": out, "report": report, "part": part.value, "summary": lines}
-    )
+    where = [f"in {out}"]
+    where += [
+        f"{name}: {file}" for name, file in (("report", report), ("sensor file", sensor_file)) if file is not None
+    ]
+    facts = {"calibration": out, "report": report, "sensor_file": sensor_file, "part": part.value, "summary": lines}
+    told.result("\n".join([*lines, *where]), facts)

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.stats import f as f_law
+from scipy.stats import t as student
 
 from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.pair_levels import Levels
@@ -21,6 +22,8 @@ from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra
 
 #: Probability that one check fails for a twin that is right.
 ALARM = 1e-3
+#: Degrees of freedom that count as any number.
+_MANY = 1e6
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Check:
     name : of the statistic.
     unit, place : unit of the values, and what `places` are.
     places, real, twin, error : [n]; the error is that of the difference.
+    freedom : degrees of freedom that the error is known with.
     """
 
     name: str
@@ -41,6 +45,7 @@ class Check:
     real: NDArray[np.float64]
     twin: NDArray[np.float64]
     error: NDArray[np.float64]
+    freedom: float = np.inf
 
     @property
     def z(self) -> NDArray[np.float64]:
@@ -49,8 +54,13 @@ class Check:
 
     @property
     def limit(self) -> float:
-        """Largest |z| that passes: all places of a right twin pass with a probability of 1 − `ALARM`."""
-        return float(norm.isf(ALARM / (2 * max(self.z.size, 1))))
+        """Largest |z| that passes: one place of a right twin is beyond with a probability of half of `ALARM`."""
+        return float(student.isf(ALARM / (4 * self.z.size), self.freedom))
+
+    @property
+    def most_rms(self) -> float:
+        """Largest rms that passes: that of a right twin is beyond with a probability of half of `ALARM`."""
+        return float(np.sqrt(f_law.isf(ALARM / 2, self.z.size, min(self.freedom, _MANY))))
 
     @property
     def worst(self) -> float:
@@ -64,7 +74,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        return bool(np.all(np.abs(self.z) <= self.limit))
+        return bool(np.all(np.abs(self.z) <= self.limit)) and self.rms <= self.most_rms
 
 
 @dataclass(frozen=True)
@@ -104,10 +114,10 @@ def _temporal(result: PairCalibration, held: PairSet, real: Half, twin: Half) ->
     rows, cols = held.shape
     clear = real.lit.clear & twin.lit.clear & (light <= result.light[result.clear].max() * 1.05)
     signal = result.curve.at(light)
-    mean_error = np.sqrt(
-        (result.curve.light_rms * signal) ** 2 + result.curve.error(light) ** 2 + result.black.rms**2
-        + result.black.error**2 + 2 * (real.lit.variance / (2 * rows * cols)) + max(result.row[0], 0.0) / rows
-    )  # fmt: skip
+    bench = (result.curve.light_rms * signal) ** 2 + result.black.rms**2
+    fitted = result.curve.error(light) ** 2 + result.black.error_at(real.lit.exposure_s) ** 2
+    own = real.lit.variance / (rows * cols) + max(result.row[0], 0.0) / rows
+    mean_error = np.sqrt(bench + fitted + own)
     fit = result.fit.covariance
     design = np.stack([
         np.ones_like(signal), signal, real.lit.exposure_s, signal**2, signal * real.lit.exposure_s,
@@ -120,30 +130,35 @@ def _temporal(result: PairCalibration, held: PairSet, real: Half, twin: Half) ->
         + 2 * result.noise.rms**2
     )  # fmt: skip
     t = np.unique(real.dark.exposure_s, return_index=True)[1]
-    dark_error = np.sqrt(2 * result.black.rms**2 + result.black.error**2)
+    dark_error = np.hypot(np.sqrt(2) * result.black.rms, result.black.error_at(real.dark.exposure_s[t]))
     dark_variance_error = np.sqrt(
-        real.dark.error[t] ** 2 + twin.dark.error[t] ** 2 + 2 * result.noise.rms**2 + result.noise.error**2
+        real.dark.error[t] ** 2
+        + twin.dark.error[t] ** 2
+        + 2 * result.noise.rms**2
+        + result.noise.error_at(real.dark.exposure_s[t]) ** 2
     )
     place = "photons per pixel" if held.has_photons else "exposure, s"
     ms = 1e3 * real.dark.exposure_s[t]
     here = light[clear]
 
+    # how much light, black level and steps of the ADC scatter is known from the fitted half alone
+    lit_freedom = max(int(result.clear.sum()) - 4, 1)
+    dark_freedom = max(result.black.groups - 1, 1)
+
     def lit(name: str, unit: str, key: str, error: NDArray) -> Check:
-        return Check(
-            name, unit, place, here, getattr(real.lit, key)[clear], getattr(twin.lit, key)[clear], error[clear]
-        )
+        mine, its = (getattr(half.lit, key)[clear] for half in (real, twin))
+        return Check(name, unit, place, here, mine, its, error[clear], lit_freedom)
+
+    def dark(name: str, unit: str, key: str, error: NDArray) -> Check:
+        mine, its = (getattr(half.dark, key)[t] for half in (real, twin))
+        return Check(name, unit, "exposure, ms", ms, mine, its, error, dark_freedom)
 
     return [
         lit("mean, lit", "DN", "mean", mean_error),
-        Check(
-            "mean, dark", "DN", "exposure, ms", ms, real.dark.mean[t], twin.dark.mean[t], np.full(t.size, dark_error)
-        ),
+        dark("mean, dark", "DN", "mean", dark_error),
         lit("temporal variance, lit", "DN²", "variance", variance_error),
-        Check(
-            "temporal variance, dark", "DN²", "exposure, ms", ms, real.dark.variance[t], twin.dark.variance[t],
-            dark_variance_error,
-        ),
-    ]  # fmt: skip
+        dark("temporal variance, dark", "DN²", "variance", dark_variance_error),
+    ]
 
 
 def _shared(result: PairCalibration, real: Half, twin: Half) -> list[Check]:

@@ -22,21 +22,22 @@ def check_line(check: Check) -> str:
         values = f"{float(check.real[0]):.4g} and {float(check.twin[0]):.4g} {check.unit}"
         return f"{told} z {check.worst:+.1f} {limit}; {values}"
     place = f"{check.places[np.argmax(np.abs(check.z))]:.4g} {check.place}"
-    return f"{told} worst z {check.worst:+.1f} {limit} of {check.z.size}, at {place}; rms z {check.rms:.2f}"
+    rms = f"rms z {check.rms:.2f} (limit {check.most_rms:.2f})"
+    return f"{told} worst z {check.worst:+.1f} {limit} of {check.z.size}, at {place}; {rms}"
 
 
 def _row(check: Check) -> tuple[str, ...]:
     told = "pass" if check.passed else "FAIL"
     alone = check.z.size == 1
     values = (number(float(check.real[0])), number(float(check.twin[0]))) if alone else ("", "")
-    scores = f"{check.worst:+.2f}", f"{check.limit:.2f}", f"{check.rms:.2f}"
+    scores = f"{check.worst:+.2f}", f"{check.limit:.2f}", f"{check.rms:.2f}", f"{check.most_rms:.2f}"
     return check.name, told, str(check.z.size), *scores, *values, check.unit
 
 
 def page(checks: Sequence[Check], findings: Sequence[str]) -> str:
     """The HTML page; it needs no other file."""
     rows = [_row(check) for check in checks]
-    head = ("statistic", "", "values", "worst z", "limit", "rms z", "captures", "twin", "unit")
+    head = ("statistic", "", "values", "worst z", "limit", "rms z", "limit", "captures", "twin", "unit")
     passed = sum(check.passed for check in checks)
     with report_style():
         drawn = row_of(*(_overlay(check) for check in checks if check.z.size > 1))

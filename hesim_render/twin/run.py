@@ -105,6 +105,7 @@ def _json(checks: list[Check], seed: int) -> str:
     listed = [
         {
             "name": check.name, "passed": check.passed, "unit": check.unit, "place": check.place, "limit": check.limit,
+            "rms": check.rms, "most_rms": check.most_rms,
             "places": check.places, "captures": check.real, "twin": check.twin, "error": check.error, "z": check.z,
         }
         for check in checks

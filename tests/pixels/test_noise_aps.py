@@ -344,7 +344,9 @@ def test_sampling_accepts_numbers_images_and_device_arrays():
 NOISY = {
     "aps__prnu_rel": 0.05, "aps__dsnu_e": 20.0, "aps__row_offset_std_dn": 5.0, "aps__dark_current_e_per_s": 4000.0,
     "aps__dark_current_nonuniformity_rel": 0.3, "aps__residual_noise_dn": 3.0, "aps__read_noise_e": 20.0,
-    "aps__system_gain_dn_per_e": 1.0, "aps__row_noise_dn": 4.0,
+    "aps__system_gain_dn_per_e": 1.0, "aps__row_noise_dn": 4.0, "aps__column_offset_std_dn": 4.5,
+    "aps__column_noise_dn": 2.6, "aps__read_noise_correlation": -0.23,
+    "aps__interference": [{"cycles_per_row": 0.25, "cycles_per_col": 0.4, "rms_dn": 3.7}],
     "aps__telegraph": {"share": 0.25, "amplitude_e": 8.0, "amplitude_law": "equal", "high_s": 1e-3, "low_s": 1e-3},
 }  # fmt: skip
 
@@ -375,17 +377,18 @@ def test_each_term_can_be_switched_off(term):
     maps = noise.fixed_pattern
     electrons, t = 1000.0, EXPOSURE_US * 1e-6
     temporal = {"shot": maps.response.mean() * electrons, "dark_current": maps.dark_e_per_s.mean() * t,
-                "read": 400.0, "row_noise": 16.0, "residual": 9.0,
+                "read": 400.0, "row_noise": 16.0, "residual": 9.0, "column_noise": 2.6**2, "interference": 3.7**2,
                 "telegraph": noise.telegraph.place.size / 128**2 * 16.0}  # fmt: skip
-    spatial = {"prnu": (electrons * maps.response).var(), "row": maps.offset_dn.mean(axis=1).var(),
-               "dsnu": (maps.offset_dn - maps.offset_dn.mean(axis=1)[:, None]).var(),
+    without_pixels = noise.without("dsnu").fixed_pattern.offset_dn
+    spatial = {"prnu": (electrons * maps.response).var(), "row": without_pixels.mean(axis=1).var(),
+               "column": without_pixels.mean(axis=0).var(), "dsnu": (maps.offset_dn - without_pixels).var(),
                "dark_current": (maps.dark_e_per_s * t).var()}  # fmt: skip
     assert set(temporal) | set(spatial) == set(APS_TERMS) - {"crosstalk"}
     less = noise.without(term)
     stack = np.stack([less.sample(electrons, EXPOSURE_US, seed=5, frame=k) for k in range(60)]).astype(float)
     left = sum(v for k, v in temporal.items() if k != term)
     # 60·16384 samples: 0.15 % standard error of a variance; z = 5.5; of row noise 60·128 ones, 1.6 % of 16 DN²
-    rows = 0 if term == "row_noise" else 5.5 * 16 * 0.016
+    rows = 5.5 * (16 + 2.6**2) * 0.016
     assert stack.var(axis=0, ddof=1).mean() == pytest.approx(left + 1 / 12, abs=5.5 * 0.0015 * float(left) + rows)
     assert less.variance_dn2(np.full((128, 128), electrons), EXPOSURE_US).mean() == pytest.approx(left, rel=1e-5)
     fixed = stack.mean(axis=0).var() - left / 60
@@ -452,3 +455,74 @@ def test_wrong_electrons(electrons):
 def test_wrong_exposure(exposure_us):
     with pytest.raises(RangeError, match="exposure_us"):
         model().sample(1.0, exposure_us, seed=1)
+
+
+def test_columns_neighbours_and_interference_share_what_they_say():
+    """500 frames of 64×96 px without light: bounds of 5 standard errors, seven comparisons, a false alarm in 4e-6."""
+    line = {"cycles_per_row": 0.25, "cycles_per_col": -0.375, "rms_dn": 1.7}
+    noise = model(
+        "eiger", crop=(96, 64), aps__column_noise_dn=1.3, aps__read_noise_correlation=-0.31, aps__interference=[line],
+        aps__dark_current_e_per_s=0.0, aps__read_noise_e=3.1, aps__system_gain_dn_per_e=2.3, aps__beta=None,
+        aps__row_noise_dn=0.0, aps__telegraph=None, aps__residual_noise_dn=0.0,
+    )  # fmt: skip
+    frames = 500
+    stack = np.stack([noise.sample(0.0, EXPOSURE_US, seed=4, frame=k) for k in range(frames)]).astype(float)
+    change = (stack - stack.mean(axis=0)) * np.sqrt(frames / (frames - 1))
+    read = (2.3 * 3.1) ** 2
+    # a wave's amplitude over the picture: its mean square is that of a line, 1/√500 of itself
+    rows, cols = np.mgrid[:64, :96] + np.array([noise.layout.row0, noise.layout.col0])[:, None, None]
+    wave = np.exp(2j * np.pi * (0.25 * rows - 0.375 * cols))
+    power = np.mean(np.abs((change * wave).mean(axis=(1, 2))) ** 2) * 2
+    assert power == pytest.approx(1.7**2, rel=0.05)  # of a constant amplitude only noise scatters
+    phases = np.angle((change * wave).mean(axis=(1, 2)))
+    assert abs(np.exp(1j * phases).mean()) < 5 / np.sqrt(frames)
+    left = change[:, :32].mean(axis=1), change[:, 32:].mean(axis=1)
+    n = frames * 96
+    # a quarter of a period a row: whole periods in 32 rows, so that the wave is not in their means
+    assert abs(np.mean(left[0] * left[1]) - 1.3**2) < 5 * (1.3**2 + read / 32) * np.sqrt(2 / n)
+    rest = change - change.mean(axis=1, keepdims=True)
+    lag = np.mean(rest[:, :, 1:] * rest[:, :, :-1]) * 64 / 63 - 1.7**2 * np.cos(2 * np.pi * 0.375)
+    assert abs(lag - (-0.31 * read)) < 5 * read / np.sqrt(rest.size)
+    two = np.mean(rest[:, :, 2:] * rest[:, :, :-2]) * 64 / 63 - 1.7**2 * np.cos(4 * np.pi * 0.375)
+    assert abs(two) < 5 * read * 1.1 / np.sqrt(rest.size)
+    total = read + 1.3**2 + 1.7**2
+    assert noise.variance_dn2(0.0, EXPOSURE_US) == pytest.approx(total)
+    assert change.var() == pytest.approx(total + 1 / 12, rel=0.01)
+    # a crop has the numbers of the whole
+    crop = ApsNoise(noise.spec, noise.layout.crop(24, 16), noise.device_seed)
+    row, col = crop.layout.row0 - noise.layout.row0, crop.layout.col0 - noise.layout.col0
+    part = crop.sample(0.0, EXPOSURE_US, seed=4, frame=3)
+    np.testing.assert_array_equal(part, stack[3][row : row + crop.layout.rows, col : col + crop.layout.cols])
+
+
+@pytest.mark.parametrize("form", ("physical", "polynomial"))
+def test_a_bent_signal_has_its_mean_and_variance(form):
+    """Closed form: mean f(E), variance f'(E)² K E where the form is physical, the polynomial in f(E) otherwise."""
+    gain, curve = 0.37, [0.02, -0.08, 0.03]
+    keys = {"aps__system_gain_dn_per_e": gain, "aps__nonlinearity": curve, "aps__dark_current_e_per_s": 0.0}
+    if form == "polynomial":
+        keys["aps__beta"] = [[[3.3, 0.31, 0.0, -2e-6, 0.0, 0.0]]]
+    noise = model(aps__read_noise_e=4.2, **keys)
+    for electrons in (150.0, 4000.0, 9000.0):
+        e, u = gain * electrons, gain * electrons / 4095
+        signal = e * (1 + curve[0] + curve[1] * u + curve[2] * u * u)
+        slope = 1 + curve[0] + 2 * curve[1] * u + 3 * curve[2] * u * u
+        expected = slope**2 * gain * e + (gain * 4.2) ** 2
+        if form == "polynomial":
+            expected = 3.3 + 0.31 * signal - 2e-6 * signal**2
+        assert noise.mean_dn(electrons, EXPOSURE_US) - noise.spec.black_level_dn == pytest.approx(signal, rel=1e-6)
+        assert noise.variance_dn2(electrons, EXPOSURE_US) == pytest.approx(expected, rel=1e-6)
+        stack = np.stack([noise.sample(electrons, EXPOSURE_US, seed=6, frame=k) for k in range(4)]).astype(float)
+        offset = noise.fixed_pattern.offset_dn
+        values = stack - offset
+        error = np.sqrt(expected / stack.size)
+        assert abs(values.mean() - signal) < 5 * error
+        assert np.mean((values - signal) ** 2) == pytest.approx(expected + 1 / 12, rel=5 * np.sqrt(2.2 / stack.size))
+
+
+@pytest.mark.parametrize("curve", ([0.0, -0.6], [-0.96], [0.0, -2.0, 1.4], []))
+def test_a_signal_that_does_not_rise_is_refused(curve):
+    """At full scale, everywhere, between the ends, and no curve at all."""
+    with pytest.raises(SpecError, match=r"slope of at least 0.05|at least 1 item"):
+        model(aps__nonlinearity=curve)
+    assert model(aps__nonlinearity=[0.0, -1.8, 1.4]).mean_dn(1.0, EXPOSURE_US) > 0

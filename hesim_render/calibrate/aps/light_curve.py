@@ -73,6 +73,7 @@ class Intercept:
     slope, slope_error : likewise.
     rms : of the residuals.
     groups : degrees of freedom and one.
+    covariance : of constant and slope; of the constant alone where all points have one x.
     """
 
     value: float
@@ -81,6 +82,12 @@ class Intercept:
     slope_error: float
     rms: float
     groups: int
+    covariance: NDArray[np.float64]
+
+    def error_at(self, x: NDArray) -> NDArray[np.float64]:
+        """Standard error of the line at x."""
+        design = np.stack([np.ones_like(x), x])[: len(self.covariance)]
+        return np.asarray(np.sqrt(np.einsum("il,ij,jl->l", design, self.covariance, design)))
 
 
 def straight(x: NDArray, y: NDArray, error: NDArray) -> Intercept:
@@ -95,8 +102,10 @@ def straight(x: NDArray, y: NDArray, error: NDArray) -> Intercept:
     errors = np.sqrt(np.diag(inverse) * scale)
     rms = float(np.sqrt(np.sum(residual**2) / dof))
     if found.size == 1:
-        return Intercept(float(found[0]), float(errors[0]), 0.0, float("nan"), rms, dof + 1)
-    return Intercept(float(found[0]), float(errors[0]), float(found[1]), float(errors[1]), rms, dof + 1)
+        return Intercept(float(found[0]), float(errors[0]), 0.0, float("nan"), rms, dof + 1, inverse * scale)
+    return Intercept(
+        float(found[0]), float(errors[0]), float(found[1]), float(errors[1]), rms, dof + 1, inverse * scale
+    )
 
 
 def linearity_error(light: NDArray, signal: NDArray, top: float) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:

@@ -27,8 +27,8 @@ from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.sensor import ApsSpec, InterferenceSpec
 
 APS_TERMS = (
-    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "column", "column_noise", "interference",
-    "residual", "crosstalk", "telegraph",
+    "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk", "telegraph", "column",
+    "column_noise", "interference",
 )  # fmt: skip
 
 
