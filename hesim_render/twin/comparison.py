@@ -142,7 +142,8 @@ def _temporal(result: PairCalibration, held: PairSet, real: Half, twin: Half) ->
     here = light[clear]
 
     # how much light, black level and steps of the ADC scatter is known from the fitted half alone
-    lit_freedom = max(int(result.clear.sum()) - 4, 1)
+    terms = max(int(np.count_nonzero(np.diag(result.curve.covariance))), int(result.fit.identified.sum()) - 1)
+    lit_freedom = max(int(result.clear.sum()) - terms, 1)
     dark_freedom = max(result.black.groups - 1, 1)
 
     def lit(name: str, unit: str, key: str, error: NDArray) -> Check:

@@ -8,10 +8,12 @@ from html import escape
 import numpy as np
 
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, points, report_style, svg
-from hesim_render.core.html import PAGE_STYLE, number, row_of, table
+from hesim_render.core.html import PAGE_STYLE, number, row_of, table, tick_text
 from hesim_render.twin.comparison import Check
 
 _SIZE_PX = (440, 340)
+#: Range of values from which an axis is logarithmic.
+_LOG_FROM = 10.0
 
 
 def check_line(check: Check) -> str:
@@ -67,7 +69,10 @@ def _overlay(check: Check) -> str:
         lower.axhline(side * check.limit, color=COLOURS[1], linewidth=0.8, linestyle="--")
     reach = max(check.limit, abs(check.worst)) * 1.15
     lower.set_ylim(-reach, reach)
-    if check.unit == "pixels" or check.name.startswith("spectrum"):
+    both = np.concatenate([check.real, check.twin])
+    if both.min() > 0 and both.max() > _LOG_FROM * both.min() and not check.place.startswith(("photons", "exposure")):
         upper.set_yscale("log")
+        upper.yaxis.set_major_formatter(tick_text)
+        upper.yaxis.set_minor_formatter("")
     legend_below(figure, upper, 2)
     return svg(figure)

@@ -249,7 +249,7 @@ def maps(result: PairCalibration) -> dict[str, NDArray]:
     step = max(1, -(-max(shape) // _FIGURE_PX))
     lit, dark = result.lit, result.dark
     points = [
-        (0, 0, t, is_lit, x, v - ADC_VARIANCE_DN2, shape[0] * shape[1])
+        (0, 0, t, is_lit, x, v - ADC_VARIANCE_DN2 - result.lines_dn2, shape[0] * shape[1])
         for is_lit, levels, light in (
             (0.0, dark, np.zeros(dark.mean.size)), (1.0, lit, np.where(result.clear, result.signal, np.nan)),
         )

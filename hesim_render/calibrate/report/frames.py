@@ -86,9 +86,10 @@ def _variance_panel(title: str, beta: NDArray, here: NDArray) -> str:
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     upper.set(title=title, ylabel="variance, DN²")
     lower.set(xlabel="light signal, DN", ylabel="residual, %", ylim=(-reach, reach))
-    for k, t in enumerate(np.unique(exposure_s)):
+    exposures = np.unique(exposure_s)
+    for k, t in enumerate(exposures):
         colour, use = COLOURS[k % len(COLOURS)], exposure_s == t
-        points(upper, x[use], y[use], colour, f"{1e3 * t:g} ms", 3.0)
+        points(upper, x[use], y[use], colour, f"{1e3 * t:g} ms" if len(exposures) > 1 else "pairs of frames", 3.0)
         line = np.linspace(x[use].min(), x[use].max(), 60)
         upper.plot(line, polynomial(beta, line, t), color=colour)
         points(lower, x[use], relative[use], colour, size=2.6)
