@@ -13,6 +13,7 @@ from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
 from hesim_render.calibrate.aps.sensor_file import write_sensor
+from hesim_render.calibrate.aps.spatial import Temporal, spatial_variance
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.pair_set import read_pair_set
 
@@ -90,6 +91,11 @@ def test_what_the_standard_lacks_is_measured():
     assert (line["cycles_per_row"], line["cycles_per_col"]) in ((0.5, 0.5), (-0.5, 0.5))
     # a checkerboard of 12 frames of random phase: its power scatters by √(1/2 · 1/12) of itself
     assert abs(line["rms_dn"] - camera.hum) < 0.45 * camera.hum
+    # the polynomial is that of pixels alone: without rows, columns and the hum, whose 4.4 DN² are a fifth of it
+    dark = camera.gain**2 * (camera.read_noise**2 + camera.dark_current * camera.long_us * 1e-6)
+    beta = [b or 0.0 for b in found["beta"][0][0]]
+    t = camera.long_us * 1e-6
+    assert beta[0] + beta[2] * t == pytest.approx(dark, rel=0.1)
     # the curve, at a half and at nine tenths of full scale
     n0, n1, n2 = found["nonlinearity"]
     for u in (0.5, 0.9):
@@ -98,6 +104,29 @@ def test_what_the_standard_lacks_is_measured():
         assumed = found["responsivity"]["value"] / camera.efficiency * electrons
         v = assumed / 4095
         assert abs(assumed * (1 + n0 + n1 * v + n2 * v * v) / true - 1) < 3e-3
+
+
+@pytest.mark.parametrize("fixed", (False, True))
+def test_errors_of_spatial_variances_are_their_scatter(fixed):
+    """800 mean images: of new devices, or of one. 2.5 % of a standard deviation each, twice that for skewed laws."""
+    rng = np.random.default_rng(6)
+    rows, cols, frames, pixel, row, col = 12, 17, 9, 11.0, 0.9, 1.7
+    own = rng.standard_normal((rows, 1)), rng.standard_normal((1, cols)), rng.standard_normal((rows, cols))
+    temporal = Temporal(pixel, row, col, 0.0, 0.0, 0.0)
+    values, errors = [], []
+    for _ in range(800):
+        drawn = own if fixed else [rng.standard_normal(part.shape) for part in own]
+        image = 0.8 * drawn[0] + 0.5 * drawn[1] + 2.3 * drawn[2]
+        noise = (pixel, (rows, cols)), (row, (rows, 1)), (col, (1, cols))
+        image = image + sum(np.sqrt(v / frames) * rng.standard_normal(size) for v, size in noise)
+        found = spatial_variance(image, temporal, frames)
+        values.append([*found.parts, found.total])
+        errors.append(found.errors(fixed))
+    values, errors = np.array(values), np.sqrt(np.mean(np.square(errors), axis=0))
+    assert np.all(np.abs(values.std(axis=0, ddof=1) / errors - 1) < 0.2)
+    if not fixed:
+        true = np.array([0.64, 0.25, 5.29, 6.18])
+        assert np.all(np.abs(values.mean(axis=0) - true) < 4.5 * errors / np.sqrt(800))
 
 
 def test_frames_that_neighbours_share_nothing_of_have_no_correlation(sections):

@@ -495,6 +495,18 @@ def test_columns_neighbours_and_interference_share_what_they_say():
     np.testing.assert_array_equal(part, stack[3][row : row + crop.layout.rows, col : col + crop.layout.cols])
 
 
+def test_columns_have_offsets_of_their_own():
+    """512 columns: 3 % standard error of their spread; the same in every row, and in a crop."""
+    noise = model(aps__column_offset_std_dn=2.7, aps__dsnu_e=0.0, aps__row_offset_std_dn=0.0)
+    offset = noise.fixed_pattern.offset_dn
+    assert np.all(offset == offset[:1]) and offset.std() == pytest.approx(2.7, rel=0.15)
+    assert np.abs(np.corrcoef(offset[0, 1:], offset[0, :-1])[0, 1]) < 5 / np.sqrt(SIDE)
+    crop = ApsNoise(noise.spec, noise.layout.crop(16, 8), noise.device_seed)
+    col = crop.layout.col0 - noise.layout.col0
+    np.testing.assert_array_equal(crop.fixed_pattern.offset_dn[0], offset[0, col : col + 16])
+    assert np.ptp(noise.without("column").fixed_pattern.offset_dn) == 0
+
+
 @pytest.mark.parametrize("form", ("physical", "polynomial"))
 def test_a_bent_signal_has_its_mean_and_variance(form):
     """Closed form: mean f(E), variance f'(E)² K E where the form is physical, the polynomial in f(E) otherwise."""

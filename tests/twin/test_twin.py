@@ -12,11 +12,14 @@ from scipy.stats import kstest
 from typer.testing import CliRunner
 
 from hesim_render.calibrate import calibrate_aps, read_calibration
+from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.cli.commands import app
 from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.twin import make_twin
 from hesim_render.twin.comparison import Check
 from hesim_render.twin.figures import bin_edges, counts_in, spectrum
+from hesim_render.twin.simulated import Bench
 
 REAL = os.environ.get("HESIM_EMVA1288_CCD")
 #: All that the twin's model has, at once.
@@ -110,6 +113,25 @@ def test_the_limit_is_exceeded_as_often_as_it_says():
             not Check("x", "", "", zero, zero, rng.standard_normal(size), np.ones(size)).passed for _ in range(20_000)
         )
         assert abs(failed - 20) < 5 * np.sqrt(20)
+
+
+def test_many_small_deviations_fail_together():
+    """25 values that are all 1.6 errors off: none is beyond its limit, but their rms is."""
+    zero = np.zeros(25)
+    check = Check("x", "", "", zero, zero, zero + 1.6, np.ones(25))
+    assert np.all(np.abs(check.z) < check.limit) and not check.passed
+    assert Check("x", "", "", zero, zero, zero + 1.6, np.ones(25), 2).passed  # errors that are hardly known
+
+
+def test_the_bench_has_the_light_of_the_captures(captures):
+    """Electrons: quantum efficiency times photons, with those of the longer exposure; none in the dark."""
+    result = evaluate(read_pair_set(captures))
+    assert result.curve.offset == pytest.approx(CAMERA.photons(CAMERA.late_us), rel=0.6)
+    bench = Bench(None, result, np.array([[1.0, 0.9]]), 1)
+    per_photon = result.responsivity.slope / result.gain.slope
+    expected = per_photon * (700.0 + result.curve.offset) * np.array([[1.0, 0.9]])
+    np.testing.assert_allclose(bench.electrons(700.0), expected, rtol=1e-12)
+    assert not bench.electrons(0.0).any()
 
 
 def test_errors_of_a_spectrum_are_those_of_its_noise():
