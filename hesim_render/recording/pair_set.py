@@ -176,8 +176,10 @@ def _listed(folder: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
             continue
         if kind == "n":
             bits, width, height = _numbers(file, line, rest, 3, "n <bits> <width> <height>")
-            if not (1 <= bits <= 16 and width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
-                raise SpecError(f"{rest.strip()}: expected 1 to 16 bit and a size above 0", file=file, line=line)
+            whole = all(value == int(value) for value in (bits, width, height))
+            if not (whole and 1 <= bits <= 16 and width * height <= MOST_PIXELS):
+                told = f"expected 1 to 16 bit and at most {MOST_PIXELS} pixels, whole numbers"
+                raise SpecError(f"{printable(rest.strip())}: {told}", file=file, line=line)
             bit_depth, shape = int(bits), (int(height), int(width))
         elif kind in "bd":
             count, told = (2, "b <exposure ns> <photons>") if kind == "b" else (1, "d <exposure ns>")

@@ -216,6 +216,10 @@ def huge(lines, folder):
     lines[2] = "n 12 1000000 1000000"
 
 
+def half_a_bit(lines, folder):
+    lines[2] = "n 12.5 52 36"
+
+
 def no_size(lines, folder):
     del lines[2]
 
@@ -251,6 +255,7 @@ BAD = {
     "a picture is listed twice": (twice, r"EMVA1288_Data.txt:6: b_000_00.png is twice"),
     "both frames are one": (same, r"EMVA1288_Data.txt:\d+: .*both frames are the same"),
     "a size no memory has": (huge, r"EMVA1288_Data.txt:3: .*expected 1 to 16 bit"),
+    "half a bit": (half_a_bit, r"EMVA1288_Data.txt:3: 12.5 52 36: expected 1 to 16 bit"),
     "no size": (no_size, r"EMVA1288_Data.txt: has no line 'n"),
     "another size": (other_size, r"b_\d+_00.png: is a I;16 picture of 52x36 px; expected a grey one of 53x36"),
     "no number": (no_number, r"EMVA1288_Data.txt:4: expected b <exposure ns> <photons>, numbers above 0"),
@@ -266,6 +271,13 @@ def test_a_wrong_list_is_one_error_with_file_and_line(written, tmp_path, name):
     with pytest.raises(SpecError, match=message) as error:
         evaluate(read_pair_set(changed(written, tmp_path / "set", edit)))
     assert "\n" not in str(error.value) and "\x1b" not in str(error.value)
+
+
+def test_captures_that_do_not_fit_into_memory_are_refused_before_a_frame_is_read(written, monkeypatch):
+    monkeypatch.setattr("hesim_render.core.guard._machine_bytes", lambda: 36 * 52 * 100)
+    monkeypatch.setattr("hesim_render.recording.pair_set.read_raw", None)
+    with pytest.raises(SpecError, match=r"EMVA1288_Data\.txt: maps and transforms of a frame would take"):
+        evaluate(read_pair_set(written))
 
 
 def spoiled(spoil, camera=CAMERA):

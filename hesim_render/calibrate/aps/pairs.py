@@ -33,6 +33,7 @@ from hesim_render.calibrate.aps.spatial import (
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance
 from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
+from hesim_render.core.guard import require_memory
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet
 
@@ -41,6 +42,8 @@ _FIT_TOP = 0.7
 #: Scatter of the light from exposure to exposure that is refused.
 _MOST_SCATTER = MOST_CHANGE
 _FEWEST_CLEAR = 5
+#: Memory of an evaluation, most of it transforms of frames in double precision.
+_BYTES_PER_PIXEL = 200
 #: Terms of the variance polynomial that flat fields of one light at many exposures do not tell: I t and t².
 _NO_TERMS = (4, 5)
 
@@ -129,6 +132,7 @@ def evaluate(pairs: PairSet, progress: Progress | None = None) -> PairCalibratio
     SpecError
         With file and line, if the captures are saturated, clipped at 0, or lit by light that drifts.
     """
+    require_memory(_BYTES_PER_PIXEL * pairs.shape[0] * pairs.shape[1], "maps and transforms of a frame", pairs.file)
     lit, dark = pair_levels(pairs, pairs.lit, progress), pair_levels(pairs, pairs.dark, progress)
     long_dark, long_lit = (long_series(pairs, which, progress) for which in (False, True))
     _check_dark(pairs, dark, long_dark)
