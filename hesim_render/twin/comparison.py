@@ -18,7 +18,7 @@ from hesim_render.calibrate.aps.pair_levels import Levels
 from hesim_render.calibrate.aps.pairs import PairCalibration, light_of
 from hesim_render.pixels.aps.formulas import polynomial
 from hesim_render.recording.pair_set import PairSet
-from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra
+from hesim_render.twin.figures import bin_edges, counts_in, deviations, spectra, without_lines
 
 #: Probability that one check fails for a twin that is right.
 ALARM = 1e-3
@@ -182,7 +182,7 @@ def _spatial(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
     for name, unit in (("dark", "DN²"), ("lit", "relative²")):
         key = f"long_{name}"
         scale = [1.0 if name == "dark" else half.signal for half in (real, twin, own)]
-        series: list[Long] = [getattr(half, key) for half in (real, twin, own)]
+        series = [without_lines(getattr(half, key), result.noise_spectrum) for half in (real, twin, own)]
         values = [np.array([*s.spatial.parts, s.spatial.total]) / f**2 for s, f in zip(series, scale, strict=True)]
         errors = [s.spatial.errors(fixed=True) / f**2 for s, f in zip(series, scale, strict=True)]
         error = np.sqrt(np.sum(np.square(errors), axis=0))
@@ -206,7 +206,7 @@ def _spatial(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
             Check(f"defects, histogram, {name}", "pixels", "deviation, " + ("DN" if name == "dark" else "relative"),
                   edges[:-1], counts[0], counts[1], np.sqrt(np.maximum(counts[0] + counts[1], 1.0)))
         )  # fmt: skip
-        found = [spectra(s, f, result.noise_spectrum) for s, f in zip(series, scale, strict=True)]
+        found = [spectra(s, f) for s, f in zip(series, scale, strict=True)]
         for direction in ("rows", "columns"):
             here = [f[direction] for f in found]
             error = np.sqrt(sum(s.error**2 for s in here))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from scipy.ndimage import uniform_filter
 
 from hesim_render.calibrate.aps.long_series import Long
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
+from hesim_render.calibrate.aps.spatial import spatial_variance
 
 #: Bands of spatial frequency, of equal numbers of frequencies.
 _BANDS = 20
@@ -36,9 +36,7 @@ class Spectrum:
     error: NDArray[np.float64]
 
 
-def spectrum(
-    image: NDArray, noise_pixel: float, noise_shared: float, axis: int, sines: Sequence[tuple[float, float]] = ()
-) -> Spectrum:
+def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int) -> Spectrum:
     """Spectrum along rows (axis 1) or columns (axis 0) of a mean image, as EMVA 1288 takes it.
 
     Each line is transformed, and the mean of their powers is taken.
@@ -49,7 +47,6 @@ def spectrum(
     noise_pixel : temporal variance of the mean of a pixel.
     noise_shared : variance of what all lines share: columns in a spectrum along rows, rows in one along columns.
     axis : direction of the transform.
-    sines : interference: cycles per pixel in this direction, and the power that it is expected to have in the mean.
     """
     lines = image if axis == 1 else image.T
     count, size = lines.shape
@@ -59,40 +56,49 @@ def spectrum(
     banded = np.array([power[group].mean() for group in groups])
     noise = noise_pixel + noise_shared
     pattern = np.maximum(banded - noise, 0.0)
-    number = np.array([group.size for group in groups])
+    number = np.array([float(group.size) for group in groups])
+    if size % 2 == 0:  # half a period a pixel has a real amplitude, and its power twice the variance
+        number[-1] **= 2
+        number[-1] /= groups[-1].size + 1
     own = (2 * pattern * noise_pixel + noise_pixel**2) / (count * number)
     shared = (2 * pattern * noise_shared + noise_shared**2 + 2 * noise_pixel * noise_shared / count) / number
-    for frequency, expected in sines:
-        # frames of any phase add up to an exponential law, or a squared normal one at half a period a pixel
-        band = next(
-            k for k, group in enumerate(groups) if group[-1] + 1 >= round(frequency * size) > 0 or k == number.size - 1
-        )
-        shared[band] += ((2 if frequency == 0.5 else 1) * expected**2 + 2 * expected * noise) / number[band] ** 2
     cycles = np.array([(group.mean() + 1) / size for group in groups])
     return Spectrum(cycles, banded, np.sqrt(own + shared))
 
 
-def spectra(series: Long, scale: float, temporal: NoiseSpectrum) -> dict[str, Spectrum]:
+def spectra(series: Long, scale: float) -> dict[str, Spectrum]:
     """Both spectra of a long series.
 
     Parameters
     ----------
     series : the series.
     scale : divides the image: 1 in the dark, the signal in the light.
-    temporal : spectrum of the temporal noise, whose lines have another phase in each frame.
     """
     row, col, pixel = (noise / scale**2 for noise in series.spatial.noise)
     rows, cols = series.mean.shape
     image = series.mean / scale
-
-    def lines(name: str, size: int) -> list[tuple[float, float]]:
-        found = [(abs(getattr(line, name)), line.rms_dn**2 / scale**2 / series.frames) for line in temporal.lines]
-        return [(cycles, variance * size / (1 if cycles == 0.5 else 2)) for cycles, variance in found if cycles > 0]
-
     return {
-        "rows": spectrum(image, pixel, max(col - pixel / rows, 0.0), 1, lines("cycles_per_col", cols)),
-        "columns": spectrum(image, pixel, max(row - pixel / cols, 0.0), 0, lines("cycles_per_row", rows)),
+        "rows": spectrum(image, pixel, max(col - pixel / rows, 0.0), 1),
+        "columns": spectrum(image, pixel, max(row - pixel / cols, 0.0), 0),
     }
+
+
+def without_lines(series: Long, temporal: NoiseSpectrum) -> Long:
+    """The series without the frequencies of interference.
+
+    Frames of any phase add up to a pattern that scatters by its own size, which tells nothing about a twin.
+    """
+    rows, cols = series.mean.shape
+    transform = np.fft.rfft2(series.mean)
+    for line in temporal.lines:
+        row, col = round(line.cycles_per_row * rows), round(line.cycles_per_col * cols)
+        transform[row % rows, col] = 0
+        if 2 * col == cols:
+            transform[-row % rows, col] = 0
+    mean = np.fft.irfft2(transform, series.mean.shape)
+    pixel = series.temporal.pixel - sum(line.rms_dn**2 for line in temporal.lines)
+    changes = replace(series.temporal, pixel=pixel)
+    return replace(series, mean=mean, spatial=spatial_variance(mean, changes, series.frames))
 
 
 def deviations(image: NDArray) -> NDArray[np.float64]:
