@@ -171,7 +171,7 @@ def test_max_depth_of_the_scene_file_changes_the_scenes_own_integrator(plugin):
         assert type(built.integrator) is type(mi.load_dict({"type": plugin}))
 
 
-@pytest.mark.parametrize("plugin", ["volpath", "volpathmis", "direct"])
+@pytest.mark.parametrize("plugin", ["volpath", "volpathmis"])
 def test_other_integrators_take_the_exact_mode_and_the_manifest_says_why(plugin):
     scene = mitsuba_scene({**ROOM, "integrator": {"type": plugin}}, depth=None)
     with pytest.raises(NeedsExactMode, match=f"integrator '{plugin}'"):
@@ -186,6 +186,70 @@ def test_direct_light_alone_is_not_made_longer():
     asked = exact_flux(furnace({"type": "direct"}, depth=2), sensor, 256)
     path = exact_flux(furnace({"type": "path", "max_depth": 2}), sensor, 256)
     np.testing.assert_allclose(asked.mean(), path.mean(), rtol=0.02)  # 192 pixels, 4 % each: 7 σ
+
+
+def test_direct_light_alone_is_a_path_of_two_segments_in_the_default_mode():
+    """Against Mitsuba's own picture by its own `direct` with 3 and 2 samples, light that comes back left out."""
+    sensor, own = mono(COLS, ROWS), {"type": "direct", "emitter_samples": 3, "bsdf_samples": 2}
+    shapes = {**ROOM, "ball": {**BALL, "bsdf": {"type": "plastic"}}, "wall": {**CLOSED["walls"], "radius": 5.0}}
+    scene = mitsuba_scene({**shapes, "integrator": own}, depth=None)
+    reference = reference_flux(scene, sensor, 256, repeats=4, seed=8)
+    # 9 means at 4.5 σ: false alarm 6e-5
+    assert agrees(default_flux(scene, sensor), reference)
+    assert not agrees(default_flux(mitsuba_scene(shapes, depth=3), sensor, 64), reference)
+    manifest = hr.simulate(scene, sensor, duration_s=0.002).manifest["settings"]
+    assert manifest["mode"] != "exact" and "exact_because" not in manifest
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"hide_emitters": True}, "hides lights"),
+        ({"emitter_samples": 0, "bsdf_samples": 2}, "'direct': with emitter_samples 0 it leaves light out"),
+        ({"emitter_samples": 2, "bsdf_samples": 0}, "'direct': with bsdf_samples 0 it leaves light out"),
+    ],
+)
+def test_settings_of_direct_light_that_change_the_picture_take_the_exact_mode(settings, message):
+    scene = mitsuba_scene({**ROOM, "integrator": {"type": "direct", **settings}}, depth=None)
+    with pytest.raises(NeedsExactMode, match=message):
+        PairTracer(scene, mono(COLS, ROWS), 1, used_responses(mono(COLS, ROWS)))
+
+
+def unused(folder):
+    """What would need the exact mode, be refused, or not be found, if a shape used it."""
+    volume = {"type": "constvolume", "value": even(0.3)}
+    return {
+        "polar": {"type": "polarizer"},
+        "lost": {"type": "twosided", "inside": {"type": "measured_polarized", "filename": str(folder / "no.pbsdf")}},
+        "cloud": {"type": "heterogeneous", "albedo": even(0.5), "sigma_t": volume},
+        "haze": {"type": "homogeneous"},
+        "stripes": {"type": "volume", "volume": volume},
+        "picture": {"type": "bitmap", "filename": str(folder / "no.png")},
+        "group": {"type": "shapegroup", "cube": {"type": "cube", "bsdf": {"type": "retarder"}}},
+        "made": mitsuba().load_dict({"type": "circular"}),
+    }
+
+
+def test_what_no_shape_uses_decides_nothing(tmp_path):
+    """Bits and mode are those without it; but its type must be known, used or not."""
+    sensor, motion = mono(COLS, ROWS), [{"object": "ball", "keyframes": STEP}]
+    used = {**ROOM, "skin": {"type": "twosided", "id": "skin", "inside": GREY}}
+    used["floor"] = {"type": "rectangle", "bsdf": {"type": "ref", "id": "skin"}}
+    plain, full = (mitsuba_scene(shapes, motion) for shapes in (used, {**unused(tmp_path), **used}))
+    np.testing.assert_array_equal(default_flux(full, sensor, 16), default_flux(plain, sensor, 16))
+    text = "".join(f'<bsdf type="{name}" id="{name}"/>' for name in ("retarder", "circular"))
+    (tmp_path / "s.xml").write_text(
+        f'<scene version="3.0.0">{text}<texture type="bitmap" id="t"><string name="filename" value="no.png"/></texture>'
+        '<bsdf type="diffuse" id="d"/><bsdf type="twosided" id="e"><ref id="d"/></bsdf>'
+        '<shape type="sphere"><ref id="e"/></shape><emitter type="constant"/></scene>'
+    )
+    built = build(mitsuba(), Scene.from_mitsuba(tmp_path / "s.xml").spec)
+    assert built.exact_because is None
+    assert [shape.bsdf().class_name() for shape in built.scene.shapes()] == ["TwoSidedBRDF"]
+    for name in ("mine", "../evil"):
+        (tmp_path / "s.xml").write_text(f'<scene version="3.0.0">\n<bsdf type="{name}" id="no"/></scene>')
+        with pytest.raises(SpecError, match=rf"s\.xml:2: no: BSDF '{name}': it is not known here; use one of blendbsdf"):
+            build(mitsuba(), Scene.from_mitsuba(tmp_path / "s.xml").spec)
 
 
 @pytest.mark.parametrize("name", sorted(plugins.REFUSED["Integrator"]))
@@ -282,7 +346,7 @@ def test_objects_that_were_made_before_are_looked_into():
         text = refusal({**ROOM, "eye": mi.load_dict(eye | changes), "i": {"type": "volpath"}}, camera=False)
         assert text.startswith("mitsuba.inline.eye: ") and message in text
     text = refusal({**ROOM, "i": mi.load_dict({"type": "prbvolpath"})})
-    assert text == "mitsuba.inline.i: integrator 'SamplingIntegrator': it is not known here; use one of path"
+    assert text == "mitsuba.inline.i: integrator 'SamplingIntegrator': it is not known here; use one of direct, path"
     made = mi.load_dict({"type": "volpath", "max_depth": 3})
     assert "max_depth cannot be set" in refusal({**ROOM, "i": made}, max_depth=5)
     with pytest.raises(NeedsExactMode, match="'volpath'"):

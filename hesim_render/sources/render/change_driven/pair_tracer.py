@@ -21,7 +21,7 @@ from hesim_render.sources.render.change_driven.edges import EdgeFit, LaneEdges, 
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, remembered, told_of
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
-from hesim_render.sources.render.scene.mitsuba_version import depth_limit, mitsuba
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba, path_depths
 from hesim_render.sources.render.tracer import BLOCK_RAYS, Tracer
 from hesim_render.sources.render.transport.matt import MattIntegrator
 from hesim_render.sources.render.transport.moving_scene import MovingScene
@@ -113,7 +113,7 @@ class PairTracer(Tracer):
         if self.built.paints is not None:
             self._integrator = MattIntegrator(self.parts, self.built.paints, scene.spec.lights, self.sensor.responses)
         else:
-            depth, roulette = (depth_limit(self.built.integrator, name) for name in ("max_depth", "rr_depth"))
+            depth, roulette = path_depths(self.built.integrator)
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
         self._aim = Aim(self.parts, self.rays)
         self._boxes = method_cache(self.parts.box_rows_in, maxsize=8)

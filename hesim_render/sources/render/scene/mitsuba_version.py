@@ -180,7 +180,7 @@ def _without_normals(state: Any) -> Callable[[str], bool]:
     merged = set()
     for node in state.nodes:
         if node.props.plugin_name() == "merge":
-            merged |= {files[number] for number in _children(node) if number in files}
+            merged |= {files[number] for number in children_of(node) if number in files}
     if len(merged) == 2:
         raise SpecError("shape 'merge': some of its meshes have normals of their vertices and others do not; take the "
                         "meshes out of 'merge'")  # fmt: skip
@@ -189,7 +189,7 @@ def _without_normals(state: Any) -> Callable[[str], bool]:
     return lambda name: named.get(name, merged == {True})
 
 
-def _children(node: Any) -> list[int]:
+def children_of(node: Any) -> list[int]:
     """Numbers of the nodes that a node of a parsed scene refers to."""
     import mitsuba as mi
 
@@ -380,11 +380,19 @@ def box_corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[
     return low + corners * (high - low)
 
 
-def depth_limit(integrator: MitsubaObject, property_name: str) -> int:
-    """A depth limit of an integrator, -1 for none. Mitsuba gives it only in the text of the integrator."""
+def path_depths(integrator: MitsubaObject) -> tuple[int, int]:
+    """Longest path of an integrator, and its first segment with Russian roulette; -1 for none."""
+    if integrator.class_name() == "DirectIntegrator":
+        return 2, -1
+    most, roulette = (number_of(integrator, name) for name in ("max_depth", "rr_depth"))
+    return most, roulette
+
+
+def number_of(integrator: MitsubaObject, property_name: str) -> int:
+    """A whole number among the properties of an integrator, -1 for none. Mitsuba gives it only in its text."""
     for line in str(integrator).splitlines():
         name, _, value = line.strip().rstrip(",").partition(" = ")
         if name == property_name:
-            depth = int(value)
-            return -1 if depth >= 2**31 else depth
-    raise AssertionError(f"a path integrator has a {property_name}")
+            number = int(value)
+            return -1 if number >= 2**31 else number
+    raise AssertionError(f"this integrator has a {property_name}")

@@ -8,17 +8,18 @@ in these tables are never loaded, so a scene file cannot name a library to run.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hesim_render.core.device_types import MitsubaModule
 from hesim_render.core.errors import SpecError
+from hesim_render.sources.render.scene.mitsuba_version import children_of
 
 #: Plugins that both modes render as Mitsuba does, by kind.
 HONOURED: dict[str, tuple[str, ...]] = {
-    "Integrator": ("path",),
+    "Integrator": ("direct", "path"),
     "Sensor": ("perspective",),
     "Emitter": ("area", "constant", "directional", "envmap", "point", "projector", "spot", "sunsky"),
     "Shape": (
@@ -42,7 +43,6 @@ EXACT: dict[str, dict[str, str]] = {
     "Integrator": {
         "volpath": "it follows light through media, not only between surfaces",
         "volpathmis": "it follows light through media, not only between surfaces",
-        "direct": "it samples direct light in a way of its own",
     },
     "Shape": {
         "instance": "it is a copy that has no surface of its own",
@@ -139,6 +139,8 @@ _THROUGH_MEDIA = ("volpath", "volpathmis")
 _HAVE_DEPTH = ("path", *_THROUGH_MEDIA)
 #: Kinds that belong to a camera; they are checked only if that camera is used.
 OF_A_CAMERA = ("Sensor", "Film", "Sampler", "ReconstructionFilter")
+#: Kinds that do nothing in a scene by themselves; shapes, lights and cameras use them.
+_OF_OTHERS = ("BSDF", "Texture", "Volume", "Medium", "PhaseFunction")
 _PLACE = re.compile(r"(?P<file>.+) \(line (?P<line>\d+), col \d+\)")
 _KEY = re.compile(r'dictionary node "(?P<key>.*)"')
 
@@ -184,18 +186,35 @@ def require_known(name: Any, file: Path | None, key: str) -> None:
 
 
 def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]:
-    """All plugins of a parsed scene, in order; `file` is the scene file, for a dictionary within it."""
+    """The plugins of a parsed scene, in order; `file` is the scene file, for a dictionary within it.
+
+    What no shape, light, camera or integrator uses is taken out of the scene: it decides nothing, and is not loaded.
+
+    Raises
+    ------
+    SpecError
+        If a plugin is not one of Mitsuba's, used or not.
+    """
     nodes, types = list(state.nodes), mi.Properties.Type
-    owners: list[list[Any]] = [[] for _ in nodes]
     for node in nodes:
-        for key in node.props:
-            if node.props.type(key) == types.ResolvedReference:
-                owners[node.props[key].index()].append(node)
+        name = node.props.plugin_name()
+        if name not in _KINDS and node.type.name != "Scene":
+            unknown = Used(_kind_of(node), name, node.props.id(), _place(mi, state, node, file), node, ())
+            raise unknown.refused(_unknown(unknown.kind))
+    _leave_out_unused(mi, nodes)
+    owners: list[list[Any]] = [[] for _ in nodes]
+    reached, waiting = {0}, [0]
+    while waiting:
+        node = nodes[waiting.pop()]
+        for number in children_of(node):
+            owners[number].append(node)
+            if number not in reached:
+                reached.add(number)
+                waiting.append(number)
     found: list[Used] = []
-    for node, above in zip(nodes, owners, strict=True):
-        place, name = _place(mi, state, node, file), node.props.plugin_name()
-        # a parsed dictionary does not state the kind of an object written in Python
-        kind = _KINDS.get(name, "Plugin") if node.type.name == "Unknown" else node.type.name
+    for number in sorted(reached):
+        node, above = nodes[number], owners[number]
+        place, name, kind = _place(mi, state, node, file), node.props.plugin_name(), _kind_of(node)
         if kind != "Scene":
             found.append(Used(kind, name, node.props.id(), place, node, tuple(above)))
         for key in node.props:
@@ -203,6 +222,27 @@ def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]
                 inside = {**place, "key": ".".join(filter(None, (place.get("key"), key)))}
                 found.extend(_made(mi, node.props[key], inside, node))
     return found
+
+
+def _kind_of(node: Any) -> str:
+    """Kind of a node. A parsed dictionary does not state that of an object written in Python."""
+    return _KINDS.get(node.props.plugin_name(), "Plugin") if node.type.name == "Unknown" else str(node.type.name)
+
+
+def _leave_out_unused(mi: MitsubaModule, nodes: Sequence[Any]) -> None:
+    """Remove from the scene itself, the first node, what only other objects can use, and groups without copies."""
+    types, scene = mi.Properties.Type, nodes[0].props
+    copied = {number for node in nodes if node.props.plugin_name() == "instance" for number in children_of(node)}
+    for key in list(scene.keys()):
+        if scene.type(key) == types.ResolvedReference:
+            number = scene[key].index()
+            is_group = nodes[number].props.plugin_name() == "shapegroup"
+            unused = number not in copied if is_group else _kind_of(nodes[number]) in _OF_OTHERS
+        else:
+            made = scene[key] if scene.type(key) == types.Object else None
+            unused = isinstance(made, (mi.BSDF, mi.Texture, mi.Volume, mi.Medium, mi.PhaseFunction))
+        if unused:
+            del scene[key]
 
 
 def _place(mi: MitsubaModule, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
@@ -267,7 +307,12 @@ def _why_refused(used: Used) -> str | None:
     if used.node is None and used.kind not in ("Integrator", "Sensor"):
         return None  # an object of a Mitsuba class that no table refuses
     known = HONOURED.get(used.kind, ()) + OF_THE_SENSOR_FILE.get(used.kind, ())
-    return None if used.name in known else f"it is not known here; use one of {', '.join(sorted(known))}"
+    return None if used.name in known else _unknown(used.kind)
+
+
+def _unknown(kind: str) -> str:
+    known = HONOURED.get(kind, ()) + OF_THE_SENSOR_FILE.get(kind, ())
+    return f"it is not known here; use one of {', '.join(sorted(known))}"
 
 
 def _exact_where_it_moves(used: Used, moved: set[str]) -> str | None:

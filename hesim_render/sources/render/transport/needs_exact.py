@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.render.scene.builder import BuiltScene
+from hesim_render.sources.render.scene.mitsuba_version import number_of
 
 
 class NeedsExactMode(SpecError):
@@ -15,7 +16,11 @@ def require_paths(built: BuiltScene) -> None:
     if built.exact_because is not None:
         raise NeedsExactMode(built.exact_because)
     name = built.integrator.class_name()
-    if name != "PathIntegrator":
+    if name == "DirectIntegrator":
+        for kind in ("emitter_samples", "bsdf_samples"):
+            if number_of(built.integrator, kind) == 0:
+                raise NeedsExactMode(f"integrator 'direct': with {kind} 0 it leaves light out")
+    elif name != "PathIntegrator":
         raise NeedsExactMode(f"integrator {name!r} follows more than paths between surfaces")
     if built.integrator.hide_emitters:
         raise NeedsExactMode("the integrator hides lights that are seen directly")
