@@ -216,7 +216,9 @@ def test_settings_of_direct_light_that_change_the_picture_take_the_exact_mode(se
 
 
 def unused(folder):
-    """What would need the exact mode, be refused, or not be found, if a shape used it."""
+    """What would need the exact mode, be refused, or not be read, if a shape used it."""
+    for name in ("no.pbsdf", "no.png"):
+        (folder / name).write_text("nothing that Mitsuba reads")
     volume = {"type": "constvolume", "value": even(0.3)}
     return {
         "polar": {"type": "polarizer"},
@@ -231,7 +233,7 @@ def unused(folder):
 
 
 def test_what_no_shape_uses_decides_nothing(tmp_path):
-    """Bits and mode are those without it; but its type must be known, used or not."""
+    """Bits and mode are those without it; but its type must be known and its files be there, used or not."""
     sensor, motion = mono(COLS, ROWS), [{"object": "ball", "keyframes": STEP}]
     used = {**ROOM, "skin": {"type": "twosided", "id": "skin", "inside": GREY}}
     used["floor"] = {"type": "rectangle", "bsdf": {"type": "ref", "id": "skin"}}
