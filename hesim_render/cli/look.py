@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from hesim_render.cli.options import Overwrite
-from hesim_render.cli.simulate import tell_recording
-from hesim_render.cli.told import Json, Quiet, Told
+from hesim_render.cli.terminal import summary
+from hesim_render.cli.told import Json, Quiet, Told, recording_facts
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.output import free_place, output_errors, replacing
 
@@ -80,4 +80,5 @@ def view(
             more += f"\n  for rerun: {rrd}"
         elif viewer or (viewer is None and rerun_view.can_show()):
             rerun_view.show(loaded, progress)
-    tell_recording(told, loaded, more, {"page": page, "rrd": rrd})
+    # a recording that misses its quality is shown all the same, with the line that says so
+    told.result(summary(loaded) + more, {**recording_facts(loaded), "page": page, "rrd": rrd})

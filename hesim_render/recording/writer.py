@@ -16,7 +16,6 @@ from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
-from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import SceneSpec
 
 if TYPE_CHECKING:
@@ -185,6 +184,8 @@ class RecordingWriter:
 
     def finish(self) -> Recording:
         """Finish and return the recording. A folder is now complete and has its final name."""
+        from hesim_render.sources.scene import Scene
+
         scene = Scene(self._scene) if isinstance(self._scene, SceneSpec) else None
         if self._folder is not None:
             found = Recording.load(self._folder.finish())

@@ -198,5 +198,5 @@ def test_the_data_set_says_that_torch_is_missing(built, monkeypatch):
     from hesim_render.benchmark import torch_dataset
 
     monkeypatch.setattr(torch_dataset, "torch", None)
-    with pytest.raises(SpecError, match=r"hesim_render\[torch\]"):
+    with pytest.raises(SpecError, match=r"torch>=2\.4"):
         torch_dataset.BenchmarkDataset(built.root)

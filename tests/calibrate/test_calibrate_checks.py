@@ -167,7 +167,7 @@ def test_searches_that_end_elsewhere_are_told(tmp_path):
     assert event_checks.check_events(lost, "voltage")[0] == []
     study = event_output.content(captures, lost, None)["multi_start"]
     assert study["lost"] == 3 and max(study["largest_difference_in_standard_errors"]) < 0.3
-    assert event_output.maps(lost)["figure_starts"].shape == (197, 4)
+    assert event_output.maps(captures, lost)["figure_starts"].shape == (197, 4)
 
 
 def test_a_flat_field_has_a_chi2(tmp_path):

@@ -331,14 +331,14 @@ def test_yaml_that_means_more_than_it_says(tmp_path, text):
 
 
 def test_names_are_printed_without_what_a_terminal_obeys(folder, capsys):
-    evil = "\x1b[31mred\x07\u202e\ud800\nline"
-    change_manifest(folder, lambda manifest: manifest["sensor"].update(name=evil))
+    """A manifest with such a name is refused, and no message obeys it."""
+    evil = "\x1b[31mred\x07\u202e\nline"
     change_manifest(folder, lambda manifest: manifest["mosaic"].update(sensor=evil))
     with pytest.raises(SystemExit) as end:
         cli.main(["view", str(folder)])
-    out = capsys.readouterr().out
-    assert end.value.code == 0 and "\\x1b[31mred\\x07\\u202e\\ud800\\nline" in out
-    assert not any(c in out for c in "\x1b\x07\u202e\ud800")
+    out, err = capsys.readouterr()
+    assert end.value.code == 2 and "mosaic.sensor: " in err and "holds a control character" in err
+    assert not any(c in out + err for c in "\x1b\x07\u202e")
     with pytest.raises(SystemExit) as end:
         cli.main(["view", "no\x1b[2Jthing"])
     assert end.value.code == 2 and "\x1b" not in capsys.readouterr().err
@@ -360,7 +360,7 @@ def test_names_in_a_report_are_text(tmp_path):
 def test_a_sensor_of_any_name_gives_readable_frames(tmp_path):
     recordings.make("eiger", tmp_path / "r", width=32, height=32, duration_us=60_000)
     made = Recording.load(tmp_path / "r")
-    made.manifest["mosaic"]["sensor"] = "Grün\x1b"
+    made.manifest["mosaic"]["sensor"] = "Grün 相机"
     other = made.save(tmp_path / "s")
     np.testing.assert_array_equal(Recording.load(other).frames[0].raw, made.frames[0].raw)
 

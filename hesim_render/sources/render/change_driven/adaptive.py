@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.distinct import distinct_columns
+from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
+from hesim_render.sources.render.change_driven.edges import PairEdges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
@@ -128,12 +130,8 @@ class AdaptiveRenderer:
         window, place = np.nonzero(todo)
         before = self.tracer.rays_done
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
-        pairs, edges = (band.index[place], numbers[todo], windows), None
-        rays: NDArray[np.integer] = what.rays[todo]
-        if self.tracer.rays.is_box:
-            tried = None if aims is None else aims.count == 0
-            given = rays, what.lit[todo], what.wanted[todo], what.floor[todo]
-            rays, edges = about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried)
+        pairs = band.index[place], numbers[todo], windows
+        rays, edges = self.rays_of(pairs, what, todo, aims)
         got = self.tracer.trace(*pairs, rays, what.lit[todo], span_us=span_us, aims=aims, edges=edges)
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
@@ -143,6 +141,27 @@ class AdaptiveRenderer:
             for values, known in zip(out.arrays, first.arrays, strict=True):
                 values[0] = known[0]
         return out, met
+
+    def rays_of(
+        self,
+        pairs: tuple[NDArray[np.uint32], NDArray[np.int64], Windows],
+        what: Plan,
+        todo: NDArray[np.bool_],
+        aims: PairAims | None,
+    ) -> tuple[NDArray[np.integer], PairEdges | None]:
+        """Numbers of rays of the pairs `todo` of a plan, and models of their edges; this traces decision rays.
+
+        Parameters
+        ----------
+        pairs : pixels on the full sensor, their windows, and all windows.
+        aims : small objects of these pairs, at which rays are aimed.
+        """
+        rays: NDArray[np.integer] = what.rays[todo]
+        if not self.tracer.rays.is_box:
+            return rays, None
+        tried = None if aims is None else aims.count == 0
+        given = rays, what.lit[todo], what.wanted[todo], what.floor[todo]
+        return about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried)
 
     def alone(
         self, pixel: NDArray[np.uint32], begin: NDArray[np.float64], end: NDArray[np.float64], role: Role, out: Flux

@@ -161,9 +161,22 @@ class ChangeDrivenFlux:
     # ---- for the forecast -------------------------------------------------------------------------
 
     def foretell(
-        self, pixel: NDArray[np.uint32], begin_us: NDArray[np.float64], end_us: NDArray[np.float64], role: Role
+        self,
+        pixel: NDArray[np.uint32],
+        begin_us: NDArray[np.float64],
+        end_us: NDArray[np.float64],
+        role: Role,
+        until: int | None = None,
     ) -> float:
-        """Rays per listed pixel for a block of windows without its first one, or for a single window."""
+        """Rays per listed pixel for a block of windows without its first one, or for a single window.
+
+        Parameters
+        ----------
+        pixel : [n], mosaic indices.
+        begin_us, end_us : [w], the windows, µs.
+        role : use of the pixels.
+        until : number of the last window on whose values something depends; None for the last one.
+        """
         if self._is_dark or pixel.size == 0:
             return 0.0
         renderer, windows, rays = self._renderer, Windows(begin_us, end_us), 0
@@ -172,9 +185,17 @@ class ChangeDrivenFlux:
         for band in renderer.bands(pixel, role):
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, near = renderer.pilot(band, windows, numbers, windows.span_us)
-            what = renderer.plan(pilot, band, is_knot=role == "events")
+            what = renderer.plan(pilot, band, is_knot=role == "events").until(
+                windows.size - 1 if until is None else until
+            )
             changing = near[band.sites.listed] if windows.size > 1 else np.ones(band.place.size, np.bool_)
-            rays += int(np.sum(np.where(what.rendered, what.rays, 0)[-later:], dtype=np.int64))
+            todo = what.rendered.copy()
+            todo[:-later] = False
+            window, place = np.nonzero(todo)
+            aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
+            before = self._tracer.rays_done
+            each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims)
+            rays += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
             rays += band.pilot_rays * later * int(np.count_nonzero(changing))
         renderer.counts, self._tracer.rays_done = counts, done
         return rays / pixel.size

@@ -78,7 +78,13 @@ def forecast(
             windows = max(block.wanted.size for block in every)
             chosen = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, _BLOCKS).astype(int))]
             patch = _patches(event_pixel, source, rng)
-            each = [source.foretell(patch, block.begin_us, block.end_us, "events") for block in chosen]
+            # the last block goes beyond the end of the run, which counts where all blocks are looked at
+            is_all = len(chosen) == len(every)
+            ends = [int(np.flatnonzero(b.wanted)[-1]) if is_all and b.wanted.any() else None for b in chosen]
+            each = [
+                source.foretell(patch, block.begin_us, block.end_us, "events", end)
+                for block, end in zip(chosen, ends, strict=True)
+            ]
             # the first window of a run belongs to no block before it, and all pixels are rendered in it
             first = source.foretell(patch, chosen[0].begin_us[:1], chosen[0].end_us[:1], "events")
             rays += (first + float(np.mean(each)) * blocks.count) * event_pixel.size
