@@ -8,6 +8,7 @@ from PIL import Image
 
 import hesim_render as hr
 from hesim_render import cli
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.specs.target import TargetSpec
 
 KINDS = sorted(
@@ -53,7 +54,8 @@ def test_it_renders(kind, sensor, tmp_path, capsys):
     with pytest.raises(SystemExit) as caught:
         cli.main(["simulate", str(tmp_path / "scene.yaml"), "--sensor", sensor, "--roi", "32x24", "--samples", "2",
                   "--duration", "0.03", "--out", str(tmp_path / "out")])  # fmt: skip
-    assert caught.value.code == 0, capsys.readouterr().err
+    # two rays a pixel are few, which the run says; a flat target needs no more
+    assert caught.value.code in (ExitStatus.DONE, ExitStatus.NOT_MET), capsys.readouterr().err
     frames = hr.Recording.load(tmp_path / "out").frames
     electrons = frames[0].electrons_mean[frames[0].valid]
     assert np.isfinite(electrons).all() and electrons.max() > 10
