@@ -101,14 +101,14 @@ def main() -> None:
 
 
 def _work() -> None:
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    # unbuffered: what a buffer still held when nobody reads any more, Python would complain about at its end
+    answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # what libraries print is no answer
     signal.signal(signal.SIGTERM, _stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one decides
 
     def answer(content: dict[str, Any]) -> None:
-        answers.write(json.dumps(content) + "\n")
-        answers.flush()
+        answers.write(json.dumps(content).encode("utf-8") + b"\n")
 
     _claimed()
     order = sys.stdin.readline()
