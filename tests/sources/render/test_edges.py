@@ -10,9 +10,10 @@ from scipy import stats
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, coverage
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.tuning import TUNING
+from hesim_render.sources.render.change_driven.tuning import TUNING, Gain
 from hesim_render.sources.render.change_driven.windows import Windows
 
 
@@ -175,3 +176,37 @@ def test_a_run_takes_lines_where_there_are_some():
     unit = source.noise_unit(pixel, found[256], True)
     assert rays[256] < 0.7 * rays[1 << 14]
     assert np.sqrt(np.mean(((found[256] - found[1 << 14]) / unit) ** 2)) < 0.5
+
+
+def test_rays_follow_from_what_the_decision_rays_saw():
+    """Fits as given, of pairs 0.8 as bright as the axis; the wanted error is 2 e⁻/s, which is 2.5 on the axis."""
+    contrast = np.array([250.0, 2500.0, 1.5, 1.5, 250.0, 250.0, 250.0, 250.0])  # 100, 1000, 0.6 wanted errors, …
+    scatter = np.array([0, 0, 0, 0, 0, 0, 40.0, 0])  # the last but one has no even levels
+    gap = np.array([0.01, 0.02, -1, -1, -1, 0.01, 0.01, 0.01])
+    fit = EdgeFit(*(v.astype(np.float32) for v in (
+        np.ones(8), np.zeros(8), np.zeros(8), gap, np.full(8, 7.0), 7 + contrast, scatter, np.full(8, 20.0),
+    )))  # fmt: skip
+    tried = []
+
+    class Tracer:
+        def edges(self, pixel, window, windows, samples, footprint_px, lit, stream):
+            tried.append((pixel.tolist(), samples, footprint_px, stream))
+            return EdgeFit(*(getattr(fit, name)[pixel] for name in vars(fit)))
+
+        def axis_factor(self, pixel):
+            return np.full(pixel.size, 0.8, np.float32)
+
+    pixel, law = np.arange(8, dtype=np.uint32), np.array([2048, 4096, 2048, 512, 1024, 1024, 1024, 128])
+    floor, lit, wanted = np.array([0, 0, 0, 0, 0, 300, 0, 0]), np.ones(8, bool), np.full(8, 2.0, np.float32)
+    given = law, lit, wanted, floor, Gain(*TUNING.matt_gain), TUNING
+    rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given)
+    # 0.4 rays for each wanted error of contrast, 64 at least; an eighth of the law; a corner as by the law; the floor;
+    # three levels as by the law; and a pair of few rays is not looked at
+    assert rays.tolist() == [64, 512, 256, 64, 1024, 512, 1024, 128]
+    assert edges.is_there.tolist() == [True, True, False, False, False, True, False, False]
+    assert tried == [(list(range(7)), 64, 1.5, Stream.RENDER_EDGE)]
+    np.testing.assert_allclose(edges.half_width[:2], [0.009, 0.014], rtol=1e-5)
+    rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given, tried=pixel == 2, flat_part=0.5,
+                              stream=Stream.AUDIT_EDGE)  # fmt: skip
+    assert rays.tolist() == [2048, 4096, 1024, *law[3:]] and edges is None
+    assert tried[1][0] == [2] and tried[1][3] == Stream.AUDIT_EDGE
