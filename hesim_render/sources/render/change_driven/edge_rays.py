@@ -60,7 +60,8 @@ def about_edges(
     # fluxes of fits are those on the optical axis
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
     contrast, by_scatter = (fit.high - fit.low) / wanted, gain.rays(fit.scatter / wanted)
-    is_edge, is_flat = fit.is_edge, contrast < 1
+    is_flat = contrast < 1
+    is_edge = fit.is_edge & ~is_flat
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
     needed = np.where(is_edge, np.maximum(2 * by_scatter, tuning.edge_contrast_rays * contrast), by_scatter)
     # no contrast at all: the neighbours gave this pair its rays, and what they show does not reach it
