@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Closer, Pilot, allocate
 from hesim_render.sources.render.change_driven.plan import Plan, changes, fill_in, longer, plan

@@ -15,7 +15,7 @@ from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
-from hesim_render.sources.render.change_driven.pilot import Pilot, take_pilot
+from hesim_render.sources.render.change_driven.pilot import Anchored, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.plan import Plan, plan
 from hesim_render.sources.render.change_driven.small_objects import Zoom
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
@@ -88,15 +88,30 @@ class AdaptiveRenderer:
         windows: Windows,
         numbers: NDArray[np.int64],
         span_us: tuple[float, float] | None,
+        anchored: Anchored | None = None,
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         """Pilot pass of a band in listed windows; see `take_pilot`."""
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
-        width = self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
+        width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         closer = self.zoom.sites(row, col, windows, numbers)
-        found = take_pilot(self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer)
+        found = take_pilot(self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored)
         self.counts.pilot_rays += self.tracer.rays_done - before
         return found
+
+    def pilot_rays(self, band: Band, windows: Windows) -> Anchored:
+        """Pilot of a band in the only window, with its rays."""
+        before, sites = self.tracer.rays_done, band.sites
+        first = np.zeros(sites.size, np.int64)
+        found = Anchored(
+            *self.tracer.pilot_rays(sites.index, first, windows, band.pilot_rays, self._footprint_px(band))
+        )
+        self.counts.pilot_rays += self.tracer.rays_done - before
+        return found
+
+    def _footprint_px(self, band: Band) -> float:
+        """Width of the area in which pilot rays of a band start, px."""
+        return self.tuning.lone_footprint_px if band.apart else self.tuning.footprint_px
 
     def plan(self, pilot: Pilot, band: Band, is_knot: bool) -> Plan:
         """Which pairs of a band are rendered, with how many rays; see `plan`."""
@@ -111,7 +126,7 @@ class AdaptiveRenderer:
         span_us: tuple[float, float] | None = None,
         first: Flux | None = None,
     ) -> tuple[Flux, NDArray[np.bool_]]:
-        """Render the pairs that a plan names.
+        """Render the pairs that a plan names, except differences, which need an anchor; see `Anchor.render`.
 
         Parameters
         ----------
@@ -127,8 +142,9 @@ class AdaptiveRenderer:
         todo = what.rendered.copy()
         if first is not None:
             todo[0] = False
-        window, place = np.nonzero(todo)
+        todo &= what.differences.rays == 0
         before = self.tracer.rays_done
+        window, place = np.nonzero(todo)
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
         rays, edges = self.rays_of(pairs, what, todo, aims)

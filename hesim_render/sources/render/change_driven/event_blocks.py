@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
+from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.plan import fill_in
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -24,20 +25,22 @@ class Blocks:
     Attributes
     ----------
     alive : places of the pixels that may change.
-    base : [1, n], flux of all pixels in the first window.
+    base : [1, n], flux of all pixels in the anchor of the first window.
     """
 
     def __init__(self, renderer: AdaptiveRenderer, pixel: NDArray[np.uint32], first: Block) -> None:
         self._renderer = renderer
         self.base = Flux.zeros(1, pixel.size)
-        begin, end = (np.full(pixel.size, times[0]) for times in (first.begin_us, first.end_us))
-        renderer.alone(pixel, begin, end, "events", self.base)
+        span_us = anchor_us(first)
+        renderer.alone(pixel, *(np.full(pixel.size, time) for time in span_us), "events", self.base)
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
         self._bands = list(renderer.bands(pixel[self.alive], "events"))
+        known = self.base.at(self.alive)
+        self._anchors = [Anchor(renderer, band, span_us, known.at(band.place)) for band in self._bands]
         #: Window whose flux is `_last`.
-        self._time: tuple[float, float] | None = (float(first.begin_us[0]), float(first.end_us[0]))
-        self._last = self.base.at(self.alive)
+        self._time: tuple[float, float] | None = None
+        self._last = known
 
     def take(self, block: Block) -> Flux:
         """Flux of the pixels that may change, [window, alive pixel]."""
@@ -45,19 +48,25 @@ class Blocks:
         is_next = self._time == (block.begin_us[0], block.end_us[0])
         out = Flux.zeros(windows.size, self.alive.size)
         centre = 0.5 * (block.begin_us + block.end_us)
-        for band in self._bands:
+        span_us = anchor_us(block)
+        for number, band in enumerate(self._bands):
+            if self._anchors[number].span_us != span_us:
+                self._anchors[number] = Anchor(renderer, band, span_us)
+            anchor = self._anchors[number]
             first = self._last.at(band.place) if is_next else None
             if first is not None and windows.size == 1:
                 out.put(band.place, first)
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
-            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us)
+            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot)
             what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             if first is None:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
                 first = renderer.render(band, windows, numbers[:1], what.first())[0]
+                anchor.render(windows, what.first(), None, first)
             flux, _ = renderer.render(band, windows, numbers, what, first=first)
+            anchor.render(windows, what, first, flux)
             for values in flux.arrays[:2]:
                 fill_in(values, what.rendered, centre)
             fill_in(flux.error, what.rendered, centre)

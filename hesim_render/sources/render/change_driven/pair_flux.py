@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
 from hesim_render.core.journal import Journal, key_of
+from hesim_render.core.tables import spread_out
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -33,6 +34,15 @@ class PairFlux:
     @property
     def mean(self) -> NDArray[np.float32]:
         return np.float32(0.5) * (self.half_a + self.half_b)
+
+    @classmethod
+    def empty(cls, count: int) -> PairFlux:
+        """Flux to be filled in."""
+        return cls(np.empty(count, np.float32), np.empty(count, np.float32), np.zeros(count, np.bool_))
+
+    def at(self, place: NDArray[np.int64]) -> PairFlux:
+        """Flux of some pairs."""
+        return PairFlux(self.half_a[place], self.half_b[place], self.met[place])
 
     def put(
         self, part: slice | NDArray[np.int64], flux: Float, met: UInt32, packets: NDArray[np.int64], packet_rays: int
@@ -70,6 +80,8 @@ class PilotFlux:
         It is larger if few rays deviate, because stratification then gains less.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
+    lit_change, hidden_change : standard deviation of the difference of single rays to the same rays in another window,
+        e⁻/s, float32; 0 where there is none to compare with.
     """
 
     lit: NDArray[np.float32]
@@ -78,9 +90,25 @@ class PilotFlux:
     lit_scatter: NDArray[np.float32]
     hidden_scatter: NDArray[np.float32]
     met: NDArray[np.bool_]
+    lit_change: NDArray[np.float32]
+    hidden_change: NDArray[np.float32]
+
+    @classmethod
+    def empty(cls, count: int) -> PilotFlux:
+        """Statistics to be filled in."""
+        kinds = {"met": np.bool_}
+        return cls(*(np.zeros(count, kinds.get(each.name, np.float32)) for each in fields(cls)))
 
     def put(
-        self, part: slice, lit: Float, hidden: Float, unshadowed: Float, met: UInt32, samples: int, alike: int
+        self,
+        part: slice,
+        lit: Float,
+        hidden: Float,
+        unshadowed: Float,
+        met: UInt32,
+        samples: int,
+        alike: int,
+        before: tuple[Float, Float] | None = None,
     ) -> None:
         """Put in the statistics of pairs.
 
@@ -91,6 +119,7 @@ class PilotFlux:
             moving object.
         samples : number of rays of each pair.
         alike : number of successive rays that are of one kind. Scatter is that within each kind.
+        before : `lit` and `hidden` of the same rays in the window to compare with; None where there is none.
         """
         import drjit as dr
 
@@ -111,8 +140,61 @@ class PilotFlux:
             scatter = unit * dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
             dr.eval(mean, scatter)
             getattr(self, name)[part], getattr(self, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
+        for values, other, name in zip((lit, hidden), before or (), ("lit_change", "hidden_change"), strict=False):
+            difference = values - other
+            mean = dr.block_sum(difference, samples) * share
+            deviation = difference - dr.gather(types.Float, mean, pair)
+            unit = power_below(dr.block_reduce(dr.ReduceOp.Max, dr.abs(deviation), samples))
+            square = dr.square(deviation * dr.gather(types.Float, 1 / unit, pair))
+            getattr(self, name)[part] = np.array(unit * dr.sqrt(dr.block_sum(square, samples) * (share * unbiased)))
         self.unshadowed[part] = np.array(dr.block_sum(unshadowed, samples) * share)
         self.met[part] = np.array(dr.block_reduce(dr.ReduceOp.Or, met, samples))
+
+
+def not_negative(flux: PairFlux) -> None:
+    """Raise negative means to 0, in place, and keep the difference of the halves as far as possible.
+
+    An estimate with a control variate may be negative; a flux is not.
+    """
+    below = np.minimum(flux.mean, 0)
+    flux.half_a[:] -= below
+    flux.half_b[:] = np.maximum(flux.half_b - below, -flux.half_a)
+
+
+@dataclass(frozen=True)
+class PilotRays:
+    """Fluxes of the pilot's single rays, on the device, one pair after the other, e⁻/s on the optical axis.
+
+    Parameters
+    ----------
+    lit, hidden : by both estimators of `MattIntegrator`.
+    samples : rays of each pair.
+    spans_us : begins and ends of the windows, µs.
+    """
+
+    lit: Float
+    hidden: Float
+    samples: int
+    spans_us: tuple[float, ...]
+
+    def at(self, pair: NDArray[np.integer]) -> tuple[Float, Float]:
+        """Fluxes of the rays of some pairs."""
+        import drjit as dr
+
+        types = jit()
+        ray = dr.arange(types.UInt32, pair.size * self.samples)
+        which = ray // dr.opaque(types.UInt32, self.samples)
+        place = spread_out(types.UInt32, pair.astype(np.uint32), which) * dr.opaque(types.UInt32, self.samples)
+        place += ray - which * dr.opaque(types.UInt32, self.samples)
+        return dr.gather(types.Float, self.lit, place), dr.gather(types.Float, self.hidden, place)
+
+
+def joined(first: PilotRays, second: PilotRays) -> PilotRays:
+    """Rays of two lists of pairs, one after the other."""
+    import drjit as dr
+
+    rays = (dr.concat([getattr(each, name) for each in (first, second)]) for name in ("lit", "hidden"))
+    return PilotRays(*rays, first.samples, first.spans_us + second.spans_us)
 
 
 def power_below(values: Float) -> Float:
@@ -130,7 +212,7 @@ def remembered(
     inputs: tuple[object, ...],
     out: PairFlux | PilotFlux | EdgeFit,
     part: slice | NDArray[np.int64],
-    trace: Callable[[], None],
+    trace: Callable[[], object],
 ) -> None:
     """Put the results of some pairs into `out`: those of an interrupted run, or new ones, which the journal keeps.
 

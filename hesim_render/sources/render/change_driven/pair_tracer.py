@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
@@ -13,12 +13,19 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
 from hesim_render.core.method_cache import method_cache
 from hesim_render.core.rng import Stream, stream_key
-from hesim_render.core.tables import spread_out
+from hesim_render.core.tables import spread_out, table
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims, in_blocks
 from hesim_render.sources.render.change_driven.edges import EdgeFit, LaneEdges, PairEdges, joined_rays
-from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, remembered, told_of
+from hesim_render.sources.render.change_driven.pair_flux import (
+    PairFlux,
+    PilotFlux,
+    PilotRays,
+    not_negative,
+    remembered,
+    told_of,
+)
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, path_depths
@@ -140,6 +147,7 @@ class PairTracer(Tracer):
         repeat: NDArray[np.integer] | int = 0,
         aims: PairAims | None = None,
         edges: PairEdges | None = None,
+        signed: bool = False,
     ) -> PairFlux:
         """Flux of every listed pair.
 
@@ -156,14 +164,13 @@ class PairTracer(Tracer):
         aims : small objects at which half of the rays are aimed, where a pair has any.
         edges : models of edges, about which half of the rays start, where a pair has one; such a pair has 16 rays or
             more, so that each half has both kinds.
+        signed : leave negative means as they are, for fluxes of which differences are taken.
 
         Returns
         -------
         Flux of the pairs, [n].
         """
-        out = PairFlux(
-            np.empty(pixel.size, np.float32), np.empty(pixel.size, np.float32), np.empty(pixel.size, np.bool_)
-        )
+        out = PairFlux.empty(pixel.size)
         packets = (samples // _PACKET).astype(np.int64)
         moments = self._moments(windows, span_us)
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
@@ -178,12 +185,11 @@ class PairTracer(Tracer):
             model = edges.part(there).mean
             out.half_a[there] += model
             out.half_b[there] += model
-        # the lit estimate of a dark pixel may be negative; a flux is not
-        below = np.minimum(out.mean, 0)
+        if not signed:
+            not_negative(out)
         scale = self.axis_factor(pixel)
-        half_a = out.half_a - below
-        out.half_b[:] = scale * np.maximum(out.half_b - below, -half_a)
-        out.half_a[:] = scale * half_a
+        out.half_a[:] *= scale
+        out.half_b[:] *= scale
         return out
 
     def pilot(
@@ -196,6 +202,7 @@ class PairTracer(Tracer):
         stream: Stream = Stream.RENDER_PILOT,
         span_us: tuple[float, float] | None = None,
         aims: PairAims | None = None,
+        before: tuple[PilotRays, NDArray[np.integer]] | None = None,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
 
@@ -207,6 +214,8 @@ class PairTracer(Tracer):
         samples : rays per pair, a power of two, at least `LEAST_SAMPLES`.
         footprint_px : width of the area in which the rays start, pixels.
         aims : small objects at which half of the rays of each pair are aimed; each pair has one or more.
+        before : rays of other windows, and [n] the place among them of the same rays as those of each pair: the
+            statistics then include the differences.
 
         Returns
         -------
@@ -214,9 +223,7 @@ class PairTracer(Tracer):
         """
         import drjit as dr
 
-        count = pixel.size
-        lit, hidden, unshadowed, *scatters = (np.empty(count, np.float32) for _ in range(5))
-        out = PilotFlux(lit, hidden, unshadowed, scatters[0], scatters[1], np.empty(count, np.bool_))
+        count, out = pixel.size, PilotFlux.empty(pixel.size)
         moments, key = self._moments(windows, span_us), self._key(stream)
         footprint = dr.opaque(jit().Float, footprint_px)
         room = max(1, self._block_rays // samples)
@@ -224,14 +231,51 @@ class PairTracer(Tracer):
             part = slice(first, min(count, first + room))
             lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
             aimed = None if aims is None else aims.part(part)
-            inputs = "pilot", *lanes, samples, footprint_px, stream, *told_of(windows, span_us, aimed)
-            trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part)
+            compared = None if before is None else (before[0], before[1][part])
+            others = () if compared is None else (compared[0].spans_us, compared[1])
+            inputs = "pilot", *lanes, samples, footprint_px, stream, *told_of(windows, span_us, aimed), *others
+            trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report((part.stop - first) * samples)
         scale = self.axis_factor(pixel)
-        for values in (out.lit, out.hidden, out.unshadowed, out.lit_scatter, out.hidden_scatter):
-            values *= scale
+        for each in fields(out):
+            if each.name != "met":
+                getattr(out, each.name)[:] *= scale
         return out
+
+    def pilot_rays(
+        self,
+        pixel: NDArray[np.uint32],
+        window: NDArray[np.integer],
+        windows: Windows,
+        samples: int,
+        footprint_px: float,
+        stream: Stream = Stream.RENDER_PILOT,
+        span_us: tuple[float, float] | None = None,
+        before: tuple[PilotRays, NDArray[np.integer]] | None = None,
+    ) -> tuple[PilotFlux, PilotRays]:
+        """As `pilot`, and the fluxes of the single rays, to compare the same rays in other windows with."""
+        import drjit as dr
+
+        count, out = pixel.size, PilotFlux.empty(pixel.size)
+        moments, key = self._moments(windows, span_us), self._key(stream)
+        footprint, room = dr.opaque(jit().Float, footprint_px), max(1, self._block_rays // samples)
+        kept = np.empty((2, count * samples), np.float32)
+        used = np.unique(window)
+        spans_us = tuple(windows.begin_us[used].tolist() + windows.end_us[used].tolist())
+        for first in range(0, count, room):
+            part = slice(first, min(count, first + room))
+            lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
+            compared = None if before is None else (before[0], before[1][part])
+            rays = self._pilot_block(lanes, moments, key, samples, footprint, None, out, part, compared)
+            for values, ray in zip(kept, rays, strict=True):
+                values[part.start * samples : part.stop * samples] = np.array(ray)
+            self._report((part.stop - first) * samples)
+        scale = self.axis_factor(pixel)
+        for each in fields(out):
+            if each.name != "met":
+                getattr(out, each.name)[:] *= scale
+        return out, PilotRays(*(table(jit().Float, values) for values in kept), samples, spans_us)
 
     def edges(
         self,
@@ -359,13 +403,16 @@ class PairTracer(Tracer):
         aims: PairAims | None,
         out: PilotFlux,
         part: slice,
-    ) -> None:
-        """Statistics of some pairs, each with the same number of rays."""
+        before: tuple[PilotRays, NDArray[np.integer]] | None,
+    ) -> tuple[Float, Float]:
+        """Statistics of some pairs, each with the same number of rays; their fluxes by both estimators."""
         packets = np.full(lanes[0].size, samples // _PACKET)
         # all rays belong to the first half
         found = self._packets_of(lanes, packets, packets * _PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
-        out.put(part, *found, samples, samples if aims is None else samples // 2)
+        compared = None if before is None else before[0].at(before[1])
+        out.put(part, *found, samples, samples if aims is None else samples // 2, compared)
+        return found[0], found[1]
 
     def _packets_of(
         self,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
-from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
+from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays, joined
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
@@ -44,6 +44,38 @@ class Closer:
 
 
 @dataclass(frozen=True)
+class Anchored:
+    """Pilot of all sites in the anchor of their block, see `anchor`.
+
+    Parameters
+    ----------
+    flux : its statistics, [site].
+    rays : its rays.
+    """
+
+    flux: PilotFlux
+    rays: PilotRays
+
+
+@dataclass(frozen=True)
+class Change:
+    """Differences of the pilot's rays to the same rays in another window, arrays [window, site], e⁻/s.
+
+    The first and the last window are compared with the anchor of the block, all others with its first window.
+
+    Parameters
+    ----------
+    lit, hidden : mean of the differences, by both estimators.
+    lit_scatter, hidden_scatter : their standard deviation from ray to ray.
+    """
+
+    lit: NDArray[np.float32]
+    hidden: NDArray[np.float32]
+    lit_scatter: NDArray[np.float32]
+    hidden_scatter: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class Pilot:
     """Statistics of sites in successive windows, all arrays [window, site]; see `PilotFlux` and `MattIntegrator`.
 
@@ -54,6 +86,7 @@ class Pilot:
     unshadowed : flux if nothing hid any light, e⁻/s.
     closer : results of extra rays at some sites, one entry per window; empty where there were none.
     aims : small objects at which rays are aimed; None if there are none.
+    change : differences to other windows; None where nothing is compared.
     """
 
     lit: NDArray[np.float32]
@@ -63,6 +96,7 @@ class Pilot:
     unshadowed: NDArray[np.float32]
     closer: list[Closer] = field(default_factory=list)
     aims: Aims | None = None
+    change: Change | None = None
 
     @property
     def windows(self) -> int:
@@ -92,6 +126,7 @@ def take_pilot(
     width_px: float,
     span_us: tuple[float, float] | None,
     closer: Sequence[Sequence[Look]] = (),
+    anchored: Anchored | None = None,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -103,6 +138,7 @@ def take_pilot(
     width_px : width of the area in which the rays start, px.
     span_us : interval around all windows for which `near` is computed, µs; None: not computed.
     closer : for each window, the sites that get extra rays; see `Zoom`.
+    anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
 
     Returns
     -------
@@ -110,21 +146,45 @@ def take_pilot(
     near : [site], True if a ray came near a moving object within the interval; always True if the camera moves,
         or if anything moves in front of a lens that spreads light (`RayFactory.spreads`).
     """
-    found = tracer.pilot(sites.index, numbers[0], windows, rays, width_px, span_us=span_us)
+    count, every, given = numbers.shape[0], np.arange(sites.size), (windows, rays, width_px)
+    own_rays: PilotRays | None = None
+    if anchored is None:
+        found = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us)
+    else:
+        before = anchored.rays, every
+        found, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before)
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
     near = found.met if knows else np.ones(sites.size, np.bool_)
-    lit, hidden, *others = (np.repeat(values[None], numbers.shape[0], axis=0) for values in _tables(found))
+    lit, hidden, *others = (np.repeat(values[None], count, axis=0) for values in _tables(found))
     pilot = Pilot(lit, hidden, others[0], others[1], others[2])
     moving = np.flatnonzero(near)
-    if numbers.shape[0] > 1 and moving.size:
-        pixel, later = np.tile(sites.index[moving], numbers.shape[0] - 1), numbers[1:, moving]
-        more = tracer.pilot(pixel, later.ravel(), windows, rays, width_px)
+    scatters = np.zeros((2, count, sites.size), np.float32)
+    # where nothing is near, the last window has the difference of the first one to the anchor
+    scatters[0, [0, -1]], scatters[1, [0, -1]] = found.lit_change, found.hidden_change
+    if count > 1 and moving.size:
+        pixel, later = np.tile(sites.index[moving], count - 1), numbers[1:, moving]
+        compared = None
+        if anchored is not None and own_rays is not None:
+            place = np.tile(moving, (count - 1, 1))
+            place[-1] += sites.size
+            compared = joined(own_rays, anchored.rays), place.ravel()
+        more = tracer.pilot(pixel, later.ravel(), *given, before=compared)
         for values, told in zip(_tables(pilot), _tables(more), strict=True):
             values[1:, moving] = told.reshape(later.shape)
+        for values, told in zip(scatters, (more.lit_change, more.hidden_change), strict=True):
+            values[1:, moving] = told.reshape(later.shape)
+    change = None
+    if anchored is not None:
+        means = [values - values[:1] for values in (pilot.lit, pilot.hidden)]
+        for mean, values, other in zip(
+            means, (pilot.lit, pilot.hidden), (anchored.flux.lit, anchored.flux.hidden), strict=True
+        ):
+            mean[[0, -1]] = values[[0, -1]] - other
+        change = Change(means[0], means[1], scatters[0], scatters[1])
     looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
     aims = Aims.of([(window, *look.aims) for window, look in looks if look.aims is not None], sites.size)
     found_closer = _look_closer(tracer, sites, windows, numbers, pilot, width_px, looks, aims)
-    return replace(pilot, closer=found_closer, aims=aims), near
+    return replace(pilot, closer=found_closer, aims=aims, change=change), near
 
 
 def _look_closer(

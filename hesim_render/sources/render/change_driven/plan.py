@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.aim import Aims
+from hesim_render.sources.render.change_driven.differences import Differences, differences
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, allocate
@@ -63,6 +64,7 @@ class Plan:
     error : expected standard error, e⁻/s.
     wanted : wanted standard error, e⁻/s.
     floor : number of rays that a pair gets whatever is known of its edges.
+    differences : pairs that are rendered as differences to another window.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     """
 
@@ -72,6 +74,7 @@ class Plan:
     error: NDArray[np.float32]
     wanted: NDArray[np.float32]
     floor: NDArray[np.int16]
+    differences: Differences
     aims: Aims | None = None
 
     def until(self, window: int) -> Plan:
@@ -88,7 +91,7 @@ class Plan:
     def first(self) -> Plan:
         """The plan of the first window alone."""
         first = {name: getattr(self, name)[:1] for name in ("rendered", "rays", "lit", "error", "wanted", "floor")}
-        return replace(self, **first)
+        return replace(self, differences=self.differences.first(), **first)
 
 
 def plan(
@@ -119,6 +122,7 @@ def plan(
         np.zeros(shape, np.float32),
         np.float32(quality) * units[:, sites.listed],
         np.zeros(shape, np.int16),
+        Differences.none(*shape),
         pilot.aims,
     )
     if last > 1:
@@ -139,7 +143,8 @@ def plan(
         at_end = is_knot and window in (0, last)
         part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
         out.rays[window], out.lit[window], out.error[window], out.floor[window] = part
-    return out
+    chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
+    return replace(out, differences=chosen)
 
 
 def fill_in(values: NDArray[np.float32], known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> None:

@@ -89,6 +89,16 @@ class Tuning:
         its sides. Without (0): what the decision rays missed makes single values that are far off.
     flat_part : part, C. Of the rays by the law, a pair in which decision rays find no contrast keeps this part at
         least. Without (0): thin objects between the decision rays make single values that are far off.
+    least_difference_rays : rays, C. Least number of rays of a difference. Without: no pilot ray sees a change, and few
+        rays see none either.
+    difference_gain : factor, C. A pair is rendered as a difference where that takes this many times fewer rays. Without
+        (1): windows to compare with are rendered for little.
+    difference_part : wanted errors, F. Wanted error of a difference; that of the other window comes on top. Without (1):
+        the error of the pair is larger than wanted.
+    difference_factor : factor, F. The standard error of a difference of n rays is this times their scatter over √n: few
+        rays change, and strata gain little. Without (1): as above.
+    unseen_change : part of all light, F. Scatter of differences that the pilot of a neighbourhood can not see. Without
+        (0): pixels at the rim of a penumbra are off.
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
@@ -132,6 +142,11 @@ class Tuning:
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.4
     flat_part: float = 1 / 8
+    least_difference_rays: int = 64
+    difference_gain: float = 4.0
+    difference_part: float = 0.7
+    difference_factor: float = 0.95
+    unseen_change: float = 0.04
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 0.4

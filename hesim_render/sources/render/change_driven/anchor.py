@@ -1,0 +1,141 @@
+"""Anchors: a window of every 64 ms in which pixels are rendered with many rays, to compare other windows with.
+
+The anchor of a window depends on its time alone, so that a pixel has the same values in all runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.mosaic.schedule import Block
+from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
+from hesim_render.sources.render.change_driven.estimates import Band, Flux
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux, not_negative
+from hesim_render.sources.render.change_driven.pilot import Anchored
+from hesim_render.sources.render.change_driven.plan import Plan
+from hesim_render.sources.render.change_driven.windows import Windows
+
+#: Time from one anchor to the next, µs; for ticks, at least so many blocks.
+_PERIOD_US, _BLOCKS = 64_000, 4
+
+
+def anchor_us(block: Block) -> tuple[float, float]:
+    """Begin and end of the anchor of a block, µs: a window as long as the first of the block."""
+    begin, end = float(block.begin_us[0]), float(block.end_us[0])
+    period = max(_PERIOD_US, _BLOCKS * (float(block.end_us[-1]) - end))
+    last = float(np.floor(end / period) * period)
+    return last - (end - begin), last
+
+
+class Anchor:
+    """The pixels of a band in one anchor. They are rendered when they are first needed.
+
+    Parameters
+    ----------
+    renderer, band : renders these pixels.
+    span_us : begin and end of the anchor, µs.
+    flux : [1, n], flux of the pixels there, where it is known already.
+
+    Attributes
+    ----------
+    span_us : as given.
+    pilot : the pilot of all sites.
+    """
+
+    def __init__(
+        self, renderer: AdaptiveRenderer, band: Band, span_us: tuple[float, float], flux: Flux | None = None
+    ) -> None:
+        self.span_us, self._renderer, self._band = span_us, renderer, band
+        self._windows = Windows(*(np.array([time]) for time in span_us))
+        self.pilot = renderer.pilot_rays(band, self._windows)
+        count = band.place.size
+        self._flux, self._is_known = Flux.zeros(1, count) if flux is None else flux, np.full(count, flux is not None)
+        self._plan: Plan | None = None
+        #: Means of a number of rays by one estimator, and where they are known.
+        self._means: dict[tuple[int, bool], tuple[PairFlux, NDArray[np.bool_]]] = {}
+
+    def render(self, windows: Windows, what: Plan, first: Flux | None, out: Flux) -> None:
+        """Render the differences of a plan: of the first and the last window to the anchor, of others to the first.
+
+        Parameters
+        ----------
+        windows : the windows of the block.
+        what : plan of the block.
+        first : [1, n], flux in the first window, where it is known; it is not rendered again.
+        out : [w, n], where the flux is put.
+        """
+        renderer, band, chosen = self._renderer, self._band, what.differences
+        todo = what.rendered & (chosen.rays > 0)
+        if first is not None:
+            todo[0] = False
+        before, last = renderer.tracer.rays_done, todo.shape[0] - 1
+        number = np.arange(todo.shape[0])[:, None]
+        for is_inner in (False, True):
+            some = todo & (((number > 0) & (number < last)) == is_inner)
+            window, place = np.nonzero(some)
+            if place.size == 0:
+                continue
+            rays, lit = chosen.rays[some], chosen.lit[some]
+            now = renderer.tracer.trace(band.index[place], window, windows, rays, lit, signed=True)
+            if is_inner:
+                assert first is not None
+                # the same rays of a pixel in the first window serve all others
+                pixel, own = np.unique(place, return_index=True)
+                of = band.index[pixel], np.zeros(pixel.size, np.int64), windows, rays[own], lit[own]
+                then = renderer.tracer.trace(*of, signed=True).at(np.searchsorted(pixel, place))
+                base = first.at(place)
+            else:
+                then, base = self._means_of(place, rays, lit), self._flux_of(place)
+            halves = [
+                own[0] + (new - old)
+                for own, new, old in zip(base.arrays, (now.half_a, now.half_b), (then.half_a, then.half_b), strict=False)
+            ]
+            got = PairFlux(halves[0], halves[1], now.met)
+            not_negative(got)
+            out.half_a[some], out.half_b[some] = got.half_a, got.half_b
+            out.error[some] = np.hypot(base.error[0], chosen.error[some])
+        renderer.counts.rays += renderer.tracer.rays_done - before
+        renderer.counts.pairs += int(np.count_nonzero(todo))
+
+    def _flux_of(self, place: NDArray[np.int64]) -> Flux:
+        """Flux of some pixels in the anchor, [1, n]."""
+        new = np.zeros(self._band.place.size, np.bool_)
+        new[place] = True
+        new &= ~self._is_known
+        if new.any():
+            renderer, band = self._renderer, self._band
+            if self._plan is None:
+                pilot, _ = renderer.pilot(band, self._windows, np.zeros((1, band.sites.size), np.int64), None)
+                self._plan = renderer.plan(pilot, band, is_knot=True)
+            before = renderer.tracer.rays_done
+            flux, _ = renderer.render(
+                band, self._windows, np.zeros((1, new.size), np.int64), replace(self._plan, rendered=new[None])
+            )
+            # they are counted with the differences
+            renderer.counts.rays -= renderer.tracer.rays_done - before
+            self._flux.put(new, flux.at(new))
+            self._is_known |= new
+        return self._flux.at(place)
+
+    def _means_of(
+        self, place: NDArray[np.int64], rays: NDArray[np.integer], lit: NDArray[np.bool_]
+    ) -> PairFlux:
+        """Means of numbers of rays of some pixels in the anchor."""
+        found = PairFlux.empty(place.size)
+        size = self._band.place.size
+        for count, is_lit in {(int(n), bool(by)) for n, by in zip(*np.unique([rays, lit], axis=1), strict=True)}:
+            values, is_known = self._means.setdefault((count, is_lit), (PairFlux.empty(size), np.zeros(size, np.bool_)))
+            own = np.flatnonzero((rays == count) & (lit == is_lit))
+            new = np.unique(place[own])
+            new = new[~is_known[new]]
+            if new.size:
+                every = np.zeros(new.size, np.int64)
+                got = self._renderer.tracer.trace(
+                    *(self._band.index[new], every, self._windows, every + count, np.full(new.size, is_lit)), signed=True
+                )
+                values.half_a[new], values.half_b[new], is_known[new] = got.half_a, got.half_b, True
+            found.half_a[own], found.half_b[own] = values.half_a[place[own]], values.half_b[place[own]]
+        return found

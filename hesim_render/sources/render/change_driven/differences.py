@@ -1,0 +1,144 @@
+"""Differences of a pair to the same pixel in another window, by the same rays in both.
+
+Where little changes, most rays see in both windows the same, and the mean of their differences has a small error. The
+flux of a pair is then that of the other window, which was rendered with many rays, plus the difference of few:
+
+    Φ̂(p, w) = Φ̂(p, v) + [ mean of m rays in w − mean of the same m rays in v ],
+
+which is unbiased for any m, because the rays that choose m are the pilot's. The first and the last window of a block
+are compared with the anchor of the block (`anchor`), all others with the first window.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.sources.render.change_driven.neighbours import Sites
+from hesim_render.sources.render.change_driven.pilot import Pilot
+from hesim_render.sources.render.change_driven.tuning import Tuning
+
+#: Scale of fluxes before they are squared, so that float32 can hold the squares.
+_SMALLER = np.float32(1e-4)
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Pairs that are rendered as differences, arrays [window, pixel].
+
+    Parameters
+    ----------
+    rays : number of rays of each in either window, a power of two; 0 for pairs that are rendered by themselves.
+    lit : estimator of the difference, see `MattIntegrator`.
+    error : expected standard error of the difference, e⁻/s.
+    """
+
+    rays: NDArray[np.int16]
+    lit: NDArray[np.bool_]
+    error: NDArray[np.float32]
+
+    def first(self) -> Differences:
+        """Those in the first window."""
+        return Differences(self.rays[:1], self.lit[:1], self.error[:1])
+
+    @classmethod
+    def none(cls, windows: int, pixels: int) -> Differences:
+        """No differences."""
+        shape = windows, pixels
+        return cls(np.zeros(shape, np.int16), np.zeros(shape, np.bool_), np.zeros(shape, np.float32))
+
+
+def difference_of(
+    pilot: Pilot,
+    window: int,
+    lit: NDArray[np.bool_],
+    sites: Sites,
+    units: NDArray[np.float32],
+    quality: float,
+    tuning: Tuning,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Rays that the difference of each listed pixel needs in one window, from the pilot.
+
+    Parameters
+    ----------
+    pilot, window : statistics with their changes, and number of the window.
+    lit : [site], estimator of the difference.
+    sites : the pixels with their neighbours.
+    units : [site], noise units, e⁻/s.
+    quality : wanted error of a pair in noise units.
+
+    Returns
+    -------
+    rays : [n], not yet a power of two.
+    scatter : [n], expected scatter of single differences, e⁻/s.
+    """
+    assert pilot.change is not None
+    change, here = pilot.change, sites.listed
+    # Few rays change, so a pixel's own pilot may have met none of them: half of the scatter is that of the pixels around.
+    square = (np.where(lit, change.lit_scatter[window], change.hidden_scatter[window]) * _SMALLER) ** 2
+    scatter = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
+    # What these rays can not have seen: a small part of them that changed by all the light there is.
+    open_flux = pilot.unshadowed[window][here]
+    scatter = np.hypot(scatter, np.float32(tuning.unseen_change) * open_flux)
+    wanted_error = np.float32(tuning.difference_part * quality) * units[here]
+    rays = (np.float32(tuning.difference_factor) * scatter / wanted_error) ** 2
+    # An edge that has moved in a neighbour may reach into this pixel between the pilot rays.
+    moved = np.where(lit, change.lit[window], change.hidden[window])
+    contrast = np.maximum(sites.most(moved, 1) - moved[here], moved[here] + sites.most(-moved, 1))
+    unseen = (np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * contrast / wanted_error) ** 2
+    brighter = np.float32(tuning.bright_rays) * sites.most(np.abs(moved), 2) / units[here]
+    rays = np.maximum(rays, np.minimum(np.maximum(unseen, brighter), np.float32(tuning.most_unseen_rays)))
+    return np.maximum(rays, np.float32(tuning.least_difference_rays)), scatter
+
+
+def differences(
+    pilot: Pilot,
+    sites: Sites,
+    units: NDArray[np.float32],
+    quality: float,
+    rendered: NDArray[np.bool_],
+    alone: NDArray[np.int16],
+    tuning: Tuning,
+) -> Differences:
+    """Choose the pairs that are rendered as differences: where that takes a small part of the rays.
+
+    Parameters
+    ----------
+    pilot, sites, quality, tuning : see `plan`.
+    units : [window, site], noise units, e⁻/s.
+    rendered : [window, pixel], rendered pairs.
+    alone : [window, pixel], rays of pairs that are rendered by themselves.
+    """
+    last = rendered.shape[0] - 1
+    out = Differences.none(*rendered.shape)
+    change = pilot.change
+    if change is None:
+        return out
+    inner = slice(1, max(1, last))
+    steadier = change.lit_scatter <= change.hidden_scatter
+    # those windows share rays in the first one, and so the estimator
+    steadier[inner] = change.lit_scatter[inner].sum(axis=0) <= change.hidden_scatter[inner].sum(axis=0)
+    for window, lit in enumerate(steadier):
+        wanted, scatter = difference_of(pilot, window, lit, sites, units[window], quality, tuning)
+        bits = np.rint(np.log2(np.minimum(wanted, tuning.most_rays))).astype(np.int16)
+        rays = np.left_shift(np.int16(1), bits)
+        pays = rendered[window] & (np.float32(tuning.difference_gain) * rays <= alone[window])
+        out.rays[window], out.lit[window], out.error[window] = np.where(pays, rays, 0), lit[sites.listed], scatter
+    for window, closer in enumerate(pilot.closer):
+        # a small object passes: many rays look for it
+        looked_at = np.zeros(sites.size, np.bool_)
+        looked_at[closer.place] = True
+        out.rays[window, looked_at[sites.listed]] = 0
+    if pilot.aims is not None:
+        window, place = np.nonzero(out.rays)
+        is_aimed = pilot.aims.at(window, sites.listed[place]).count > 0
+        out.rays[window[is_aimed], place[is_aimed]] = 0
+    # all windows between take as many rays as the one that needs most, and together pay for those in the first window
+    own = out.rays[inner]
+    most = own.max(axis=0, initial=0)
+    saved = np.where(own > 0, alone[inner].astype(np.int32) - most, 0).sum(axis=0)
+    own[:] = np.where((own > 0) & (saved > most), most, 0)
+    out.error[:] *= np.float32(tuning.difference_factor) / np.sqrt(np.maximum(out.rays, 1).astype(np.float32))
+    return out
