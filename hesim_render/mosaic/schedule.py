@@ -126,23 +126,28 @@ def tick_blocks(spec: EvsSpec, begin_us: float, end_us: float) -> Iterator[Block
 
 
 def instant_blocks(
-    instants_us: Callable[[float, float], NDArray[np.int64]], window_us: int, begin_us: float, end_us: float
+    instants_us: Callable[[float, float], NDArray[np.int64]],
+    window_us: int,
+    begin_us: float,
+    end_us: float,
+    intervals: int = BLOCK_INTERVALS,
 ) -> Iterator[Block]:
     """Windows that end at the instants of a source, after one time and up to another.
 
-    The instants of every `BLOCK_INTERVALS` cells are cut into blocks of as many intervals.
+    The instants of every `BLOCK_INTERVALS` cells are cut into blocks of at most `intervals` intervals.
 
     Parameters
     ----------
     instants_us : whole µs from one time to another, both included, with the multiples of `CELL_US`.
     window_us : length of a window, µs.
     begin_us, end_us : the times, µs.
+    intervals : largest number of intervals of a block.
     """
     length = BLOCK_INTERVALS * CELL_US
     for number in range(int(begin_us // length), -(-int(np.ceil(end_us)) // length)):
         instants = instants_us(number * length, (number + 1) * length)
-        for first in range(0, instants.size - 1, BLOCK_INTERVALS):
-            ends = instants[first : first + BLOCK_INTERVALS + 1].astype(np.float64)
+        for first in range(0, instants.size - 1, intervals):
+            ends = instants[first : first + intervals + 1].astype(np.float64)
             wanted = (ends > begin_us) & (ends <= end_us)
             wanted[0] = False
             if wanted.any():
@@ -150,13 +155,17 @@ def instant_blocks(
 
 
 def blocks_of_run(
-    instants_us: Callable[[float, float], NDArray[np.int64]], window_us: int, begin_us: int, end_us: int
+    instants_us: Callable[[float, float], NDArray[np.int64]],
+    window_us: int,
+    begin_us: int,
+    end_us: int,
+    intervals: int = BLOCK_INTERVALS,
 ) -> Iterator[Block]:
     """Windows of a run as in `instant_blocks`: the first begins with the run, the last ends with it or just after.
 
     Parameters
     ----------
-    instants_us : see `instant_blocks`.
+    instants_us, intervals : see `instant_blocks`.
     window_us : length of a window, µs.
     begin_us, end_us : begin and end of the run, µs.
     """
@@ -166,7 +175,7 @@ def blocks_of_run(
     cell = end_us // CELL_US * CELL_US
     instants = instants_us(cell, cell + CELL_US)
     beyond = int(instants[np.searchsorted(instants, end_us)])
-    yield from instant_blocks(instants_us, window_us, first, beyond)
+    yield from instant_blocks(instants_us, window_us, first, beyond, intervals)
 
 
 @dataclass(frozen=True)

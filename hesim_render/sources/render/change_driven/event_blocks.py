@@ -5,12 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.mosaic.schedule import Block
+from hesim_render.mosaic.schedule import BLOCK_INTERVALS, Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.plan import fill_in
 from hesim_render.sources.render.change_driven.windows import Windows
+
+
+#: Intervals of a block of an asynchronous sensor, and the pixels up to which it may have as many. The last window of each
+#: block is rendered at all pixels, so that fewer blocks cost less; all windows of a block are held in memory.
+_INTERVALS = ((64, 150_000), (32, 500_000))
+
+
+def intervals_of(pixels: int) -> int:
+    """Largest number of intervals of a block, for a sensor of so many pixels."""
+    return next((intervals for intervals, most in _INTERVALS if pixels <= most), BLOCK_INTERVALS)
 
 
 class Blocks:

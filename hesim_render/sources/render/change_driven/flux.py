@@ -26,7 +26,7 @@ from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
-from hesim_render.sources.render.change_driven.event_blocks import Blocks
+from hesim_render.sources.render.change_driven.event_blocks import Blocks, intervals_of
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
@@ -132,7 +132,10 @@ class ChangeDrivenFlux:
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
         """See `FluxSource.sample_blocks`."""
-        return blocks_of_run(self._clock.instants_us, window_us, begin_us, end_us)
+        geometry = self.sensor.spec.geometry
+        return blocks_of_run(
+            self._clock.instants_us, window_us, begin_us, end_us, intervals_of(geometry.rows * geometry.cols)
+        )
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval that follow all motion, including that of the camera, µs."""
