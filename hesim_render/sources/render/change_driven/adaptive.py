@@ -43,6 +43,7 @@ class AdaptiveRenderer:
     zoom : finds pixels that small objects may cross.
     index : [row · cols + col], number of each mosaic pixel on the full sensor.
     counts : work done so far.
+    look_stride : windows from one look of the pilot to the next.
     """
 
     def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning) -> None:
@@ -51,7 +52,9 @@ class AdaptiveRenderer:
         self.counts = Counts()
         self._sensor = tracer.sensor
         self.index = self._sensor.layout.full_index.ravel()
-        rays = tracer.rays
+        evs, rays = self._sensor.spec.evs, tracer.rays
+        # windows of an asynchronous sensor are so close that nothing moves far from one to the next
+        self.look_stride = tuning.look_stride if evs is not None and evs.tick_us is None else 1
         self.zoom = Zoom(
             tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning, rays.can_aim, rays.blur_px
         )
@@ -89,13 +92,14 @@ class AdaptiveRenderer:
         numbers: NDArray[np.int64],
         span_us: tuple[float, float] | None,
         anchored: Anchored | None = None,
+        stride: int = 1,
     ) -> tuple[Pilot, NDArray[np.bool_]]:
         """Pilot pass of a band in listed windows; see `take_pilot`."""
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
         width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         closer = self.zoom.sites(row, col, windows, numbers)
-        found = take_pilot(self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored)
+        found = take_pilot(self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored, stride)
         self.counts.pilot_rays += self.tracer.rays_done - before
         return found
 

@@ -68,7 +68,9 @@ class Blocks:
                 out.put(band.place, first)
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
-            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot)
+            pilot, _ = renderer.pilot(
+                band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride
+            )
             what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             if first is None:

@@ -92,6 +92,20 @@ class Sites:
             found = np.maximum(found, across[shift : shift + rows])
         return self._at_listed(found)
 
+    def near(self, marked: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+        """True at sites [m] at most `radius` pixels away from a marked one [m], also diagonally."""
+        if self.shape is None or self.cell is None:
+            return marked
+        image = self._image(marked, radius, False)
+        rows, cols = self.shape
+        across = image[:, :cols].copy()
+        for shift in range(1, 2 * radius + 1):
+            across |= image[:, shift : shift + cols]
+        found = across[:rows].copy()
+        for shift in range(1, 2 * radius + 1):
+            found |= across[shift : shift + rows]
+        return found.ravel()[self.cell]
+
     def _image(self, values: NDArray, margin: int, empty: float | bool) -> NDArray:
         assert self.shape is not None
         rows, cols = self.shape

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 
+#: Relative differences of fluxes that rounding explains.
+_ROUNDING = np.float32(1e-5)
 #: Scale of fluxes before they are squared, so that float32 can hold the squares.
 _SMALLER = np.float32(1e-4)
 
@@ -127,6 +130,7 @@ def take_pilot(
     span_us: tuple[float, float] | None,
     closer: Sequence[Sequence[Look]] = (),
     anchored: Anchored | None = None,
+    stride: int = 1,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -162,17 +166,33 @@ def take_pilot(
     # where nothing is near, the last window has the difference of the first one to the anchor
     scatters[0, [0, -1]], scatters[1, [0, -1]] = found.lit_change, found.hidden_change
     if count > 1 and moving.size:
-        pixel, later = np.tile(sites.index[moving], count - 1), numbers[1:, moving]
-        compared = None
-        if anchored is not None and own_rays is not None:
-            place = np.tile(moving, (count - 1, 1))
-            place[-1] += sites.size
-            compared = joined(own_rays, anchored.rays), place.ravel()
-        more = tracer.pilot(pixel, later.ravel(), *given, before=compared)
-        for values, told in zip(_tables(pilot), _tables(more), strict=True):
-            values[1:, moving] = told.reshape(later.shape)
-        for values, told in zip(scatters, (more.lit_change, more.hidden_change), strict=True):
-            values[1:, moving] = told.reshape(later.shape)
+
+        def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> None:
+            """Trace sites in windows other than the first."""
+            compared = None
+            if anchored is not None and own_rays is not None:
+                compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
+            more = tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared)
+            tables = zip((*_tables(pilot), *scatters), (*_tables(more), more.lit_change, more.hidden_change), strict=True)
+            for values, told in tables:
+                values[window, place] = told
+
+        looks = np.append(np.arange(0, count - 1, stride), count - 1)
+        look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
+        for early, late in pairwise(looks.tolist()):
+            between = np.arange(early + 1, late)
+            if between.size == 0:
+                continue
+            # what shows the same in two looks, in all pixels around, has kept its light between them
+            changed = np.zeros(sites.size, np.bool_)
+            for values in (pilot.lit, pilot.hidden):
+                changed |= np.abs(values[late] - values[early]) > _ROUNDING * np.abs(values[early])
+            busy = sites.near(changed, REACH - 1) & near
+            for values in _tables(pilot):
+                values[between] = values[early]
+            for values in scatters:
+                values[between] = values[early] if early else 0  # the first window has the difference to the anchor
+            look(np.repeat(between, np.count_nonzero(busy)), np.tile(np.flatnonzero(busy), between.size))
     change = None
     if anchored is not None:
         means = [values - values[:1] for values in (pilot.lit, pilot.hidden)]
