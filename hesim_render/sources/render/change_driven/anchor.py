@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.estimates import Band, Flux
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, not_negative
@@ -22,12 +21,16 @@ from hesim_render.sources.render.change_driven.windows import Windows
 _PERIOD_US, _BLOCKS = 64_000, 4
 
 
-def anchor_us(block: Block) -> tuple[float, float]:
+def period_us(end_us: NDArray[np.float64]) -> float:
+    """Time from one anchor to the next, µs, for blocks with windows that end at these times."""
+    return max(_PERIOD_US, _BLOCKS * float(end_us[-1] - end_us[0]))
+
+
+def anchor_us(begin_us: NDArray[np.float64], end_us: NDArray[np.float64]) -> tuple[float, float]:
     """Begin and end of the anchor of a block, µs: a window as long as the first of the block."""
-    begin, end = float(block.begin_us[0]), float(block.end_us[0])
-    period = max(_PERIOD_US, _BLOCKS * (float(block.end_us[-1]) - end))
+    end, period = float(end_us[0]), period_us(end_us)
     last = float(np.floor(end / period) * period)
-    return last - (end - begin), last
+    return last - (end - float(begin_us[0])), last
 
 
 class Anchor:
@@ -91,7 +94,9 @@ class Anchor:
                 then, base = self._means_of(place, rays, lit), self._flux_of(place)
             halves = [
                 own[0] + (new - old)
-                for own, new, old in zip(base.arrays, (now.half_a, now.half_b), (then.half_a, then.half_b), strict=False)
+                for own, new, old in zip(
+                    base.arrays, (now.half_a, now.half_b), (then.half_a, then.half_b), strict=False
+                )
             ]
             got = PairFlux(halves[0], halves[1], now.met)
             not_negative(got)
@@ -100,6 +105,26 @@ class Anchor:
         renderer.counts.rays += renderer.tracer.rays_done - before
         renderer.counts.pairs += int(np.count_nonzero(todo))
 
+    def rays_of(self, what: Plan, todo: NDArray[np.bool_]) -> tuple[int, int]:
+        """Number of rays that the differences `todo` of a plan take, and of those that their pixels take in the anchor.
+
+        Rays in the anchor to compare with are counted as if each were used once.
+        """
+        rays = np.where(todo, what.differences.rays, 0).astype(np.int64)
+        is_at_end = np.zeros(todo.shape[0], np.bool_)
+        is_at_end[[0, -1]] = True
+        own = int(rays.sum() + rays[~is_at_end].max(axis=0, initial=0).sum())
+        compared = (rays[is_at_end] > 0).any(axis=0)
+        return own, int(self._own_plan().rays[0][compared].sum(dtype=np.int64)) + int(rays[is_at_end].sum())
+
+    def _own_plan(self) -> Plan:
+        """How the pixels are rendered in the anchor."""
+        if self._plan is None:
+            renderer, band = self._renderer, self._band
+            pilot, _ = renderer.pilot(band, self._windows, np.zeros((1, band.sites.size), np.int64), None)
+            self._plan = renderer.plan(pilot, band, is_knot=True)
+        return self._plan
+
     def _flux_of(self, place: NDArray[np.int64]) -> Flux:
         """Flux of some pixels in the anchor, [1, n]."""
         new = np.zeros(self._band.place.size, np.bool_)
@@ -107,22 +132,16 @@ class Anchor:
         new &= ~self._is_known
         if new.any():
             renderer, band = self._renderer, self._band
-            if self._plan is None:
-                pilot, _ = renderer.pilot(band, self._windows, np.zeros((1, band.sites.size), np.int64), None)
-                self._plan = renderer.plan(pilot, band, is_knot=True)
+            what = replace(self._own_plan(), rendered=new[None])
             before = renderer.tracer.rays_done
-            flux, _ = renderer.render(
-                band, self._windows, np.zeros((1, new.size), np.int64), replace(self._plan, rendered=new[None])
-            )
+            flux, _ = renderer.render(band, self._windows, np.zeros((1, new.size), np.int64), what)
             # they are counted with the differences
             renderer.counts.rays -= renderer.tracer.rays_done - before
             self._flux.put(new, flux.at(new))
             self._is_known |= new
         return self._flux.at(place)
 
-    def _means_of(
-        self, place: NDArray[np.int64], rays: NDArray[np.integer], lit: NDArray[np.bool_]
-    ) -> PairFlux:
+    def _means_of(self, place: NDArray[np.int64], rays: NDArray[np.integer], lit: NDArray[np.bool_]) -> PairFlux:
         """Means of numbers of rays of some pixels in the anchor."""
         found = PairFlux.empty(place.size)
         size = self._band.place.size
@@ -134,7 +153,8 @@ class Anchor:
             if new.size:
                 every = np.zeros(new.size, np.int64)
                 got = self._renderer.tracer.trace(
-                    *(self._band.index[new], every, self._windows, every + count, np.full(new.size, is_lit)), signed=True
+                    *(self._band.index[new], every, self._windows, every + count, np.full(new.size, is_lit)),
+                    signed=True,
                 )
                 values.half_a[new], values.half_b[new], is_known[new] = got.half_a, got.half_b, True
             found.half_a[own], found.half_b[own] = values.half_a[place[own]], values.half_b[place[own]]

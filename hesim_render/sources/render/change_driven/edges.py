@@ -122,10 +122,14 @@ class EdgeFit:
         return cls(*(np.empty(count, np.float32) for _ in fields(cls)))
 
     @property
+    def is_line(self) -> NDArray[np.bool_]:
+        """True where a line separates two even levels, one of which may be that of a single ray."""
+        return (self.gap > 0) & (self.fewer >= 1) & (self.scatter < _MOST_UNEVEN * (self.high - self.low))
+
+    @property
     def is_edge(self) -> NDArray[np.bool_]:
         """True where a line separates two even levels."""
-        is_even = self.scatter < _MOST_UNEVEN * (self.high - self.low)
-        return (self.gap > 0) & (self.fewer >= _LEAST_ON_A_SIDE) & is_even
+        return self.is_line & (self.fewer >= _LEAST_ON_A_SIDE)
 
     def replace(self, part: slice | NDArray[np.int64], fits: EdgeFit) -> None:
         """Put in the fits of some pairs."""
@@ -165,9 +169,9 @@ class EdgeFit:
         high = dr.block_sum(dr.select(above, flux, 0), rays) / dr.maximum(above_count, 1)
         low = dr.block_sum(dr.select(above, 0, flux), rays) / dr.maximum(below_count, 1)
         deviation = flux - dr.select(above, spread(high), spread(low))
-        # relative to the contrast, so that no square leaves float32
-        contrast = dr.maximum(high - low, 1e-30)
-        scatter = contrast * dr.sqrt(dr.block_sum(dr.square(deviation / spread(contrast)), rays) / count)
+        # relative to the largest flux, so that no square leaves float32
+        unit = dr.maximum(dr.block_reduce(dr.ReduceOp.Max, dr.abs(flux), rays), 1e-30)
+        scatter = unit * dr.sqrt(dr.block_sum(dr.square(deviation / spread(unit)), rays) / count)
         side = dr.select(above, types.Float(1), -1)
         dr.eval(side, low, high, scatter, above_count, below_count)
         angle, gap, at = _widest_gap(x, y, side, rays)

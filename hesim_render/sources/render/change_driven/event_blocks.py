@@ -41,7 +41,7 @@ class Blocks:
     def __init__(self, renderer: AdaptiveRenderer, pixel: NDArray[np.uint32], first: Block) -> None:
         self._renderer = renderer
         self.base = Flux.zeros(1, pixel.size)
-        span_us = anchor_us(first)
+        span_us = anchor_us(first.begin_us, first.end_us)
         renderer.alone(pixel, *(np.full(pixel.size, time) for time in span_us), "events", self.base)
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
@@ -58,7 +58,7 @@ class Blocks:
         is_next = self._time == (block.begin_us[0], block.end_us[0])
         out = Flux.zeros(windows.size, self.alive.size)
         centre = 0.5 * (block.begin_us + block.end_us)
-        span_us = anchor_us(block)
+        span_us = anchor_us(block.begin_us, block.end_us)
         for number, band in enumerate(self._bands):
             if self._anchors[number].span_us != span_us:
                 self._anchors[number] = Anchor(renderer, band, span_us)
@@ -68,9 +68,7 @@ class Blocks:
                 out.put(band.place, first)
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
-            pilot, _ = renderer.pilot(
-                band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride
-            )
+            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride)
             what = renderer.plan(pilot, band, is_knot=True).until(int(np.flatnonzero(block.wanted)[-1]))
             numbers = np.repeat(np.arange(windows.size)[:, None], band.place.size, axis=1)
             if first is None:

@@ -24,6 +24,7 @@ from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
+from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import Blocks, intervals_of
@@ -170,8 +171,10 @@ class ChangeDrivenFlux:
         end_us: NDArray[np.float64],
         role: Role,
         until: int | None = None,
-    ) -> float:
-        """Rays per listed pixel for a block of windows without its first one, or for a single window.
+        is_anchor: bool = False,
+    ) -> tuple[float, float]:
+        """Rays per listed pixel for a block of windows without its first one, or for a single window; and for its
+        anchor.
 
         Parameters
         ----------
@@ -179,29 +182,41 @@ class ChangeDrivenFlux:
         begin_us, end_us : [w], the windows, µs.
         role : use of the pixels.
         until : number of the last window on whose values something depends; None for the last one.
+        is_anchor : True for an anchor, which is compared with nothing.
         """
         if self._is_dark or pixel.size == 0:
-            return 0.0
-        renderer, windows, rays = self._renderer, Windows(begin_us, end_us), 0
+            return 0.0, 0.0
+        renderer, windows, rays, anchor_rays = self._renderer, Windows(begin_us, end_us), 0, 0
         counts, done = replace(renderer.counts), self._tracer.rays_done
         later = max(1, windows.size - 1)
         for band in renderer.bands(pixel, role):
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
-            pilot, near = renderer.pilot(band, windows, numbers, windows.span_us)
+            is_compared = role == "events" and not is_anchor
+            anchor = Anchor(renderer, band, anchor_us(begin_us, end_us)) if is_compared else None
+            before = renderer.counts.pilot_rays
+            pilot, _ = renderer.pilot(
+                *(band, windows, numbers, windows.span_us),
+                *(() if anchor is None else (anchor.pilot, renderer.look_stride)),
+            )
+            # of the sites, some are neighbours beyond the patch
+            share = band.place.size / band.sites.size
+            rays += int(share * later / windows.size * (renderer.counts.pilot_rays - before))
             what = renderer.plan(pilot, band, is_knot=role == "events").until(
                 windows.size - 1 if until is None else until
             )
-            changing = near[band.sites.listed] if windows.size > 1 else np.ones(band.place.size, np.bool_)
             todo = what.rendered.copy()
             todo[:-later] = False
+            if anchor is not None:
+                own, at_anchor = anchor.rays_of(what, todo)
+                rays, anchor_rays = rays + own, anchor_rays + at_anchor
+            todo &= what.differences.rays == 0
             window, place = np.nonzero(todo)
             aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
             before = self._tracer.rays_done
             each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims)
             rays += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
-            rays += band.pilot_rays * later * int(np.count_nonzero(changing))
         renderer.counts, self._tracer.rays_done = counts, done
-        return rays / pixel.size
+        return rays / pixel.size, anchor_rays / pixel.size
 
     def rays_per_second(self) -> float:
         """Measured speed of the tracer on this machine, over pixels from the whole region, rays/s."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hesim_render.core.distinct import distinct_pixels
 from hesim_render.core.progress import Progress
 from hesim_render.mosaic.schedule import BlockSample, Exposure
+from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 #: Number of patches, side of a patch, px, and number of blocks over the run, in which rays are counted.
@@ -81,20 +82,27 @@ def forecast(
             # the last block goes beyond the end of the run, which counts where all blocks are looked at
             is_all = len(chosen) == len(every)
             ends = [int(np.flatnonzero(b.wanted)[-1]) if is_all and b.wanted.any() else None for b in chosen]
-            each = [
-                source.foretell(patch, block.begin_us, block.end_us, "events", end)
-                for block, end in zip(chosen, ends, strict=True)
-            ]
-            # the first window of a run belongs to no block before it, and all pixels are rendered in it
-            first = source.foretell(patch, chosen[0].begin_us[:1], chosen[0].end_us[:1], "events")
-            rays += (first + float(np.mean(each)) * blocks.count) * event_pixel.size
+            each, anchors = zip(
+                *(
+                    source.foretell(patch, block.begin_us, block.end_us, "events", end)
+                    for block, end in zip(chosen, ends, strict=True)
+                ),
+                strict=True,
+            )
+            # all pixels are rendered in the first anchor, and in later ones those that are compared with it
+            begin, end = anchor_us(every[0].begin_us, every[0].end_us)
+            first, _ = source.foretell(patch, np.array([begin]), np.array([end]), "events", is_anchor=True)
+            share = np.mean([np.ptp(block.end_us) / period_us(block.end_us) for block in chosen])
+            more_anchors = max(0.0, float(np.ceil(blocks.count * share)) - 1)
+            each_pixel = first + float(np.mean(anchors)) * more_anchors + float(np.mean(each)) * blocks.count
+            rays += each_pixel * event_pixel.size
         pixel = distinct_pixels(
             frame_pixel if exposures else frame_pixel[:0], event_pixel if is_static else event_pixel[:0]
         )
         if pixel.size:
             patch = _patches(pixel, source, rng)
             begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))
-            each_frame = source.foretell(patch, np.array([begin]), np.array([end]), "any")
+            each_frame, _ = source.foretell(patch, np.array([begin]), np.array([end]), "any")
             rays += each_frame * pixel.size * (1 if is_static else len(exposures))
         rate = max(rate, source.rays_per_second())
     held = _WINDOW_BYTES * windows * event_pixel.size * len(sources)

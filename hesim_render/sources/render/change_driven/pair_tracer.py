@@ -342,7 +342,7 @@ class PairTracer(Tracer):
         every = np.arange(lanes[0].size)
         first, fit = decision_rays(every, 0, None), EdgeFit.empty(every.size)
         fit.put(slice(None), first, samples)
-        lines = np.flatnonzero(fit.is_edge)
+        lines = np.flatnonzero(fit.is_line)
         if lines.size:
             closer = EdgeFit.empty(lines.size)
             more = decision_rays(lines, 1, fit.models(lines, wider=True))

@@ -173,7 +173,9 @@ def take_pilot(
             if anchored is not None and own_rays is not None:
                 compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
             more = tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared)
-            tables = zip((*_tables(pilot), *scatters), (*_tables(more), more.lit_change, more.hidden_change), strict=True)
+            tables = zip(
+                (*_tables(pilot), *scatters), (*_tables(more), more.lit_change, more.hidden_change), strict=True
+            )
             for values, told in tables:
                 values[window, place] = told
 

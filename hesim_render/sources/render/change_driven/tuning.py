@@ -145,7 +145,7 @@ class Tuning:
     edge_rays: int = 64
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.4
-    flat_part: float = 1 / 8
+    flat_part: float = 1 / 32
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.7
