@@ -12,7 +12,6 @@ from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.plan import fill_in
 from hesim_render.sources.render.change_driven.windows import Windows
 
-
 #: Intervals of a block of an asynchronous sensor, and the pixels up to which it may have as many. The last window of each
 #: block is rendered at all pixels, so that fewer blocks cost less; all windows of a block are held in memory.
 _INTERVALS = ((64, 150_000), (32, 500_000))
