@@ -27,9 +27,7 @@ class Kind(StrEnum):
     truth = "truth"
     filter_sets = "filter_sets"
     palettes = "palettes"
-    study_specs = "study_specs"
-    design_specs = "design_specs"
-    sweep_specs = "sweep_specs"
+    studies = "studies"
 
 
 def doctor() -> None:

@@ -96,5 +96,5 @@ def read_design(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     SpecError
         With file, line and key of all that is wrong.
     """
-    file = locate(name_or_path, "design_specs")
+    file = locate(name_or_path, "studies")
     return validate(DesignSpec, load_yaml(file), file, overrides or {})

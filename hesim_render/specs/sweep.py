@@ -127,5 +127,5 @@ def read_sweep(name_or_path: str | Path) -> SweepSpec:
     SpecError
         With file, line and key of all that is wrong.
     """
-    file = locate(name_or_path, "sweep_specs")
+    file = locate(name_or_path, "studies")
     return validate(SweepSpec, load_yaml(file), file, {})

@@ -250,7 +250,7 @@ class _Studies:
     def __init__(self, spec: SweepSpec) -> None:
         assert spec.study is not None
         self._spec = spec
-        self._file = locate(spec.beside(spec.study), "study_specs")
+        self._file = locate(spec.beside(spec.study), "studies")
 
     def _study(self, run: Run) -> StudySpec:
         """The study with the keys of a run; those that begin with sensor. change its sensors."""

@@ -135,7 +135,7 @@ def test_a_dry_run_of_a_lab(capsys, tmp_path):
 
 def test_lists_as_json_agree_with_the_files(capsys):
     """Only some keys of each file are parsed; the whole files say the same."""
-    for kind in ("scenes", "sensors", "study_specs", "filter_sets"):
+    for kind in ("scenes", "sensors", "studies", "filter_sets"):
         found = {row["name"]: row for row in json.loads(call(capsys, "list", kind, "--json")[1])[kind]}
         assert list(found) == list_names(kind)
         for name in list_names(kind)[:: 7 if kind == "scenes" else 1]:

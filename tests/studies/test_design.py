@@ -15,6 +15,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.design import DesignSpec, read_design
 from hesim_render.specs.files import list_names
 from hesim_render.specs.filter_set import read_filter_set
+from hesim_render.specs.study_kind import StudyKind, study_kind
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colour_difference import delta_e_2000, lab
 from hesim_render.spectral.physical import dye_transmittance, silicon_index, thin_film_transmittance
@@ -435,5 +436,7 @@ def test_bad_designs_are_one_clear_line(tmp_path, changes, message):
 
 
 def test_shipped_designs_load():
-    for name in list_names("design_specs"):
+    designs = [name for name in list_names("studies") if study_kind(name) is StudyKind.design]
+    assert len(designs) == 3
+    for name in designs:
         assert Problem(read_design(name)).starts()

@@ -17,6 +17,7 @@ from hesim_render.sources.crosstalk import mixed
 from hesim_render.specs.files import list_names
 from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.study import read_study
+from hesim_render.specs.study_kind import StudyKind, study_kind
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.studies import Table, channel_noise, with_filter_set
 from hesim_render.studies.filter_sets import filters_of, mixing
@@ -233,7 +234,9 @@ def test_every_shipped_filter_set_stands_before_a_sensor():
         sensor = set_on("eiger" if spec.evs_grid else "reference-bayer", name)
         assert sensor.spec.tile == spec.tile and (sensor.spec.evs is not None) == (spec.evs_grid is not None)
         assert channel_noise(sensor, filters_of(sensor, "aps"), 1000, 4).count.sum() <= 4
-    for name in list_names("study_specs"):
+    comparisons = [name for name in list_names("studies") if study_kind(name) is StudyKind.comparison]
+    assert len(comparisons) == 5
+    for name in comparisons:
         assert len(read_study(name).filter_sets) + len(read_study(name).sensors) > 2
     palette = read_palette("dyes")
     # the infrared cut keeps what cannot be rendered out
@@ -304,7 +307,7 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
 BAD = [
     ({"filter_sets": ["rccc"]}, r"filter_sets\.0: rccc on reference-bayer: its filters span 2 of the 3 dimensions"),
     ({"filter_sets": ["rggb", "mono"]}, r"filter_sets\.1: mono on reference-bayer: its filters span 1 of"),
-    ({"filter_sets": ["rgb"]}, r"no filter_set named 'rgb'; shipped are .*did you mean"),
+    ({"filter_sets": ["rgb"]}, r"no filter set named 'rgb'; shipped are .*did you mean"),
     ({"filter_sets": ["cygm"], "palette": "nikon-5100"}, r"the palette 'nikon-5100' has no filter 'cyan'"),
     ({"filter_sets": ["quad-bayer-white-event"]}, r"the set has event pixels, and the sensor has no 'evs' section"),
     ({"filter_sets": ["rggb", "rggb"]}, r"two have the name 'rggb'"),

@@ -12,7 +12,8 @@ from hesim_render import cli
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.isp import Pipeline, process
 from hesim_render.sources.render.audit.audit import Audit
-from hesim_render.specs.files import data_folder, list_names
+from hesim_render.specs.files import data_folder
+from hesim_render.specs.study_kind import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep
@@ -182,7 +183,7 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
         ({"vary": {"isp.demosaic.method": ["linear"]}}, "for sweeps of recordings"),
         ({"vary": {"filter_set": ["rggb"]}}, "run with filter_set=rggb.*unknown key"),
         ({"scenes": ["flat-field"]}, "scenes: not in a sweep of a study"),
-        ({"study": "five-cfa"}, "no study_spec named 'five-cfa'.*did you mean"),
+        ({"study": "five-cfa"}, "no study named 'five-cfa'.*did you mean"),
     ):
         with pytest.raises(SpecError, match=message) as caught:
             sweep({**spec, **changes}, out=tmp_path / "bad")
@@ -192,8 +193,7 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
 def test_ranges_and_files(tmp_path, capsys):
     assert RangeSpec(first=1, last=1000, count=4, scale="log").values() == [1, 10, 100, 1000]
     assert RangeSpec(first=0, last=1, count=5).values() == [0, 0.25, 0.5, 0.75, 1]
-    for name in list_names("sweep_specs"):
-        assert read_sweep(name).vary
+    assert study_kind("light-and-exposure") is StudyKind.sweep and read_sweep("light-and-exposure").vary
     file = tmp_path / "sweep.yaml"
     file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
