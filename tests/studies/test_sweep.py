@@ -13,7 +13,7 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.isp import Pipeline, process
 from hesim_render.sources.render.audit.audit import Audit
 from hesim_render.specs.files import data_folder
-from hesim_render.specs.study_kind import StudyKind, study_kind
+from hesim_render.specs.kinds import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep
@@ -197,7 +197,7 @@ def test_ranges_and_files(tmp_path, capsys):
     file = tmp_path / "sweep.yaml"
     file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
-        cli.main(["sweep", str(file), "--out", str(tmp_path / "out")])
+        cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0 and "1 runs in" in capsys.readouterr().out
     (kept,) = (tmp_path / "out" / "recordings").iterdir()
     assert hr.Recording.load(kept).manifest["seed"] == 5
@@ -212,7 +212,7 @@ def test_runs_that_miss_their_quality_are_told(tmp_path, capsys, monkeypatch):
     file.write_text(json.dumps({**BASE, **changes, "options": {"quality": 8}}))
     for _ in range(2):
         with pytest.raises(SystemExit) as stop:
-            cli.main(["sweep", str(file), "--out", str(out)])
+            cli.main(["study", str(file), "--out", str(out)])
         told = capsys.readouterr().out
         assert stop.value.code == 3 and "  NOT MET: 2 of 2 runs are worse than asked for (row 1, row 2)" in told
     assert [row["audit"] for row in json.loads((out / "results.json").read_text())["rows"]] == ["not met"] * 2

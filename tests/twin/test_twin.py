@@ -89,7 +89,9 @@ def test_a_wrong_twin_fails_where_it_is_wrong(captures, tmp_path, monkeypatch, n
 
 def test_the_command_tells_each_check_and_its_status(captures, tmp_path):
     out = tmp_path / "out"
-    result = CliRunner().invoke(app, ["twin", str(captures), "--out", str(out), "--seed", "3", "--json", "--quiet"])
+    result = CliRunner().invoke(
+        app, ["calibrate", "twin", str(captures), "--out", str(out), "--seed", "3", "--json", "--quiet"]
+    )
     assert result.exit_code == 0, result.output
     facts = json.loads(result.stdout)
     assert facts["passed"] and len(facts["checks"]) == 20
