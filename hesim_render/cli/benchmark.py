@@ -109,7 +109,10 @@ def verify(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Compare every file of a benchmark with its SHA-256. Ends with status 1 where anything differs."""
+    """Compare every file of a benchmark with its SHA-256.
+
+    Ends with status 1 where anything differs.
+    """
     from hesim_render.benchmark.folder import Benchmark
     from hesim_render.benchmark.verify import digest_of, discard_damaged, verify_benchmark
 
@@ -148,7 +151,10 @@ def evaluate(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Measure the baselines of each task, and your own results, on the clips of a split."""
+    """Score the baselines and your own results.
+
+    On the clips of a split, for each task.
+    """
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
     if out is not None:
@@ -192,7 +198,10 @@ def export(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Write a benchmark for another program, or as a few large files for training."""
+    """Write a benchmark for another program, or training.
+
+    In a layout that another program loads, or as a few large files.
+    """
     from hesim_render.benchmark.layouts import LAYOUTS, export_benchmark
     from hesim_render.benchmark.shards import pack_benchmark, verify_shards
 
@@ -230,7 +239,10 @@ def peers(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Compare our sensor and other event simulators in the same light. Ends with status 1 where one of them fails."""
+    """Compare our sensor and other event simulators.
+
+    In the same light. Ends with status 1 where one of them fails.
+    """
     from hesim_render.benchmark.peers import compare_peers, peers_table
     from hesim_render.specs.files import parse_override
     from hesim_render.specs.peers import read_peers

@@ -61,7 +61,7 @@ def lab(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """A virtual calibration session: dark and lit captures to calibrate from."""
+    """Simulate dark and bright captures to calibrate from."""
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     dark_us, lit_us = parse_exposures(dark_ms), parse_exposures(lit_ms)
@@ -97,7 +97,10 @@ def aps(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Noise of frame pixels from captures, into a file that a sensor file can point at."""
+    """Find the noise of frame pixels from captures.
+
+    A sensor file can point at the file that is written.
+    """
     from hesim_render.calibrate import calibrate_aps
     from hesim_render.recording.pair_set import is_pair_set
 
@@ -128,7 +131,10 @@ def evs(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Thresholds and noise of event pixels from captures, into a file that a sensor file can point at."""
+    """Find thresholds and noise of event pixels.
+
+    A sensor file can point at the file that is written.
+    """
     from hesim_render.calibrate import calibrate_evs
 
     console = Console(json_, quiet)

@@ -21,7 +21,10 @@ def twin(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Calibrate on half of EMVA 1288 captures, simulate the rest, compare: pass or fail for each statistic."""
+    """Calibrate on half of the captures, test on the rest.
+
+    The other half is simulated, and each statistic passes or fails.
+    """
     from hesim_render.twin import make_twin
     from hesim_render.twin.page import check_line
 

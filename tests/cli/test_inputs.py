@@ -112,5 +112,7 @@ def test_the_help_of_a_command_is_short_and_all_options_are_one_step_away(name, 
     assert call(capsys, *name.split(), "--help")[1].endswith(shown)  # the full help changes nothing
 
 
-def test_there_are_few_commands():
+def test_there_are_few_commands_and_their_lists_are_not_cut(capsys):
     assert len(program().commands) <= 15
+    for name, command in program().commands.items():
+        assert "..." not in call(capsys, name, "--help")[1] or not getattr(command, "commands", None)
