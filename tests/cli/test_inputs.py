@@ -115,4 +115,5 @@ def test_the_help_of_a_command_is_short_and_all_options_are_one_step_away(name, 
 def test_there_are_few_commands_and_their_lists_are_not_cut(capsys):
     assert len(program().commands) <= 15
     for name, command in program().commands.items():
-        assert "..." not in call(capsys, name, "--help")[1] or not getattr(command, "commands", None)
+        if getattr(command, "commands", None):
+            assert "..." not in call(capsys, name, "--help")[1].partition("Commands:")[2]
