@@ -92,7 +92,7 @@ def build_benchmark(
         spans = spans_of(spec.duration_us, max(1, round(span_s * 1e6)) if span_s else 0) if is_shared else ()
         left = {clip.name: 1.0 for clip in missing}
 
-        def told(answer: dict[str, Any]) -> None:
+        def on_answer(answer: dict[str, Any]) -> None:
             name = answer["name"]
             part = left[name] if "error" in answer else 1 / (len(spans) + 1)
             left[name] -= part
@@ -102,7 +102,7 @@ def build_benchmark(
             if progress is not None:
                 progress(done["clips"], len(plan.clips), "clips")
 
-        failed = _run(missing, spans, order_of(spec, root), workers, client, told) if missing else {}
+        failed = _run(missing, spans, order_of(spec, root), workers, client, on_answer) if missing else {}
     _report(root, expected, len(missing), time.monotonic() - begin, done, workers, scheduler)
     if failed:
         lines = [f"{name}: {reason}" for name, reason in sorted(failed.items())]
@@ -154,18 +154,18 @@ def _run(
     order: str,
     workers: int,
     client: Any,
-    told: Callable[[dict[str, Any]], None],
+    on_answer: Callable[[dict[str, Any]], None],
 ) -> dict[str, str]:
     if client is not None:
         from hesim_render.benchmark.cluster import run_on_cluster
 
-        return run_on_cluster(client, order, clips, told, spans)
+        return run_on_cluster(client, order, clips, on_answer, spans)
     if workers:
-        return LocalWorkers(order, workers).run(clips, told, spans)
+        return LocalWorkers(order, workers).run(clips, on_answer, spans)
     failed: dict[str, str] = {}
     for clip in clips:
         answer = attempt(order, clip.as_dict())
-        told(answer)
+        on_answer(answer)
         if "error" in answer:
             failed[clip.name] = answer["error"]
             if answer["fatal"]:

@@ -167,8 +167,8 @@ def _events_stream(info: str, path: Path) -> tuple[tuple[int, int], int]:
         if found.get("typeIdentifier") == "EVTS":
             name, cols, rows = node.get("name", ""), found.get("sizeX", ""), found.get("sizeY", "")
             if not all(re.fullmatch(r"\d{1,6}", value) for value in (name, cols, rows)):
-                told = printable(f"{name!r} of {cols!r} x {rows!r}")
-                raise SpecError(f"has a stream of events without number and size ({told[:80]})", file=path)
+                entry = printable(f"{name!r} of {cols!r} x {rows!r}")
+                raise SpecError(f"has a stream of events without number and size ({entry[:80]})", file=path)
             return (int(rows), int(cols)), int(name)
     raise SpecError("has no stream of events", file=path)
 

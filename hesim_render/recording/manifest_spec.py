@@ -109,7 +109,7 @@ class _Lens(Strict):
     f_number: PositiveFloat
     focal_length_mm: PositiveFloat
     magnification: NonNegativeFloat
-    axis_mm: tuple[float, float] = Field((0.0, 0.0), description="recordings of before it was told have it there")
+    axis_mm: tuple[float, float] = Field((0.0, 0.0), description="default of recordings that lack it")
     effects: dict[str, Any] = Field({}, description="aberrations that are on, as in the sensor file")
 
 

@@ -91,9 +91,9 @@ def make_twin(
                 bench.long(held, True),
             )  # fmt: skip
             checks = compare(result, held, real, twin)
-            told = [finding.text for finding in findings(result)]
+            texts = [finding.text for finding in findings(result)]
             (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
-            (folder.path / "twin.html").write_text(page(checks, told), encoding="utf-8")
+            (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
         return Twin(folder.commit(), checks)
     except BaseException:
         folder.discard()
