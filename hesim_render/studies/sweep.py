@@ -24,7 +24,7 @@ from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.study import StudySpec
 from hesim_render.specs.sweep import RangeSpec, SweepSpec, read_sweep
 from hesim_render.studies.run import study
-from hesim_render.studies.sweep_metrics import Figures, changed_pipeline
+from hesim_render.studies.sweep_metrics import RunFigures, changed_pipeline
 from hesim_render.studies.table import Cell, Table
 
 #: File that marks the folder of a sweep.
@@ -218,7 +218,7 @@ class _Recordings:
     def rows(self, run: Run) -> list[dict[str, Cell]]:
         """The one row of a run."""
         recording = self._recording(run)
-        figures = Figures(recording, self._developed(run))
+        figures = RunFigures(recording, self._developed(run))
         audit = recording.manifest["settings"].get("render", {}).get("audit", {})
         row: dict[str, Cell] = {name: cell for metric in self._spec.wanted for name, cell in figures(metric).items()}
         return [row | {VERDICT: audit.get("verdict", "not audited")}]

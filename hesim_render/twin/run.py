@@ -20,7 +20,7 @@ from hesim_render.sensor.sensor import load_sensor
 from hesim_render.specs.calibration import read_maps
 from hesim_render.twin.comparison import ALARM, Check, Half, compare
 from hesim_render.twin.page import page
-from hesim_render.twin.simulated import Bench
+from hesim_render.twin.simulated import TwinBench
 
 RESULT_NAME = "twin.json"
 
@@ -81,7 +81,7 @@ def make_twin(
             calibration = folder.path / "calibration.yaml"
             result = calibrate_pairs(fitted, calibration, progress=progress)
             sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
-            bench = Bench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_relative"], seed)
+            bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_relative"], seed)
             real = Half(
                 pair_levels(held, held.lit, progress), pair_levels(held, held.dark, progress),
                 long_series(held, False, progress), long_series(held, True, progress),

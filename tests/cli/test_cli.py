@@ -16,7 +16,7 @@ from hesim_render import cli
 from hesim_render.capture.noise_terms import NOISE_TERMS
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core import backend
-from hesim_render.core.backend import Candidate
+from hesim_render.core.backend import BackendCandidate
 from hesim_render.core.errors import RangeError
 from hesim_render.core.region import parse_roi
 from hesim_render.core.shipped import data_folder, list_names
@@ -189,7 +189,7 @@ def test_doctor_says_what_runs(capsys):
 
 
 def test_doctor_says_what_to_install_where_nothing_runs(capsys, monkeypatch):
-    broken = Candidate("llvm", "system", "/nowhere/libLLVM-20.so")
+    broken = BackendCandidate("llvm", "system", "/nowhere/libLLVM-20.so")
     monkeypatch.setattr(backend, "candidates", lambda: [broken])
     status, out, err = call(capsys, "info")
     assert status == 2 and "does not work: no such file" in out

@@ -117,10 +117,10 @@ def benchmark(folder):
 
 
 def read_plan(folder):
-    from hesim_render.benchmark.plan import Plan
+    from hesim_render.benchmark.plan import BenchmarkPlan
     from hesim_render.specs.benchmark import read_benchmark
 
-    for clip in Plan(read_benchmark(folder / "b.yaml")).clips:
+    for clip in BenchmarkPlan(read_benchmark(folder / "b.yaml")).clips:
         assert clip.name
 
 

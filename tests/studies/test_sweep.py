@@ -17,7 +17,7 @@ from hesim_render.specs.kinds import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep
-from hesim_render.studies.sweep_metrics import Figures
+from hesim_render.studies.sweep_metrics import RunFigures
 
 BASE = {
     "schema_version": 1, "name": "test", "scenes": ["flat-field"], "sensors": ["reference-mono"], "roi": "32x24",
@@ -133,7 +133,9 @@ def test_keys_of_the_isp_are_varied_on_one_recording(tmp_path, monkeypatch):
     assert row["picture_psnr_db"] == pytest.approx(expected, rel=1e-6)
     assert 0 < row["picture_ssim"] < 1 and row["picture_delta_e"] > 0
     # the noise-free picture is never smoothed
-    reduced = Figures(rec, Pipeline.of("black_level", "white_balance", "demosaic", "noise_reduction", "colour_matrix"))
+    reduced = RunFigures(
+        rec, Pipeline.of("black_level", "white_balance", "demosaic", "noise_reduction", "colour_matrix")
+    )
     plain_steps = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix")
     clean = (64 + 0.25 * rec.frames[0].electrons_mean).astype(np.float32)
     np.testing.assert_allclose(reduced.clean_picture, process(clean, rec.mosaic, plain_steps), atol=1e-6)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
-from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, Steps
+from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import Label, Origin
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.nominal import NominalSteps
@@ -155,7 +155,7 @@ class _WithDeadTime:
         self._stepped = np.ones(pixels, np.bool_)
 
     def take(
-        self, stage: EvsStage, electrons: Float, t_us: int, effects: Steps, verdicts: _Verdicts
+        self, stage: EvsStage, electrons: Float, t_us: int, effects: PixelSteps, verdicts: _Verdicts
     ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         own = self._own.step(electrons, t_us)
         steps = as_steps(own, self._steps + np.arange(own.size), self._cols)
@@ -223,7 +223,7 @@ class _Verdicts:
         return effect[decided], np.where(signal[decided], Label.SIGNAL, Label.MISMATCH).astype(np.uint8)
 
 
-def as_steps(events: NDArray[np.void], number: NDArray[np.int64], cols: int) -> Steps:
+def as_steps(events: NDArray[np.void], number: NDArray[np.int64], cols: int) -> PixelSteps:
     """Events as steps, with numbers that name them; `cols` of the event grid."""
     pixel = events["y"].astype(np.int64) * cols + events["x"]
-    return Steps(events["t_us"], pixel, events["polarity"].astype(np.int64), number)
+    return PixelSteps(events["t_us"], pixel, events["polarity"].astype(np.int64), number)
