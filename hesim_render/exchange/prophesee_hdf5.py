@@ -76,6 +76,7 @@ def _packed_records(made: Any) -> Any:
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     layout.set_chunk((_CHUNK,))
     layout.set_filter(ecf.FILTER, h5py.h5z.FLAG_OPTIONAL, ())
+    layout.set_obj_track_times(False)  # the same events give the same bytes at any time
     space = h5py.h5s.create_simple((0,), (h5py.h5s.UNLIMITED,))
     return h5py.h5d.create(
         made.create_group("CD").id, b"events", h5py.h5t.py_create(_RECORD, logical=True), space, layout

@@ -5,6 +5,7 @@ import re
 import struct
 import subprocess
 import sys
+import time
 
 import aedat
 import evt3
@@ -131,6 +132,8 @@ def test_the_bytes_do_not_depend_on_the_blocks(name, tmp_path, monkeypatch):
     events = many(5000, 1 << 20, (4, 4))
     whole = written(events, name, tmp_path, (4, 4)).read_bytes()
     monkeypatch.setattr(stream, "BLOCK", 7)
+    if name in ("prophesee", "dsec"):
+        time.sleep(1.1)  # HDF5 keeps times in whole seconds, if it is let
     assert written(events, name, tmp_path, (4, 4)).read_bytes() == whole
 
 
