@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.core.namespace import NUMPY
-from hesim_render.core.units import S_PER_US, US_PER_S
+from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs import formulas
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.event_noise import noise_rates_hz
@@ -105,11 +105,9 @@ class _Pixel:
         if spec is None:
             return sampling
         corner = spec.cutoff_hz
-        if spec.follows_light and spec.signal_dn is not None and spec.min_cutoff_hz is not None:
-            reference = self.spec.signal_reference
-            scale = float(self.noise.signal_scale[self.position]) * reference.k_dn_per_e * reference.t_ref_us / US_PER_S
-            signal = lux * (1 + step) * self.flux * scale
-            corner = min(max(corner * signal / spec.signal_dn, spec.min_cutoff_hz), corner)
+        if spec.follows_light:
+            electrons = np.asarray(lux * (1 + step) * self.flux * (self.spec.window_us * S_PER_US))
+            corner = float(self.noise.corner_hz(electrons, self.position))
         return latency_us(corner, theta, after - before) + sampling
 
 
