@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hesim_render.benchmark.sharp import windows
 from hesim_render.capture.simulate import flux_source
 from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
-from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import Scene
@@ -38,7 +37,7 @@ def through_one_filter(sensor: Sensor, name: str) -> Sensor:
     rows = ["".join("F" for _ in row) for row in spec.tile_rows]
     pixel = PixelSpec.model_validate({"filter": name, "roles": ["aps"]})
     changes = {"tile": "\n".join(rows), "pixels": {"F": pixel}, "evs": None, "evs_grid": None}
-    same = Layout(spec.model_copy(update=changes), layout.row0, layout.col0, layout.rows, layout.cols)
+    same = replace(layout, spec=spec.model_copy(update=changes))
     return replace(sensor, layout=same)
 
 

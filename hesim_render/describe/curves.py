@@ -12,9 +12,9 @@ from hesim_render.core.errors import RangeError
 from hesim_render.core.namespace import NUMPY
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.pixels.evs import formulas
+from hesim_render.pixels.evs.noise_rates import noise_rates_hz
+from hesim_render.sensor.from_data_sheet import electrons_per_s_lux, latency_us
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.specs.event_noise import noise_rates_hz
-from hesim_render.specs.from_data_sheet import electrons_per_s_lux, latency_us
 from hesim_render.spectral.spectrum import Spectrum, illuminant
 
 
@@ -119,7 +119,7 @@ def event_curves(
     """Noise, noise events and latency of an event pixel against light.
 
     Rates at a fixed tick are the formulas of `hesim_render.pixels.evs.formulas`; of asynchronous pixels those of
-    `hesim_render.specs.event_noise`.
+    `hesim_render.pixels.evs.noise_rates`.
 
     Parameters
     ----------

@@ -1,7 +1,6 @@
 """Imports point down only, nothing imports itself in a circle, and one package alone knows Mitsuba."""
 
 import ast
-import importlib
 import re
 import subprocess
 import sys
@@ -162,26 +161,6 @@ def test_values_on_the_device_have_named_types(name):
             given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
             for annotation in [node.returns, *(argument.annotation for argument in given)]:
                 assert not (isinstance(annotation, ast.Name) and annotation.id == "Any"), f"{node.name}, {node.lineno}"
-
-
-def test_names_of_before_give_the_modules_of_today():
-    from hesim_render._moved import MOVED
-
-    for old, new in MOVED.items():
-        assert f"hesim_render.{new}" in MODULES or f"hesim_render.{new}" in PACKAGES, new
-        assert not (PACKAGE / Path(*old.split("."))).with_suffix(".py").exists()
-    for old in ("spectra", "renderer.flux", "video.inversion", "errors"):
-        assert importlib.import_module(f"hesim_render.{old}") is importlib.import_module(f"hesim_render.{MOVED[old]}")
-    from hesim_render.renderer.reference import WindowReference
-
-    import hesim_render as hr
-    from hesim_render import spectra
-    from hesim_render.recording import Recording
-    from hesim_render.sensor import Sensor, load_sensor
-
-    assert hr.renderer.__name__ == "hesim_render.sources.render"
-    assert spectra.__name__ == "hesim_render.spectral.spectrum" and spectra.__spec__.name == spectra.__name__
-    assert Recording.__module__ == "hesim_render.recording.recording" and Sensor and load_sensor and WindowReference
 
 
 def test_hooks_need_nothing_but_the_checkouts_own_environment():
