@@ -13,7 +13,6 @@ from hesim_render.capture.run_settings import RunSettings
 from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core.errors import SpecError, TooLongError
 from hesim_render.core.progress import Progress
-from hesim_render.mosaic.schedule import BlockSample
 from hesim_render.recording.truth_kinds import EVENTS
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
@@ -46,10 +45,7 @@ class SceneRun:
 
     @cached_property
     def _demand(self) -> Demand:
-        # what rests is rendered once: its windows cost nothing
-        blocks = BlockSample([], 1.0) if self._renderer.is_static else self._plain.sample_of_event_blocks()
-        pixel, exposures = self._plain.frame_exposures
-        return Demand(self._settings.duration_us, self._plain.event_pixels, blocks, pixel, exposures)
+        return self._plain.demand
 
     def expect(self, on_estimate: Callable[[Estimate], None] | None) -> Estimate | None:
         """Estimate the run, where anybody wants to know, and refuse one that is too long.

@@ -71,3 +71,21 @@ class Renderer(FluxSource, Protocol):
         part : number of this part of the light.
         """
         ...
+
+
+class Untraced:
+    """The parts of `Renderer` of a source without rays: it has no error, keeps nothing and counts nothing."""
+
+    quality: None = None
+    auditable: None = None
+
+    @property
+    def work(self) -> dict[str, float]:
+        """See `Renderer.work`."""
+        return {}
+
+    def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
+        """See `Renderer.report`: there is no long render."""
+
+    def go_on(self, journal: Journal, part: int = 0) -> None:
+        """See `Renderer.go_on`: a run that goes on reads its pictures again."""
