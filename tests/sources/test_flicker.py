@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mitsuba_specfilm import reference_flux
 from rendering import make_scene, mono
 
 import hesim_render as hr
@@ -16,7 +17,6 @@ from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.renderer import flickering
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
-from hesim_render.sources.render.specfilm import reference_flux
 from hesim_render.sources.scene import Scene
 from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral.waveform import Mains, Pwm

@@ -7,6 +7,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from mitsuba_reference import WindowReference
 from random_scenes import DURATION_US, RandomScene
 from scipy import stats
 
@@ -15,7 +16,6 @@ from hesim_render.sources.render.audit.compare import Counted, compare_crossings
 from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.error_target import Noise
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.reference import WindowReference
 from hesim_render.sources.render.renderer import flickering
 
 QUALITY = 0.5
