@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from hesim_render.core.backend import jit
+from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.noise_rates import RateTable
-from hesim_render.pixels.evs.reference_law import POLE, Law, Pixels, law
+from hesim_render.pixels.evs.reference_law import Law, Pixels, law
 
 LOWER = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.25, 7.0)
 DIFFERENCE = (0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6, 3.6, 5.0, 7.5)
@@ -48,7 +49,7 @@ def simulate(entries: list[tuple[float, float, float]], start: np.ndarray, seed:
     import drjit as dr
 
     types = jit()
-    h = math.tau / math.sqrt(math.sqrt(2) - 1) / NODES
+    h = POLE / NODES
     step = math.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
     amplitude = math.sqrt(3 / (2 + (1 + h) * math.exp(-h)))
     (f00, _), (f10, f11) = (amplitude * np.linalg.cholesky(np.eye(2) - step @ step.T)).tolist()

@@ -14,7 +14,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.overheads import noise_seconds
 from hesim_render.capture.scene_renderer import scene_renderer
-from hesim_render.core.progress import in_words
+from hesim_render.core.progress import Progress, in_words
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.demand import Demand
@@ -57,12 +57,13 @@ class BuildEstimate:
         return asdict(self)
 
 
-def estimate_build(plan: Plan, clips: list[Clip]) -> BuildEstimate:
+def estimate_build(plan: Plan, clips: list[Clip], progress: Progress | None = None) -> BuildEstimate:
     """Estimate time and size of clips.
 
     Parameters
     ----------
     plan, clips : what is to be built.
+    progress : called with (done, total, what).
     """
     if not clips:
         return BuildEstimate(0, 0.0, 0.0)
@@ -75,7 +76,9 @@ def estimate_build(plan: Plan, clips: list[Clip]) -> BuildEstimate:
     }
     sample = list(chosen.values())[:_MOST]
     seconds: list[float] = []
-    for clip in sample:
+    for number, clip in enumerate(sample):
+        if progress is not None:
+            progress(number, len(sample), "estimate")
         sensor = plan.sensor(clip)
         with tempfile.TemporaryDirectory() as folder:
             files = plan.scene_files(clip)

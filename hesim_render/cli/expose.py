@@ -65,11 +65,11 @@ def expose(
         "pan_px_per_s": None if pan is None else _pair(pan), "zoom_per_s": zoom, "rotation_deg_per_s": rotate,
         "quantity": "radiance" if radiance else None, "beyond": "hold" if hold else None,
     }  # fmt: skip
-    import hesim_render as hr
-
-    loaded = cropped(hr.load_sensor(sensor, sensor_changes), roi)
     told = Told(json_, quiet, dry_run)
     with told.stop_at_estimate(), told.progress(f"{cube.name} → {sensor}") as progress:
+        import hesim_render as hr
+
+        loaded = cropped(hr.load_sensor(sensor, sensor_changes), roi)
         recording = hr.simulate_cube(
             cube, loaded, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed, clean=clean,
             without=without or (), on_estimate=told.estimated(progress),

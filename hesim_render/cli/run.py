@@ -27,13 +27,13 @@ def run(
     quiet: Quiet = False,
 ) -> None:
     """Do a whole run from one file: record a scene, video or cube, then develop, export and view it."""
-    from hesim_render.capture.run_file import run as run_all
-    from hesim_render.recording.quality import is_short_of_wish
-    from hesim_render.specs.files import parse_override
-
     told = Told(json_, quiet, dry_run)
-    changes = dict(map(parse_override, set_ or []))
     with told.stop_at_estimate(), told.progress(file.name) as progress:
+        from hesim_render.capture.run_file import run as run_all
+        from hesim_render.recording.quality import is_short_of_wish
+        from hesim_render.specs.files import parse_override
+
+        changes = dict(map(parse_override, set_ or []))
         made = run_all(
             file, out, overrides=changes, allow_outside=allow_outside, overwrite=overwrite, progress=progress,
             on_estimate=told.estimated(progress), max_minutes=None if yes else LONG_MINUTES,

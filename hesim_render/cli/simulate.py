@@ -159,14 +159,14 @@ def rerun(
 ) -> None:
     """Make a recording again from its recording.json: the same bytes, on the same versions and backend."""
     check_output(out, overwrite)
-    from hesim_render.capture.again import simulate_again
-    from hesim_render.recording.recording import Recording
-    from hesim_render.sources.scene import load_scene
-
-    loaded = Recording.load(recording)
-    given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
     told = Told(json_, quiet, dry_run)
     with told.stop_at_estimate(), told.progress(f"{recording} again") as progress:
+        from hesim_render.capture.again import simulate_again
+        from hesim_render.recording.recording import Recording
+        from hesim_render.sources.scene import load_scene
+
+        loaded = Recording.load(recording)
+        given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
         again = simulate_again(
             loaded, out, given, overwrite=overwrite, progress=progress, on_estimate=told.estimated(progress),
             max_minutes=None if yes else LONG_MINUTES, resume=True,
@@ -209,11 +209,11 @@ def _simulate(
     **options: Any,
 ) -> Recording:
     check_output(out, overwrite)
-    import hesim_render as hr
-
-    loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
-    loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
     with told.stop_at_estimate(), told.progress(f"{scene} → {sensor}") as progress:
+        import hesim_render as hr
+
+        loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
+        loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
         return hr.simulate(
             loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
             on_estimate=told.estimated(progress), resume=True, **options,

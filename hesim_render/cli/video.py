@@ -78,12 +78,12 @@ def video(
     scene_changes, sensor_changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.exposure_us")
     check_output(out, overwrite)
-    import hesim_render as hr
-    from hesim_render.mosaic.colour_profile import load_camera
-
-    loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
     told = Told(json_, quiet, dry_run)
     with told.stop_at_estimate(), told.progress(f"{Path(source).name} → {sensor}") as progress:
+        import hesim_render as hr
+        from hesim_render.mosaic.colour_profile import load_camera
+
+        loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
         recording = hr.simulate_video(
             source, loaded_sensor, out=out, overwrite=overwrite, progress=progress, duration_s=duration, seed=seed,
             max_minutes=None if yes else LONG_MINUTES, on_estimate=told.estimated(progress),

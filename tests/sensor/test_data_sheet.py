@@ -19,6 +19,12 @@ SHEET = "evs.data_sheet."
 BARE = IMX636[: IMX636.index("sources:")]
 
 
+def corner_at(photoreceptor, lux):
+    """Corner of a photoreceptor whose signal is in lux: a line from the dark to its largest value."""
+    dark, largest = photoreceptor.min_cutoff_hz, photoreceptor.cutoff_hz
+    return min(dark + (largest - dark) * lux / photoreceptor.signal_dn, largest)
+
+
 def reset_pixel_rates(on, off, dead_periods, seed, pixels=400, periods=700, first=100, nodes=16, leak_periods=0.0):
     """Events per period of noisy pixels with a dead time, by simulation in NumPy from the law of the noise alone. Leak
     events, which are not counted, begin a dead time as well.
@@ -165,14 +171,20 @@ def test_the_coefficients_have_the_figures_of_the_sheet():
     # shot noise of light and dark current: σ² of 5 lx over that of 20 lx is (20 + L0)/(5 + L0)
     variance = {lux: (beta.beta3**2 * lux + beta.beta4**2) / (lux + 0.08) ** 2 for lux in (5.0, 20.0)}
     assert variance[5.0] / variance[20.0] == pytest.approx(20.08 / 5.08)
-    # at 5 lx the corner leaves 59 of the 60 Hz of the noise
-    corner_hz = evs.photoreceptor.cutoff_hz * 5 / evs.photoreceptor.signal_dn
-    share = corner_hz / 60
-    assert 0.9 < share < 1
-    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6, 0.1)
-    assert variance[5.0] * share == pytest.approx(noise**2, rel=1e-4)
     assert evs.photoreceptor.filters_noise and evs.photoreceptor_cutoff_hz == 60
-    assert evs.photoreceptor.min_cutoff_hz == pytest.approx(corner_hz * 0.08 / 5)
+    assert evs.photoreceptor.min_cutoff_hz == pytest.approx(corner_at(evs.photoreceptor, 5) * 0.08 / 5.08)
+
+
+def test_noise_that_the_corner_limits_has_the_rate_of_the_sheet():
+    """At 5 lx the corner leaves 60 of 90 Hz, and of the variance the same part."""
+    evs = read_sensor("imx636", {SHEET + "noise_bandwidth_hz": 90}).evs
+    (beta,) = evs.coefficients
+    variance = (beta.beta3**2 * 5 + beta.beta4**2) / 5.08**2
+    corner_hz = corner_at(evs.photoreceptor, 5)
+    share = corner_hz / 90
+    assert 0.6 < share < 0.7
+    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6, 0.1)
+    assert variance * share == pytest.approx(noise**2, rel=1e-4)
 
 
 def two_rates(tmp_path, first, second):
@@ -199,6 +211,8 @@ def test_v2e_options_keep_their_meaning():
     assert (evs.contrast_threshold_on, evs.contrast_threshold_off, evs.leak_rate_hz) == (0.2, 0.2, 0.1)
     assert evs.threshold_mismatch_std == pytest.approx(0.05 / 0.2)
     assert evs.refractory_period_us is None and evs.photoreceptor.cutoff_hz == 30
+    for grey in (0, 77, 255):  # v2e's own law
+        assert corner_at(evs.photoreceptor, 100 * grey / 255) == pytest.approx(30 * (grey + 20) / 275)
     (beta,) = evs.coefficients
     for lux, rate_hz in ((0.0, 5.0), (100.0, 1.25)):  # white has a quarter of the noise of the dark
         sigma = (beta.beta3 * lux + beta.beta4) / (lux + beta.beta2)
@@ -260,7 +274,7 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
         return
     sheet, (beta,) = evs.data_sheet, evs.coefficients
     for level in sheet.background:
-        corner_hz = evs.photoreceptor.cutoff_hz * min(level.lux / evs.photoreceptor.signal_dn, 1)
+        corner_hz = corner_at(evs.photoreceptor, level.lux)
         share = min(corner_hz / evs.photoreceptor_cutoff_hz, 1)
         sigma = math.sqrt((beta.beta3**2 * level.lux + beta.beta4**2) * share) / (level.lux + beta.beta2)
         on, off = noise_rates_hz(
@@ -272,7 +286,7 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
     for speed in sheet.speed:
         if speed.latency_us is not None:
             bright = speed.lux * (1 + sheet.speed_step_percent / 100)
-            corner_hz = evs.photoreceptor.cutoff_hz * min(bright / evs.photoreceptor.signal_dn, 1)
+            corner_hz = corner_at(evs.photoreceptor, bright)
             pole = 2 * np.pi * corner_hz / np.sqrt(np.sqrt(2) - 1) * 1e-6
             change = math.log((bright + beta.beta2) / (speed.lux + beta.beta2))
             found = optimize.brentq(
