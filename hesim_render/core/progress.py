@@ -302,6 +302,12 @@ def progress_report(title: str, stream: TextIO | None = None, first_s: float | N
     return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target, first_s))
 
 
+def expect(progress: Progress | None, seconds: float) -> None:
+    """Let a report know the estimated time of the run from now on, s; a function of a caller is not told."""
+    if isinstance(progress, ProgressReport):
+        progress.expect(seconds)
+
+
 @contextlib.contextmanager
 def shown(progress: Progress | Literal[False] | None, title: str) -> Iterator[Progress | None]:
     """The `progress` of a caller; by default a bar in a notebook, and nothing elsewhere."""

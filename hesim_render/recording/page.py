@@ -20,7 +20,7 @@ from hesim_render.recording.quality import render_lines
 from hesim_render.recording.showcase import contact_sheet
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 PAGE = "recording.html"
 #: Longest lists of numbers that the page shows in full.
@@ -35,7 +35,7 @@ body{max-width:none;margin:1.5rem 2.5vw}h2{margin-top:.6rem}
 """
 
 
-def write_page(recording: Recording, folder: Path) -> Path:
+def write_page(recording: Recorded, folder: Path) -> Path:
     """Write ``recording.html``: parameters, pictures (those of the folder) and plots. Returns its path.
 
     Parameters
@@ -74,7 +74,7 @@ def write_page(recording: Recording, folder: Path) -> Path:
     return target
 
 
-def html_summary(recording: Recording) -> str:
+def html_summary(recording: Recorded) -> str:
     """`Recording._repr_html_`."""
     sheet = contact_sheet(recording).convert("RGB")
     sheet.thumbnail((2 * _THUMBNAIL_PX, 2 * _THUMBNAIL_PX))

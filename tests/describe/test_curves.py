@@ -13,11 +13,11 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.describe import event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
+from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs import read_sensor
-from hesim_render.specs.event_noise import events_per_period
+from hesim_render.sensor.from_data_sheet import electrons_per_s_lux
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.files import list_names
-from hesim_render.specs.from_data_sheet import electrons_per_s_lux
 from hesim_render.spectral.spectrum import illuminant
 
 #: A pixel of 20 Hz, which is quick to simulate, written as a data sheet.

@@ -12,7 +12,7 @@ from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.nominal import NominalSteps
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 SIDE, THETA = 48, 0.2
 #: x = I + 1 with I = 2 DN per electron of a window; s² = β4², so that the noise of ln x at x = 101 is β4/101.

@@ -7,16 +7,16 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from mitsuba_reference import WindowReference
 from random_scenes import DURATION_US, RandomScene
 from scipy import stats
 
 import hesim_render as hr
-from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.error_target import Noise
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.reference import WindowReference
+from hesim_render.sources.render.renderer import flickering
 
 QUALITY = 0.5
 #: Share of values off by more than three wanted errors that a run should have at most.
@@ -101,7 +101,7 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
     the reference is exact enough (`exact` of `all`): mean deviation, number off, and mean square over the errors.
     """
     _Seen.made.clear()
-    with mock.patch("hesim_render.capture.simulate.NotedFlux", _Seen):
+    with mock.patch("hesim_render.capture.scene_run.NotedFlux", _Seen):
         run = hr.simulate(
             random.scene, random.sensor, duration_s=DURATION_US * 1e-6, seed=random.seed, max_minutes=None
         )

@@ -225,8 +225,8 @@ def test_lamps_of_a_grid_blink_on_a_board_in_steady_light():
     target = {"type": "led-grid", "rows": 1, "cols": 1, "pitch_m": 0.04, "diameter_m": 0.039, "luminance_cd_m2": 100,
               "margin_m": 0.02, "waveform": {"type": "pwm", "frequency_hz": 100, "duty": 0.25}}  # fmt: skip
     scene = make_scene(target=target, light={"type": "uniform", "illuminance_lux": 10}, camera=CAMERA)
-    from hesim_render.sources.flicker import flickering
     from hesim_render.sources.render.exact import RenderedFlux
+    from hesim_render.sources.render.renderer import flickering
 
     source = flickering(scene, lambda part, _: RenderedFlux(part, mono(32, 32), 16, 1))
     response = luminance_response(source.sensor)

@@ -11,11 +11,11 @@ from hesim_render.calibrate.report.events import evs_section
 from hesim_render.calibrate.report.frames import aps_section
 from hesim_render.calibrate.report.parts import plain_text
 from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning
+from hesim_render.calibration.file import as_written
+from hesim_render.calibration.spec import SECTIONS
 from hesim_render.core.drawing import report_style
 from hesim_render.core.html import PAGE_STYLE, table
 from hesim_render.core.output import alone_in, replacing
-from hesim_render.specs.calibration import as_written
-from hesim_render.specs.calibration_spec import SECTIONS
 
 
 def write_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:

@@ -7,10 +7,10 @@ import pytest
 from scipy import constants, optimize
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs import read_sensor
-from hesim_render.specs.event_noise import events_per_period, noise_rates_hz, noise_sigma
+from hesim_render.pixels.evs.noise_rates import events_per_period, noise_rates_hz, noise_sigma
+from hesim_render.sensor.from_data_sheet import corner_of_latency_hz, electrons_per_s_lux, latency_us
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.files import data_folder, list_names
-from hesim_render.specs.from_data_sheet import corner_of_latency_hz, electrons_per_s_lux, latency_us
 from hesim_render.spectral.spectrum import illuminant, photopic
 
 IMX636 = (data_folder("sensors") / "imx636.yaml").read_text()
