@@ -49,7 +49,7 @@ def test_places_are_those_of_opencv_and_the_inverse_returns(name):
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_inverse_converges_as_newtons_method_does(name, monkeypatch):
-    """Quadratically, from starts that are right for the radial part; with a wrong determinant it takes 5 to 10 steps."""
+    """Quadratically, from starts that are right for the radial part; a wrong determinant takes 5 to 10 steps."""
     model, formula, steps = Distortion.of(MODELS[name], FARTHEST), Distortion._formula, []
     assert model.starts
     monkeypatch.setattr(Distortion, "_formula", lambda self, x, y: steps.append(x.size) or formula(self, x, y))
