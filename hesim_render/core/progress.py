@@ -24,6 +24,8 @@ _LEAST_DONE = 0.01
 _REFRESH_S = 0.5
 #: Without a terminal: seconds to the first line, growth of the interval per line, longest interval.
 _FIRST_LINE_S, _GROWTH, _LONGEST_S = 30.0, 2.0, 600.0
+#: The same where an answer is expected at once.
+SOON_S = 2.0
 
 
 class Pace:
@@ -43,7 +45,7 @@ class Pace:
         self.estimate_s: float | None = None
         self.what = ""
         self.fraction = 0.0
-        self._is_told = False
+        self._is_announced = False
 
     @property
     def elapsed_s(self) -> float:
@@ -79,12 +81,12 @@ class Pace:
 
     def late_note(self) -> str | None:
         """A note about a run that takes `LATE` times its estimate; once, None before and after."""
-        if self._is_told or self.estimate_s is None:
+        if self._is_announced or self.estimate_s is None:
             return None
         taken = self._clock() - self._expected_at_s
         if taken < max(LATE * self.estimate_s, _LEAST_LATE_S):
             return None
-        self._is_told = True
+        self._is_announced = True
         return (
             f"takes longer than its estimate: {in_words(taken)} so far, estimated were {in_words(self.estimate_s)}; "
             + self.describe()
@@ -170,9 +172,9 @@ class ProgressReport:
 class _Lines:
     """Occasional lines, for logs."""
 
-    def __init__(self, title: str, stream: TextIO) -> None:
+    def __init__(self, title: str, stream: TextIO, first_s: float | None = None) -> None:
         self._title, self._stream = title, stream
-        self._next_s = _FIRST_LINE_S
+        self._next_s = _FIRST_LINE_S if first_s is None else first_s
 
     def show(self, pace: Pace) -> None:
         now = pace.elapsed_s
@@ -242,8 +244,8 @@ class _Notebook:
         self._handle = display(HTML(self._text(Pace())), display_id=True)
 
     def _text(self, pace: Pace) -> str:
-        told = f"{self._title}: {pace.describe()}, {in_words(pace.elapsed_s)} so far"
-        return f"<progress value='{pace.fraction:.3f}' max='1'></progress> {html.escape(told)}{self._notes}"
+        status = f"{self._title}: {pace.describe()}, {in_words(pace.elapsed_s)} so far"
+        return f"<progress value='{pace.fraction:.3f}' max='1'></progress> {html.escape(status)}{self._notes}"
 
     def show(self, pace: Pace) -> None:
         self._handle.update(self._html(self._text(pace)))
@@ -285,18 +287,25 @@ def in_notebook() -> bool:
     return getattr(shell, "kernel", None) is not None
 
 
-def progress_report(title: str, stream: TextIO | None = None) -> ProgressReport:
+def progress_report(title: str, stream: TextIO | None = None, first_s: float | None = None) -> ProgressReport:
     """A report that suits the place where this runs.
 
     Parameters
     ----------
     title : title of the run.
     stream : default stderr.
+    first_s : time until the first line where `stream` is no terminal, s; default 30 s.
     """
     target, title = sys.stderr if stream is None else stream, printable(title)
     if in_notebook():
         return ProgressReport(_Notebook(title))
-    return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target))
+    return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target, first_s))
+
+
+def expect(progress: Progress | None, seconds: float) -> None:
+    """Let a report know the estimated time of the run from now on, s; a function of a caller is not told."""
+    if isinstance(progress, ProgressReport):
+        progress.expect(seconds)
 
 
 @contextlib.contextmanager
