@@ -163,7 +163,7 @@ def test_a_plan_ends_at_the_first_window_after_the_run():
     rendered = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [1, 1]], bool)
     shape = rendered.shape
     one = Plan(rendered, np.ones(shape, np.int16), rendered, *(np.ones(shape, np.float32) for _ in range(2)),
-               np.ones(shape, np.int16))  # fmt: skip
+               np.ones(shape, np.int16), Differences.none(*shape))  # fmt: skip
     cut = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [0, 0]], bool)
     np.testing.assert_array_equal(one.until(2).rendered, cut)
     np.testing.assert_array_equal(one.until(5).rendered, rendered)

@@ -41,6 +41,14 @@ def fitted(x, y, flux):
     return found
 
 
+def test_rays_that_differ_by_rounding_have_no_scatter():
+    """It was infinite: deviations were divided by the difference of two sides of which one had no ray."""
+    rng = np.random.default_rng(5)
+    flux = 37_000 * (1 + 1e-7 * rng.integers(-1, 2, (20, 64)))
+    found = fitted(*(rng.random((2, 20, 64)) - 0.5), flux)
+    assert np.all(found.scatter < 1e-6 * 37_000) and not found.is_edge.any()
+
+
 def test_the_line_is_the_one_with_the_largest_distance_from_all_rays():
     """In all directions. A search in steps misses the widest gap now and then: at most 1 of 100 lines is not found, and
     3 of 100 have a gap that is smaller than the one about the true line.
@@ -174,7 +182,7 @@ def test_a_run_takes_lines_where_there_are_some():
         found[least] = np.array([0.5 * (np.array(s.half_a, np.float64) + np.array(s.half_b)) for s in samples])
         rays[least] = source.rays_traced
     unit = source.noise_unit(pixel, found[256], True)
-    assert rays[256] < 0.7 * rays[1 << 14]
+    assert rays[256] < 0.75 * rays[1 << 14]
     assert np.sqrt(np.mean(((found[256] - found[1 << 14]) / unit) ** 2)) < 0.5
 
 

@@ -76,7 +76,7 @@ def difference_of(
     """
     assert pilot.change is not None
     change, here = pilot.change, sites.listed
-    # Few rays change, so a pixel's own pilot may have met none of them: half of the scatter is that of the pixels around.
+    # Few rays change, and a pixel's own pilot may have met none of them: half of the scatter is that of pixels around.
     square = (np.where(lit, change.lit_scatter[window], change.hidden_scatter[window]) * _SMALLER) ** 2
     scatter = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
     # What these rays can not have seen: a small part of them that changed by all the light there is.
@@ -132,9 +132,9 @@ def differences(
         looked_at[closer.place] = True
         out.rays[window, looked_at[sites.listed]] = 0
     if pilot.aims is not None:
-        window, place = np.nonzero(out.rays)
-        is_aimed = pilot.aims.at(window, sites.listed[place]).count > 0
-        out.rays[window[is_aimed], place[is_aimed]] = 0
+        which, place = np.nonzero(out.rays)
+        is_aimed = pilot.aims.at(which, sites.listed[place]).count > 0
+        out.rays[which[is_aimed], place[is_aimed]] = 0
     # all windows between take as many rays as the one that needs most, and together pay for those in the first window
     own = out.rays[inner]
     most = own.max(axis=0, initial=0)

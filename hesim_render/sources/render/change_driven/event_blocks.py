@@ -12,8 +12,8 @@ from hesim_render.sources.render.change_driven.estimates import Flux
 from hesim_render.sources.render.change_driven.plan import fill_in
 from hesim_render.sources.render.change_driven.windows import Windows
 
-#: Intervals of a block of an asynchronous sensor, and the pixels up to which it may have as many. The last window of each
-#: block is rendered at all pixels, so that fewer blocks cost less; all windows of a block are held in memory.
+#: Intervals of a block of an asynchronous sensor, and the largest sensor, in pixels, that has as many. The last window
+#: of each block is rendered at all pixels, so that fewer blocks cost less; all windows of a block are held in memory.
 _INTERVALS = ((64, 150_000), (32, 500_000))
 
 
@@ -41,7 +41,8 @@ class Blocks:
         self._renderer = renderer
         self.base = Flux.zeros(1, pixel.size)
         span_us = anchor_us(first.begin_us, first.end_us)
-        renderer.alone(pixel, *(np.full(pixel.size, time) for time in span_us), "events", self.base)
+        begin, end = (np.full(pixel.size, time) for time in span_us)
+        renderer.alone(pixel, begin, end, "events", self.base)
         renderer.counts.values -= pixel.size
         self.alive = np.flatnonzero(~renderer.still("events").known[pixel])
         self._bands = list(renderer.bands(pixel[self.alive], "events"))

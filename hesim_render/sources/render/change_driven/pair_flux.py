@@ -96,8 +96,8 @@ class PilotFlux:
     @classmethod
     def empty(cls, count: int) -> PilotFlux:
         """Statistics to be filled in."""
-        kinds = {"met": np.bool_}
-        return cls(*(np.zeros(count, kinds.get(each.name, np.float32)) for each in fields(cls)))
+        lit, hidden, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
+        return cls(lit, hidden, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
 
     def put(
         self,
@@ -193,8 +193,8 @@ def joined(first: PilotRays, second: PilotRays) -> PilotRays:
     """Rays of two lists of pairs, one after the other."""
     import drjit as dr
 
-    rays = (dr.concat([getattr(each, name) for each in (first, second)]) for name in ("lit", "hidden"))
-    return PilotRays(*rays, first.samples, first.spans_us + second.spans_us)
+    lit, hidden = (dr.concat([getattr(each, name) for each in (first, second)]) for name in ("lit", "hidden"))
+    return PilotRays(lit, hidden, first.samples, first.spans_us + second.spans_us)
 
 
 def power_below(values: Float) -> Float:

@@ -275,7 +275,8 @@ class PairTracer(Tracer):
         for each in fields(out):
             if each.name != "met":
                 getattr(out, each.name)[:] *= scale
-        return out, PilotRays(*(table(jit().Float, values) for values in kept), samples, spans_us)
+        lit, hidden = (table(jit().Float, values) for values in kept)
+        return out, PilotRays(lit, hidden, samples, spans_us)
 
     def edges(
         self,

@@ -203,9 +203,9 @@ def take_pilot(
         ):
             mean[[0, -1]] = values[[0, -1]] - other
         change = Change(means[0], means[1], scatters[0], scatters[1])
-    looks = [(window, look) for window, row in enumerate(closer) for look in row if look.place.size]
-    aims = Aims.of([(window, *look.aims) for window, look in looks if look.aims is not None], sites.size)
-    found_closer = _look_closer(tracer, sites, windows, numbers, pilot, width_px, looks, aims)
+    near_by = [(window, one) for window, row in enumerate(closer) for one in row if one.place.size]
+    aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
+    found_closer = _look_closer(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
     return replace(pilot, closer=found_closer, aims=aims, change=change), near
 
 

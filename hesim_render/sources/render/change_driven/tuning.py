@@ -96,12 +96,13 @@ class Tuning:
         rays see none either.
     difference_gain : factor, C. A pair is rendered as a difference where that takes this many times fewer rays. Without
         (1): windows to compare with are rendered for little.
-    difference_part : wanted errors, F. Wanted error of a difference; that of the other window comes on top. Without (1):
-        the error of the pair is larger than wanted.
-    difference_factor : factor, F. The standard error of a difference of n rays is this times their scatter over √n: few
-        rays change, and strata gain little. Without (1): as above.
-    unseen_change : part of all light, F. Scatter of differences that the pilot of a neighbourhood can not see. Without
-        (0): pixels at the rim of a penumbra are off.
+    difference_part : wanted errors, C. Wanted error of a difference; that of the other window comes on top. Without
+        (1): the error of the pair is larger than wanted.
+    difference_factor : factor, F (star alone, windows 4 to 60 ms apart). The standard error of a difference of n rays
+        is this times their scatter over √n: few rays change, and strata gain little. Without (0.5): differences are off
+        by twice what they should.
+    unseen_change : part of all light, F (as before). Scatter of differences that the pilot of a neighbourhood does not
+        show. Without (0): pixels at the rim of a penumbra are off.
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
@@ -145,7 +146,7 @@ class Tuning:
     edge_rays: int = 64
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.4
-    flat_part: float = 1 / 32
+    flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.7
