@@ -50,6 +50,12 @@ def test_wheel_and_source_archive_are_whole_and_pass_twine(tmp_path):
     for folder in ("scenes", "sensors", "filter_sets", "palettes", "study_specs", "design_specs", "sweep_specs"):
         missing = {f"hesim_render/{folder}/{path.name}" for path in (ROOT / folder).glob("*.yaml")} - names
         assert not missing
+    data = {
+        path.relative_to(ROOT).as_posix()
+        for kind in ("html", "css", "npz")
+        for path in (ROOT / "hesim_render").rglob(f"*.{kind}")
+    }
+    assert len(data) > 10 and data <= names
     assert "hesim_render/py.typed" in names and not [name for name in names if name.startswith("tests/")]
     with tarfile.open(archive) as whole:
         within = {name.partition("/")[2] for name in whole.getnames()}
