@@ -78,10 +78,10 @@ def read_header(path: Path) -> tuple[tuple[int, int] | None, int]:
         file.seek(begin)
         kind = file.read(2)
     if len(kind) < 2 or kind[0] not in (_OLD_EVENTS, _EVENTS) or kind[1] != _ENTRY.itemsize:
-        told = " of ".join(map(str, kind)) or "nothing"
+        kinds = " of ".join(map(str, kind)) or "nothing"
         raise SpecError(
-            f"holds entries of type {told} bytes at byte {begin}; expected type {_OLD_EVENTS} or {_EVENTS} (events) of "
-            f"{_ENTRY.itemsize}",
+            f"holds entries of type {kinds} bytes at byte {begin}; expected type {_OLD_EVENTS} or {_EVENTS} (events) "
+            f"of {_ENTRY.itemsize}",
             file=path,
         )
     return _shape(keys, path), begin + 2

@@ -135,8 +135,8 @@ def stated_size(width: str, height: str, largest: int, path: Path) -> tuple[int,
         If one of them is no number from 1 to `largest`.
     """
     if not all(side.isdecimal() and len(side) < 6 and 0 < int(side) <= largest for side in (width, height)):
-        told = printable(f"{width}x{height}")
-        raise SpecError(f"has the size {told}; expected 1x1 to {largest}x{largest} px", file=path)
+        shown = printable(f"{width}x{height}")
+        raise SpecError(f"has the size {shown}; expected 1x1 to {largest}x{largest} px", file=path)
     return int(height), int(width)
 
 

@@ -76,8 +76,8 @@ def _render(render: dict[str, Any] | None) -> dict[str, object]:
         for name, error in ((render or {}).get("error_noise") or {}).items()
         if error is not None
     ]
-    told = [line for line in render_lines(render) if not line.startswith("render,")] if errors else []
-    return {"errors": errors, "audit": told or ["No audit: nothing was rendered again to compare with."]}
+    verdicts = [line for line in render_lines(render) if not line.startswith("render,")] if errors else []
+    return {"errors": errors, "audit": verdicts or ["No audit: nothing was rendered again to compare with."]}
 
 
 def _short(node: Any) -> Any:

@@ -99,7 +99,7 @@ class Figures:
                 corners.append((level.lux * (1 + step), corner_of_latency_hz(level.latency_us, on, change)))
         return cls(
             (on, off), spread / ((on + off) / 2), [(b.lux, b.rate_hz - sheet.leak_hz) for b in sheet.background],
-            sheet.dark_lux, sheet.noise_bandwidth_hz, bool(sheet.speed), sheet.leak_hz, corners, sheet.refractory_us,
+            sheet.dark_lux, sheet.noise_cutoff_hz, bool(sheet.speed), sheet.leak_hz, corners, sheet.refractory_us,
         )  # fmt: skip
 
     @classmethod
@@ -198,7 +198,7 @@ def _values(spec: SheetSensorSpec) -> dict[str, Any]:
     photoreceptor = _photoreceptor(figures)
     bandwidth_hz = figures.bandwidth_hz or photoreceptor["cutoff_hz"]
     if photoreceptor and bandwidth_hz > photoreceptor["cutoff_hz"]:
-        raise SpecError(f"noise_bandwidth_hz {bandwidth_hz:g} is above the pixel's {photoreceptor['cutoff_hz']:.4g} Hz")
+        raise SpecError(f"noise_cutoff_hz {bandwidth_hz:g} is above the pixel's {photoreceptor['cutoff_hz']:.4g} Hz")
     dark_lux, beta3, beta4 = _noise(figures, bandwidth_hz, photoreceptor)
     beta = {"beta1": 1.0, "beta2": dark_lux, "beta3": beta3, "beta4": beta4}
     if figures.shot_law == "linear":

@@ -109,8 +109,8 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
             if key in verdict
         ]
         found.append((str(verdict["against"]), rows))
-    told = [f"{number(before)} to {number(after)}" for before, after in costs]
-    return filled("studies/verdict.html", verdicts=found, tile=tile, costs=told)
+    changes = [f"{number(before)} to {number(after)}" for before, after in costs]
+    return filled("studies/verdict.html", verdicts=found, tile=tile, costs=changes)
 
 
 def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:

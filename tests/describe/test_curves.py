@@ -22,7 +22,7 @@ from hesim_render.spectral.spectrum import illuminant
 
 #: A pixel of 20 Hz, which is quick to simulate, written as a data sheet.
 SLOW = {
-    "evs.data_sheet.noise_bandwidth_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
+    "evs.data_sheet.noise_cutoff_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
     "evs.data_sheet.speed": [{"lux": 5, "bandwidth_hz": 20}], "evs.data_sheet.refractory_us": 5000,
 }  # fmt: skip
 
@@ -134,7 +134,7 @@ def test_rare_background_with_its_leak(name, pixels):
     (stated,) = sheet.background
     curves = event_curves(sensor, [float(stated.lux)])
     assert curves.on_hz[0] + curves.off_hz[0] == pytest.approx(stated.rate_hz, rel=1e-3)
-    begin_s, end_s = (round(periods / sheet.noise_bandwidth_hz, 1) for periods in (1000, 3000))
+    begin_s, end_s = (round(periods / sheet.noise_cutoff_hz, 1) for periods in (1000, 3000))
     found = sum(simulated_rates(sensor, stated.lux, begin_s, end_s - begin_s))
     drawn = of_drawn_thresholds(sensor, stated.lux)
     assert found == pytest.approx(drawn, rel=0.05)  # 10,000 events or more

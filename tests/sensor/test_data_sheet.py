@@ -177,7 +177,7 @@ def test_the_coefficients_have_the_figures_of_the_sheet():
 
 def test_noise_that_the_corner_limits_has_the_rate_of_the_sheet():
     """At 5 lx the corner leaves 60 of 90 Hz, and of the variance the same part."""
-    evs = read_sensor("imx636", {SHEET + "noise_bandwidth_hz": 90}).evs
+    evs = read_sensor("imx636", {SHEET + "noise_cutoff_hz": 90}).evs
     (beta,) = evs.coefficients
     variance = (beta.beta3**2 * 5 + beta.beta4**2) / 5.08**2
     corner_hz = corner_at(evs.photoreceptor, 5)
@@ -191,7 +191,7 @@ def two_rates(tmp_path, first, second):
     file = tmp_path / "mine.yaml"
     file.write_text(BARE)
     changes = {
-        SHEET + "speed": [], SHEET + "dark_lux": None, SHEET + "noise_bandwidth_hz": 150,
+        SHEET + "speed": [], SHEET + "dark_lux": None, SHEET + "noise_cutoff_hz": 150,
         SHEET + "background": [{"lux": lux, "rate_hz": rate_hz} for lux, rate_hz in (first, second)],
     }  # fmt: skip
     return read_sensor(file, changes)
@@ -245,7 +245,7 @@ def test_changes_reach_the_sheet_and_have_the_last_word():
         ("lux: 1000, latency_us: 100}", "lux: 1000, latency_us: 5000}", "evs.data_sheet", "not fall"),
         ("latency_us: 100}", "latency_us: 100, bandwidth_hz: 3}", SHEET + "speed.0", "not both"),
         ("speed_step_percent: 100", "speed_step_percent: 20", "evs.data_sheet", "more than the threshold of 25 %"),
-        ("noise_bandwidth_hz: 60", "noise_bandwidth_hz: 5000", "evs.data_sheet", "above the pixel's"),
+        ("noise_cutoff_hz: 60", "noise_cutoff_hz: 5000", "evs.data_sheet", "above the pixel's"),
         ("  window_us: 1\n", "  window_us: 1\n  leak_rate_hz: 1\n", "evs.leak_rate_hz", "follows from data_sheet"),
         ("reference: last_event", "reference: previous_sample\n  tick_us: 100", "evs", "asynchronous pixels"),
         ("light: LED-B2", "light: {peak_nm: 900, fwhm_nm: 1}", "evs.data_sheet", "lux"),

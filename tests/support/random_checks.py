@@ -142,7 +142,7 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
 def count_events(sensor, chosen, own, reference, stated, reference_error) -> Counted:
     """Events of some pixels by their own flux and by the reference, both [window, pixel].
 
-    What is sure depends on both standard errors, because a matt scene can be more exact than its reference.
+    What is sure depends on both standard errors, because a diffuse scene can be more exact than its reference.
     """
     noise = sensor.evs
     levels = [noise.log_signal(values, chosen) for values in (own, reference, own + np.hypot(stated, reference_error))]

@@ -233,7 +233,7 @@ def test_lamps_of_a_grid_blink_on_a_board_in_steady_light():
     pixel = np.array([16 * 32 + 16, 2], np.uint32)  # a lamp, and the board
     for begin, end, power in ((0, 2000, 4.0), (3000, 9000, 0.0), (0, 10000, 1.0)):
         flux = np.mean([np.array(half) for half in source.mean_flux(pixel, begin, end)], axis=0)
-        # the lamp is also a matt surface of 5 % in the light of the room
+        # the lamp is also a diffuse surface of 5 % in the light of the room
         expected = np.array([100 * power + 0.05 * 10 / np.pi, 0.05 * 10 / np.pi]) * response
         np.testing.assert_allclose(flux, expected, rtol=6e-3)
     both = hr.simulate(scene, mono(8, 8), duration_s=0.01, clean=True).manifest
