@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import poisson
 
 from hesim_render.calibrate.asynchronous.fit import Fit
-from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
+from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, TrialCounts, chances, log_prior
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibration.rates import rate_hz
@@ -83,7 +83,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
     """[test, pixel]."""
     k = 0 if polarity > 0 else 1
     grid = fit.likelihood.grids[k]
-    counts = Counts.of([steps], polarity)
+    counts = TrialCounts.of([steps], polarity)
     log = counts.log_likelihood(fit.values, grid, fit.law)
     log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
     weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
@@ -91,7 +91,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
     events = counts.events.reshape(log.shape[0], chance.shape[0], -1).sum(axis=2)
     trials = events + counts.silent
     sure, never = chance > 1 - _SURE, chance < _SURE
-    quiet = Counts.of([steady], polarity)
+    quiet = TrialCounts.of([steady], polarity)
     seen = quiet.events.sum(axis=1, keepdims=True)
     usual = chances(fit.values, quiet.sets[0], polarity, grid, fit.law).sum(axis=1)
     bins = len(steady.edges_s) - 1
