@@ -203,7 +203,7 @@ class AsynchronousGoodness(EventGoodness):
 
 
 class AsynchronousSection(_Section):
-    """``evs`` of a sensor without fixed comparisons: what trials after a reset told."""
+    """``evs`` of a sensor without fixed comparisons: from trials after a reset."""
 
     reference: Literal["last_event"]
     shot_law: Literal["linear", "sqrt"]

@@ -109,7 +109,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
 def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefects:
     """Classify the bad pixels: stuck, hot, flickering or other.
 
-    A flickering pixel is told from a hot one by the parts of the trials in the brightest light: their scatter has a
+    The parts of the trials in the brightest light distinguish a flickering pixel from a hot one: their scatter has a
     chance below 1e-6 at a constant rate.
     """
     nothing = np.zeros(bad.size, np.float32)
@@ -156,7 +156,7 @@ def _flicker(found: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: N
     usual = float(good.mean(dtype=np.float64)) / parts.trials if good.size else 0.0
     share, correlation = dynamics(counts, parts.trials, usual)
     chance = np.maximum(counts.mean(axis=0, dtype=np.float64) / parts.trials - usual, 0.0) / share
-    # more cannot be told from the trials than that one is silent in all of those in which the pixel fires
+    # the trials show no more than that one is silent in all of those in which the pixel fires
     most = 1 - 0.5 / np.maximum(counts.shape[0] * parts.trials * share, 1.0)
     rate = rate_hz(np.minimum(chance, most), parts.trial_s)
     on_share = own[0] / np.maximum(own.sum(axis=0), 1e-300)
