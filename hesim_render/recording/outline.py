@@ -74,4 +74,4 @@ def frame_summary(raw: np.ndarray, rows: list[tuple[str, str]]) -> str:
     some = raw[::step, ::step].astype(np.float64)
     low, high = np.quantile(some, [0.005, 0.995]) if some.size else (0.0, 1.0)
     grey = np.clip(255 * (some - low) / max(high - low, 1.0), 0, 255).astype(np.uint8)
-    return f"{table(('', ''), rows)}{inline_picture(grey, 'RAW values')}"
+    return table(("", ""), rows) + inline_picture(grey, "RAW values")
