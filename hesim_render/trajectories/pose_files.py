@@ -107,8 +107,8 @@ def _rows(file: Path, quaternion: str) -> _Found:
     elif is_csv:
         first = rows.pop(0) if rows else (1, "")
         if tuple(cell.strip() for cell in first[1].split(",")) != CSV_COLUMNS:
-            told = f"the header must be {','.join(CSV_COLUMNS)}, or that of a EuRoC file"
-            raise SpecError(told, file=file, line=first[0])
+            expected = f"the header must be {','.join(CSV_COLUMNS)}, or that of a EuRoC file"
+            raise SpecError(expected, file=file, line=first[0])
     lines: list[int | None] = []
     times, numbers = [], []
     for number, line in rows:

@@ -112,7 +112,7 @@ def _noise(fit: Fit, signal_dn: float) -> dict[str, Any]:
     some = fit.free & (slope != 0)
     variance = slope[some] @ fit.covariance[np.ix_(some, some)] @ slope[some]
     if not variance > 0:
-        return not_identifiable("not told by the trials")
+        return not_identifiable("the trials do not determine it")
     return estimated(value, float(np.sqrt(variance)), "ln")
 
 
@@ -122,7 +122,7 @@ def maps(result: AsynchronousCalibration) -> dict[str, NDArray]:
     rates = EventDefectRates(defects.kind, defects.on_hz, defects.off_hz, defects.firing_share, defects.change_hz)
     arrays: dict[str, NDArray] = {
         "bad_pixels": defects.bad, **rates.maps(),
-        "threshold_on_relative": result.relative[0], "threshold_off_relative": result.relative[1],
+        "threshold_on_rel": result.relative[0], "threshold_off_rel": result.relative[1],
         "threshold_on_noise": result.noise[0], "threshold_off_noise": result.noise[1],
     }  # fmt: skip
     good = ~defects.bad
