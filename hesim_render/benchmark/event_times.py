@@ -27,13 +27,13 @@ def nearest_us(asked: NDArray, given: NDArray, shape: tuple[int, int]) -> NDArra
     keys = np.sort(_place(given, shape) * span + (given["t_us"] - begin))
     place, time = _place(asked, shape), asked["t_us"] - begin
     after = np.searchsorted(keys, place * span + time)
-    found = np.full((2, len(asked)), np.inf)
+    offset_us = np.full((2, len(asked)), np.inf)
     for row, index in enumerate((after - 1, after)):
         inside = (index >= 0) & (index < len(keys))
         key = keys[np.clip(index, 0, len(keys) - 1)]
         same = inside & (key // span == place)
-        found[row, same] = (key % span - time)[same]
-    return np.where(np.abs(found[0]) < np.abs(found[1]), found[0], found[1])
+        offset_us[row, same] = (key % span - time)[same]
+    return np.where(np.abs(offset_us[0]) < np.abs(offset_us[1]), offset_us[0], offset_us[1])
 
 
 def _place(events: NDArray, shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -63,15 +63,15 @@ def timing(events: NDArray, truth: NDArray, shape: tuple[int, int], match_us: fl
     early = nearest_us(events, truth, shape)
     matched = late[np.abs(late) <= match_us]
     nan = float("nan")
-    found = {
+    figures = {
         "missed": 1 - len(matched) / len(late) if len(late) else nan,
         "extra": float(np.mean(np.abs(early) > match_us)) if len(early) else nan,
         "delay_us": nan, "timing_us": nan, "timing_90_us": nan,
     }  # fmt: skip
     if len(matched):
-        found["delay_us"] = float(np.median(matched))
-        found["timing_us"], found["timing_90_us"] = map(float, np.quantile(np.abs(matched), [0.5, 0.9]))
-    return found
+        figures["delay_us"] = float(np.median(matched))
+        figures["timing_us"], figures["timing_90_us"] = map(float, np.quantile(np.abs(matched), [0.5, 0.9]))
+    return figures
 
 
 def quiet_rates(events: NDArray, truth: NDArray, shape: tuple[int, int], duration_us: float) -> dict[str, float]:
@@ -94,8 +94,8 @@ def quiet_rates(events: NDArray, truth: NDArray, shape: tuple[int, int], duratio
     quiet = ~binary_dilation(busy, np.ones((3, 3), bool))
     count = int(np.count_nonzero(quiet))
     there = quiet[events["y"], events["x"]]
-    found: dict[str, float] = {"quiet_pixels": count}
+    rates: dict[str, float] = {"quiet_pixels": count}
     for name, sign in (("quiet_on_hz", 1), ("quiet_off_hz", -1)):
         total = np.count_nonzero(there & (events["polarity"] == sign))
-        found[name] = total / (count * duration_us / US_PER_S) if count else float("nan")
-    return found
+        rates[name] = total / (count * duration_us / US_PER_S) if count else float("nan")
+    return rates

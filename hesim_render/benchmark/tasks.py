@@ -64,8 +64,8 @@ class ClipTasks:
         if self._predictions is None:
             return {}
         full_scale = 2**self._clip.recording.mosaic.bit_depth - 1 if task in IN_DN else None
-        found = self._predictions.read(task, self._clip.name, item, shape, full_scale)
-        return {} if found is None else {"prediction": found}
+        prediction = self._predictions.read(task, self._clip.name, item, shape, full_scale)
+        return {} if prediction is None else {"prediction": prediction}
 
     def _truth(self, frame: Frame) -> tuple[float, NDArray] | None:
         """Time and RAW of the sharp image in the middle of a frame's exposure; None where there is none."""
@@ -105,10 +105,10 @@ class ClipTasks:
             truth = self._truth(frame)
             if truth is None:
                 continue
-            found = {"blurred": frame.raw.astype(np.float64)}
+            estimates = {"blurred": frame.raw.astype(np.float64)}
             if self._has_events():
-                found["double-integral"] = self._sharpened(frame, truth[0])
-            for name, raw in (found | self._predicted("deblur", frame.index, frame.raw.shape)).items():
+                estimates["double-integral"] = self._sharpened(frame, truth[0])
+            for name, raw in (estimates | self._predicted("deblur", frame.index, frame.raw.shape)).items():
                 yield self._score("deblur", name, frame.index, raw, truth[1])
 
     def interpolate(self) -> Iterator[Score]:
@@ -124,15 +124,15 @@ class ClipTasks:
             if truth is None:
                 continue
             first, last = before.raw.astype(np.float64), after.raw.astype(np.float64)
-            found = {"hold": first, "average": (first + last) / 2}
+            estimates = {"hold": first, "average": (first + last) / 2}
             if self._has_events():
                 t = truth[0]
                 weight = (t - _middle_us(before)) / (_middle_us(after) - _middle_us(before))
-                found["double-integral"] = (1 - weight) * self._sharpened(before, t) + weight * self._sharpened(
+                estimates["double-integral"] = (1 - weight) * self._sharpened(before, t) + weight * self._sharpened(
                     after, t
                 )
-            found |= self._predicted("interpolate", left_out.index, left_out.raw.shape)
-            for name, raw in found.items():
+            estimates |= self._predicted("interpolate", left_out.index, left_out.raw.shape)
+            for name, raw in estimates.items():
                 yield self._score("interpolate", name, left_out.index, raw, truth[1])
 
     def _score(self, task: str, method: str, item: int, raw: NDArray, truth: NDArray) -> Score:
@@ -179,14 +179,14 @@ class ClipTasks:
         for frame, after in zip(frames[:-1], frames[1:], strict=True):
             truth = stored.read("frames/flow_forward_px", frame.index)
             valid = stored.read("frames/visible_forward", frame.index) & np.isfinite(truth).all(axis=-1)
-            found: dict[str, NDArray] = {"zero": np.zeros(truth.shape)}
+            estimates: dict[str, NDArray] = {"zero": np.zeros(truth.shape)}
             if picture_methods():
                 first, second = self._development.grey_pair(frame.raw, after.raw)
-                found |= {name: of_pictures(name, first, second) for name in picture_methods()}
+                estimates |= {name: of_pictures(name, first, second) for name in picture_methods()}
             if self._has_events():
-                found["plane-fit"] = self._event_flow(_middle_us(frame), _middle_us(after))
-            found |= self._predicted("flow", frame.index, truth.shape)
-            for name, flow in found.items():
+                estimates["plane-fit"] = self._event_flow(_middle_us(frame), _middle_us(after))
+            estimates |= self._predicted("flow", frame.index, truth.shape)
+            for name, flow in estimates.items():
                 yield Score(self._clip.name, "flow", name, frame.index, flow_scores(flow, truth, valid))
 
     def _event_flow(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
@@ -208,9 +208,9 @@ class ClipTasks:
             with np.errstate(divide="ignore", invalid="ignore"):
                 truth = np.log(sharp.flux_e_per_s(number).astype(np.float64))
             events = self._clip.recording.event_slice(0, int(t_us) + 1)
-            found: dict[str, NDArray] = {"leaky-sum": leaky_sum(events, layout.shape, float(t_us), thresholds)}
-            found |= self._predicted("intensity", number, layout.shape)
-            for name, picture in found.items():
+            estimates: dict[str, NDArray] = {"leaky-sum": leaky_sum(events, layout.shape, float(t_us), thresholds)}
+            estimates |= self._predicted("intensity", number, layout.shape)
+            for name, picture in estimates.items():
                 yield Score(self._clip.name, "intensity", name, number, intensity_scores(picture, truth))
 
     def hdr(self) -> Iterator[Score]:
@@ -228,10 +228,10 @@ class ClipTasks:
                 continue
             truth, valid = sharp.flux_e_per_s(nearest), self._development.layout.aps_mask
             exposures = [flux_of(frame.raw, frame.exposure_us, aps, self._clip.recording.mosaic) for frame in frames]
-            found: dict[str, NDArray] = {"shortest": exposures[0].flux, "longest": exposures[-1].flux}
-            found["merge"] = merged(exposures)
-            found |= self._predicted("hdr", number, truth.shape)
-            for name, flux in found.items():
+            estimates: dict[str, NDArray] = {"shortest": exposures[0].flux, "longest": exposures[-1].flux}
+            estimates["merge"] = merged(exposures)
+            estimates |= self._predicted("hdr", number, truth.shape)
+            for name, flux in estimates.items():
                 yield Score(self._clip.name, "hdr", name, number, flux_scores(flux, truth, valid))
 
     def demosaic(self) -> Iterator[Score]:
@@ -249,9 +249,9 @@ class ClipTasks:
             raw = sharp.raw_dn(number).astype(np.float64)
             exposure_us = float(self._clip.content["exposure_us"] or aps.exposure_us)
             truth = development.full_dn(colours.flux_e_per_s(number)[..., order], exposure_us)
-            found = {"guided": development.demosaiced(raw), "bilinear": bilinear(raw, mosaic.tile_channel)}
-            found |= self._predicted("demosaic", number, truth.shape)
-            for name, channels in found.items():
+            estimates = {"guided": development.demosaiced(raw), "bilinear": bilinear(raw, mosaic.tile_channel)}
+            estimates |= self._predicted("demosaic", number, truth.shape)
+            for name, channels in estimates.items():
                 values = development.channel_scores(channels, truth)
                 yield Score(self._clip.name, "demosaic", name, number, values)
 

@@ -33,7 +33,7 @@ class Frames(Protocol):
 
 
 @dataclass(frozen=True)
-class Moments:
+class FrameMoments:
     """Statistics of a stack of frames, exposures in increasing order.
 
     Attributes
@@ -65,7 +65,9 @@ class Moments:
         return self.exposures_us.astype(np.float64) * 1e-6
 
 
-def measure(stack: Frames, used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None = None) -> Moments:
+def measure(
+    stack: Frames, used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None = None
+) -> FrameMoments:
     """Read a stack once. Sums of differences from the first frame are whole numbers, hence exact.
 
     Parameters
@@ -117,7 +119,7 @@ def measure(stack: Frames, used: NDArray[np.bool_], full_scale_dn: int, progress
             variance[k] = (squares - shift * total) / (frames - 1)
             if progress is not None:
                 progress(f"reading {stack.file.name}", (source + 1) / exposures)
-    return Moments(
+    return FrameMoments(
         np.sort(stack.exposures_us), frames, mean, variance, lowest, highest, first, row_means, half_means, half
     )  # fmt: skip
 

@@ -22,7 +22,7 @@ SENSOR_MAPS = {
     section: tuple(dict.fromkeys((*names, *RATES[section].names(), *COUNTED[section].names())))
     for section, names in (
         ("aps", ("n_row", "n_blc", "n_dp", "response")),
-        ("evs", ("bad_pixels", "threshold_on_relative", "threshold_off_relative")),
+        ("evs", ("bad_pixels", "threshold_on_rel", "threshold_off_rel")),
     )
 }
 

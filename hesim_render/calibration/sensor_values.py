@@ -12,7 +12,7 @@ from hesim_render.calibration.rates import rate_hz
 from hesim_render.calibration.spec import (
     AsynchronousSection,
     CalibrationSpec,
-    Estimate,
+    EstimateSpec,
     EventSection,
     FrameSection,
 )
@@ -119,7 +119,7 @@ def _evs_values(sensor: Mapping[str, Any], evs: EventSection, noise: NoiseFile) 
     own, file = sensor["evs"], noise.path
     if own.get("reference") != "previous_sample":
         raise SpecError("its events are of fixed comparisons; the sensor needs reference 'previous_sample'", file=file)
-    hardware = None if isinstance(evs.theta_hardware_v, Estimate) else evs.theta_hardware_v
+    hardware = None if isinstance(evs.theta_hardware_v, EstimateSpec) else evs.theta_hardware_v
     theta_v = 1.0 if hardware is None else hardware
     theta = evs.theta.value
     if theta is None:
@@ -196,7 +196,7 @@ def _asymmetry(evs: EventSection) -> float:
     return (off.value - on.value) / total
 
 
-def _needed(item: Estimate, key: str, file: Path) -> float:
+def _needed(item: EstimateSpec, key: str, file: Path) -> float:
     if item.value is None:
         raise SpecError(
             f"not identifiable, so that nothing can be simulated with it: {item.reason}", file=file, key=key

@@ -49,7 +49,7 @@ class _Section(Strict):
     model_config = ConfigDict(extra="allow")
 
 
-class Estimate(_Section):
+class EstimateSpec(_Section):
     """A parameter: a number with its standard error, or null and the reason why it is not known."""
 
     value: float | None
@@ -60,7 +60,7 @@ class Estimate(_Section):
     note: str = ""
 
     @model_validator(mode="after")
-    def _check(self) -> Estimate:
+    def _check(self) -> EstimateSpec:
         if self.value is None and self.reason is None:
             raise ValueError("value: null needs a reason beside it")
         return self
@@ -71,13 +71,13 @@ class Estimate(_Section):
         return math.inf if self.standard_error is None else self.standard_error
 
 
-class FullWell(Estimate):
+class FullWell(EstimateSpec):
     """Saturation capacity."""
 
     limited_by: Literal["ADC full scale", "full well"] | None = None
 
 
-class Finding(_Section):
+class FindingSpec(_Section):
     """A deviation of the captures from the assumptions of the noise model."""
 
     check: str
@@ -105,24 +105,24 @@ class FrameSection(_Section):
     goodness: FrameGoodness
     black_dn: float
     n_row_std_dn: float = Field(ge=0)
-    row_noise_dn: Estimate | None = Field(None, description="calibrations of before it was measured lack it")
-    column_noise_dn: Estimate | None = Field(None, description="of captures of EMVA 1288 alone, as the next six")
+    row_noise_dn: EstimateSpec | None = Field(None, description="calibrations of before it was measured lack it")
+    column_noise_dn: EstimateSpec | None = Field(None, description="of captures of EMVA 1288 alone, as the next six")
     column_offset_std_dn: float | None = Field(None, ge=0)
     nonlinearity: list[float] | None = Field(None, min_length=3, max_length=3)
-    read_noise_correlation: Estimate | None = None
+    read_noise_correlation: EstimateSpec | None = None
     interference: list[dict[str, float]] | None = None
-    responsivity: Estimate | None = None
-    quantum_efficiency: Estimate | None = None
+    responsivity: EstimateSpec | None = None
+    quantum_efficiency: EstimateSpec | None = None
     bad_pixels: NonNegativeInt
     telegraph_pixels: NonNegativeInt | None = Field(None, description="calibrations of before they were found lack it")
-    K: Estimate
-    read_noise_e: Estimate
-    dark_current_e_per_s: Estimate
+    K: EstimateSpec
+    read_noise_e: EstimateSpec
+    dark_current_e_per_s: EstimateSpec
     full_well_e: FullWell
-    dsnu_e: Estimate
-    prnu_percent: Estimate
-    linearity_error: Estimate
-    findings: list[Finding] = []
+    dsnu_e: EstimateSpec
+    prnu_percent: EstimateSpec
+    linearity_error: EstimateSpec
+    findings: list[FindingSpec] = []
     maps: MapsFile
     frame_rate_hz: PositiveFloat | None = Field(None, description="of the captures; older calibrations lack it")
 
@@ -135,10 +135,10 @@ class FrameSection(_Section):
 class EventParameters(_Section):
     """A, B, C and D of all event pixels together, or of a tile position."""
 
-    A: Estimate
-    B: Estimate
-    C: Estimate
-    D: Estimate
+    A: EstimateSpec
+    B: EstimateSpec
+    C: EstimateSpec
+    D: EstimateSpec
 
 
 class PositionParameters(EventParameters):
@@ -156,16 +156,18 @@ class EventGoodness(_Section):
 class EventSection(EventParameters):
     """``evs``: results from event counts and contrast steps."""
 
-    theta_hardware_v: PositiveFloat | Estimate
+    theta_hardware_v: PositiveFloat | EstimateSpec
     shot_law: Literal["linear", "sqrt"]
     positions: list[PositionParameters] = Field(min_length=1)
-    theta: Estimate
-    theta_on: Estimate
-    theta_off: Estimate
-    threshold_mismatch: Estimate
-    asymmetry: Estimate
-    leak_per_trial: Estimate
-    leak_rate_hz: Estimate | None = Field(None, description="missing where the period of the comparisons is not known")
+    theta: EstimateSpec
+    theta_on: EstimateSpec
+    theta_off: EstimateSpec
+    threshold_mismatch: EstimateSpec
+    asymmetry: EstimateSpec
+    leak_per_trial: EstimateSpec
+    leak_rate_hz: EstimateSpec | None = Field(
+        None, description="missing where the period of the comparisons is not known"
+    )
     tick_us: PositiveFloat | None = Field(
         None, description="period of the comparisons of the captures, µs; older calibrations lack it"
     )
@@ -175,7 +177,7 @@ class EventSection(EventParameters):
     defects: dict[Literal["stuck", "hot", "flickering", "other"], NonNegativeInt] | None = Field(
         None, description="bad pixels by what they do; calibrations of before they were named lack it"
     )
-    findings: list[Finding] = []
+    findings: list[FindingSpec] = []
     maps: MapsFile
 
     @property
@@ -184,7 +186,7 @@ class EventSection(EventParameters):
         return None if self.tick_us is None else self.tick_us * S_PER_US
 
 
-class NoiseInLight(Estimate):
+class NoiseInLight(EstimateSpec):
     """σ of ln x in one light."""
 
     signal_dn: float = Field(ge=0)
@@ -201,23 +203,23 @@ class AsynchronousGoodness(EventGoodness):
 
 
 class AsynchronousSection(_Section):
-    """``evs`` of a sensor without fixed comparisons: what trials after a reset told."""
+    """``evs`` of a sensor without fixed comparisons: from trials after a reset."""
 
     reference: Literal["last_event"]
     shot_law: Literal["linear", "sqrt"]
     beta: list[_Beta] = Field(min_length=1)
-    theta: Estimate
-    theta_on: Estimate
-    theta_off: Estimate
-    threshold_mismatch: Estimate
-    threshold_mismatch_on: Estimate
-    threshold_mismatch_off: Estimate
-    photoreceptor_cutoff_hz: Estimate
-    leak_rate_hz: Estimate
+    theta: EstimateSpec
+    theta_on: EstimateSpec
+    theta_off: EstimateSpec
+    threshold_mismatch: EstimateSpec
+    threshold_mismatch_on: EstimateSpec
+    threshold_mismatch_off: EstimateSpec
+    photoreceptor_cutoff_hz: EstimateSpec
+    leak_rate_hz: EstimateSpec
     noise: list[NoiseInLight] = []
     goodness: AsynchronousGoodness
     bad_pixels: NonNegativeInt
-    findings: list[Finding] = []
+    findings: list[FindingSpec] = []
     maps: MapsFile
 
     @property

@@ -131,13 +131,13 @@ def write_captures(
     if on_estimate is not None:
         shots = 0 if bench.aps is None else frames * (len(dark_exposures_us) + len(lit_exposures_us))
         gigabytes = shots * sensor.rows * sensor.cols * 2e-9
-        told = [f"{shots} frames, {gigabytes:.3g} GB"] if shots else []
+        parts_of_estimate = [f"{shots} frames, {gigabytes:.3g} GB"] if shots else []
         if plans:
             seconds = sum(plan.duration_s for plan in plans.values())
-            told.append(f"event pixels for {seconds:.3g} s, in {len(plans)} kinds of trials")
+            parts_of_estimate.append(f"event pixels for {seconds:.3g} s, in {len(plans)} kinds of trials")
         elif bench.evs is not None:
-            told.append(f"{2 * ticks + 2 * step_trials * _CONTRASTS} comparisons of event pixels")
-        on_estimate("; ".join(told))
+            parts_of_estimate.append(f"{2 * ticks + 2 * step_trials * _CONTRASTS} comparisons of event pixels")
+        on_estimate("; ".join(parts_of_estimate))
     folder = OutputFolder(out, CAPTURE_NAME, overwrite)
     try:
         with output_errors(folder.target):

@@ -63,21 +63,21 @@ class SceneRun:
         TooLongError
             If the run takes longer than `RunSettings.max_minutes`.
         """
-        renderer, told, most = self._renderer, self._progress, self._settings.max_minutes
+        renderer, report, most = self._renderer, self._progress, self._settings.max_minutes
         # a bar is worth the estimate of a run whose rays follow its changes; that of the exact mode renders pictures
-        is_shown = told is not None and renderer.auditable is not None
+        is_shown = report is not None and renderer.auditable is not None
         expected: Estimate | None = None
         if is_shown or on_estimate is not None or most is not None:
             expected = with_overheads(
-                renderer.estimate(self._demand, told), renderer.sensor, self._demand,
+                renderer.estimate(self._demand, report), renderer.sensor, self._demand,
                 audited=self._is_audited, rests=renderer.is_static,
             )  # fmt: skip
         if expected is not None and on_estimate is not None:
             on_estimate(expected)
         if expected is not None and most is not None:
             require_short(expected, most, f"a shorter --duration, a smaller --roi, or {self._cheaper()}")
-        if told is not None:
-            renderer.report(self._demand, expected, told)
+        if report is not None:
+            renderer.report(self._demand, expected, report)
         return expected
 
     def _cheaper(self) -> str:
@@ -131,9 +131,9 @@ class SceneRun:
         writer : of the recording.
         scene, sensor : as loaded, in the units of their files.
         """
-        told, kinds = self._progress, set(self._settings.kinds)
+        report, kinds = self._progress, set(self._settings.kinds)
         if kinds - {EVENTS}:
-            step = None if told is None else lambda done, total: told(done, total, "truth")
+            step = None if report is None else lambda done, total: report(done, total, "truth")
             writer.write_truth(SceneTruth(scene, sensor), step)
         if EVENTS in kinds:
             try:

@@ -97,9 +97,9 @@ def simulate(
     backend.jit()
     noise = noise_models(sensor, run_settings.clean, run_settings.without, TERMS)
     sensor = sensor.without([term for term in run_settings.without if term in LENS_TERMS])
-    with shown(progress, f"{scene.name} → {sensor.name}") as told:
-        if told is not None:
-            told(0, 1, "preparation")
+    with shown(progress, f"{scene.name} → {sensor.name}") as report:
+        if report is not None:
+            report(0, 1, "preparation")
         # the renderer sees lights in absolute units; the recording keeps the scene as it is written
         seen, level = in_absolute_light(scene)
         asked = run_settings.quality, run_settings.samples, run_settings.exact
@@ -109,10 +109,10 @@ def simulate(
         if level is not None:
             stated["light_level"] = level.as_dict()
         stated |= {"backend": backend.select().label, "camera": camera_used(source.view)}
-        run = SceneRun(source, noise, run_settings, told)
+        run = SceneRun(source, noise, run_settings, report)
         expected = run.expect(on_estimate)
         if expected is not None:
-            expect(told, expected.seconds)
+            expect(report, expected.seconds)
         with RecordingWriter(
             out, source.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=stated,
             overwrite=overwrite,

@@ -61,7 +61,7 @@ def lab(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Simulate dark and bright captures to calibrate from."""
+    """Simulate dark and lit captures to calibrate from."""
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     dark_us, lit_us = parse_exposures(dark_ms), parse_exposures(lit_ms)

@@ -112,12 +112,12 @@ def _system_libraries() -> list[Path]:
     for pattern in _SYSTEM_FOLDERS:
         root = Path("/")
         folders += sorted(root.glob(pattern.lstrip("/")))
-    found: dict[str, Path] = {}
+    libraries: dict[str, Path] = {}
     for folder in folders:
         for path in list(folder.glob("libLLVM[-.]*so*")) + list(folder.glob("libLLVM*.dylib")):
             if _major(path) >= OLDEST_LLVM:
-                found.setdefault(os.path.realpath(path), path)
-    return sorted(found.values(), key=_major, reverse=True)
+                libraries.setdefault(os.path.realpath(path), path)
+    return sorted(libraries.values(), key=_major, reverse=True)
 
 
 def _extra_library() -> tuple[str, tuple[str, ...]] | None:
@@ -138,19 +138,19 @@ def candidates() -> list[BackendCandidate]:
     forced = os.environ.get(BACKEND_VARIABLE, "").lower()
     if forced not in ("", "llvm", "cuda"):
         raise BackendError(f"{BACKEND_VARIABLE} is {forced!r}; expected 'llvm' or 'cuda'")
-    found: list[BackendCandidate] = []
+    listed: list[BackendCandidate] = []
     if forced != "llvm" and _has_cuda():
-        found.append(BackendCandidate("cuda", "GPU", ""))
+        listed.append(BackendCandidate("cuda", "GPU", ""))
     if forced != "cuda":
         given = os.environ.get("DRJIT_LIBLLVM_PATH")
         extra = _extra_library()
         if given and given != _chosen_here:
             preload = extra[1] if extra and given == extra[0] else ()  # inherited from a parent that chose it
-            found.append(BackendCandidate("llvm", "DRJIT_LIBLLVM_PATH", given, preload))
-        found += [BackendCandidate("llvm", "system", str(path)) for path in _system_libraries()]
+            listed.append(BackendCandidate("llvm", "DRJIT_LIBLLVM_PATH", given, preload))
+        listed += [BackendCandidate("llvm", "system", str(path)) for path in _system_libraries()]
         if extra:
-            found.append(BackendCandidate("llvm", "'llvm' extra", extra[0], extra[1]))
-    return found
+            listed.append(BackendCandidate("llvm", "'llvm' extra", extra[0], extra[1]))
+    return listed
 
 
 def _has_cuda() -> bool:

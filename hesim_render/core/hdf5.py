@@ -53,8 +53,8 @@ class Disk:
 
     def readinto(self, buffer: Any) -> int:
         view = memoryview(buffer).cast("B")
-        found = self._file.readinto(view) or 0
-        view[found:] = bytes(len(view) - found)  # data that were dropped
+        count = self._file.readinto(view) or 0
+        view[count:] = bytes(len(view) - count)  # data that were dropped
         return len(view)
 
     def truncate(self, size: int) -> int:
@@ -144,18 +144,18 @@ def dataset_of(file: Any, name: str, path: Path, kinds: str = "ui", also: Collec
         part = "/".join(parts[: k + 1])
         if not isinstance(file.get(part, getlink=True), h5py.HardLink):
             raise SpecError(f"{part} is a link to elsewhere", file=path)
-    found = file[name]
-    if not isinstance(found, h5py.Dataset) or found.dtype.kind not in kinds:
+    data = file[name]
+    if not isinstance(data, h5py.Dataset) or data.dtype.kind not in kinds:
         raise SpecError(f"{name} is no data set of {_KINDS.get(kinds, 'numbers')}", file=path)
-    layout = found.id.get_create_plist()
-    if found.is_virtual or layout.get_external_count():
+    layout = data.id.get_create_plist()
+    if data.is_virtual or layout.get_external_count():
         raise SpecError(f"{name} has its values in another file", file=path)
-    if found.chunks is not None:  # one is read whole, whatever part of it is asked for
-        require_memory(math.prod(found.chunks) * found.dtype.itemsize, f"a chunk of {name}", path, _LARGEST_CHUNK)
+    if data.chunks is not None:  # one is read whole, whatever part of it is asked for
+        require_memory(math.prod(data.chunks) * data.dtype.itemsize, f"a chunk of {name}", path, _LARGEST_CHUNK)
     for k in range(layout.get_nfilters()):
         if (used := layout.get_filter(k)[0]) not in {*_FILTERS, *also}:
             raise SpecError(f"{name} is packed by filter {used}; expected one of {sorted(_FILTERS)}", file=path)
-    return found
+    return data
 
 
 def read_dataset(path: Path, what: str, name: str, number: int | None = None, kinds: str = "fui") -> Any:
@@ -179,9 +179,9 @@ def read_dataset(path: Path, what: str, name: str, number: int | None = None, ki
     with reading(path, what), h5py.File(path, "r") as file:
         if name not in file:
             raise SpecError(f"has no {name}", file=path)
-        found = dataset_of(file, name, path, kinds)
-        if number is not None and not 0 <= number < (found.shape or (0,))[0]:
-            raise RangeError("number", number, f"0 to {(found.shape or (0,))[0] - 1}")
-        shape = found.shape if number is None else found.shape[1:]
-        require_memory(math.prod(shape) * found.dtype.itemsize, name, path, MOST_BYTES)
-        return found[()] if number is None else found[number]
+        data = dataset_of(file, name, path, kinds)
+        if number is not None and not 0 <= number < (data.shape or (0,))[0]:
+            raise RangeError("number", number, f"0 to {(data.shape or (0,))[0] - 1}")
+        shape = data.shape if number is None else data.shape[1:]
+        require_memory(math.prod(shape) * data.dtype.itemsize, name, path, MOST_BYTES)
+        return data[()] if number is None else data[number]

@@ -98,7 +98,7 @@ def read_arrays(
         If the file or a `required` array is missing, unreadable, of the wrong shape or kind, or larger than the memory
         limit of a map.
     """
-    found: dict[str, NDArray] = {}
+    arrays: dict[str, NDArray] = {}
     total = 0
     with reading(file, _WHAT), zipfile.ZipFile(file) as archive:
         names = require_names(archive, file, required)
@@ -110,8 +110,8 @@ def read_arrays(
                 _require_kind(shape, dtype, member, file, (shapes or {}).get(member), kinds)
                 total += math.prod(shape) * dtype.itemsize
                 require_memory(total, "all arrays together", file)
-                found[member] = _values(stream, shape, fortran_order, dtype, member, file)
-    return found
+                arrays[member] = _values(stream, shape, fortran_order, dtype, member, file)
+    return arrays
 
 
 def read_array(file: Path, shape: tuple[int, ...] | None = None, kinds: str = "") -> NDArray:
@@ -123,18 +123,18 @@ def read_array(file: Path, shape: tuple[int, ...] | None = None, kinds: str = ""
         If it cannot be read or fails a check.
     """
     with reading(file, "as an .npy file of numbers"), file.open("rb") as stream:
-        found = read_header(stream, "the array", file)
-        _require_kind(found[0], found[2], "the array", file, shape, kinds)
-        return _values(stream, *found, "the array", file)
+        header = read_header(stream, "the array", file)
+        _require_kind(header[0], header[2], "the array", file, shape, kinds)
+        return _values(stream, *header, "the array", file)
 
 
 def require_names(archive: zipfile.ZipFile, file: Path, required: Iterable[str]) -> list[str]:
     """Names of all arrays of an ``.npz`` file; the required ones must be among them."""
-    found = [name.removesuffix(".npy") for name in archive.namelist()]
+    names = [name.removesuffix(".npy") for name in archive.namelist()]
     for name in required:
-        if name not in found:
-            raise SpecError(f"holds no array {name!r} (found: {', '.join(found) or 'none'})", file=file)
-    return found
+        if name not in names:
+            raise SpecError(f"holds no array {name!r} (found: {', '.join(names) or 'none'})", file=file)
+    return names
 
 
 def member_header(file: Path, member: str) -> tuple[tuple[int, ...], np.dtype]:

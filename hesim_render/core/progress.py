@@ -303,7 +303,7 @@ def progress_report(title: str, stream: TextIO | None = None, first_s: float | N
 
 
 def expect(progress: Progress | None, seconds: float) -> None:
-    """Let a report know the estimated time of the run from now on, s; a function of a caller is not told."""
+    """Let a report know the estimated time of the run from now on, s; a function of a caller does not get it."""
     if isinstance(progress, ProgressReport):
         progress.expect(seconds)
 

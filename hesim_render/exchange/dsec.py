@@ -135,25 +135,25 @@ def _block(columns: Any, first: int, last: int, shape: tuple[int, int] | None, p
 
 def _column(file: Any, name: str, path: Path, kind: Any = np.uint64) -> Any:
     """A one-dimensional data set whose values are all stored, without fill values."""
-    found = dataset_of(file, name, path)
-    if found.dtype.kind != "u" or found.dtype.itemsize > np.dtype(kind).itemsize:
-        raise SpecError(f"{name} holds {found.dtype.name}; expected {np.dtype(kind).name}", file=path)
-    if found.ndim != 1:
-        raise SpecError(f"{name} has shape {found.shape}; expected one dimension", file=path)
-    size, item = found.shape[0], found.dtype.itemsize
-    if found.chunks is None:
-        stored = found.id.get_storage_size() >= size * item
+    column = dataset_of(file, name, path)
+    if column.dtype.kind != "u" or column.dtype.itemsize > np.dtype(kind).itemsize:
+        raise SpecError(f"{name} holds {column.dtype.name}; expected {np.dtype(kind).name}", file=path)
+    if column.ndim != 1:
+        raise SpecError(f"{name} has shape {column.shape}; expected one dimension", file=path)
+    size, item = column.shape[0], column.dtype.itemsize
+    if column.chunks is None:
+        stored = column.id.get_storage_size() >= size * item
     else:
-        require_memory(found.chunks[0] * item, f"a chunk of {name}", path, LARGEST_CHUNK_BYTES)
-        stored = found.id.get_num_chunks() >= -(-size // found.chunks[0])
+        require_memory(column.chunks[0] * item, f"a chunk of {name}", path, LARGEST_CHUNK_BYTES)
+        stored = column.id.get_num_chunks() >= -(-size // column.chunks[0])
     if not stored:
         raise SpecError(f"{name} holds fewer values than the {size} it says", file=path)
-    return found
+    return column
 
 
 def _offset(file: Any, path: Path) -> int:
-    found = dataset_of(file, "t_offset", path)
-    offset = int(found[()]) if found.shape == () else -1
+    stored = dataset_of(file, "t_offset", path)
+    offset = int(stored[()]) if stored.shape == () else -1
     if not 0 <= offset <= _LATEST_US:
         raise SpecError(f"t_offset must be one whole number of µs from 0 to {_LATEST_US}", file=path)
     return offset
@@ -161,10 +161,10 @@ def _offset(file: Any, path: Path) -> int:
 
 def _index(file: Any, total: int, path: Path) -> NDArray[np.int64]:
     """``ms_to_idx``: starts at 0, ends at the number of events, and never decreases."""
-    found = _column(file, "ms_to_idx", path)
-    if not 0 < found.shape[0] <= LONGEST_US // 1000 + 3:
-        raise SpecError(f"ms_to_idx holds {found.shape[0]} values; expected one for each ms", file=path)
-    index = found[:]
+    entries = _column(file, "ms_to_idx", path)
+    if not 0 < entries.shape[0] <= LONGEST_US // 1000 + 3:
+        raise SpecError(f"ms_to_idx holds {entries.shape[0]} values; expected one for each ms", file=path)
+    index = entries[:]
     if np.any(index[1:] < index[:-1]) or index[-1] > total:
         raise SpecError(f"ms_to_idx must run from 0 to the number of events, {total}, without going back", file=path)
     return index.astype(np.int64)

@@ -36,10 +36,10 @@ def exposure_triggers(begin_us: ArrayLike, end_us: ArrayLike) -> NDArray:
     [edge] of `TRIGGER_DTYPE`, on `EXPOSURE_CHANNEL`.
     """
     times = np.stack([np.asarray(begin_us, np.int64), np.asarray(end_us, np.int64)], axis=-1)
-    found = np.zeros(times.size, dtype=TRIGGER_DTYPE)
-    found["t_us"], found["channel"] = times.ravel(), EXPOSURE_CHANNEL
-    found["edge"] = np.tile(np.array([1, -1], np.int8), len(times))
-    return found
+    edges = np.zeros(times.size, dtype=TRIGGER_DTYPE)
+    edges["t_us"], edges["channel"] = times.ravel(), EXPOSURE_CHANNEL
+    edges["edge"] = np.tile(np.array([1, -1], np.int8), len(times))
+    return edges
 
 
 def exposures(triggers: NDArray, channel: int, count: int, file: str | Path) -> tuple[NDArray, NDArray]:
@@ -57,12 +57,12 @@ def exposures(triggers: NDArray, channel: int, count: int, file: str | Path) -> 
     SpecError
         If the line does not have `count` pulses that begin with a rising edge and end with a falling one.
     """
-    found = triggers[triggers["channel"] == channel]
-    begin, end = found[::2], found[1::2]
-    if found.size != 2 * count or np.any(begin["edge"] != 1) or np.any(end["edge"] != -1):
+    edges = triggers[triggers["channel"] == channel]
+    begin, end = edges[::2], edges[1::2]
+    if edges.size != 2 * count or np.any(begin["edge"] != 1) or np.any(end["edge"] != -1):
         lines = ", ".join(map(str, np.unique(triggers["channel"]))) or "none"
         raise SpecError(
-            f"has {found.size} edges of triggers on line {channel} (lines with triggers: {lines}); expected a rising "
+            f"has {edges.size} edges of triggers on line {channel} (lines with triggers: {lines}); expected a rising "
             f"and a falling one for each of {count} frames",
             file=file,
         )
@@ -77,13 +77,13 @@ def joined(parts: Iterable[NDArray], file: str | Path) -> NDArray:
     SpecError
         If there are more than `MOST_TRIGGERS`.
     """
-    found, count = [no_triggers()], 0
+    every, count = [no_triggers()], 0
     for part in parts:
         count += part.size
         if count > MOST_TRIGGERS:
             raise SpecError(f"has more than {MOST_TRIGGERS} edges of triggers", file=file)
-        found.append(part)
-    return np.concatenate(found)
+        every.append(part)
+    return np.concatenate(every)
 
 
 def merged(

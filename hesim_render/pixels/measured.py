@@ -151,7 +151,7 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
     polarity : ``on`` or ``off``.
     spread : relative standard deviation over pixels.
     """
-    name = f"threshold_{polarity}_relative"
+    name = f"threshold_{polarity}_rel"
     found = _read(layout, "evs", (name, "bad_pixels", "defect"))
     if found is None or name not in found[0]:
         return None

@@ -164,28 +164,28 @@ def images_at(
     number : which of them.
     """
     now = rows[number]
-    found: list[tuple[str, NDArray]] = []
+    arrays: list[tuple[str, NDArray]] = []
     if "depth" in kinds:
-        found += [("depth_m", truth.depth(now, grid)), ("distance_m", truth.distance(now, grid))]
+        arrays += [("depth_m", truth.depth(now, grid)), ("distance_m", truth.distance(now, grid))]
     if "normals" in kinds:
-        found.append(("normal", truth.normals(now, grid)))
+        arrays.append(("normal", truth.normals(now, grid)))
     if "position" in kinds:
-        found.append(("position_m", truth.position(now, grid)))
+        arrays.append(("position_m", truth.position(now, grid)))
     if "ids" in kinds:
         ids = truth.ids(now, grid)
-        found += [("object", ids.object), ("instance", ids.instance), ("material", ids.material)]
+        arrays += [("object", ids.object), ("instance", ids.instance), ("material", ids.material)]
     if "mixed" in kinds:
-        found.append(("mixed", truth.mixed(now, grid)))
+        arrays.append(("mixed", truth.mixed(now, grid)))
     if "flow" in kinds:
         for name, other in (("forward", number + 1), ("backward", number - 1)):
             if not 0 <= other < len(rows):
                 shape = truth.raster(grid).shape
-                found.append((f"flow_{name}_px", np.full((*shape, 2), np.nan, np.float32)))
-                found.append((f"visible_{name}", np.zeros(shape, np.bool_)))
+                arrays.append((f"flow_{name}_px", np.full((*shape, 2), np.nan, np.float32)))
+                arrays.append((f"visible_{name}", np.zeros(shape, np.bool_)))
                 continue
             flow = truth.flow(now, rows[other], grid)
-            found += [(f"flow_{name}_px", flow.flow_px), (f"visible_{name}", flow.visible)]
-    return found
+            arrays += [(f"flow_{name}_px", flow.flow_px), (f"visible_{name}", flow.visible)]
+    return arrays
 
 
 def _write_series(file: Any, truth: SceneTruth, request: TruthRequest) -> None:
@@ -266,6 +266,6 @@ class StoredTruth:
 
 
 def _names(file: Any) -> list[str]:
-    found: list[str] = []
-    file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Dataset) else None)
-    return found
+    names: list[str] = []
+    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names

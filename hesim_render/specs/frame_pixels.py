@@ -9,7 +9,7 @@ from pydantic import Field, PositiveInt, model_validator
 from hesim_render.specs.defects import TelegraphSpec
 from hesim_render.specs.files import Strict
 
-#: Smallest slope of a bent signal up to full scale; the light could not be told from the signal below.
+#: Smallest slope of a bent signal up to full scale; the light would not follow from the signal below.
 _LEAST_SLOPE = 0.05
 
 

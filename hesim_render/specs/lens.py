@@ -220,8 +220,8 @@ class LensSpec(Strict):
 
     def used_effects(self) -> dict[str, Any]:
         """Effects that are on, by name, as plain values; kernels are not listed."""
-        told = self.model_dump(mode="json", include=set(EFFECTS), exclude_none=True)
-        found = {name: told[name] for name, neutral in EFFECTS.items() if name in told and told[name] != neutral}
+        given = self.model_dump(mode="json", include=set(EFFECTS), exclude_none=True)
+        found = {name: given[name] for name, neutral in EFFECTS.items() if name in given and given[name] != neutral}
         if self.psf_fwhm_um > 0:
             found["psf"] = {"type": "gaussian", "image_height_mm": [0.0], "fwhm_um": [self.psf_fwhm_um]}
         if isinstance(found.get("psf"), dict):

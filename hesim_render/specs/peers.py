@@ -23,8 +23,8 @@ class Peer(Strict):
     )
     encoding: Literal["linear", "srgb"] = Field("linear", description="of the pictures that it expects")
     bits: Literal[8, 16] = 8
-    noise: bool = Field(False, description="told to the program, which switches its own noise on or off")
-    options: dict[str, Any] = Field({}, description="told to the program")
+    noise: bool = Field(False, description="given to the program, which switches its own noise on or off")
+    options: dict[str, Any] = Field({}, description="given to the program")
     timeout_s: float = Field(3600, gt=0, le=1e6)
 
 

@@ -1,4 +1,4 @@
-"""The file of a study of filter sets: what is combined, and what is told of each combination."""
+"""The file of a study of filter sets: what is combined, and which figures of each combination."""
 
 from __future__ import annotations
 

@@ -147,14 +147,14 @@ class Problem:
 
         types = jit()
         bounds = self.family.bounds()
-        found = {}
+        curves = {}
         for number, name in enumerate(self.vary):
             own = []
             for k, (low, high) in enumerate(bounds):
                 share = dr.gather(types.Float64, parameters, types.UInt32(number * len(bounds) + k))
                 own.append(low + (high - low) * share)
-            found[name] = self.family.transmittance(own)
-        return found
+            curves[name] = self.family.transmittance(own)
+        return curves
 
     def shares(self, parameters: Float64) -> list[Float64]:
         """Share of each frame filter in the frame pixels, at least `share_min`, sum 1."""
@@ -228,24 +228,24 @@ class Problem:
         """Parameters to start from, each 0 to 1."""
         rng = np.random.default_rng(self.spec.seed)
         low, high = np.array(self.family.bounds()).T
-        found = []
+        starts = []
         for _ in range(self.spec.starts):
             own = [(self.family.start(self.start_transmittance[name], rng) - low) / (high - low) for name in self.vary]
-            found.append(np.clip(np.concatenate([*own, *self._other_starts()]), 0, 1))
-        return found
+            starts.append(np.clip(np.concatenate([*own, *self._other_starts()]), 0, 1))
+        return starts
 
     def _other_starts(self) -> list[NDArray[np.float64]]:
         """Depth and shares as they are, as parameters."""
-        found = []
+        parameters = []
         if self.spec.silicon_depth_um is not None:
             least, most = self.spec.silicon_depth_um
-            found.append(np.array([(self._start_depth_um - least) / (most - least)]))
+            parameters.append(np.array([(self._start_depth_um - least) / (most - least)]))
         if self.spec.tile_px is not None:
             tile, free = self.tile(*self.spec.tile_px)
             filters = [self.filter_set.pixels[str(letter)].filter for letter in tile[free]]
             above = np.array([filters.count(name) / len(filters) for name in self.frames]) - self.spec.share_min
-            found.append(np.maximum(above, 0.02) / above.max())
-        return found
+            parameters.append(np.maximum(above, 0.02) / above.max())
+        return parameters
 
 
 def optimise(problem: Problem, progress: Callable[[float, float, str], None] | None = None) -> DesignResult:
@@ -267,14 +267,14 @@ def optimise(problem: Problem, progress: Callable[[float, float, str], None] | N
     for number, start in enumerate(problem.starts()):
         if progress is not None:
             progress(number, spec.starts, f"start {number + 1} of {spec.starts}")
-        found = minimize(
+        optimum = minimize(
             problem, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * start.size,
             options={"maxiter": spec.steps, "maxfun": 4 * spec.steps, "ftol": 1e-10, "gtol": 1e-8},
         )  # fmt: skip
-        costs.append([problem(start)[0], float(found.fun)])
-        evaluations += int(found.nfev) + 1
-        if best is None or found.fun < best.fun:
-            best = found
+        costs.append([problem(start)[0], float(optimum.fun)])
+        evaluations += int(optimum.nfev) + 1
+        if best is None or optimum.fun < best.fun:
+            best = optimum
     assert best is not None
     given = jit().Float64(np.ascontiguousarray(best.x))
     curves = problem.transmittances(given)

@@ -16,7 +16,7 @@ from hesim_render.specs.boards import (
     CircleGridTarget,
     LedGridTarget,
 )
-from hesim_render.targets.piece import Piece, around, box, cells, disc, patch_boxes, polygons_piece
+from hesim_render.targets.piece import TargetPiece, around, box, cells, disc, patch_boxes, polygons_piece
 
 #: Bits of a tag of the family 36h11 without its border, along a side.
 _TAG_BITS = 6
@@ -39,7 +39,7 @@ def opencv() -> Any:
     return cv2
 
 
-def checkerboard(target: CheckerboardTarget) -> list[Piece]:
+def checkerboard(target: CheckerboardTarget) -> list[TargetPiece]:
     """Squares of two reflectances; the top-left one is light."""
     boxes = patch_boxes(target.rows, target.cols, target.width_m, target.height_m, 1.0)
     is_light = np.add.outer(np.arange(target.rows), np.arange(target.cols)).ravel() % 2 == 0
@@ -49,7 +49,7 @@ def checkerboard(target: CheckerboardTarget) -> list[Piece]:
     return pieces
 
 
-def charuco(target: CharucoTarget) -> list[Piece]:
+def charuco(target: CharucoTarget) -> list[TargetPiece]:
     """A ChArUco board: OpenCV says where markers are and what is in them.
 
     Raises
@@ -95,7 +95,7 @@ def charuco_board(target: CharucoTarget) -> Any:
     return aruco.CharucoBoard((target.cols, target.rows), target.square_m, target.marker_m, dictionary, ids)
 
 
-def aprilgrid(target: AprilGridTarget) -> list[Piece]:
+def aprilgrid(target: AprilGridTarget) -> list[TargetPiece]:
     """A grid of AprilTags whose bits are those of OpenCV's dictionary of the family 36h11.
 
     Raises
@@ -128,7 +128,7 @@ def _board(
     dark: NDArray[np.bool_],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-) -> list[Piece]:
+) -> list[TargetPiece]:
     """A board from its cells; x and y from the top left corner of the pattern, m."""
     w, h = target.pattern_m
     light_boxes, dark_boxes = cells(dark, x - w / 2, h / 2 - y)
@@ -163,7 +163,7 @@ def disc_centres(target: CircleGridTarget | LedGridTarget) -> NDArray[np.float64
     return np.column_stack([x, h / 2 - (row + 0.5) * target.pitch_m])
 
 
-def disc_grid(target: CircleGridTarget | LedGridTarget) -> list[Piece]:
+def disc_grid(target: CircleGridTarget | LedGridTarget) -> list[TargetPiece]:
     """Dark discs on a light board, or lamps on a dark one."""
     centres, rim = disc_centres(target), disc(target.diameter_m / 2)
     asymmetric = isinstance(target, CircleGridTarget) and target.asymmetric

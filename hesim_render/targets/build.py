@@ -14,19 +14,19 @@ from hesim_render.specs import resolution as resolution_specs
 from hesim_render.specs.target import TargetSpec
 from hesim_render.targets import boards, charts, leaves, resolution
 from hesim_render.targets.image import image
-from hesim_render.targets.piece import Piece, bent, box, polygons_piece
+from hesim_render.targets.piece import TargetPiece, bent, box, polygons_piece
 from hesim_render.targets.points import placement
 
 #: Angle of the flat strips of a bent target. They depart from the cylinder by 1e-5 of its radius at most.
 _STRIP_RAD = 0.009
 
 
-def _flat(target: chart_specs.FlatTarget) -> list[Piece]:
+def _flat(target: chart_specs.FlatTarget) -> list[TargetPiece]:
     w, h = target.width_m / 2, target.height_m / 2
     return [polygons_piece("flat", target.reflectance.load(), [box(-w, w, -h, h)])]
 
 
-_BUILDERS: dict[type, Callable[[Any], list[Piece]]] = {
+_BUILDERS: dict[type, Callable[[Any], list[TargetPiece]]] = {
     chart_specs.FlatTarget: _flat,
     chart_specs.ColorCheckerTarget: charts.colorchecker,
     chart_specs.PatchChartTarget: charts.patch_chart,
@@ -49,7 +49,7 @@ _BUILDERS: dict[type, Callable[[Any], list[Piece]]] = {
 }
 
 
-def build_target(target: TargetSpec) -> list[Piece]:
+def build_target(target: TargetSpec) -> list[TargetPiece]:
     """The pieces of a target before its tilt and shift; flat, they tile its rectangle exactly, without overlap.
 
     Raises
@@ -70,13 +70,13 @@ def build_target(target: TargetSpec) -> list[Piece]:
     return [bent(piece, radius, abs(radius) * _STRIP_RAD) for piece in pieces]
 
 
-def placed_pieces(target: TargetSpec) -> list[Piece]:
+def placed_pieces(target: TargetSpec) -> list[TargetPiece]:
     """The pieces of a target at their place at rest."""
     pose = placement(target)
     pieces = build_target(target)
     if np.array_equal(pose, np.eye(4)):
         return pieces
     return [
-        Piece(p.name, p.reflectance, p.vertices_m @ pose[:3, :3].T + pose[:3, 3], p.faces, p.uv, p.radiance)
+        TargetPiece(p.name, p.reflectance, p.vertices_m @ pose[:3, :3].T + pose[:3, 3], p.faces, p.uv, p.radiance)
         for p in pieces
     ]

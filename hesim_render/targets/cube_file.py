@@ -51,24 +51,24 @@ def open_cube(file: Path, wavelength_nm: Sequence[float] | None = None) -> CubeF
     if not file.exists():
         raise SpecError("no such file", file=file)
     with reading(file, "as a cube"):
-        found = reader(file)
-    if min(found.shape) < 1 or found.shape[2] < 2:
-        raise SpecError(f"expected a cube [row, col, wavelength], found {found.shape}", file=file)
+        cube = reader(file)
+    if min(cube.shape) < 1 or cube.shape[2] < 2:
+        raise SpecError(f"expected a cube [row, col, wavelength], found {cube.shape}", file=file)
     if wavelength_nm is not None:
-        if found.wavelength_nm is not None:
+        if cube.wavelength_nm is not None:
             raise SpecError("has wavelengths of its own: leave wavelength_nm out", file=file, key="wavelength_nm")
-        found = replace(found, wavelength_nm=np.asarray(wavelength_nm, dtype=np.float64))
-    bands = found.wavelength_nm
+        cube = replace(cube, wavelength_nm=np.asarray(wavelength_nm, dtype=np.float64))
+    bands = cube.wavelength_nm
     if bands is None:
         raise SpecError("says no wavelengths: give them (wavelength_nm)", file=file, key="wavelength_nm")
-    if bands.shape != (found.shape[2],):
+    if bands.shape != (cube.shape[2],):
         raise SpecError(
-            f"the cube has {found.shape[2]} planes and wavelength_nm {bands.size} values", file=file,
+            f"the cube has {cube.shape[2]} planes and wavelength_nm {bands.size} values", file=file,
             key="wavelength_nm",
         )  # fmt: skip
     if not (np.isfinite(bands).all() and np.all(np.diff(bands) > 0)):
         raise SpecError("the wavelengths of a cube must increase", file=file, key="wavelength_nm")
-    return found
+    return cube
 
 
 def _npy(file: Path) -> CubeFile:
@@ -118,27 +118,27 @@ def _exr(file: Path) -> CubeFile:
     units = header.get("emissiveUnits", b"")
     is_absolute = (units.decode() if isinstance(units, bytes) else units) == RADIANCE_UNITS
     for pattern in EXR_CHANNELS:
-        found = sorted(
+        channels = sorted(
             (float(match[1].replace(",", ".")), name) for name in names if (match := pattern.fullmatch(name))
         )
-        if len(found) >= 2:
+        if len(channels) >= 2:
             break
     else:
         some = ", ".join(sorted(names)[:8])
         raise SpecError(f"expected channels T.550,0nm … or w550nm … (a picture: R, G, B); found {some}", file=file)
-    if any((names[name].xSampling, names[name].ySampling) != (1, 1) for _, name in found):
+    if any((names[name].xSampling, names[name].ySampling) != (1, 1) for _, name in channels):
         raise SpecError("its channels do not have the same pixels", file=file)
     window = header["dataWindow"]
     top, rows, cols = window.min.y, window.max.y - window.min.y + 1, window.max.x - window.min.x + 1
-    chosen = [name for _, name in found]
+    chosen = [name for _, name in channels]
 
     def read(first: int, end: int) -> NDArray[np.float32]:
         kind = Imath.PixelType(Imath.PixelType.FLOAT)
         lines = opened.channels(chosen, kind, top + first, top + end - 1)
         return np.stack([np.frombuffer(each, np.float32).reshape(end - first, cols) for each in lines], axis=-1)
 
-    bands = np.array([wavelength for wavelength, _ in found])
-    return CubeFile(file, (rows, cols, len(found)), bands, read, "EXR", is_absolute=is_absolute)
+    bands = np.array([wavelength for wavelength, _ in channels])
+    return CubeFile(file, (rows, cols, len(channels)), bands, read, "EXR", is_absolute=is_absolute)
 
 
 def _of_planes(planes: Sequence[NDArray]) -> Rows:

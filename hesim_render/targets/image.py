@@ -8,7 +8,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.charts import ImageTarget
 from hesim_render.specs.reflectance import PictureFile
 from hesim_render.targets.cube import read_cube
-from hesim_render.targets.piece import Picture, Piece, picture_piece
+from hesim_render.targets.piece import Picture, TargetPiece, picture_piece
 
 #: Wavelengths up to which the first and the last plane of a cube are held, nm; all responses lie between them.
 _HELD_NM = (300.0, 1100.0)
@@ -16,7 +16,7 @@ _HELD_NM = (300.0, 1100.0)
 _ROUNDING = 1e-6
 
 
-def image(target: ImageTarget) -> list[Piece]:
+def image(target: ImageTarget) -> list[TargetPiece]:
     """A rectangle with the picture of a file, from edge to edge.
 
     Raises

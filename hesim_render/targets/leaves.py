@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.specs.charts import DeadLeavesTarget
-from hesim_render.targets.piece import Picture, Piece, picture_piece, require_texels
+from hesim_render.targets.piece import Picture, TargetPiece, picture_piece, require_texels
 
 #: Leaves drawn at a time.
 _BATCH = 4096
 
 
-def dead_leaves(target: DeadLeavesTarget) -> list[Piece]:
+def dead_leaves(target: DeadLeavesTarget) -> list[TargetPiece]:
     """Discs that hide each other, from the front to the back, until nothing is left uncovered.
 
     A texel has the grey of the front-most disc over its centre [cao2010]. Discs fall evenly on the target widened by

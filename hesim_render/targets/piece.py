@@ -39,7 +39,7 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class TargetPiece:
     """Part of a target with one reflectance, or with a picture.
 
     Parameters
@@ -62,7 +62,7 @@ class Piece:
 
 def polygons_piece(
     name: str, reflectance: Spectrum, polygons: Sequence[ArrayLike], radiance: Spectrum | None = None
-) -> Piece:
+) -> TargetPiece:
     """Convex polygons, each [k, 2] counter-clockwise, as one mesh of triangle fans."""
     vertices: list[NDArray[np.float64]] = []
     faces: list[tuple[int, int, int]] = []
@@ -72,7 +72,7 @@ def polygons_piece(
         vertices.append(np.column_stack([points, np.zeros(len(points))]))
         faces += [(base, base + k, base + k + 1) for k in range(1, len(points) - 1)]
         base += len(points)
-    return Piece(name, reflectance, np.concatenate(vertices), np.array(faces, dtype=np.uint32), radiance=radiance)
+    return TargetPiece(name, reflectance, np.concatenate(vertices), np.array(faces, dtype=np.uint32), radiance=radiance)
 
 
 def picture_piece(
@@ -81,11 +81,11 @@ def picture_piece(
     width_m: float,
     height_m: float,
     uv: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 1.0),
-) -> Piece:
+) -> TargetPiece:
     """A picture on a rectangle; `uv` are the u of its left and right side and the v of its lower and upper one."""
     u0, u1, v0, v1 = uv
     corners = np.array(box(-width_m / 2, width_m / 2, -height_m / 2, height_m / 2))
-    return Piece(
+    return TargetPiece(
         name,
         picture,
         np.column_stack([corners, np.zeros(4)]),
@@ -186,7 +186,7 @@ def cells(dark: NDArray[np.bool_], x: NDArray[np.float64], y: NDArray[np.float64
     return found
 
 
-def bent(piece: Piece, radius_m: float, step_m: float) -> Piece:
+def bent(piece: TargetPiece, radius_m: float, step_m: float) -> TargetPiece:
     """A piece on a cylinder about an axis parallel to y; lengths along the surface stay.
 
     Triangles are cut at lines of equal x, `step_m` apart, and each part is flat.
@@ -209,7 +209,7 @@ def bent(piece: Piece, radius_m: float, step_m: float) -> Piece:
     vertices = on_cylinder(flat[:, :2], radius_m)
     faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
     own_uv = None if piece.uv is None else flat[:, 2:]
-    return Piece(piece.name, piece.reflectance, vertices, faces, own_uv, piece.radiance)
+    return TargetPiece(piece.name, piece.reflectance, vertices, faces, own_uv, piece.radiance)
 
 
 def on_cylinder(flat: NDArray[np.float64], radius_m: float) -> NDArray[np.float64]:

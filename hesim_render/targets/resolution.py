@@ -17,7 +17,7 @@ from hesim_render.specs.resolution import (
 )
 from hesim_render.targets.piece import (
     Picture,
-    Piece,
+    TargetPiece,
     around,
     box,
     patch_boxes,
@@ -33,7 +33,7 @@ _RIM_STEP_RAD = radians(0.5)
 _TEXELS_PER_CYCLE = 24
 
 
-def slanted_edge(target: SlantedEdgeTarget) -> list[Piece]:
+def slanted_edge(target: SlantedEdgeTarget) -> list[TargetPiece]:
     """One edge through the centre, turned clockwise from the vertical: its upper end leans to the right."""
     w, h = target.width_m / 2, target.height_m / 2
     lean = tan(radians(target.angle_deg))
@@ -52,7 +52,7 @@ def slanted_edge(target: SlantedEdgeTarget) -> list[Piece]:
     ]
 
 
-def edge_field(target: EdgeFieldTarget) -> list[Piece]:
+def edge_field(target: EdgeFieldTarget) -> list[TargetPiece]:
     """Turned squares, each in a cell of its own."""
     cells = patch_boxes(target.rows, target.cols, target.width_m, target.height_m, 1.0)
     half = target.fill * min(target.width_m / target.cols, target.height_m / target.rows) / 2
@@ -69,7 +69,7 @@ def edge_field(target: EdgeFieldTarget) -> list[Piece]:
     return [polygons_piece("dark", target.dark.load(), dark), polygons_piece("light", target.light.load(), light)]
 
 
-def siemens_star(target: SiemensStarTarget) -> list[Piece]:
+def siemens_star(target: SiemensStarTarget) -> list[TargetPiece]:
     """Sectors of a disc that fills the smaller side; the first dark one begins at the +x axis, counter-clockwise."""
     w, h = target.width_m / 2, target.height_m / 2
     radius = min(w, h)
@@ -106,7 +106,7 @@ def _on_rectangle(angle: float, half_width: float, half_height: float) -> tuple[
     return reach * c, reach * s
 
 
-def resolution_wedges(target: ResolutionWedgesTarget) -> list[Piece]:
+def resolution_wedges(target: ResolutionWedgesTarget) -> list[TargetPiece]:
     """Two wedges, each in a half of the target.
 
     Raises
@@ -160,7 +160,7 @@ def _wedge(
     return dark, light
 
 
-def zone_plate(target: ZonePlateTarget) -> list[Piece]:
+def zone_plate(target: ZonePlateTarget) -> list[TargetPiece]:
     """Sinusoidal rings as a picture with square texels.
 
     Raises

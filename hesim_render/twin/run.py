@@ -81,7 +81,7 @@ def make_twin(
             calibration = folder.path / "calibration.yaml"
             result = calibrate_pairs(fitted, calibration, progress=progress)
             sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
-            bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_relative"], seed)
+            bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_rel"], seed)
             real = Half(
                 pair_levels(held, held.lit, progress), pair_levels(held, held.dark, progress),
                 long_series(held, False, progress), long_series(held, True, progress),

@@ -24,13 +24,13 @@ class TwinBench:
     ----------
     sensor : the twin.
     result : the calibration that it has, with the light's offset and responsivity.
-    light_relative : [row, col], shading of the light.
+    light_rel : [row, col], shading of the light.
     seed : of all temporal noise.
     """
 
-    def __init__(self, sensor: Sensor, result: PairCalibration, light_relative: NDArray, seed: int) -> None:
+    def __init__(self, sensor: Sensor, result: PairCalibration, light_rel: NDArray, seed: int) -> None:
         self._sensor, self._result, self._seed = sensor, result, seed
-        self._shading = light_relative.astype(np.float64)
+        self._shading = light_rel.astype(np.float64)
         self._frame = 0
 
     def electrons(self, light: float) -> NDArray[np.float64]:

@@ -122,7 +122,7 @@ def test_each_pixel_has_its_own_threshold_and_error(plain):
     """z of 1024 pixels: mean and standard deviation as of a normal law (5 σ: 0.16 and 0.11)."""
     _, section, maps, on, off = plain
     for name, truth in (("on", on), ("off", off)):
-        found = maps[f"threshold_{name}_relative"].ravel() * section[f"theta_{name}"]["value"]
+        found = maps[f"threshold_{name}_rel"].ravel() * section[f"theta_{name}"]["value"]
         error = maps[f"threshold_{name}_noise"].ravel() * section[f"theta_{name}"]["value"]
         z = (found - truth) / error
         assert abs(z.mean()) < 0.3 and z.std() == pytest.approx(1.0, abs=0.12)
@@ -427,7 +427,7 @@ def test_a_session_of_davis346_gives_its_own_parameters_back(session):
     assert section["bad_pixels"] == 0 and section["findings"] == [] and section["shot_law"] == "sqrt"
     maps = read_maps(folder / "calibration.yaml", "evs")
     for name, truth in (("on", sensor.evs.threshold_on_map), ("off", sensor.evs.threshold_off_map)):
-        assert np.corrcoef(maps[f"threshold_{name}_relative"].ravel(), truth.ravel())[0, 1] > 0.95
+        assert np.corrcoef(maps[f"threshold_{name}_rel"].ravel(), truth.ravel())[0, 1] > 0.95
 
 
 @pytest.mark.slow

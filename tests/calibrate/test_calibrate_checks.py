@@ -15,7 +15,7 @@ from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import goodness as event_goodness
 from hesim_render.calibrate.evs import output as event_output
 from hesim_render.calibrate.evs.counts import read_static
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.calibrate.report.parts import findings
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.recording.capture_set import read_captures
@@ -103,7 +103,7 @@ def test_row_noise_of_few_wide_and_narrow_rows_has_no_bias():
         stack = 100 + rng.normal(0, 1, (1, 6, 12, 8)) + rng.normal(0, 2, (1, 6, 12, 1))
         mean, variance = stack.mean(axis=1), stack.var(axis=1, ddof=1).astype(np.float32)
         ends = np.full(mean.shape, 100, np.uint16)
-        moments = Moments(np.array([1000]), 6, mean, variance, ends, ends, ends, stack.mean(axis=3),
+        moments = FrameMoments(np.array([1000]), 6, mean, variance, ends, ends, ends, stack.mean(axis=3),
                           np.zeros((1, 6, 2)), np.zeros(mean.shape, np.int8))  # fmt: skip
         found.append(common_mode.row_noise(moments, used).variance)
         left.append(common_mode.without_rows(moments, used, 1023, 4.0).variance.mean())
@@ -119,7 +119,7 @@ def test_the_error_of_the_row_noise_is_its_scatter():
         stack = 100 + rng.normal(0, 3, (1, 5, 30, 64)) + rng.normal(0, 0.7, (1, 5, 30, 1))
         mean, variance = stack.mean(axis=1), stack.var(axis=1, ddof=1).astype(np.float32)
         ends = np.full(mean.shape, 100, np.uint16)
-        moments = Moments(np.array([1000]), 5, mean, variance, ends, ends, ends, stack.mean(axis=3),
+        moments = FrameMoments(np.array([1000]), 5, mean, variance, ends, ends, ends, stack.mean(axis=3),
                           np.zeros((1, 5, 2)), np.zeros(mean.shape, np.int8))  # fmt: skip
         found.append(common_mode.row_noise(moments, used))
     assert np.median([each.error for each in found]) == pytest.approx(
@@ -237,7 +237,7 @@ def test_drift_of_black_and_of_light_are_told_apart_to_the_number():
     flat = np.full((1, size, size), 9.0, np.float32)
     empty = np.zeros((1, size, size), np.uint16)
     rows = np.zeros((1, frames, size))
-    moments = Moments(np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None])
+    moments = FrameMoments(np.array([1000]), frames, flat, flat, empty, empty, empty, rows, means[None], half[None])
     drift = common_mode.frame_drift(moments, 0, 0.0, levels[half])
     assert drift.black.variance == pytest.approx(black[1:].var(ddof=1), rel=0.05)
     assert drift.light.variance == pytest.approx(light[1:].var(ddof=1), rel=0.02)

@@ -148,7 +148,7 @@ def test_mismatch_is_recovered_and_part_of_the_fit(mismatched):
     # The map is the pixels' own thresholds: it correlates with the truth as 0.03 against 0.0133 of noise allow.
     true = np.random.default_rng(3).standard_normal((256, 256))
     good = ~maps["bad_pixels"]
-    pixel = (maps["threshold_on_relative"] + maps["threshold_off_relative"])[good] / 2
+    pixel = (maps["threshold_on_rel"] + maps["threshold_off_rel"])[good] / 2
     assert np.corrcoef(pixel, true[good])[0, 1] > 0.9
 
 

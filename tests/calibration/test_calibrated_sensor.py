@@ -88,7 +88,7 @@ def test_a_sensor_that_was_loaded_needs_no_file(folder, tmp_path, used):
     # the measured maps are in those bits
     offset = kept["pickle"].aps.fixed_pattern.offset_dn
     np.testing.assert_allclose(offset - offset.mean(), sum_of(maps[0]), atol=1e-3)
-    known = maps[1]["threshold_on_relative"].ravel()
+    known = maps[1]["threshold_on_rel"].ravel()
     assert np.corrcoef(kept["pickle"].evs.threshold_on_map.ravel(), known)[0, 1] > 0.999
 
 

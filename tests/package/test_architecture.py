@@ -141,6 +141,19 @@ def test_calibration_runs_where_drjit_and_mitsuba_cannot_be_imported():
             assert all(other.endswith(".formulas") for other in pixels), name
 
 
+def test_a_class_has_a_name_of_its_own():
+    """Two things of one name cannot be distinguished in a search, a traceback or a sentence."""
+    homes = {}
+    for name, path in MODULES.items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(name)
+    twice = {name: found for name, found in homes.items() if len(found) > 1}
+    assert not {
+        name for name in twice if not all(home.startswith("hesim_render.sources.render") for home in twice[name])
+    }
+
+
 @pytest.mark.parametrize("kind", ("aps", "evs"))
 def test_formulas_draw_nothing_and_need_no_device(kind):
     """They stand on the array namespace alone: no generator, no backend, no sampler."""

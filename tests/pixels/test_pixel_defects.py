@@ -9,7 +9,7 @@ from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibratio
 from hesim_render.calibrate.aps.telegraph import _suspects, fit_two_levels
 from hesim_render.calibrate.evs.counts import read_static
 from hesim_render.calibrate.flicker import dynamics, unsteady
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture.lab import write_captures
 from hesim_render.capture.noise_terms import noise_models
@@ -484,7 +484,7 @@ def test_variances_of_good_pixels_are_not_looked_at():
     variance = true * rng.chisquare(frames - 1, true.shape) / (frames - 1)
     mean = 64 + dark + np.sqrt(true / frames) * rng.standard_normal(true.shape)
     level = np.full(true.shape, 64, np.uint16)
-    moments = Moments(
+    moments = FrameMoments(
         np.rint(EXPOSURES_S * 1e6).astype(np.int64), frames, mean.astype(np.float32), variance.astype(np.float32),
         level, level, level, np.empty(0), np.empty(0), np.empty(0, np.int8),
     )  # fmt: skip

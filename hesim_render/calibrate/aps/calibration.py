@@ -19,7 +19,7 @@ from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.photon_transfer import linearity, photon_transfer
 from hesim_render.calibrate.aps.telegraph import TelegraphMaps, find_telegraph
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_variance, join, pool, variance_map
-from hesim_render.calibrate.moments import Moments, Progress, measure
+from hesim_render.calibrate.moments import FrameMoments, Progress, measure
 from hesim_render.calibrate.result import check_calibration, check_report, write_section
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
@@ -91,7 +91,7 @@ def describe(captures: CaptureSet) -> dict[str, Any]:
 
 def _read(
     stacks: tuple[FrameStack, FrameStack], used: NDArray[np.bool_], full_scale_dn: int, progress: Progress | None
-) -> list[Moments]:
+) -> list[FrameMoments]:
     """Read both stacks in parallel. Decompression takes most of the time and releases Python's lock."""
     with ThreadPoolExecutor(2) as pool_of_two:
         return list(pool_of_two.map(lambda stack: measure(stack, used, full_scale_dn, progress), stacks))
@@ -114,8 +114,12 @@ def used_pixels(captures: CaptureSet, shape: tuple[int, ...]) -> NDArray[np.bool
 
 
 def analyse(
-    captures: CaptureSet, dark_moments: Moments, lit: Moments, used: NDArray[np.bool_], telegraph: TelegraphMaps
-) -> tuple[ApsCalibration, Moments, Moments]:
+    captures: CaptureSet,
+    dark_moments: FrameMoments,
+    lit: FrameMoments,
+    used: NDArray[np.bool_],
+    telegraph: TelegraphMaps,
+) -> tuple[ApsCalibration, FrameMoments, FrameMoments]:
     """Everything the frames' moments tell.
 
     Parameters
@@ -176,7 +180,9 @@ def analyse(
     return result, dark_moments, lit
 
 
-def _check_light(dark: DarkModel, lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int) -> None:
+def _check_light(
+    dark: DarkModel, lit: FrameMoments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int
+) -> None:
     if np.mean(lit.highest[:, good] >= full_scale_dn) > 0.98:
         raise SpecError("the lit frames are saturated at every exposure; capture shorter exposures or less light")
     k = len(signals) - 1
@@ -193,8 +199,8 @@ def _fit(
     positions: list[Position],
     tile: tuple[int, int],
     dark: DarkModel,
-    dark_moments: Moments,
-    lit: Moments,
+    dark_moments: FrameMoments,
+    lit: FrameMoments,
     signals: NDArray,
     good: NDArray[np.bool_],
     dark_clear: NDArray[np.bool_],
@@ -224,8 +230,8 @@ def _fit(
 
 def _unlike_their_kind(
     beta: NDArray,
-    dark: Moments,
-    lit: Moments,
+    dark: FrameMoments,
+    lit: FrameMoments,
     signals: NDArray,
     dark_clear: NDArray[np.bool_],
     usable: NDArray[np.bool_],

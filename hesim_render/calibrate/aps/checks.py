@@ -16,7 +16,7 @@ from scipy.stats import norm
 from hesim_render.calibrate.aps.common_mode import FrameDrift, Shared, frame_drift
 from hesim_render.calibrate.aps.fitted import ApsCalibration
 from hesim_render.calibrate.finding import ALARM, Finding
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, polynomial
 
 #: Fractions of the temporal variance and of a parameter's standard error below which a drift is harmless.
@@ -58,7 +58,7 @@ class FrameChecks:
     findings: list[Finding]
 
 
-def check_frames(result: ApsCalibration, dark: Moments, lit: Moments) -> FrameChecks:
+def check_frames(result: ApsCalibration, dark: FrameMoments, lit: FrameMoments) -> FrameChecks:
     """Every check of the frames.
 
     Parameters
@@ -153,7 +153,7 @@ def _worst(drifts: list[tuple[FrameDrift, Shared]], least: float) -> tuple[Frame
     return drift, p_value
 
 
-def _line(result: ApsCalibration, dark: Moments, rows: float) -> Finding | None:
+def _line(result: ApsCalibration, dark: FrameMoments, rows: float) -> Finding | None:
     """Dark means that do not lie on a straight line of exposure, all pixels together."""
     t = dark.exposures_s
     good = ~result.bad & ~result.dark.bad & ~result.dark.hot
@@ -179,7 +179,7 @@ def _line(result: ApsCalibration, dark: Moments, rows: float) -> Finding | None:
     )
 
 
-def _proportions(result: ApsCalibration, lit: Moments, rows: float) -> list[Proportion]:
+def _proportions(result: ApsCalibration, lit: FrameMoments, rows: float) -> list[Proportion]:
     """Least squares of signal − rate · exposure over the usable pixels of each exposure: a shift and a proportional
     part.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_law
 
 from hesim_render.calibrate.finding import ALARM
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 
 #: Least fraction of a row that is not clipped for which the row's own sample of its noise is used.
 _LEAST_CLEAR = 0.2
@@ -52,7 +52,7 @@ class Shared:
         return float(np.sqrt(max(self.variance, 0.0)))
 
 
-def row_noise(dark: Moments, used: NDArray[np.bool_]) -> Shared:
+def row_noise(dark: FrameMoments, used: NDArray[np.bool_]) -> Shared:
     """Temporal row noise in DN² of the dark frames, all exposures together.
 
     Lit frames are not suitable: flickering light changes bright rows more than dim ones.
@@ -82,7 +82,7 @@ def row_noise(dark: Moments, used: NDArray[np.bool_]) -> Shared:
     return Shared(scale * (ratio - 1), error, ratio, float(f_law.sf(ratio, freedom, behind)))
 
 
-def without_rows(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, typical: float) -> Moments:
+def without_rows(moments: FrameMoments, used: NDArray[np.bool_], full_scale_dn: int, typical: float) -> FrameMoments:
     """The moments with temporal row noise subtracted from the sample variances.
 
     The subtracted value is the rows' own sample of the noise in these frames. Subtracting the expected value would
@@ -107,7 +107,9 @@ def without_rows(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, 
     return replace(moments, variance=variance)
 
 
-def _row_changes(moments: Moments, k: int, used: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _row_changes(
+    moments: FrameMoments, k: int, used: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Changes of the rows' means from frame to frame, and the part of their variance due to the pixels' own noise.
 
     Parameters
@@ -151,7 +153,7 @@ class FrameDrift:
     light_range: float
 
 
-def frame_drift(moments: Moments, k: int, row_variance: float, signal_dn: NDArray | None) -> FrameDrift:
+def frame_drift(moments: FrameMoments, k: int, row_variance: float, signal_dn: NDArray | None) -> FrameDrift:
     """Drift of the frames of an exposure: of the black level in the dark; of black level and light separately in the
     light.
 

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from hesim_render.calibrate.aps.dark import DarkModel
 from hesim_render.calibrate.aps.variance import variance_map
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.specs.sensor import SensorSpec
 from hesim_render.spectral import spectrum as spectra
@@ -35,12 +35,12 @@ class Composite:
     standard_error_dn_per_s: NDArray[np.float32]
 
 
-def light_signal(lit: Moments, dark: DarkModel, k: int) -> NDArray[np.float32]:
+def light_signal(lit: FrameMoments, dark: DarkModel, k: int) -> NDArray[np.float32]:
     """Light above black of exposure k: mean − N_FP − t · N_DP, DN [row, col]."""
     return lit.mean[k] - dark.n_fp - np.float32(lit.exposures_s[k]) * dark.n_dp
 
 
-def saturation_dn(lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int) -> float | None:
+def saturation_dn(lit: FrameMoments, signals: NDArray, good: NDArray[np.bool_], full_scale_dn: int) -> float | None:
     """Light signal in DN at which the full well clips below the ADC's full scale, or None where it does not.
 
     A pixel is over full well if a shorter exposure predicts more than 1.15 times its signal while its value stays below
@@ -67,7 +67,7 @@ def saturation_dn(lit: Moments, signals: NDArray, good: NDArray[np.bool_], full_
 
 
 def clear_of_clipping(
-    lit: Moments,
+    lit: FrameMoments,
     signal: NDArray,
     k: int,
     beta: NDArray | None,
@@ -100,7 +100,7 @@ def clear_of_clipping(
     return clear if saturation is None else clear & (signal + margin < saturation)
 
 
-def compose(lit: Moments, dark: DarkModel, usable: NDArray[np.bool_], beta: NDArray) -> Composite:
+def compose(lit: FrameMoments, dark: DarkModel, usable: NDArray[np.bool_], beta: NDArray) -> Composite:
     """Weighted least squares of signal = rate · exposure through the usable exposures [exposure, row, col]."""
     top = np.zeros(lit.mean.shape[1:])
     bottom = np.zeros_like(top)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2
 
@@ -49,7 +49,9 @@ class DarkModel:
         return float(line @ self.covariance @ line)
 
 
-def fit_dark(moments: Moments, used: NDArray[np.bool_], full_scale_dn: int, row_variance_dn2: float = 0.0) -> DarkModel:
+def fit_dark(
+    moments: FrameMoments, used: NDArray[np.bool_], full_scale_dn: int, row_variance_dn2: float = 0.0
+) -> DarkModel:
     """Straight lines through the dark means, one per pixel, exposures weighted by their median variance.
 
     Parameters

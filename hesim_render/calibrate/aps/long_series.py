@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum, noise_spectrum
 from hesim_render.calibrate.aps.pair_levels import CLIPPED_SHARE, MOST_CHANGE, SpatialStack
 from hesim_render.calibrate.aps.spatial import SpatialVariance, Temporal, spatial_variance, temporal_of
-from hesim_render.calibrate.moments import Moments, Progress, measure
+from hesim_render.calibrate.moments import FrameMoments, Progress, measure
 from hesim_render.recording.pair_set import PairSet
 
 
@@ -61,7 +61,7 @@ def long_series(pairs: PairSet, is_lit: bool, progress: Progress | None) -> Long
     return long_of(moments, None if is_lit else noise_spectrum(stack, mean))
 
 
-def long_of(moments: Moments, spectrum: NoiseSpectrum | None) -> Long:
+def long_of(moments: FrameMoments, spectrum: NoiseSpectrum | None) -> Long:
     """A long series from the moments of its frames."""
     mean = moments.mean[0].astype(np.float64)
     temporal, levels = temporal_of(moments)

@@ -15,7 +15,7 @@ from hesim_render.calibrate.aps.composite import signal_at_event_pixels
 from hesim_render.calibrate.aps.fitted import ApsCalibration, Position
 from hesim_render.calibrate.aps.variance import TERMS, VarianceFit, variance_map
 from hesim_render.calibrate.estimate import estimated
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.calibration.rates import TelegraphPerFrame
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet
@@ -25,7 +25,9 @@ _FIGURE_PX = 320
 _POINTS = 240
 
 
-def content(captures: CaptureSet, result: ApsCalibration, dark_moments: Moments, lit: Moments) -> dict[str, Any]:
+def content(
+    captures: CaptureSet, result: ApsCalibration, dark_moments: FrameMoments, lit: FrameMoments
+) -> dict[str, Any]:
     tile = captures.spec.tile_rows, captures.spec.tile_cols
 
     def table(value: Callable[[VarianceFit], Any], missing: Any) -> list[list[Any]]:
@@ -98,7 +100,7 @@ def _row_noise(result: ApsCalibration) -> dict[str, Any]:
     return {"value": 0.0, "upper_limit": limit, "unit": "DN", "note": "rows share no more than chance makes them"}
 
 
-def _ranges(result: ApsCalibration, lit: Moments, tile: tuple[int, int]) -> list[list[Any]]:
+def _ranges(result: ApsCalibration, lit: FrameMoments, tile: tuple[int, int]) -> list[list[Any]]:
     """[lowest, highest] signal of each lit exposure per position: where the polynomial may be used."""
 
     def ranges(position: Position) -> list[Any]:
@@ -112,7 +114,9 @@ def _ranges(result: ApsCalibration, lit: Moments, tile: tuple[int, int]) -> list
     return [[ranges((i, j)) if (i, j) in result.bins else None for j in range(tile[1])] for i in range(tile[0])]
 
 
-def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moments: Moments) -> dict[str, NDArray]:
+def maps(
+    captures: CaptureSet, result: ApsCalibration, lit: FrameMoments, dark_moments: FrameMoments
+) -> dict[str, NDArray]:
     tile = captures.spec.tile_rows, captures.spec.tile_cols
     dark, composite = result.dark, result.composite
     covariance = np.full((*tile, 6, 6), np.nan)
@@ -139,7 +143,9 @@ def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moment
     return arrays | _figures(result, lit, dark_moments, tile)
 
 
-def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[int, int]) -> dict[str, NDArray]:
+def _figures(
+    result: ApsCalibration, lit: FrameMoments, dark: FrameMoments, tile: tuple[int, int]
+) -> dict[str, NDArray]:
     """Data of the report's figures, kept small: thinned maps, pooled variances, histograms of single values."""
     beta = result.beta(tile)
     step = max(1, -(-max(lit.mean.shape[1:]) // _FIGURE_PX))
@@ -173,7 +179,7 @@ def _figures(result: ApsCalibration, lit: Moments, dark: Moments, tile: tuple[in
 
 
 def _noise_histogram(
-    moments: Moments, k: int, signal: NDArray | None, mask: NDArray, beta: NDArray, rows: Shared
+    moments: FrameMoments, k: int, signal: NDArray | None, mask: NDArray, beta: NDArray, rows: Shared
 ) -> NDArray[np.float64]:
     """Distribution of single values about their mean: rows of (deviation DN, measured, predicted density)."""
     n = moments.frames

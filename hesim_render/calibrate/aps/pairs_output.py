@@ -42,7 +42,7 @@ def calibrate_pairs(
 
     Returns
     -------
-    What the captures told.
+    The result of the captures.
 
     Raises
     ------
@@ -87,8 +87,8 @@ def content(result: PairCalibration) -> dict[str, Any]:
             "cubic_per_dn": [[None if fit.cubic is None else list(fit.cubic)]],
             "dof": [[fit.dof]],
             "levels_chi2_per_dof": result.level_chi2,
-            "levels_relative_rms": result.level_rms,
-            "light_relative_rms": curve.light_rms,
+            "level_rms_rel": result.level_rms,
+            "light_rms_rel": curve.light_rms,
         },
         "range": {
             "exposures_us": [1e6 * t for t in (result.lit.exposure_s.min(), result.lit.exposure_s.max())],
@@ -261,7 +261,7 @@ def maps(result: PairCalibration) -> dict[str, NDArray]:
         "n_blc": (result.dark_pattern.col + result.dark_pattern.pixel).astype(np.float32),
         "n_dp": np.full(shape, max(result.black.slope, 0.0), np.float32),
         "response": (1 + result.light_pattern.whole - shading).astype(np.float32),
-        "light_relative": (1 + shading).astype(np.float32),
+        "light_rel": (1 + shading).astype(np.float32),
         "bad_pixels": result.defects,
         "figure_variance_map": result.long_lit.variance[::step, ::step],
         "figure_variance_exposure_us": np.array(1e6 * result.pairs.spatial_lit.exposure_s),

@@ -11,7 +11,7 @@ from hesim_render.calibrate.aps.composite import Composite
 from hesim_render.calibrate.aps.dark import DarkModel
 from hesim_render.calibrate.aps.variance import Pooled, VarianceFit
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.specs.capture import CaptureSpec
 
 _FLAT_SPREAD = 0.1
@@ -56,7 +56,7 @@ def system_gain(bins: Pooled, top_dn: float) -> tuple[float, float]:
 
 
 def linearity(
-    lit: Moments, signals: NDArray, usable: NDArray[np.bool_], composite: Composite, top_dn: float
+    lit: FrameMoments, signals: NDArray, usable: NDArray[np.bool_], composite: Composite, top_dn: float
 ) -> dict[str, Any]:
     """Deviation of each exposure from proportionality, over pixels between 5 and 95 % of saturation."""
     deviations = []

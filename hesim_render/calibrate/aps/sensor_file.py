@@ -42,13 +42,13 @@ sources:
   quantum_efficiency: "{efficiency_source}"
   aps: "measured: {calibration}"
 assumptions:
-  geometry.pitch_um: not told by the captures; a placeholder
+  geometry.pitch_um: not known from the captures; a placeholder
   filters: the captures tell the efficiency at their own wavelength alone; clear between ultraviolet and infrared
   lens: user's choice; a placeholder
   aps.full_well_e: "{well_note}"
   aps.exposure_us: that of the long series
-  aps.frame_rate_hz: not told by the captures
-  aps.shutter: not told by the captures
+  aps.frame_rate_hz: not known from the captures
+  aps.shutter: not known from the captures
 """
 
 
@@ -59,7 +59,7 @@ def write_sensor(file: str | Path, calibration: str | Path, result: PairCalibrat
     ----------
     file : to write, replaced if it exists.
     calibration : the calibration, which it names by its path from `file`.
-    result : what the captures told.
+    result : of the captures.
 
     Raises
     ------

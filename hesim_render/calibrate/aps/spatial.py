@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from hesim_render.calibrate.aps.noise_spectrum import NoiseSpectrum
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 
 #: Deviation, in standard deviations, from which a pixel is an individual and no part of the spread of the others.
 _INDIVIDUAL = 5.0
@@ -83,7 +83,7 @@ class SpatialVariance:
         return np.append(each, np.sqrt(np.sum(each**2)))
 
 
-def temporal_of(moments: Moments) -> tuple[Temporal, NDArray[np.float64]]:
+def temporal_of(moments: FrameMoments) -> tuple[Temporal, NDArray[np.float64]]:
     """Temporal variances of a series, and the mean of each frame, DN."""
     _, rows, cols = moments.variance.shape
     frames = moments.frames

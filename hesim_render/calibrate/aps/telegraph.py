@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from hesim_render.calibrate.moments import Moments
+from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import FrameStack
@@ -50,7 +50,7 @@ class TelegraphMaps:
 
 
 def find_telegraph(
-    stack: FrameStack, moments: Moments, used: NDArray[np.bool_], tile: tuple[int, int], full_scale_dn: int
+    stack: FrameStack, moments: FrameMoments, used: NDArray[np.bool_], tile: tuple[int, int], full_scale_dn: int
 ) -> TelegraphMaps:
     """Pixels with two levels in dark frames.
 
@@ -79,7 +79,7 @@ def find_telegraph(
 
 
 def _suspects(
-    moments: Moments, used: NDArray[np.bool_], tile: tuple[int, int], full_scale_dn: int
+    moments: FrameMoments, used: NDArray[np.bool_], tile: tuple[int, int], full_scale_dn: int
 ) -> NDArray[np.bool_]:
     """Pixels [row, col] whose variance over all exposures is above that of good pixels with the same dark current."""
     excess, freedom = np.zeros(used.shape), np.zeros(used.shape)

@@ -165,7 +165,7 @@ class VarianceFit:
     covariance : [6, 6], scaled by χ² where that exceeds 1; 0 for terms that are not identified.
     chi2_per_dof, dof : goodness of fit over all pixels and exposures. p_value : chance of a larger χ².
     expected_chi2 : per dof; above 1 where the variance is of few electrons, whose Poisson law has longer tails.
-    cubic : coefficient of I³ where it is fitted besides, DN⁻¹, and its standard error; None where it is not told.
+    cubic : coefficient of I³ where it is fitted besides, DN⁻¹, and its standard error; None where none is identifiable.
     hidden_pixels : pixel-exposures left out because rounding hides their noise.
     """
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from hesim_render.calibrate.asynchronous.checks import Goodness, check_trials
+from hesim_render.calibrate.asynchronous.checks import TrialGoodness, check_trials
 from hesim_render.calibrate.asynchronous.defects import TrialDefects, classify, plainly_bad, unlike
 from hesim_render.calibrate.asynchronous.fit import MOST_PIXELS, Fit, fit_trials, rough_start
-from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, NAMES, THETA, Counts, Law, log_prior
+from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, NAMES, THETA, Law, TrialCounts, log_prior
 from hesim_render.calibrate.asynchronous.trials import Trials, read_trials
 from hesim_render.calibrate.estimate import Spread
 from hesim_render.calibrate.finding import Finding
@@ -54,7 +54,7 @@ class AsynchronousCalibration:
     relative: tuple[NDArray[np.float32], NDArray[np.float32]]
     noise: tuple[NDArray[np.float32], NDArray[np.float32]]
     findings: list[Finding]
-    goodness: dict[str, Goodness]
+    goodness: dict[str, TrialGoodness]
 
 
 def analyse_trials(
@@ -148,7 +148,7 @@ def _pixel_thresholds(
     mean, spread = np.ones((2, count), np.float32)
     for begin in range(0, count, _CHUNK):
         some = np.arange(begin, min(begin + _CHUNK, count))
-        counts = Counts.of((steady.of(some), steps.of(some)), polarity)
+        counts = TrialCounts.of((steady.of(some), steps.of(some)), polarity)
         log = counts.log_likelihood(fit.values, grid, fit.law) + prior
         weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
         mean[some] = weight @ relative

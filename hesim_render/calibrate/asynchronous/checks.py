@@ -37,7 +37,7 @@ _FAMILIES = ("steps", "times", "steady")
 
 
 @dataclass(frozen=True)
-class Goodness:
+class TrialGoodness:
     """χ² of one family of columns, or of all, its degrees of freedom, and the probability of a larger one."""
 
     chi2: float
@@ -55,7 +55,7 @@ class Columns:
     family: NDArray[np.intp]
 
 
-def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], dict[str, Goodness]]:
+def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], dict[str, TrialGoodness]]:
     """Every check, on the pixels of the fit: `sets` are their trials, steady and with steps."""
     columns = _columns(fit)
     goodness = {name: _judge(columns, np.flatnonzero(columns.family == k), fit) for k, name in enumerate(_FAMILIES)}
@@ -102,13 +102,13 @@ def _columns(fit: Fit) -> Columns:
     return Columns(residual[:, enough], expected[enough], silent[enough], family[enough])
 
 
-def _judge(columns: Columns, some: NDArray[np.intp], fit: Fit) -> Goodness:
+def _judge(columns: Columns, some: NDArray[np.intp], fit: Fit) -> TrialGoodness:
     """Test of some columns. Neighbouring columns are added where there are many in relation to the pixels."""
     count = columns.residual.shape[0]
     group = np.arange(some.size) * min(1.0, count / _PIXELS_PER_COLUMN / max(some.size, 1))
     group = np.unique(np.floor(group).astype(int), return_inverse=True)[1]
     if some.size == 0 or group.max() + 1 > count / 4:
-        return Goodness(float("nan"), 0, 1.0)
+        return TrialGoodness(float("nan"), 0, 1.0)
     gather = np.zeros((some.size, group.max() + 1))
     gather[np.arange(some.size), group] = 1.0
     residual = columns.residual[:, some] @ gather
@@ -126,7 +126,7 @@ def _judge(columns: Columns, some: NDArray[np.intp], fit: Fit) -> Goodness:
     along = vectors[:, kept].T @ (total / scale)
     chi2, dof = float(np.sum(along**2 / values[kept])), int(kept.sum())
     ratio = chi2 * (count - dof) / (dof * (count - 1))
-    return Goodness(chi2, dof, float(f_law.sf(ratio, dof, count - dof)))
+    return TrialGoodness(chi2, dof, float(f_law.sf(ratio, dof, count - dof)))
 
 
 _LOOK_AT = {
@@ -152,7 +152,7 @@ _LOOK_AT = {
 }
 
 
-def _family(name: str, goodness: Goodness) -> Finding | None:
+def _family(name: str, goodness: TrialGoodness) -> Finding | None:
     if not goodness.p_value < ALARM:
         return None
     check, text = _LOOK_AT[name]

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from scipy.stats import poisson
 
 from hesim_render.calibrate.asynchronous.fit import Fit
-from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
+from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, TrialCounts, chances, log_prior
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.flicker import dynamics, unsteady
 from hesim_render.calibration.rates import rate_hz
@@ -83,7 +83,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
     """[test, pixel]."""
     k = 0 if polarity > 0 else 1
     grid = fit.likelihood.grids[k]
-    counts = Counts.of([steps], polarity)
+    counts = TrialCounts.of([steps], polarity)
     log = counts.log_likelihood(fit.values, grid, fit.law)
     log += log_prior(fit.values[THETA[k]], fit.values[MISMATCH[k]], grid)
     weight = np.exp(log - logsumexp(log, axis=1, keepdims=True))
@@ -91,7 +91,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
     events = counts.events.reshape(log.shape[0], chance.shape[0], -1).sum(axis=2)
     trials = events + counts.silent
     sure, never = chance > 1 - _SURE, chance < _SURE
-    quiet = Counts.of([steady], polarity)
+    quiet = TrialCounts.of([steady], polarity)
     seen = quiet.events.sum(axis=1, keepdims=True)
     usual = chances(fit.values, quiet.sets[0], polarity, grid, fit.law).sum(axis=1)
     bins = len(steady.edges_s) - 1
@@ -109,7 +109,7 @@ def _tests(fit: Fit, steady: Trials, steps: Trials, polarity: int) -> NDArray[np
 def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefects:
     """Classify the bad pixels: stuck, hot, flickering or other.
 
-    A flickering pixel is told from a hot one by the parts of the trials in the brightest light: their scatter has a
+    The parts of the trials in the brightest light distinguish a flickering pixel from a hot one: their scatter has a
     chance below 1e-6 at a constant rate.
     """
     nothing = np.zeros(bad.size, np.float32)
@@ -156,7 +156,7 @@ def _flicker(found: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: N
     usual = float(good.mean(dtype=np.float64)) / parts.trials if good.size else 0.0
     share, correlation = dynamics(counts, parts.trials, usual)
     chance = np.maximum(counts.mean(axis=0, dtype=np.float64) / parts.trials - usual, 0.0) / share
-    # more cannot be told from the trials than that one is silent in all of those in which the pixel fires
+    # the trials show no more than that one is silent in all of those in which the pixel fires
     most = 1 - 0.5 / np.maximum(counts.shape[0] * parts.trials * share, 1.0)
     rate = rate_hz(np.minimum(chance, most), parts.trial_s)
     on_share = own[0] / np.maximum(own.sum(axis=0), 1e-300)

@@ -75,7 +75,7 @@ def chances(values: NDArray, trials: Trials, polarity: int, thresholds: NDArray,
 
 
 @dataclass(frozen=True)
-class Counts:
+class TrialCounts:
     """Outcomes of one polarity; rows are pixels.
 
     Attributes
@@ -91,7 +91,7 @@ class Counts:
     silent: NDArray[np.float64]
 
     @classmethod
-    def of(cls, sets: Sequence[Trials], polarity: int) -> Counts:
+    def of(cls, sets: Sequence[Trials], polarity: int) -> TrialCounts:
         sets = [t.towards(polarity) for t in sets]
         own = [t.events(polarity).reshape(-1, t.calm.shape[1]) for t in sets]
         silent = [t.calm - t.on.sum(axis=1, dtype=np.int64) - t.off.sum(axis=1, dtype=np.int64) for t in sets]
@@ -127,12 +127,12 @@ class Likelihood:
     """ln L of all pixels as a function of the parameters."""
 
     law: Law
-    counts: tuple[Counts, Counts]
+    counts: tuple[TrialCounts, TrialCounts]
     grids: tuple[NDArray[np.float64], NDArray[np.float64]]
 
     @classmethod
     def of(cls, sets: Sequence[Trials], law: Law, grids: tuple[NDArray, NDArray]) -> Likelihood:
-        return cls(law, (Counts.of(sets, 1), Counts.of(sets, -1)), grids)
+        return cls(law, (TrialCounts.of(sets, 1), TrialCounts.of(sets, -1)), grids)
 
     def given_thresholds(self, values: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """ln L [pixel, threshold] of ON and of OFF."""

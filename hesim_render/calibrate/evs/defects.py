@@ -142,13 +142,13 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     if not bad.any():
         return found
     silent = np.ones(int(bad.sum()), bool)
-    own, excess, told = [], [], []
+    own, excess, significant = [], [], []
     for signal, on, off in static.sessions:
         both = np.stack([on[bad], off[bad]]).astype(np.float64)
         usual, most = _of_like(signal, bad, (on, off), static.trials)
         beyond = both > most + _SIGMAS * np.sqrt(most + 1)
         excess.append(beyond.any(axis=0))
-        told.append(beyond)
+        significant.append(beyond)
         own.append([own_events(both[k] / static.trials, usual[0], usual[1], 1 - 2 * k) for k in (0, 1)])
         silent &= both.sum(axis=0) == 0
     if steps is not None:
@@ -167,7 +167,7 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     named[silent] = Defect.STUCK
     found.kind[bad] = named
     # a polarity with no more events than good pixels have does not count: its threshold may be low
-    chance = np.where(np.any(told, axis=0), rates.mean(axis=0), 0.0)
+    chance = np.where(np.any(significant, axis=0), rates.mean(axis=0), 0.0)
     flickers = np.flatnonzero(named == Defect.FLICKERING)
     if static.parts is not None and flickers.size:
         share, correlation = dynamics(

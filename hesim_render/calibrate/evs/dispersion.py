@@ -140,8 +140,8 @@ class _Mixture:
         u, k, n = self.u * scale[self.group], self.events, self.trials
         own = (k + 0.5) / (n + 1)
         middle = -ndtri(own)
-        told = (u * m) ** 2 * n * np.exp(-middle * middle) / (2 * np.pi * own * (1 - own))
-        z, width = np.clip((middle / u - 1) / m * told / (1 + told), -12, 12), np.ones_like(u)
+        information = (u * m) ** 2 * n * np.exp(-middle * middle) / (2 * np.pi * own * (1 - own))
+        z, width = np.clip((middle / u - 1) / m * information / (1 + information), -12, 12), np.ones_like(u)
         for _ in range(4):
             t = u * (1 + m * np.clip(z, -12, 12))
             q = np.clip(ndtr(-t), 1e-300, 1 - 1e-15)

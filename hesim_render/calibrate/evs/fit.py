@@ -117,7 +117,7 @@ def maximise(
     for round_ in range(_ROUNDS):
         if round_ % _PATIENCE == _PATIENCE - 1:
             if np.all(value - before < _PROGRESS):
-                break  # far out in a valley without end, where only a combination of parameters is told
+                break  # far out in a valley without end, where only a combination of parameters is identifiable
             before = value
         now = eta[active]
         plain = _solve(now, score, information, 0.0)

@@ -57,11 +57,11 @@ def middle_and_spread(
         quantiles.append(np.array([[*np.quantile(part, list(QUANTILES)), _trimmed_mean(part)] for part in parts]))
     enough = np.min([q[:, :-1] for q in quantiles], axis=0) >= LEAST_EVENTS
     first = np.where(enough.any(axis=1), np.argmax(enough, axis=1), levels.size - 1)
-    told, row = enough.any(axis=1), np.arange(first.size)
+    has_quantile, row = enough.any(axis=1), np.arange(first.size)
     spreads = []
     for q in quantiles:
         for k in range(levels.size - 1):
-            at = told & (first == k)
+            at = has_quantile & (first == k)
             if not at.any():
                 continue
             low, high = (-ndtri(np.maximum(q[at, j] + 0.5, 0.5) / (trials + 1)) for j in (k, k + 1))
@@ -92,7 +92,7 @@ def middle_and_spread(
         from_quantile = here / np.maximum(1 + wide * levels[first], 0.1)
         v = -ndtri(np.clip((q[:, -1] + 0.5) / (trials + 1), 1e-300, 0.5))
         from_mean = v / np.sqrt(np.maximum(1 - (spread * v) ** 2, 0.05))
-        middles.append(np.where(told, from_quantile, from_mean))
+        middles.append(np.where(has_quantile, from_quantile, from_mean))
     return middles, spread
 
 

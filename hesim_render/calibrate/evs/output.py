@@ -145,11 +145,13 @@ def _gauge(result: EvsCalibration) -> dict[str, Any]:
         covariance[:4, :4] = fit.covariance[:4, :4]
         covariance[4, 4] = theta0_error**2
         error = np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0))
-        a_told, b_told, c_told, d_told = (fit.identified(name) for name in "ABCD")
-        told = [True, a_told and b_told, True, c_told and b_told, b_told, d_told]
+        is_known = {name: fit.identified(name) for name in "ABCD"}
+        identifiable = [
+            True, is_known["A"] and is_known["B"], True, is_known["C"] and is_known["B"], is_known["B"], is_known["D"]
+        ]  # fmt: skip
         values = [theta0, a / b, 1.0, c * theta0 / b, theta0 / b, d]
-        betas.append([v if ok else None for v, ok in zip(values, told, strict=True)])
-        errors.append([e if ok else None for e, ok in zip(error, told, strict=True)])
+        betas.append([v if ok else None for v, ok in zip(values, identifiable, strict=True)])
+        errors.append([e if ok else None for e, ok in zip(error, identifiable, strict=True)])
     return {
         "gauge": "beta2 = 1 V; beta0 = theta/Theta"
         + ("" if known else " = 1, as theta was not measured: the response to contrast is not calibrated"),
@@ -165,8 +167,8 @@ def maps(captures: CaptureSet, result: EvsCalibration) -> dict[str, NDArray]:
     known = counted if interval_s is None else counted.per_second(interval_s)
     arrays = {"bad_pixels": result.bad, **known.maps()}
     if result.thresholds is not None:
-        arrays["threshold_on_relative"] = result.thresholds.pixel_on
-        arrays["threshold_off_relative"] = result.thresholds.pixel_off
+        arrays["threshold_on_rel"] = result.thresholds.pixel_on
+        arrays["threshold_off_rel"] = result.thresholds.pixel_off
     return arrays | _static_figures(result, static) | _step_figures(result)
 
 

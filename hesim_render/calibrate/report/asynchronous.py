@@ -80,7 +80,7 @@ def _noise_rate(maps: dict[str, NDArray]) -> str:
 def _pixels(maps: dict[str, NDArray]) -> str:
     """Distribution of thresholds over the good pixels."""
     good = ~maps["bad_pixels"]
-    values = [maps[f"threshold_{name}_relative"][good] for name in ("on", "off")]
+    values = [maps[f"threshold_{name}_rel"][good] for name in ("on", "off")]
     low, high = (float(v) for v in np.quantile(np.concatenate(values), [0.001, 0.999]))
     edges = np.linspace(low - 0.02, high + 0.02, 50).tolist()
     figure, axes = panel("Thresholds over their mean", "θ of a pixel / mean", "pixels")
@@ -91,7 +91,7 @@ def _pixels(maps: dict[str, NDArray]) -> str:
 
 
 def _map(maps: dict[str, NDArray], name: str, sign: str) -> str:
-    values = np.where(maps["bad_pixels"], np.nan, maps[f"threshold_{name}_relative"])
+    values = np.where(maps["bad_pixels"], np.nan, maps[f"threshold_{name}_rel"])
     return picture(f"{sign} over its mean", values, "", 320)
 
 

@@ -148,18 +148,18 @@ class VideoFlux(WindowByWindow, Untraced):
 
     def notes(self) -> list[str]:
         """Notes for the user about the reliability of the result, in sentences."""
-        found = []
+        notes = []
         scale = min(self.mapping.rows.scale, self.mapping.cols.scale)
         if scale < 1:
-            found.append(f"the pictures are enlarged {1 / scale:.3g} times: the sensor sees their pixels as squares")
+            notes.append(f"the pictures are enlarged {1 / scale:.3g} times: the sensor sees their pixels as squares")
         if self.sensor.spec.evs is not None:
-            found += event_notes(self.sensor.spec.evs, self.clock.period_us, self._is_held)
+            notes += event_notes(self.sensor.spec.evs, self.clock.period_us, self._is_held)
         effects = [name for name in self.sensor.optics.used_effects() if name != "relative_illumination"]
         if effects:
-            found.append(f"the pictures are the image on the chip: {', '.join(effects)} of the lens are not applied")
+            notes.append(f"the pictures are the image on the chip: {', '.join(effects)} of the lens are not applied")
         if self._is_irregular:
-            found.append("the video's time stamps are irregular and were kept; fps makes them regular")
-        return found
+            notes.append("the video's time stamps are irregular and were kept; fps makes them regular")
+        return notes
 
     def slice_edges_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval at which the next picture takes over, µs."""
@@ -215,13 +215,13 @@ class VideoFlux(WindowByWindow, Untraced):
         if len(cells) <= 1:  # a point in time on an edge belongs to the picture that begins there
             cells = range(cells.start, cells.start + 1)
         bounds = np.concatenate([[-np.inf], edges, [np.inf]])
-        found: dict[int, NDArray[np.float64]] = {}
+        weights: dict[int, NDArray[np.float64]] = {}
         for cell in cells:
             low, high = np.clip(begin, bounds[cell], bounds[cell + 1]), np.clip(end, bounds[cell], bounds[cell + 1])
             length = end - begin
             share = np.where(length > 0, (high - low) / np.where(length > 0, length, 1.0), 1.0)
             if self._is_held:
-                found[cell] = share
+                weights[cell] = share
                 continue
             # cell k extends from the middle of picture k - 1 to that of picture k; the mean of a straight line is
             # its value half-way
@@ -229,18 +229,18 @@ class VideoFlux(WindowByWindow, Untraced):
             part = np.zeros(())
             if after > before:
                 part = ((low + high) / 2 - edges[before]) / (edges[after] - edges[before])
-            found[before] = found.get(before, 0.0) + share * (1 - part)
+            weights[before] = weights.get(before, 0.0) + share * (1 - part)
             if after > before:
-                found[after] = found.get(after, 0.0) + share * part
-        return found
+                weights[after] = weights.get(after, 0.0) + share * part
+        return weights
 
     def _flux_of(self, number: int) -> Float:
         """Φ of all mosaic pixels in one picture, Dr.Jit Float [row · cols + col], e⁻/s."""
         import drjit as dr
 
-        found = self._maps.get(number)
-        if found is not None:
-            return found
+        cached = self._maps.get(number)
+        if cached is not None:
+            return cached
         types = jit()
         for old in [kept for kept in self._maps if abs(kept - number) > self._reach]:
             del self._maps[old]

@@ -39,7 +39,7 @@ from hesim_render.specs.surface import leaves_of
 from hesim_render.specs.target import lamps_of
 from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
 from hesim_render.targets.build import placed_pieces
-from hesim_render.targets.piece import Picture, Piece
+from hesim_render.targets.piece import Picture, TargetPiece
 
 
 @dataclass
@@ -243,7 +243,7 @@ def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, lis
     return groups[item.name] if is_read and not brings_normals(path) else []
 
 
-def _target_pieces(spec: SceneSpec) -> list[Piece]:
+def _target_pieces(spec: SceneSpec) -> list[TargetPiece]:
     assert spec.target is not None
     try:
         return placed_pieces(spec.target)
@@ -253,7 +253,7 @@ def _target_pieces(spec: SceneSpec) -> list[Piece]:
         raise SpecError(str(error), file=spec.file) from None
 
 
-def _piece(mi: MitsubaModule, name: str, piece: Piece) -> MitsubaObject:
+def _piece(mi: MitsubaModule, name: str, piece: TargetPiece) -> MitsubaObject:
     """A part of the target."""
     if isinstance(piece.reflectance, Picture):
         bsdf = {"type": "diffuse", "reflectance": picture_texture(mi, piece.reflectance)}

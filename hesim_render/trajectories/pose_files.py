@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import read_text, reading
 from hesim_render.core.units import US_PER_S
-from hesim_render.specs.yamlfile import parse_yaml
+from hesim_render.core.yaml_file import parse_yaml
 
 #: Columns of a CSV file of this package; those of TUM files are the same, with the time in seconds.
 CSV_COLUMNS = ("t_us", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -107,8 +107,8 @@ def _rows(file: Path, quaternion: str) -> _Found:
     elif is_csv:
         first = rows.pop(0) if rows else (1, "")
         if tuple(cell.strip() for cell in first[1].split(",")) != CSV_COLUMNS:
-            told = f"the header must be {','.join(CSV_COLUMNS)}, or that of a EuRoC file"
-            raise SpecError(told, file=file, line=first[0])
+            expected = f"the header must be {','.join(CSV_COLUMNS)}, or that of a EuRoC file"
+            raise SpecError(expected, file=file, line=first[0])
     lines: list[int | None] = []
     times, numbers = [], []
     for number, line in rows:
