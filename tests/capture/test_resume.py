@@ -24,11 +24,14 @@ RUNS = {
 
 
 def record(name, out, *, stop_after=None, monkeypatch=None, **more):
-    """Simulate; the calls of the tracer that did work. `stop_after` so many of them comes Ctrl-C."""
+    """Simulate; the calls of the tracer that did work which is kept. `stop_after` so many of them comes Ctrl-C.
+
+    Pilots whose single rays are compared are not kept: they are a small part, and large.
+    """
     scene, changes, sensor, options = RUNS[name]
     calls = 0
     with monkeypatch.context() as patch:
-        for kind, method in ((PairTracer, "_trace_block"), (PairTracer, "_pilot_block"), (PixelTracer, "_block")):
+        for kind, method in ((PairTracer, "_trace_block"), (PairTracer, "_edge_block"), (PixelTracer, "_block")):
             work = getattr(kind, method)
 
             def counted(*given, call=work, **named):

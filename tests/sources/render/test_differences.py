@@ -101,7 +101,12 @@ def test_windows_within_a_block_share_their_rays_and_pay_for_those_in_its_first(
     # one window alone would take 128 rays and 128 in the first, which is as much as 256 of its own
     once = np.ones((4, 121), bool)
     once[1] = False
-    assert chosen(pilot_of(4, lit_scatter=200.0, hidden_scatter=5e4), 512, once).rays[:, CENTRE].tolist() == [128, 0, 128, 128]
+    assert chosen(pilot_of(4, lit_scatter=200.0, hidden_scatter=5e4), 512, once).rays[:, CENTRE].tolist() == [
+        128,
+        0,
+        128,
+        128,
+    ]
     alone = np.full((4, 121), 512, np.int16)
     alone[2] = 256
     found = differences(pilot_of(4), sites_of(), np.full((4, 121), UNIT, np.float32), QUALITY, once, alone, TUNING)

@@ -10,7 +10,7 @@ from rendering import mono, pair_tracer, traced
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.pair_flux import PilotFlux
+from hesim_render.sources.render.change_driven.pair_flux import PilotFlux, PilotRays
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.sampling.sampler import sampler_class
@@ -156,7 +156,7 @@ def test_the_scatter_of_a_pilot_has_no_range(power):
     two_kinds, one_bright = np.repeat([5.0, 3.0], 16) + rng.normal(size=32), np.where(np.arange(32) == 7, 900.0, 0.25)
     rays = np.stack([two_kinds, one_bright])
     flux, met = (types.Float(np.ldexp(rays, power).ravel().astype(np.float32)), types.UInt32(np.zeros(64, np.uint32)))
-    out = PilotFlux(*(np.zeros(2, np.float32) for _ in range(5)), np.ones(2, np.bool_))
+    out = PilotFlux.empty(2)
     with np.errstate(all="raise"):
         out.put(slice(0, 2), flux, 2 * flux, flux, met, 32, 16)
     deviation = rays.reshape(2, 2, 16) - rays.reshape(2, 2, 16).mean(axis=2, keepdims=True)
@@ -164,6 +164,24 @@ def test_the_scatter_of_a_pilot_has_no_range(power):
     np.testing.assert_allclose(np.ldexp(out.lit_scatter.astype(np.float64), -power), expected, rtol=1e-5)
     np.testing.assert_allclose(np.ldexp(out.hidden_scatter.astype(np.float64), -power), 2 * expected, rtol=1e-5)
     np.testing.assert_allclose(np.ldexp(out.lit.astype(np.float64), -power), rays.mean(axis=1), rtol=1e-5)
+
+
+def test_a_pilot_says_how_much_single_rays_change():
+    """Standard deviation of the differences to the same rays in another window, by NumPy, for both estimators."""
+    types, rng = jit(), np.random.default_rng(4)
+    now, before = 7e4 + 900 * rng.normal(size=(2, 3, 16))
+    before[1] = now[1] - 350  # all rays alike: the mean changes, and nothing scatters
+    fluxes = [types.Float(values.ravel().astype(np.float32)) for values in (now, 0.5 * now, before, 0.3 * before)]
+    rays, out = PilotRays(fluxes[2], fluxes[3], 16, (0.0, 1.0)), PilotFlux.empty(2)
+    pairs = np.array([2, 0])
+    some = [types.Float(np.array(values).reshape(3, 16)[pairs].ravel()) for values in fluxes[:2]]
+    met = types.UInt32(np.zeros(32, np.uint32))
+    out.put(slice(0, 2), *some, some[0], met, 16, 16, rays.at(pairs))
+    for found, difference in ((out.lit_change, now - before), (out.hidden_change, 0.5 * now - 0.3 * before)):
+        np.testing.assert_allclose(found, difference[pairs].std(axis=1, ddof=1), rtol=1e-4)
+    every = PilotFlux.empty(3)
+    every.put(slice(0, 3), *fluxes[:2], fluxes[0], types.UInt32(np.zeros(48, np.uint32)), 16, 16, rays.at(np.arange(3)))
+    assert every.lit_change[1] < 0.05 and every.lit_change[0] > 500
 
 
 @pytest.mark.slow

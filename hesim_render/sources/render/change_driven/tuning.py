@@ -98,11 +98,11 @@ class Tuning:
         (1): windows to compare with are rendered for little.
     difference_part : wanted errors, C. Wanted error of a difference; that of the other window comes on top. Without
         (1): the error of the pair is larger than wanted.
-    difference_factor : factor, F (star alone, windows 4 to 60 ms apart). The standard error of a difference of n rays
-        is this times their scatter over √n: few rays change, and strata gain little. Without (0.5): differences are off
-        by twice what they should.
-    unseen_change : part of all light, F (as before). Scatter of differences that the pilot of a neighbourhood does not
-        show. Without (0): pixels at the rim of a penumbra are off.
+    difference_factor : factor, F. From the star alone, windows 4 to 60 ms apart: the standard error of a difference of
+        n rays is this times their scatter over √n, because few rays change, and strata gain little. Without (0.5):
+        differences are off by twice what they should.
+    unseen_change : part of all light, F. From the star alone: scatter of differences that the pilot of a neighbourhood
+        does not show. Without (0): pixels at the rim of a penumbra are off.
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
