@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.benchmark.plan import Clip, Plan
+from hesim_render.benchmark.plan import BenchmarkPlan, Clip
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.overheads import noise_seconds
-from hesim_render.capture.simulate import flux_source
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.progress import Progress, in_words
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.forecast import forecast
+from hesim_render.sources.demand import Demand
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import Scene, load_scene
 
@@ -58,7 +57,7 @@ class BuildEstimate:
         return asdict(self)
 
 
-def estimate_build(plan: Plan, clips: list[Clip], progress: Progress | None = None) -> BuildEstimate:
+def estimate_build(plan: BenchmarkPlan, clips: list[Clip], progress: Progress | None = None) -> BuildEstimate:
     """Estimate time and size of clips.
 
     Parameters
@@ -91,7 +90,7 @@ def estimate_build(plan: Plan, clips: list[Clip], progress: Progress | None = No
     return BuildEstimate(len(clips), len(clips) * each, size)
 
 
-def _sharp_exposures(plan: Plan, sensor: Sensor) -> list[Exposure]:
+def _sharp_exposures(plan: BenchmarkPlan, sensor: Sensor) -> list[Exposure]:
     spec = plan.spec.sharp
     if spec is None or sensor.spec.aps is None:
         return []
@@ -101,24 +100,22 @@ def _sharp_exposures(plan: Plan, sensor: Sensor) -> list[Exposure]:
     return [Exposure(k, start, spec.window_us, sensor.rows, line_us) for k, start in enumerate(starts)]
 
 
-def _render_seconds(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> float:
+def _render_seconds(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> float:
     spec = plan.spec
     seed = spec.seeds[clip.seed]
     if spec.samples is not None:
         return 0.0  # most of the time of small clips is not that of rays
-    flux, _ = flux_source(in_absolute_light(scene)[0], sensor, seed, spec.quality, None, False, None)
-    parts = [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
+    flux = scene_renderer(in_absolute_light(scene)[0], sensor, seed, spec.quality)
     level = spec.noise[clip.noise]
     capture = Capture(flux, flux.sensor, *noise_models(sensor, level.clean, level.without), spec.duration_us, seed)
     pixel, exposures = capture.frame_exposures
     blocks = capture.sample_of_event_blocks()
-    expected = forecast(
-        parts, capture.event_pixels, blocks, pixel, [*exposures, *_sharp_exposures(plan, sensor)]
-    )  # fmt: skip
+    asked = [*exposures, *_sharp_exposures(plan, sensor)]
+    expected = flux.estimate(Demand(spec.duration_us, capture.event_pixels, blocks, pixel, asked))
     return expected.seconds + noise_seconds(flux.sensor, spec.duration_us, blocks.windows, rests=flux.is_static)
 
 
-def _bytes(plan: Plan, sensor: Sensor) -> float:
+def _bytes(plan: BenchmarkPlan, sensor: Sensor) -> float:
     """Expected size of a clip."""
     spec, aps = plan.spec, sensor.spec.aps
     frames = 0 if aps is None else int(spec.duration_s * aps.frame_rate_hz)

@@ -20,7 +20,7 @@ from hesim_render.recording.colour_view import colour_picture
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: Interval of boxes on the event grid, µs: that of DSEC-det.
 BOXES_EVERY_US = 50_000
@@ -79,9 +79,9 @@ def classes(names: tuple[str, ...]) -> tuple[list[str], NDArray[np.int64]]:
 
 
 def _event_boxes(
-    recording: Recording, truth: SceneTruth, every_us: int | None, kind: np.dtype
+    recording: Recorded, truth: SceneTruth, every_us: int | None, kind: np.dtype
 ) -> tuple[NDArray, NDArray[np.int64], dict[str, Any]]:
-    """Boxes on the event grid as records, their times, and what is told about them."""
+    """Boxes on the event grid as records, their times, and their description."""
     step = every_us or min(BOXES_EVERY_US, recording.duration_us)
     times = np.arange(0, recording.duration_us + 1, step, dtype=np.int64)
     names, class_of = classes(truth.names.objects)
@@ -93,30 +93,28 @@ def _event_boxes(
         for column, key in enumerate("xywh"):
             rows[key] = boxes[:, column]
         parts.append(rows)
-    told = {"every_us": int(step), "classes": names, "tracks": dict(enumerate(truth.names.objects[1:], start=1))}
-    return np.concatenate(parts), times, told
+    facts = {"every_us": int(step), "classes": names, "tracks": dict(enumerate(truth.names.objects[1:], start=1))}
+    return np.concatenate(parts), times, facts
 
 
-def write_prophesee_boxes(
-    recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None
-) -> dict[str, Any]:
+def write_prophesee_boxes(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``recording_bbox.npy`` for ``recording_td.dat``."""
-    rows, _, told = _event_boxes(recording, truth, every_us, PROPHESEE_BOX)
+    rows, _, facts = _event_boxes(recording, truth, every_us, PROPHESEE_BOX)
     np.save(folder / "recording_bbox.npy", rows)
-    return told
+    return facts
 
 
-def write_dsec_det(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def write_dsec_det(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``object_detections/left/tracks.npy``, with the times of the boxes as those of images."""
-    rows, times, told = _event_boxes(recording, truth, every_us, DSEC_BOX)
+    rows, times, facts = _event_boxes(recording, truth, every_us, DSEC_BOX)
     for name in ("object_detections/left", "images"):
         (folder / name).mkdir(parents=True)
     np.save(folder / "object_detections" / "left" / "tracks.npy", rows)
     (folder / "images" / "timestamps.txt").write_text("".join(f"{t}\n" for t in times), encoding="ascii")
-    return told
+    return facts
 
 
-def write_coco(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def write_coco(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``annotations/instances.json`` with boxes and masks of each frame, and the frames as 8-bit sRGB in ``images``."""
     from PIL import Image
 

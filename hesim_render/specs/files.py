@@ -95,9 +95,9 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
     if os.path.isfile(given):
         return given
     names = list_names(kind)
+    one = "study" if kind == "studies" else kind[:-1].replace("_", " ")
     raise SpecError(
-        f"no {kind[:-1]} named {str(name_or_path)!r}; shipped are {', '.join(names)}"
-        f"{did_you_mean(str(name_or_path), names)}"
+        f"no {one} named {str(name_or_path)!r}; shipped are {', '.join(names)}{did_you_mean(str(name_or_path), names)}"
     )
 
 
@@ -123,6 +123,13 @@ def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> None:
             node[int(keys[-1])] = value
         else:
             node[keys[-1]] = value
+
+
+def as_read(value: Any) -> Any:
+    """A copy as if it had been read from a file, so that changes by `--set` reach into it."""
+    if isinstance(value, dict):
+        return CommentedMap({key: as_read(inner) for key, inner in value.items()})
+    return CommentedSeq([as_read(inner) for inner in value]) if isinstance(value, list) else value
 
 
 def _item(node: CommentedSeq, key: str, dotted: str) -> Any:

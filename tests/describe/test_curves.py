@@ -13,16 +13,16 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.describe import event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
+from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs import read_sensor
-from hesim_render.specs.event_noise import events_per_period
+from hesim_render.sensor.from_data_sheet import electrons_per_s_lux
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.files import list_names
-from hesim_render.specs.from_data_sheet import electrons_per_s_lux
 from hesim_render.spectral.spectrum import illuminant
 
 #: A pixel of 20 Hz, which is quick to simulate, written as a data sheet.
 SLOW = {
-    "evs.data_sheet.noise_bandwidth_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
+    "evs.data_sheet.noise_cutoff_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
     "evs.data_sheet.speed": [{"lux": 5, "bandwidth_hz": 20}], "evs.data_sheet.refractory_us": 5000,
 }  # fmt: skip
 
@@ -134,7 +134,7 @@ def test_rare_background_with_its_leak(name, pixels):
     (stated,) = sheet.background
     curves = event_curves(sensor, [float(stated.lux)])
     assert curves.on_hz[0] + curves.off_hz[0] == pytest.approx(stated.rate_hz, rel=1e-3)
-    begin_s, end_s = (round(periods / sheet.noise_bandwidth_hz, 1) for periods in (1000, 3000))
+    begin_s, end_s = (round(periods / sheet.noise_cutoff_hz, 1) for periods in (1000, 3000))
     found = sum(simulated_rates(sensor, stated.lux, begin_s, end_s - begin_s))
     drawn = of_drawn_thresholds(sensor, stated.lux)
     assert found == pytest.approx(drawn, rel=0.05)  # 10,000 events or more

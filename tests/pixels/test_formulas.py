@@ -202,7 +202,9 @@ def test_calibration_fits_the_formulas_where_drjit_and_mitsuba_cannot_be_importe
     for found, expected in zip(told["found"], (variance, np.log(x), noise / x**2), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-12)
     formulas = {f"hesim_render.pixels.{name}" for name in ("aps", "aps.formulas", "evs", "evs.formulas")}
-    assert formulas <= set(told["loaded"]) <= formulas | {"hesim_render.pixels.evs.events"}  # the type of events
+    # the type of events, and the rates that sensor files of data sheets need
+    others = {"hesim_render.pixels.evs.events", "hesim_render.pixels.evs.noise_rates"}
+    assert formulas <= set(told["loaded"]) <= formulas | others
     # the fits found the truth of the sets: six z values beyond 4.5 have a chance of 4e-5
     data = read_calibration(out)
     known = {"K": 0.25, "read_noise_e": 6.0, "dark_current_e_per_s": 2000.0}

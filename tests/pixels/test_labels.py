@@ -6,13 +6,13 @@ import pytest
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import partners
-from hesim_render.pixels.evs.balance import Balance, Steps
+from hesim_render.pixels.evs.balance import Balance, PixelSteps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.nominal import NominalSteps
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 #: Not square, so that rows are not taken for columns.
 ROWS, COLS, THETA = 36, 64, 0.2
@@ -403,7 +403,7 @@ def test_pairs_against_a_pixel_by_pixel_version_in_any_portions():
                 pixel, k = np.nonzero((t >= low) & (t < high))
                 order = np.argsort(t[pixel, k], kind="stable")
                 pixel, k = pixel[order], k[order]
-                parts.append(Steps(t[pixel, k], pixel, s[pixel, k], pixel * length + k))
+                parts.append(PixelSteps(t[pixel, k], pixel, s[pixel, k], pixel * length + k))
             cause, effect, lost = balance.take(*parts)
             found |= set(zip(cause.tolist(), effect.tolist(), strict=True))
             assert lost.size == 0
@@ -412,7 +412,7 @@ def test_pairs_against_a_pixel_by_pixel_version_in_any_portions():
 
 def steps(*given):
     """(time, pixel, sign, number) each."""
-    return Steps(*np.array(given, np.int64).reshape(-1, 4).T)
+    return PixelSteps(*np.array(given, np.int64).reshape(-1, 4).T)
 
 
 def test_pairs_of_pixels_with_a_dead_time():

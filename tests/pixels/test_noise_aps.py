@@ -9,7 +9,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 SIDE = 512
 EXPOSURE_US = 10_000

@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibration.rates import EventDefectRates
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.rng import Stream, device_normal, device_uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.events import Origin
-from hesim_render.pixels.measured import event_defects
+from hesim_render.pixels.measured import event_defect_rates
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
-from hesim_render.specs.calibration_spec import Defect
 from hesim_render.specs.defects import EventDefectSpec
-from hesim_render.specs.sensor import EvsSpec
+from hesim_render.specs.event_pixels import EvsSpec
 
 #: Events of a defect per comparison above which more change nothing: the chance of no event is e⁻³⁰.
 _MOST_PER_TICK = 30.0
@@ -30,7 +31,7 @@ _AHEAD = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class EventDefects:
+class PixelDefects:
     """Defects of the event pixels of a region.
 
     Attributes
@@ -50,7 +51,7 @@ class EventDefects:
     firing_share: NDArray[np.float64]
     change_hz: NDArray[np.float64]
 
-    def without(self, term: str) -> EventDefects:
+    def without(self, term: str) -> PixelDefects:
         """The same defects without the stuck (``stuck``), hot (``hot``) or flickering (``flickering``) pixels."""
         if term == "stuck":
             return replace(self, stuck=self.stuck[:0])
@@ -62,7 +63,7 @@ class EventDefects:
         return self.stuck.size + self.place.size > 0
 
 
-def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
+def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> PixelDefects:
     """Defects of a device: measured where a calibration has them, drawn from the device seed otherwise.
 
     Parameters
@@ -72,13 +73,13 @@ def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
     device_seed : which device of this kind.
     """
     key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
-    measured = event_defects(layout)
+    measured = event_defect_rates(layout)
     if measured is not None:
         return _measured(measured, key)
     return _drawn(spec.defects or EventDefectSpec(), key, device_seed)
 
 
-def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> EventDefects:
+def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> PixelDefects:
     if spec.stuck_share + spec.hot_share + spec.flickering_share == 0:
         number = np.ones(key.size)
     else:
@@ -90,7 +91,7 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
     firing, quiet = spec.flickering_firing_s or 1.0, spec.flickering_quiet_s or 1.0
     ones = np.ones(flickering.size)
     place = np.concatenate([hot, flickering])
-    return EventDefects(
+    return PixelDefects(
         stuck=stuck,
         place=place,
         key=key[place],
@@ -103,12 +104,12 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
     )
 
 
-def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32]) -> EventDefects:
-    stuck = np.flatnonzero(maps["defect"].ravel() == Defect.STUCK)
-    names = ("on_hz", "off_hz", "firing_share", "change_hz")
-    values = np.stack([maps[f"defect_{name}"].ravel() for name in names]).astype(np.float64)
+def _measured(rates: EventDefectRates, key: NDArray[np.uint32]) -> PixelDefects:
+    stuck = np.flatnonzero(rates.kind.ravel() == Defect.STUCK)
+    every = rates.on_hz, rates.off_hz, rates.firing_share, rates.change_hz
+    values = np.stack([values.ravel() for values in every]).astype(np.float64)
     place = np.flatnonzero((values[:2] > 0).any(axis=0))
-    return EventDefects(stuck, place, key[place], *values[:, place])
+    return PixelDefects(stuck, place, key[place], *values[:, place])
 
 
 class DefectEvents:
@@ -122,7 +123,7 @@ class DefectEvents:
         are limited.
     """
 
-    def __init__(self, defects: EventDefects, seed: int, tick_s: float | None = None) -> None:
+    def __init__(self, defects: PixelDefects, seed: int, tick_s: float | None = None) -> None:
         self._defects = defects
         total = defects.on_hz + defects.off_hz
         self._on_part = defects.on_hz / np.maximum(total, 1e-300)

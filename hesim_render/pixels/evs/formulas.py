@@ -31,6 +31,10 @@ from hesim_render.core.namespace import Namespace
 
 ShotLaw = Literal["linear", "sqrt"]
 
+#: Two equal poles that are −3 dB together at f: the rate of each over f, a = 2π f/√(√2 − 1), and its frequency over f.
+POLE = math.tau / math.sqrt(math.sqrt(2.0) - 1.0)
+POLE_HZ = 1 / math.sqrt(math.sqrt(2.0) - 1.0)
+
 
 @dataclass(frozen=True)
 class Coefficients:
@@ -137,6 +141,11 @@ def noise_equivalent(
     return xp.maximum(noise, least_change * voltage(k, signal)) / k.slope
 
 
+def corner_line(part: Values, least_hz: float, largest_hz: float) -> Values:
+    """Corner frequency at a part of the signal at which it is `largest_hz`; limits as for `corner_hz`."""
+    return least_hz + (largest_hz - least_hz) * part
+
+
 def corner_hz(
     k: Coefficients, log: Values, reference_level: Values, least_hz: float, largest_hz: float, xp: Namespace
 ) -> Values:
@@ -158,7 +167,7 @@ def corner_hz(
     -------
     Corner frequency, Hz.
     """
-    line = least_hz + (largest_hz - least_hz) * ((xp.exp(log) - k.base) / reference_level)
+    line = corner_line((xp.exp(log) - k.base) / reference_level, least_hz, largest_hz)
     return xp.clip(line, least_hz, largest_hz)  # the lower limit is for rounding: no light is below 0
 
 

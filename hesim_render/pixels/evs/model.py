@@ -22,14 +22,14 @@ from hesim_render.core.rng import Stream, device_normal
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
-from hesim_render.pixels.evs.defects import EventDefects, defects_of
+from hesim_render.pixels.evs.defects import PixelDefects, defects_of
 from hesim_render.pixels.evs.formulas import Coefficients
+from hesim_render.pixels.evs.noise_rates import LEAST_THRESHOLD_REL
 from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
 from hesim_render.pixels.terms import switched_off
-from hesim_render.specs.event_noise import LEAST_THRESHOLD_REL
+from hesim_render.specs.event_pixels import EvsCoefficients, EvsSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
-from hesim_render.specs.sensor import EvsCoefficients, EvsSpec
 
 #: Kinds of defects, each a term.
 _DEFECTS = ("stuck", "hot", "flickering")
@@ -89,7 +89,7 @@ class EvsNoise(PlainState):
         return 0.0 if "leak" in self.off else self.spec.leak_rate_hz
 
     @cached_property
-    def defects(self) -> EventDefects:
+    def defects(self) -> PixelDefects:
         """Stuck, hot and flickering pixels of this device."""
         found = defects_of(self.spec, self.layout, self.device_seed)
         for term in self.off.intersection(_DEFECTS):

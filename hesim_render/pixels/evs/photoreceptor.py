@@ -21,6 +21,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.units import US_PER_S
+from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
 
 #: Nodes per period of the highest corner frequency. Between nodes, y is taken as a straight line.
@@ -35,7 +36,7 @@ _State = tuple[Float, Float]
 
 def _rate(corner_hz: Float) -> Float:
     """a in 1/µs of both poles of a corner frequency."""
-    return corner_hz * (math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / US_PER_S)
+    return corner_hz * (POLE / US_PER_S)
 
 
 class Photoreceptor:

@@ -1,10 +1,10 @@
-"""What the rate of a video's pictures does to events, told for the way in which the pixels compare."""
+"""What the rate of a video's pictures does to events, for the way in which the pixels compare."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from hesim_render.specs.sensor import EvsSpec
+from hesim_render.specs.event_pixels import EvsSpec
 
 
 def event_notes(spec: EvsSpec, period_us: float, is_held: bool) -> list[str]:
