@@ -60,7 +60,7 @@ def test_a_dry_run_estimates_and_writes_nothing(options, moving, capsys, tmp_pat
 
 
 @pytest.mark.parametrize(("words", "estimates"), [
-    (STILL, "capture.simulate.forecast"), (STILL, "load_scene"),
+    (STILL, "sources.render.change_driven.flux.forecast"), (STILL, "load_scene"),
     (["benchmark", "build", "tiny.yaml"], "benchmark.build.estimate_build"),
 ])  # fmt: skip
 @pytest.mark.parametrize("is_dry", [True, False])
