@@ -348,6 +348,13 @@ def spoiled(folder, target, name, **arrays):
     return target
 
 
+def calm_trials(most):
+    """Of 1000 trials, all are calm in one pixel and so many in the others; no event follows."""
+    calm, none = np.full((32, 32, 32), most), np.zeros((32, 2, 32, 32), int)
+    calm[:, 3, 7] = 1000
+    return {"n_calm": calm, "n_on": none, "n_off": none}
+
+
 @pytest.mark.parametrize(
     ("name", "arrays", "text"),
     [
@@ -364,6 +371,8 @@ def spoiled(folder, target, name, **arrays):
         ("evs_s_curve", {"n_on": np.full((32, 2, 32, 32), 9000)}, "more trials together than n_calm"),
         ("evs_s_curve", {"n_on": np.full((32, 2, 32, 32), -1)}, "numbers below 0"),
         ("evs_s_curve", {"n_calm": np.zeros((32, 32, 32)) + 0.5}, "save whole numbers"),
+        ("evs_s_curve", calm_trials(188), "fewer than a fifth of the trials are calm"),
+        ("evs_s_curve", calm_trials(210), "no event of one polarity"),
         ("evs_noise_rate", {"contrast": np.array([0, 0.1, 0])}, "contrast must be 0 in steady light"),
         ("evs_noise_rate", {"signal_dn": np.array([np.inf, 1, 2])}, "signal_dn must be a list of finite"),
     ],

@@ -154,7 +154,9 @@ def test_numbers_that_are_none_become_null():
 
 
 def test_numbers_are_short():
-    assert [number(v) for v in (0, 1234567, 0.25, 2e-4)] == ["0", "1.2e6", "0.25", "2.0e-4"]
+    assert [number(v) for v in (0, 1234567, 34567.8, 1234.5, 0.25, 2e-4)] == [
+        "0", "1.2e6", "34568", "1234", "0.25", "2.0e-4",
+    ]  # fmt: skip
 
 
 def _figures(calibration, report, monkeypatch):

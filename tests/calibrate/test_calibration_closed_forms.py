@@ -13,6 +13,7 @@ from scipy.special import betainc, gammaincc, ndtr
 
 import hesim_render as hr
 from hesim_render.calibrate.aps import checks as frame_checks
+from hesim_render.calibrate.aps import photon_transfer
 from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixels
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
@@ -147,6 +148,30 @@ def test_system_gain_is_exact_however_noisy_the_signals_are(tau, monkeypatch):
     dark_variance = 2 * shared**2 / ((FRAMES - 1) * bins.pixels[dark])
     error = np.sqrt(bottom + np.sum(np.square(of_dark) * dark_variance)) / bottom
     assert system_gain(bins, top_dn=700.0)[1] == pytest.approx(error, rel=1e-9)
+
+
+def test_prnu_is_the_spread_of_good_pixels_at_each_position_of_the_tile():
+    """Two positions of different rates and spreads; pixels that are bad, hot or without a rate have absurd ones."""
+    rng, spread, noise = np.random.default_rng(9), (0.03, 0.017), 0.011
+    rate, error = np.empty((36, 25)), np.full((36, 25), np.nan)
+    for row, level in enumerate((730.0, 210.0)):
+        values = rng.standard_normal((18, 25))
+        values.flat[:3] = 0  # the three that do not count
+        rest = values.ravel()[3:]
+        rest -= rest.mean()
+        values.ravel()[3:] = rest / rest.std()
+        rate[row::2] = level * (1 + np.hypot(spread[row], noise) * values)
+        error[row::2] = level * noise
+        rate[row::2].flat[:3] = rate[row, :3] = np.nan, 9e4, -7e4
+    bad, hot = np.zeros((2, 36, 25), bool)
+    bad[:2, 1] = hot[:2, 2] = True
+    dark, spec = SimpleNamespace(bad=bad, hot=hot), SimpleNamespace(tile_rows=2, tile_cols=1)
+    found = photon_transfer._prnu(Composite(rate, error), dark, spec)
+    assert found["value"] == pytest.approx(100 * np.sqrt(np.mean(np.square(spread))), rel=1e-6)
+    total = np.square(spread) + noise**2
+    scatter = np.sqrt(np.sum(2 * total**2 / (18 * 25 - 3))) / 2
+    expected = 100 * scatter / (2 * np.sqrt(np.mean(np.square(spread))))
+    assert found["standard_error"] == pytest.approx(expected, rel=1e-6)
 
 
 # ---- thresholds ---------------------------------------------------------------------------------

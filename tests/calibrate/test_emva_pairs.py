@@ -13,7 +13,7 @@ from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
 from hesim_render.calibrate.aps.sensor_file import write_sensor
-from hesim_render.calibrate.aps.spatial import Temporal, spatial_variance
+from hesim_render.calibrate.aps.spatial import Temporal, pattern_of, spatial_variance
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.pair_set import read_pair_set
 
@@ -371,3 +371,16 @@ def test_the_reference_set_gives_the_figures_of_the_reference_implementation(tmp
     assert found["prnu_percent"]["value"] == pytest.approx(prnu, rel=5e-3)
     assert found["full_well_e"]["photons"] == saturation
     assert result.long_lit.spatial.col == pytest.approx(col, rel=5e-3)
+
+
+def test_a_faint_pattern_keeps_its_variance_below_the_noise_of_the_mean():
+    """A twentieth of the noise: the variance over the picture is made exact, so that only the scatter of the means over
+    boxes is left, 1 % of the pattern.
+    """
+    values = np.random.default_rng(12).standard_normal((384, 512))
+    values -= values.mean(axis=1, keepdims=True)
+    values -= values.mean(axis=0)
+    noise, pattern = 2.3, 0.115
+    image = 700 + np.sqrt((noise + pattern) / values.var()) * values
+    found = pattern_of(image, (noise / 512, noise / 384, noise)).pixel
+    assert found.var() == pytest.approx(pattern, rel=0.05)
