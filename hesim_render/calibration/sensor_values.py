@@ -57,6 +57,7 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile, data: Calibratio
         raise SpecError(
             f"is of a sensor with a tile of {captured[0]}×{captured[1]}, not {shape[0]}×{shape[1]}", file=noise.path
         )
+    # all values are collected before any is set: a calibration that does not fit changes nothing
     changed: dict[str, Any] = {}
     for section in data.sections:
         if not isinstance(sensor.get(section), dict):
@@ -71,6 +72,7 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile, data: Calibratio
         else:
             found = _evs_values(sensor, data.evs, noise)
         changed |= {f"evs.{key}": value for key, value in (found | _signal_reference(data)).items()}
+    # each value that was measured says so; what the file said of its source does not hold any more
     for key, value in changed.items():
         section, name = key.split(".")
         sensor[section][name] = value

@@ -94,6 +94,7 @@ class SceneRun:
     def record(self, writer: RecordingWriter) -> None:
         """Capture frames and events; the audit notes some values on their way."""
         source, settings = self._renderer, self._settings
+        # units are drawn during the run, before anybody can know their values: the audit cannot choose easy ones
         if self._is_audited:
             spec = source.sensor.spec.evs
             stretch = STRETCHES[spec.reference] if spec is not None else (0, 1, 0)

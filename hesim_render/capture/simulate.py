@@ -93,6 +93,7 @@ def simulate(
     scene, sensor = scene_and_sensor(scene, sensor)
     run_settings = RunSettings(**settings)
     duration_us, seed = run_settings.duration_us, run_settings.seed
+    # what can be refused without a renderer is refused before it compiles anything
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     backend.jit()
     noise = noise_models(sensor, run_settings.clean, run_settings.without, TERMS)
@@ -105,10 +106,12 @@ def simulate(
         asked = run_settings.quality, run_settings.samples, run_settings.exact
         source = renderer or scene_renderer(seen, sensor, seed, *asked)
         warn_if_unseen(scene.spec, source.view, duration_us)
+        # all that decides the bits of the recording; it is also the name of the journal that a later call goes on from
         stated = run_settings.as_dict() | source.settings
         if level is not None:
             stated["light_level"] = level.as_dict()
         stated |= {"backend": backend.select().label, "camera": camera_used(source.view)}
+        # the estimate may end the run: nothing is written before it
         run = SceneRun(source, noise, run_settings, report)
         expected = run.expect(on_estimate)
         if expected is not None:
@@ -117,9 +120,11 @@ def simulate(
             out, source.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=stated,
             overwrite=overwrite,
         ) as writer, _journal(resume and renderer is None, out, writer, overwrite) as journal:  # fmt: skip
+            # traced pairs are taken from the journal of an interrupted run, and kept there for the next one
             if journal is not None:
                 source.go_on(journal)
             run.record(writer)
+            # the audit renders again what the run noted, so it comes after the run
             writer.add_settings({"render": run.verdict()})
             run.write_truth(writer, scene, sensor)
             return warn_of_exposure(writer.finish())

@@ -78,6 +78,7 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
 
 def telegraph_rates(layout: Layout) -> TelegraphRates | None:
     """Random telegraph noise of each pixel of the region, [row, col]; None if not measured."""
+    # per second where the calibration has it; older ones, and those of captures without an interval, are per frame
     known = _all_of(TelegraphRates, layout, "aps", _frame_region)
     if known is not None:
         return known

@@ -56,17 +56,21 @@ def read_sensor_file(name_or_path: str | Path, overrides: Mapping[str, Any] | No
     data, changes = load_yaml(file), dict(overrides or {})
     if "pixels" not in data and {"target", "objects", "light", "camera", "mitsuba"} & set(data):
         raise SpecError("is a scene file; expected a sensor file", file=file)
+    # parse: the calibration is taken out, because its values come before those of the overrides
     noise = _noise_of(data, changes, file)
     # the intervals of the file itself: overrides are of the simulation
     own = {name: dict(data[name]) for name in ("aps", "evs") if isinstance(data.get(name), Mapping)}
     # what does not follow from a data sheet is needed to read it; the rest has the last word over it
     needed = {key: value for key, value in changes.items() if not _is_derived(key)}
     apply_overrides(data, needed)
+    # resolve, first step: thresholds and noise from the figures of a data sheet
     evs = data.get("evs")
     if isinstance(evs, CommentedMap) and any(evs.get(section) is not None for section in SHEETS):
         _require_once(data, file)
         derive(data, validate(SheetSensorSpec, data, file, needed), file)
+    # the whole file is checked here; where nothing is to be resolved this is the only time
     spec, maps = validate(SensorSpec, data, file, changes), None
+    # second step: what was measured replaces what was assumed
     if noise is not None:
         calibration = read_named(noise)
         noise = with_intervals(own, noise, calibration)

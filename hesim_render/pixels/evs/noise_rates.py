@@ -132,11 +132,13 @@ def noise_rates_hz(
     """
     if sigma <= 0:
         return 0.0, 0.0
+    # each pixel has its own pair of thresholds: the mean over both normal laws, by the trapezoid rule
     deviates, weights = (_DEVIATES, _WEIGHTS) if mismatch > 0 else (np.zeros(1), np.ones(1))
     spread = np.maximum(1 + mismatch * deviates, LEAST_THRESHOLD_REL)
     on, off = np.meshgrid(thresholds[0] * spread / sigma, thresholds[1] * spread / sigma)
     dead_periods = dead_s * bandwidth_hz
     rates = bandwidth_hz * events_per_period(on, off, dead_periods, leak_hz / bandwidth_hz) * np.outer(weights, weights)
+    # both directions travel equally far in the long run: the lower threshold, with what lies beyond it, has more events
     beyond = _beyond((on + off) / 2, dead_periods)
     share = np.clip((off + beyond) / (on + off + 2 * beyond), 0.0, 1.0)
     return float(np.sum(rates * share)), float(np.sum(rates * (1 - share)))
