@@ -69,6 +69,7 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile, data: Calibratio
             found = _asynchronous_values(sensor, data.evs, noise.path)
         else:
             found = _evs_values(sensor, data.evs, noise)
+        sensor["evs"].pop("leak", None)  # leak_rate_hz is the calibrated one
         changed |= {f"evs.{key}": value for key, value in (found | _signal_reference(data)).items()}
     for key, value in changed.items():
         section, name = key.split(".")

@@ -22,6 +22,7 @@ from hesim_render.specs.defects import EventDefectSpec, TelegraphSpec
 from hesim_render.specs.doubts import doubts
 from hesim_render.specs.files import Strict, load_yaml, locate, validate
 from hesim_render.specs.from_data_sheet import derive, placeholders
+from hesim_render.specs.leak import LeakSpec
 from hesim_render.specs.lens import LensSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 from hesim_render.specs.problems import line_of
@@ -206,6 +207,7 @@ class EvsSpec(Strict):
     shot_law: Literal["linear", "sqrt"]
     noise_mode: Literal["per_instant", "independent"] = "per_instant"
     leak_rate_hz: float = Field(0.0, ge=0, le=1e6, description="Poisson process of ON events, per pixel")
+    leak: LeakSpec | None = Field(None, description="in place of leak_rate_hz: which process the leak is")
     photoreceptor_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="noise bandwidth (last_event)")
     photoreceptor: PhotoreceptorSpec | None = Field(None, description="bandwidth of the signal; default unlimited")
     data_sheet: DataSheetSpec | None = Field(None, description="figures that the values above follow from")
@@ -245,6 +247,13 @@ class EvsSpec(Strict):
             raise ValueError("data_sheet and v2e say the same in two ways: leave one of them out")
         if (self.data_sheet or self.v2e) is not None and self.reference != "last_event":
             raise ValueError("data_sheet and v2e describe asynchronous pixels: they need reference 'last_event'")
+        if self.leak is not None and self.leak_rate_hz > 0:
+            raise ValueError("leak and leak_rate_hz (or leak_hz of a data sheet) say the same: leave one of them out")
+        if self.leak is not None and self.leak.process == "drift" and self.reference != "last_event":
+            raise ValueError(
+                "leak.process 'drift' moves the reference of asynchronous pixels, reference 'last_event'; a fixed tick "
+                "has process 'poisson'"
+            )
         if self.readout_buffer_events is not None and self.readout_max_events_per_s is None:
             raise ValueError("readout_buffer_events needs readout_max_events_per_s")
         follows_light = self.photoreceptor is not None and self.photoreceptor.follows_light
