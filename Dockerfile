@@ -6,7 +6,7 @@ WORKDIR /src
 COPY . .
 RUN python -m venv /opt/hesim
 RUN /opt/hesim/bin/pip install --no-cache-dir '.[llvm,targets,meshes,cubes]'
-RUN /opt/hesim/bin/hesim-render doctor
+RUN /opt/hesim/bin/hesim-render info
 RUN useradd --create-home hesim && mkdir /data && chown hesim /data
 USER hesim
 WORKDIR /data

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 
-COMMANDS = ("--help", "simulate --help", "list scenes", "list sensors", "list")
+COMMANDS = ("--help", "simulate --help", "info scenes", "info sensors", "info names")
 
 
 def best(command):

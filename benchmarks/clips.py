@@ -27,7 +27,7 @@ from hesim_render.benchmark import clip as clip_module
 from hesim_render.benchmark.build import build_benchmark, opened
 from hesim_render.benchmark.clip import build_clip
 from hesim_render.benchmark.local import LocalWorkers
-from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.benchmark.spans import spans_of
 from hesim_render.benchmark.worker import order_of
 from hesim_render.capture import simulate as simulate_module
@@ -87,7 +87,7 @@ def timed(spent):
 
 
 def parts(spec, folder):
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     total: dict[str, float] = {}
     for clip in plan.clips:
         spent: dict[str, float] = {}
@@ -107,7 +107,7 @@ def parts(spec, folder):
 
 def run(spec, folder, count, spans=()):
     """Clips by `count` workers of one thread: when they began, the time of each answer, and that inside its unit."""
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     opened(plan, folder)
     answers, begin = [], time.monotonic()
     failed = LocalWorkers(order_of(spec, folder), count, threads=1).run(

@@ -1,5 +1,5 @@
-"""Time of the framing (`--look`) of every shipped scene, and cost of all geometric truth and event labels on top of a
-render, at the default quality.
+"""Time of the framing (`--framing`) of every shipped scene, and cost of all geometric truth and event labels on top
+of a render, at the default quality.
 
 Runs `rotating-star` and a scene with a mesh of 20 000 triangles on `gen2`, 512×384 pixels, 0.1 s, without truth and
 with all kinds of it, and prints the time of both and the share on top. Processor time counts the work of all threads

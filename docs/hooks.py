@@ -19,7 +19,7 @@ PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.
 CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(\[])")
 #: A symbol of one letter with an index.
 INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
-#: Where docs/cli.md is to have what `--help` says of each command.
+#: Where docs/cli.md is to have what `--help-all` says of each command.
 COMMANDS = "<!-- commands -->"
 
 
@@ -124,14 +124,15 @@ def bibliography() -> str:
 
 
 def commands() -> str:
-    """What `--help` says of every command, as Markdown."""
+    """What `--help-all` says of every command, as Markdown."""
     from hesim_render.cli.commands import program
+    from hesim_render.cli.options import full_help
 
     def section(name: str, command: Any) -> list[str]:
         context = command.context_class(
             command, info_name=f"hesim-render {name}", terminal_width=100, max_content_width=100
         )
-        lines = [f"### {name}", "", "```text", command.get_help(context).strip(), "```", ""]
+        lines = [f"### {name}", "", "```text", full_help(context).strip(), "```", ""]
         for below, child in getattr(command, "commands", {}).items():
             lines += section(f"{name} {below}", child)
         return lines

@@ -18,7 +18,7 @@ from hesim_render.benchmark.folder import CARD_FILE, MANIFEST_FILE, PLAN_FILE, S
 from hesim_render.benchmark.forecast import BuildEstimate, estimate_build
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.local import LocalWorkers
-from hesim_render.benchmark.plan import Plan, shared_parts
+from hesim_render.benchmark.plan import BenchmarkPlan, shared_parts
 from hesim_render.benchmark.spans import SPAN_S, Span, discard_spans, spans_of
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
@@ -79,7 +79,7 @@ def build_benchmark(
     if not 0 <= span_s < float("inf"):
         raise RangeError("span_s", span_s, "a length of time, s; or 0 for whole clips")
     spec = spec if isinstance(spec, BenchmarkSpec) else read_benchmark(spec)
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     plan.check()
     with _client(scheduler) as client:
         root = opened(plan, Path(out))
@@ -92,7 +92,7 @@ def build_benchmark(
         spans = spans_of(spec.duration_us, max(1, round(span_s * 1e6)) if span_s else 0) if is_shared else ()
         left = {clip.name: 1.0 for clip in missing}
 
-        def told(answer: dict[str, Any]) -> None:
+        def on_answer(answer: dict[str, Any]) -> None:
             name = answer["name"]
             part = left[name] if "error" in answer else 1 / (len(spans) + 1)
             left[name] -= part
@@ -102,7 +102,7 @@ def build_benchmark(
             if progress is not None:
                 progress(done["clips"], len(plan.clips), "clips")
 
-        failed = _run(missing, spans, order_of(spec, root), workers, client, told) if missing else {}
+        failed = _run(missing, spans, order_of(spec, root), workers, client, on_answer) if missing else {}
     _report(root, expected, len(missing), time.monotonic() - begin, done, workers, scheduler)
     if failed:
         lines = [f"{name}: {reason}" for name, reason in sorted(failed.items())]
@@ -119,7 +119,7 @@ def check_build(spec: BenchmarkSpec, out: str | Path) -> tuple[int, list[Clip], 
     -------
     Number of clips, those that are still to be built, and their estimate; None where there are none.
     """
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     plan.check()
     root = _checked(plan, Path(out))
     missing = [clip for clip in plan.clips if not is_complete(root, clip)]
@@ -154,18 +154,18 @@ def _run(
     order: str,
     workers: int,
     client: Any,
-    told: Callable[[dict[str, Any]], None],
+    on_answer: Callable[[dict[str, Any]], None],
 ) -> dict[str, str]:
     if client is not None:
         from hesim_render.benchmark.cluster import run_on_cluster
 
-        return run_on_cluster(client, order, clips, told, spans)
+        return run_on_cluster(client, order, clips, on_answer, spans)
     if workers:
-        return LocalWorkers(order, workers).run(clips, told, spans)
+        return LocalWorkers(order, workers).run(clips, on_answer, spans)
     failed: dict[str, str] = {}
     for clip in clips:
         answer = attempt(order, clip.as_dict())
-        told(answer)
+        on_answer(answer)
         if "error" in answer:
             failed[clip.name] = answer["error"]
             if answer["fatal"]:
@@ -173,7 +173,7 @@ def _run(
     return failed
 
 
-def _plan_content(plan: Plan) -> dict[str, Any]:
+def _plan_content(plan: BenchmarkPlan) -> dict[str, Any]:
     """What decides the bytes of all clips: the specification and the content of the files that it names."""
     spec = plan.spec
     first = {clip.sensor: clip for clip in reversed(plan.clips)}
@@ -189,7 +189,7 @@ def _plan_content(plan: Plan) -> dict[str, Any]:
     }
 
 
-def opened(plan: Plan, out: Path) -> Path:
+def opened(plan: BenchmarkPlan, out: Path) -> Path:
     """The folder of the benchmark, with its plan in it.
 
     Parameters
@@ -212,7 +212,7 @@ def opened(plan: Plan, out: Path) -> Path:
     return root
 
 
-def _checked(plan: Plan, out: Path) -> Path:
+def _checked(plan: BenchmarkPlan, out: Path) -> Path:
     """The folder of the benchmark, which is empty, missing, or holds clips of this plan."""
     content = _plan_content(plan)
     root = check_target(out, PLAN_FILE, overwrite=True)
@@ -256,7 +256,7 @@ def _report(
         unfinished.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
 
 
-def _finish(plan: Plan, root: Path) -> None:
+def _finish(plan: BenchmarkPlan, root: Path) -> None:
     """Write manifest and card from the clips.
 
     Raises

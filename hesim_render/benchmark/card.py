@@ -104,9 +104,9 @@ def card(manifest: dict[str, Any], clips: list[dict[str, Any]]) -> str:
             f"| `{name}` | {values['min']:.3g} | {values['median']:.3g} | {values['max']:.3g} | "
             f"{values['decades']:.1f} | {FIGURES[name]}{zero} |"
         )
-    told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
+    audits_text = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
     lines += [
-        "", f"{_render(spec)}. Audits: {told}.", "",
+        "", f"{_render(spec)}. Audits: {audits_text}.", "",
         "| Folder of a clip | |", "|---|---|",
         "| `clip.json` | numbers on the axes, figures, parts, error and audit, units, versions, hashes |",
         "| `recording/` | RAW frames with blur, events, their truth and labels |",

@@ -10,7 +10,7 @@ from typing import Any
 
 from hesim_render.benchmark.colour_truth import COLOURS_FILE, frame_filters, write_colours
 from hesim_render.benchmark.generator import file_hash
-from hesim_render.benchmark.plan import Clip, Plan
+from hesim_render.benchmark.plan import BenchmarkPlan, Clip
 from hesim_render.benchmark.sharp import SHARP_FILE, sharp_flux, windows, write_sharp
 from hesim_render.benchmark.spans import (
     Span,
@@ -75,7 +75,7 @@ def is_complete(root: Path, clip: Clip) -> bool:
     return (clip_folder(root, clip) / CLIP_FILE).is_file()
 
 
-def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
+def build_clip(plan: BenchmarkPlan, clip: Clip, root: Path) -> Built:
     """Build a clip, unless it is there. Its bytes depend on the plan alone, not on time, machine load or worker.
 
     Parameters
@@ -109,7 +109,7 @@ def build_clip(plan: Plan, clip: Clip, root: Path) -> Built:
     return Built(clip.name, time.monotonic() - begin, size)
 
 
-def render_span(plan: Plan, clip: Clip, span: Span, root: Path) -> Built:
+def render_span(plan: BenchmarkPlan, clip: Clip, span: Span, root: Path) -> Built:
     """Render the light of a span of a clip into a journal that `build_clip` reads, unless that has been done.
 
     Parameters
@@ -146,7 +146,7 @@ def render_span(plan: Plan, clip: Clip, span: Span, root: Path) -> Built:
     return Built(clip.name, time.monotonic() - begin, 0)
 
 
-def _scene(plan: Plan, clip: Clip, folder: Path) -> tuple[Scene, tuple[str, ...]]:
+def _scene(plan: BenchmarkPlan, clip: Clip, folder: Path) -> tuple[Scene, tuple[str, ...]]:
     """The scene of a clip and its parts; a generated one is written into a folder."""
     generated = plan.scene_files(clip)
     if generated is None:
@@ -155,7 +155,7 @@ def _scene(plan: Plan, clip: Clip, folder: Path) -> tuple[Scene, tuple[str, ...]
         return load_scene(generated.write(folder / SCENE)), generated.parts
 
 
-def _renderer(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> tuple[Any, dict[str, Any]]:
+def _renderer(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> tuple[Any, dict[str, Any]]:
     """The renderer of a clip and its settings."""
     spec = plan.spec
     quality = spec.quality if spec.samples is None else None
@@ -163,14 +163,14 @@ def _renderer(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> tuple[Any
     return flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
 
 
-def _sharp_source(plan: Plan, clip: Clip, renderer: tuple[Any, dict[str, Any]], sensor: Sensor) -> FluxSource:
+def _sharp_source(plan: BenchmarkPlan, clip: Clip, renderer: tuple[Any, dict[str, Any]], sensor: Sensor) -> FluxSource:
     """The light of the sharp images: with the crosstalk that the frames of the clip have."""
     level = plan.spec.noise[clip.noise]
     aps, _ = noise_models(sensor, level.clean, level.without)
     return with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
 
 
-def _fill(plan: Plan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
+def _fill(plan: BenchmarkPlan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
     """Render a clip into a folder, which will be `target`; returns its description."""
     spec = plan.spec
     scene, parts = _scene(plan, clip, folder)
@@ -217,13 +217,13 @@ def _fill(plan: Plan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
     }
 
 
-def _journal(plan: Plan, clip: Clip, target: Path, scene: Scene, sensor: Sensor) -> Journal:
+def _journal(plan: BenchmarkPlan, clip: Clip, target: Path, scene: Scene, sensor: Sensor) -> Journal:
     """What the renderer of a clip has traced, here and in spans, for a build that goes on within a long clip."""
     run, others = _run_of(plan, clip, scene, sensor), journals_in(target)
     return Journal(target, run, overwrite=True, shared=True, after_s=_KEPT_AFTER_S, others=others)
 
 
-def _run_of(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> dict[str, Any]:
+def _run_of(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> dict[str, Any]:
     """All that the light of a clip depends on."""
     hashes = {"scene_hash": content_hash(scene.spec), "sensor_hash": content_hash(sensor.spec)}
     return {

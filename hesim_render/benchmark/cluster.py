@@ -30,7 +30,7 @@ def connected(address: str) -> Any:
         from distributed.comm.core import CommClosedError
     except ImportError:
         raise RangeError("--scheduler", address, f"dask.distributed: {how_to_install('cluster')}") from None
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a lost scheduler is told by our own error
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # our own error names a lost scheduler
     try:
         return Client(address, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, CommClosedError) as error:  # TimeoutError is an OSError
@@ -40,7 +40,11 @@ def connected(address: str) -> Any:
 
 
 def run_on_cluster(
-    client: Any, order: str, clips: Sequence[Clip], told: Callable[[dict[str, Any]], None], spans: Sequence[Span] = ()
+    client: Any,
+    order: str,
+    clips: Sequence[Clip],
+    on_answer: Callable[[dict[str, Any]], None],
+    spans: Sequence[Span] = (),
 ) -> dict[str, str]:
     """Build clips on a cluster, whose workers see the folder of the benchmark under the same path.
 
@@ -49,7 +53,7 @@ def run_on_cluster(
     client : from `connected`.
     order : from `order_of`.
     clips : what is built.
-    told : called with each answer (`attempt`).
+    on_answer : called with each answer (`attempt`).
     spans : of every clip; the clip comes after all of them.
 
     Returns
@@ -89,7 +93,7 @@ def run_on_cluster(
         elif answer is None:
             raise failure
         if clip.name not in failed:
-            told(answer)
+            on_answer(answer)
         if "error" in answer:
             failed.setdefault(clip.name, answer["error"])
             if answer.get("fatal"):

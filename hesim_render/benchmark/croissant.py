@@ -76,11 +76,11 @@ def croissant(manifest: dict[str, Any], manifest_text: str) -> str:
             "@type": "cr:FileSet",
             "@id": name,
             "name": name,
-            "description": told,
+            "description": description,
             "encodingFormat": kind,
             "includes": files,
         }
-        for name, files, kind, told in _FILES
+        for name, files, kind, description in _FILES
         if name not in absent
     ]
     fields = [

@@ -18,7 +18,7 @@ _MU = 5000.0
 _SATURATED = 0.98
 
 
-class Exposure(NamedTuple):
+class ExposureFlux(NamedTuple):
     """One exposure as flux.
 
     Parameters
@@ -33,7 +33,7 @@ class Exposure(NamedTuple):
     seconds: float
 
 
-def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> Exposure:
+def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> ExposureFlux:
     """Flux of one exposure with the variance that it has in the dark, as the sensor's own figures have them.
 
     Parameters
@@ -50,10 +50,10 @@ def flux_of(raw: NDArray, exposure_us: float, aps: ApsSpec, mosaic: Mosaic) -> E
     electrons = (raw.astype(np.float64) - mosaic.black_level_dn) / aps.system_gain_dn_per_e
     variance = max(aps.read_noise_e**2 + aps.dark_current_e_per_s * seconds, 1e-12)
     top = mosaic.black_level_dn + _SATURATED * (mosaic.white_level_dn - mosaic.black_level_dn)
-    return Exposure(electrons / seconds, np.where(raw >= top, np.inf, variance / seconds**2), seconds)
+    return ExposureFlux(electrons / seconds, np.where(raw >= top, np.inf, variance / seconds**2), seconds)
 
 
-def merged(exposures: Sequence[Exposure]) -> NDArray[np.float64]:
+def merged(exposures: Sequence[ExposureFlux]) -> NDArray[np.float64]:
     """Mean flux of several exposures, weighted by their inverse variances; without motion it is the best linear one.
 
     The variance of all has the shot noise of one flux, their mean weighted by the dark variances. With the noisy flux
@@ -73,7 +73,7 @@ def merged(exposures: Sequence[Exposure]) -> NDArray[np.float64]:
     return _weighted(exposures, [each.dark_variance + light / each.seconds for each in exposures])
 
 
-def _weighted(exposures: Sequence[Exposure], variances: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _weighted(exposures: Sequence[ExposureFlux], variances: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     weights = [1 / variance for variance in variances]
     total = np.sum(weights, axis=0)
     mean = np.sum([w * each.flux for w, each in zip(weights, exposures, strict=True)], axis=0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.benchmark.plan import Clip, Plan
+from hesim_render.benchmark.plan import BenchmarkPlan, Clip
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.overheads import noise_seconds
@@ -58,7 +58,7 @@ class BuildEstimate:
         return asdict(self)
 
 
-def estimate_build(plan: Plan, clips: list[Clip]) -> BuildEstimate:
+def estimate_build(plan: BenchmarkPlan, clips: list[Clip]) -> BuildEstimate:
     """Estimate time and size of clips.
 
     Parameters
@@ -88,7 +88,7 @@ def estimate_build(plan: Plan, clips: list[Clip]) -> BuildEstimate:
     return BuildEstimate(len(clips), len(clips) * each, size)
 
 
-def _sharp_exposures(plan: Plan, sensor: Sensor) -> list[Exposure]:
+def _sharp_exposures(plan: BenchmarkPlan, sensor: Sensor) -> list[Exposure]:
     spec = plan.spec.sharp
     if spec is None or sensor.spec.aps is None:
         return []
@@ -98,7 +98,7 @@ def _sharp_exposures(plan: Plan, sensor: Sensor) -> list[Exposure]:
     return [Exposure(k, start, spec.window_us, sensor.rows, line_us) for k, start in enumerate(starts)]
 
 
-def _render_seconds(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> float:
+def _render_seconds(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> float:
     spec = plan.spec
     seed = spec.seeds[clip.seed]
     if spec.samples is not None:
@@ -115,7 +115,7 @@ def _render_seconds(plan: Plan, clip: Clip, scene: Scene, sensor: Sensor) -> flo
     return expected.seconds + noise_seconds(flux.sensor, spec.duration_us, blocks.windows, rests=flux.is_static)
 
 
-def _bytes(plan: Plan, sensor: Sensor) -> float:
+def _bytes(plan: BenchmarkPlan, sensor: Sensor) -> float:
     """Expected size of a clip."""
     spec, aps = plan.spec, sensor.spec.aps
     frames = 0 if aps is None else int(spec.duration_s * aps.frame_rate_hz)

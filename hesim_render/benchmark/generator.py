@@ -41,7 +41,7 @@ def file_hash(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class SceneFiles:
+class GeneratedScene:
     """A scene and what it is made of.
 
     Parameters
@@ -151,7 +151,7 @@ class Generator:
     def _pool(self, split: str, kinds: tuple[str, ...]) -> list[Path]:
         return [path for path in self._given[split] if path.suffix.lower() in kinds]
 
-    def scene(self, scene: int, motion: int, light: int) -> SceneFiles:
+    def scene(self, scene: int, motion: int, light: int) -> GeneratedScene:
         """One scene, with one of its motions and one of its lights.
 
         Parameters
@@ -197,7 +197,7 @@ class Generator:
             "motion": moving,
             "max_depth": _MAX_DEPTH,
         }
-        return SceneFiles(content, texts, palette.files, tuple(sorted(set(parts))))
+        return GeneratedScene(content, texts, palette.files, tuple(sorted(set(parts))))
 
     def _solid(
         self, rng: np.random.Generator, name: str, size: float, palette: Palette, texts: dict[str, str],

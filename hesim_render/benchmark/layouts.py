@@ -17,7 +17,7 @@ from PIL import Image
 
 from hesim_render.benchmark.cumulative import cumulative_grid
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
-from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
@@ -35,7 +35,7 @@ class _Clip:
     """A clip with its pictures, all exposed alike, and its events in coordinates of the picture."""
 
     def __init__(self, clip: BenchmarkClip) -> None:
-        self.clip, self.development = clip, Development(clip)
+        self.clip, self.development = clip, ClipDevelopment(clip)
         self.name = clip.name
         self._gain: float | None = None
 

@@ -15,7 +15,7 @@ from hesim_render.core.units import US_PER_S
 
 try:
     import torch
-except ImportError:  # told when a filter is trained
+except ImportError:  # reported when a filter is trained
     torch = None  # type: ignore[assignment]
 
 #: Neighbours within this distance are looked at, px; time constants of how much a past event counts, µs.

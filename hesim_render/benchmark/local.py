@@ -23,7 +23,7 @@ _GRACE_S = 2.0
 #: How a worker process is started.
 COMMAND = python_command(with_package("from hesim_render.benchmark.worker import main; main()"))
 #: Called with the answer for each unit of work as it comes.
-Told = Callable[[dict[str, Any]], None]
+OnAnswer = Callable[[dict[str, Any]], None]
 
 
 @dataclass
@@ -76,13 +76,13 @@ class LocalWorkers:
         self._waits.register(worker.answers, selectors.EVENT_READ, worker)
         return worker
 
-    def run(self, clips: Sequence[Clip], told: Told, spans: Sequence[Span] = ()) -> dict[str, str]:
+    def run(self, clips: Sequence[Clip], on_answer: OnAnswer, spans: Sequence[Span] = ()) -> dict[str, str]:
         """Build clips.
 
         Parameters
         ----------
         clips : in the order in which they are begun.
-        told : called with each answer of a worker (`attempt`).
+        on_answer : called with each answer of a worker (`attempt`).
         spans : of every clip, whose light is rendered span by span before the clip is built.
 
         Returns
@@ -101,7 +101,7 @@ class LocalWorkers:
         def fail(unit: Unit, answer: dict[str, Any]) -> None:
             failed.setdefault(answer["name"], answer["error"])
             waiting.drop(unit.clip)
-            told(answer)
+            on_answer(answer)
 
         try:
             for _ in range(min(self._count, len(waiting))):
@@ -136,7 +136,7 @@ class LocalWorkers:
                         unit, worker.unit = worker.unit, None
                         waiting.done(unit)
                         if "error" not in answer:
-                            told(answer)
+                            on_answer(answer)
                         else:
                             fail(unit, answer)
                             if answer.get("fatal"):

@@ -121,5 +121,5 @@ def write_pictures(
 
 
 def write_settings(folder: Path, settings: dict[str, Any]) -> None:
-    """Write ``settings.json`` beside pictures: what the next program is told."""
+    """Write ``settings.json`` beside pictures: the settings of the next program."""
     (folder / SETTINGS_FILE).write_text(json.dumps(settings, indent=1) + "\n", encoding="utf-8")

@@ -73,7 +73,7 @@ def _run(peer: Peer, folder: Path, arguments: list[str], limit_s: float) -> str:
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace", start_new_session=True,
     )  # fmt: skip
     try:
-        output, told = process.communicate(timeout=limit_s)
+        output, errors = process.communicate(timeout=limit_s)
     except subprocess.TimeoutExpired:
         raise PeerError(f"took more than {limit_s:g} s") from None
     finally:
@@ -81,8 +81,8 @@ def _run(peer: Peer, folder: Path, arguments: list[str], limit_s: float) -> str:
             os.killpg(process.pid, signal.SIGKILL)  # its own children as well
             process.communicate()
     if process.returncode:
-        lines = [line for line in told.splitlines() if line.strip()]
-        last = printable(lines[-1][:300]) if lines else "it told nothing"
+        lines = [line for line in errors.splitlines() if line.strip()]
+        last = printable(lines[-1][:300]) if lines else "it printed nothing"
         raise PeerError(f"exit status {process.returncode}: {last}")
     return output
 

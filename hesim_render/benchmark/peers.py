@@ -90,8 +90,8 @@ def compare_peers(
     if sensor.spec.evs is None:
         raise SpecError(f"{sensor.name} has no event pixels", key="sensor")
     scenes = [load_scene(file_of(spec.folder, name, f"scenes.{k}")) for k, name in enumerate(spec.scenes)]
-    told = {OURS: {"version": __version__}} | {peer.name: _told(peer, spec.folder) for peer in spec.peers}
-    able = [peer for peer in spec.peers if "version" in told[peer.name]]
+    facts = {OURS: {"version": __version__}} | {peer.name: _version_of(peer, spec.folder) for peer in spec.peers}
+    able = [peer for peer in spec.peers if "version" in facts[peer.name]]
     rows: list[dict[str, Any]] = []
     errors = {}
     total, done = len(scenes) * (1 + len(spec.fps)), 0
@@ -106,7 +106,7 @@ def compare_peers(
         done += 1
     settings = spec.model_dump(mode="json", exclude={"peers", "sensor"})
     result = {
-        "settings": settings, "sensor": sensor.name, "shape": list(sensor.layout.evs_shape), "peers": told,
+        "settings": settings, "sensor": sensor.name, "shape": list(sensor.layout.evs_shape), "peers": facts,
         "render_error": errors, "rows": rows,
     }  # fmt: skip
     if target is not None:
@@ -115,7 +115,7 @@ def compare_peers(
     return result
 
 
-def _told(peer: Peer, folder: Path) -> dict[str, str]:
+def _version_of(peer: Peer, folder: Path) -> dict[str, str]:
     """Version of a peer, or why there is none."""
     if program_of(peer, folder) is None:
         return {"missing": f"{peer.command[0]} is not installed here"}
@@ -179,7 +179,7 @@ def _rows(
 
 
 def _settings(peer: Peer, sensor: Sensor, spec: PeersSpec, fps: float) -> dict[str, Any]:
-    """What a peer is told: the pictures, and the figures of the sensor that it may have as well."""
+    """What a peer is given: the pictures, and the figures of the sensor that it may have as well."""
     evs = sensor.spec.evs
     assert evs is not None
     rows, cols = sensor.layout.evs_shape
@@ -215,8 +215,8 @@ def peers_table(result: dict[str, Any]) -> str:
             cells = [f"failed: {row['error']}"] if "error" in row else cells
             lines.append(f"| {row['peer']} | {' | '.join(cells)} |")
         lines.append("")
-    for name, told in result["peers"].items():
-        lines.append(f"{name}: " + "; ".join(f"{key} {value}" for key, value in told.items()))
+    for name, facts in result["peers"].items():
+        lines.append(f"{name}: " + "; ".join(f"{key} {value}" for key, value in facts.items()))
     return "\n".join(lines)
 
 

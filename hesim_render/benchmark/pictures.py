@@ -27,7 +27,7 @@ _LINEAR = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix
 _PERCENTILE, _WHITE = 99.5, 0.95
 
 
-class Development:
+class ClipDevelopment:
     """RAW of one clip into comparable pictures.
 
     Parameters

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render.benchmark.draws import AUDITS, CLIPS, EXPOSURES, draws, log_uniform
-from hesim_render.benchmark.generator import Generator, SceneFiles
+from hesim_render.benchmark.generator import GeneratedScene, Generator
 from hesim_render.core.errors import SpecError
 from hesim_render.sensor.sensor import Sensor, load_sensor
 from hesim_render.sources.scene import Scene, load_scene
@@ -48,7 +48,7 @@ class Clip:
         return asdict(self)
 
 
-class Plan:
+class BenchmarkPlan:
     """All clips of a benchmark. Scenes and sensors are made when a clip asks for them.
 
     Parameters
@@ -99,7 +99,7 @@ class Plan:
         name += f"-{spec.noise[noise].name}-r{spec.seeds[seed]}"
         return Clip(name, split, scene, motion, light, sensor, exposure, noise, seed, exposure_us)
 
-    def scene_files(self, clip: Clip) -> SceneFiles | None:
+    def scene_files(self, clip: Clip) -> GeneratedScene | None:
         """The generated scene of a clip; None for a given one."""
         if clip.scene >= self.spec.scenes.count:
             return None

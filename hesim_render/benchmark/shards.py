@@ -38,7 +38,7 @@ class _ShardEntry(BaseModel):
     sha256: str
 
 
-class _Index(BaseModel):
+class _ShardIndex(BaseModel):
     """What is read of `INDEX_FILE`."""
 
     shards: list[_ShardEntry]
@@ -213,7 +213,7 @@ def verify_shards(target: str | Path, progress: Progress | None = None) -> list[
         If there is no finished set.
     """
     store = store_of(target)
-    index = parsed_json(b"".join(store.blocks(INDEX_FILE)), _Index, f"{target}/{INDEX_FILE}")
+    index = parsed_json(b"".join(store.blocks(INDEX_FILE)), _ShardIndex, f"{target}/{INDEX_FILE}")
     problems = []
     for done, shard in enumerate(index["shards"]):
         try:

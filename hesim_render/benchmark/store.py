@@ -115,18 +115,18 @@ class RemoteStore:
         def put(name: str, file: Path) -> None:
             path = self._path(name)
             unfinished = f"{path}.partial"
-            with _told(self._address):
+            with _address_errors(self._address):
                 made.append(unfinished)
                 self._system.makedirs(path.rpartition("/")[0], exist_ok=True)
                 self._system.put_file(str(file), unfinished)
                 made.append(path)
                 self._system.mv(unfinished, path)  # object stores show an object when all of it is there, others do not
 
-        with _told(self._address):
+        with _address_errors(self._address):
             if self._system.isfile(self._path(marker)):
                 if not overwrite:
-                    told = "exists; give another name, or overwrite it (--overwrite, overwrite=True)"
-                    raise OutputError(f"{self._address}: {told}")
+                    problem = "exists; give another name, or overwrite it (--overwrite, overwrite=True)"
+                    raise OutputError(f"{self._address}: {problem}")
                 self._system.rm_file(self._path(marker))  # the set is no longer whole
         try:
             yield put
@@ -145,7 +145,7 @@ class RemoteStore:
             raise SpecError(f"cannot be read ({error.strerror or type(error).__name__})", file=name) from None
 
 
-def _told(address: str) -> Any:
+def _address_errors(address: str) -> Any:
     return output_errors(Path(address))
 
 

@@ -17,7 +17,7 @@ from hesim_render.benchmark.folder import BenchmarkClip
 from hesim_render.benchmark.intensity import intensity_scores, leaky_sum
 from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error
 from hesim_render.benchmark.optical_flow import flow_scores, of_pictures, picture_methods, plane_fit
-from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.pixels.evs.events import Label
 from hesim_render.recording.frame import Frame
@@ -56,7 +56,7 @@ class ClipTasks:
     def __init__(
         self, clip: BenchmarkClip, predictions: Predictions | None = None, longer: Sequence[BenchmarkClip] = ()
     ) -> None:
-        self._clip, self._development = clip, Development(clip)
+        self._clip, self._development = clip, ClipDevelopment(clip)
         self._predictions, self._longer = predictions, longer
 
     def _predicted(self, task: str, item: int, shape: tuple[int, ...]) -> dict[str, NDArray]:

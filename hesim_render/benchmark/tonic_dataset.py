@@ -85,8 +85,8 @@ class EventDataset:
         if not self._folders:
             raise SpecError(f"no clip of the split {split} has events and the target {target}", file=root)
         if len(shapes) > 1:
-            told = ", ".join(f"{cols}x{rows}" for rows, cols in sorted(shapes))
-            raise SpecError(f"clips have event grids of different sizes ({told} px)", file=root)
+            sizes = ", ".join(f"{cols}x{rows}" for rows, cols in sorted(shapes))
+            raise SpecError(f"clips have event grids of different sizes ({sizes} px)", file=root)
         rows, cols = shapes.pop()
         #: Width and height of the event grid, and number of polarities.
         self.sensor_size = (cols, rows, 2)

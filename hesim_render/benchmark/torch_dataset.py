@@ -18,7 +18,7 @@ from hesim_render.mosaic.description import Mosaic
 try:
     import torch
     from torch.utils.data import Dataset as _Dataset
-except ImportError:  # told when a data set is made
+except ImportError:  # reported when a data set is made
     torch, _Dataset = None, object
 
 Task = Literal["deblur", "interpolate"]

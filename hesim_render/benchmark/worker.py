@@ -20,7 +20,7 @@ from typing import Any
 from hesim_render import __version__
 from hesim_render.benchmark.clip import build_clip, render_span
 from hesim_render.benchmark.devices import claim_device
-from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.benchmark.units import Unit
 from hesim_render.core.errors import HesimError, OutputError
 from hesim_render.core.output import discard_unfinished
@@ -37,10 +37,10 @@ def order_of(spec: BenchmarkSpec, root: Path) -> str:
 
 
 @functools.lru_cache(maxsize=4)
-def _opened(order: str) -> tuple[Plan, Path, str]:
+def _opened(order: str) -> tuple[BenchmarkPlan, Path, str]:
     content = json.loads(order)
     spec = BenchmarkSpec.model_validate(content["spec"]).model_copy(update={"folder": Path(content["folder"])})
-    return Plan(spec), Path(content["root"]), content["version"]
+    return BenchmarkPlan(spec), Path(content["root"]), content["version"]
 
 
 @functools.cache

@@ -48,8 +48,8 @@ def simulate_again(
     recording = as_recording(recording)
     manifest, folder = recording.manifest, recording.path
     file = None if folder is None else folder / manifests.MANIFEST_NAME
-    settings, told = manifest["settings"], manifest.get("scene")
-    if told is None or "mode" not in settings:
+    settings, stored = manifest["settings"], manifest.get("scene")
+    if stored is None or "mode" not in settings:
         raise SpecError("only a recording of a scene can be made again; this one is of a video, or imported", file=file)
     if manifest["time"]["begin_us"] != 0:
         raise SpecError(
@@ -60,10 +60,11 @@ def simulate_again(
         raise SpecError("the sensor is calibrated, and the maps of its calibration are not in the recording", file=file,
                         key="sensor.spec.noise")  # fmt: skip
     if scene is None:
-        scene = scene_of(told, file, "--scene PATH, or scene=load_scene(PATH)")
-    elif content_hash(scene.spec) != told["sha256"]:
-        raise SpecError(f"scene {scene.name!r} is not the one of the recording, {told['name']!r}, or was changed since",
-                        file=file)  # fmt: skip
+        scene = scene_of(stored, file, "--scene PATH, or scene=load_scene(PATH)")
+    elif content_hash(scene.spec) != stored["sha256"]:
+        raise SpecError(
+            f"scene {scene.name!r} is not the one of the recording, {stored['name']!r}, or was changed since", file=file
+        )
     roi = manifest["roi"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
     sensor = Sensor(layout, Lens.of(spec), manifest["sensor"]["file"])

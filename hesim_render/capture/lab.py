@@ -311,8 +311,8 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
         }  # fmt: skip
         content["contrast_of"] = "signal"
     content["notes"] = (
-        f"a virtual session, hesim-render lab {spec.name}: {illuminant}, {bench.lux:.4g} lux on the brightest patch; "
-        f"seed {seed}"
+        f"a virtual session, hesim-render calibrate lab {spec.name}: {illuminant}, {bench.lux:.4g} lux on the "
+        f"brightest patch; seed {seed}"
     )
     _dump(content, folder / CAPTURE_NAME)
 

@@ -35,7 +35,7 @@ class OpenFrame:
 
 
 @dataclass(frozen=True)
-class Piece:
+class ExposurePart:
     """Part of an exposure during which the source is in one state."""
 
     frame: OpenFrame
@@ -80,12 +80,12 @@ class OpenFrames:
         for index, frame in self._open.items():
             restore(frame, state["open"][str(index)])
 
-    def pieces(self) -> Iterator[Piece]:
+    def pieces(self) -> Iterator[ExposurePart]:
         """Exposures, cut where the source changes its state, in order of their ends, after those that are exposed."""
         return islice(self._pieces(), self._exposed, None)
 
-    def _pieces(self) -> Iterator[Piece]:
-        waiting: list[tuple[float, int, Piece]] = []
+    def _pieces(self) -> Iterator[ExposurePart]:
+        waiting: list[tuple[float, int, ExposurePart]] = []
         for exposure in self._exposures:
             # no piece of this exposure ends before the exposure begins
             while waiting and waiting[0][0] <= exposure.start_us:
@@ -93,11 +93,11 @@ class OpenFrames:
             frame = self._open.get(exposure.index) or OpenFrame(exposure)
             edges = self._source.slice_edges_us(exposure.start_us, exposure.end_us)
             for begin, end in pairwise([float(exposure.start_us), *edges, exposure.end_us]):
-                heappush(waiting, (end, exposure.index, Piece(frame, begin, end)))
+                heappush(waiting, (end, exposure.index, ExposurePart(frame, begin, end)))
         while waiting:
             yield heappop(waiting)[2]
 
-    def expose(self, piece: Piece) -> Iterator[Frame]:
+    def expose(self, piece: ExposurePart) -> Iterator[Frame]:
         """Add to each row the part of its exposure that lies in a piece. Yield the frame after its last piece."""
         frame = piece.frame
         if frame.half_a is None:

@@ -109,6 +109,6 @@ def simulate_cube(
     with RecordingWriter(
         out, sensor, seed=seed, duration_us=duration_us, settings=settings, overwrite=overwrite, mosaic=mosaic
     ) as writer:
-        with shown(progress, f"{Path(cube).name} → {sensor.name}") as told:
-            capture.record(writer, told)
+        with shown(progress, f"{Path(cube).name} → {sensor.name}") as report:
+            capture.record(writer, report)
         return warn_of_exposure(writer.finish())

@@ -181,14 +181,14 @@ def simulate_video(
             ) as writer,
             _journal(resume, source, flux, expected, out, writer, overwrite) as journal,
         ):
-            with shown(progress, f"{Path(name).name} → {sensor.name}") as told:
-                if isinstance(told, ProgressReport):
-                    told.expect(expected.seconds)
+            with shown(progress, f"{Path(name).name} → {sensor.name}") as report:
+                if isinstance(report, ProgressReport):
+                    report.expect(expected.seconds)
                 flux.start_digest()
                 kept = None if journal is None else KeptRun(capture, journal, _PART_S)
                 if kept is not None:
-                    kept.go_on(writer, told)
-                capture.record(writer, told, None if kept is None else kept.keep)
+                    kept.go_on(writer, report)
+                capture.record(writer, report, None if kept is None else kept.keep)
             writer.add_settings({"video": flux.describe()})
             return warn_of_exposure(writer.finish())
     finally:

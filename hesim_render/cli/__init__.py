@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.cli.former_names import name_now
 from hesim_render.cli.interrupts import Interrupts
 from hesim_render.cli.option_names import in_options
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
 from hesim_render.core.output import discard_unfinished
 
-#: What Dr.Jit says.
+#: Text in Dr.Jit's errors.
 _OUT_OF_MEMORY = "out of memory"
 
 
@@ -93,14 +94,15 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
         if isinstance(error, HesimError):
             complain(*in_options(error, program(), given).splitlines())
         elif isinstance(error, usage_error):
-            complain(error.format_message().replace("Value error, ", ""))
+            now = name_now(given)
+            complain(error.format_message().replace("Value error, ", "") + (f" It is now: {now}" if now else ""))
         elif isinstance(error, OSError):
             silence_stdout()
             where = error.filename or ("standard output" if _is_of_stdout(error) else "a file cannot be written")
             complain(f"{where}: {error.strerror or error}")
         elif isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _OUT_OF_MEMORY in str(error)):
-            said = (str(error).splitlines() or [""])[0][:200]
-            complain(f"not enough memory{f' ({said})' if said else ''}; a smaller region (--roi) or file needs less")
+            cause = (str(error).splitlines() or [""])[0][:200]
+            complain(f"not enough memory{f' ({cause})' if cause else ''}; a smaller region (--roi) or file needs less")
         else:
             raise
         return ExitStatus.REFUSED

@@ -1,4 +1,4 @@
-"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate``, ``export``, ``pack`` and ``peers``."""
+"""Benchmarks: ``benchmark build``, ``verify``, ``evaluate``, ``export`` and ``peers``."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hesim_render.cli.console import Console, DryRun, Json, Quiet, facts_of
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.options import LONG_MINUTES, Overwrite, Yes, listed
+from hesim_render.cli.options import LONG_MINUTES, HelpAll, Overwrite, Yes, listed
 from hesim_render.cli.terminal import complain
-from hesim_render.cli.told import DryRun, Json, Quiet, Told, facts_of
-from hesim_render.core.errors import RangeError, TooLongError
+from hesim_render.core.errors import RangeError, TooLongError, did_you_mean
 from hesim_render.core.output import free_place
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from hesim_render.core.progress import ProgressReport
 
 app = typer.Typer(help="Build, verify and evaluate benchmarks of many clips.", no_args_is_help=True)
+#: Formats of `export` that are a few large files.
+_SHARDS = ("webdataset", "hdf5")
 _Folder = Annotated[Path, typer.Argument(help="folder of a benchmark")]
 
 
@@ -42,6 +44,7 @@ def build(
     dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
     """Build all clips of a benchmark, with manifest and card.
 
@@ -55,18 +58,18 @@ def build(
     if scheduler is not None and workers != 1:
         raise RangeError("--workers", workers, "nothing beside --scheduler, whose workers build the clips")
     content = read_benchmark(spec, dict(map(parse_override, set_ or [])))
-    told = Told(json_, quiet, dry_run)
+    console = Console(json_, quiet, dry_run)
     if dry_run:
         total, missing, expected = check_build(content, out)
         text = f"{total} clips, {len(missing)} of them not yet built; nothing was written (--dry-run)"
-        told.text("" if expected is None else f"estimate: {expected}")
+        console.text("" if expected is None else f"estimate: {expected}")
         facts = {"dry_run": True, "clips": total, "missing": len(missing), "estimate": expected and facts_of(expected)}
-        told.result(text, facts)
+        console.result(text, facts)
         return
-    with told.progress(content.name) as progress:
+    with console.progress(content.name) as progress:
         built = build_benchmark(
             content, out, workers=workers, scheduler=scheduler, span_s=span, estimate=estimate,
-            on_estimate=lambda expected: _estimated(told, expected, progress, workers, yes or scheduler is not None),
+            on_estimate=lambda expected: _estimated(console, expected, progress, workers, yes or scheduler is not None),
             progress=progress,
         )  # fmt: skip
     clips = built.manifest["clips"]
@@ -76,16 +79,18 @@ def build(
     card = built.root / "README.md"
     audits = {clip.name: clip.content["render"].get("audit") for clip in built.clips()}
     short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
-    told.result(
+    console.result(
         "\n".join([f"{text}  card: {card}", *(f"  {line}" for line in verdict_lines(audits, "clips"))]),
         {"benchmark": built.root, "card": card, "clips": len(clips), "splits": count, "not_met": short},
         ExitStatus.NOT_MET if short else ExitStatus.DONE,
     )
 
 
-def _estimated(told: Told, expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool) -> None:
+def _estimated(
+    console: Console, expected: BuildEstimate, progress: ProgressReport, workers: int, is_wanted: bool
+) -> None:
     """Print the estimate; refuse a long build that nobody has wanted."""
-    told.estimated(progress)(expected)
+    console.estimated(progress)(expected)
     seconds = expected.seconds / max(1, workers)
     if seconds > 60 * LONG_MINUTES and not is_wanted:
         raise TooLongError(
@@ -102,23 +107,27 @@ def verify(
     discard: Annotated[bool, typer.Option("--discard", help="remove damaged clips; build makes them again")] = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Compare every file of a benchmark with its SHA-256. Ends with status 1 where anything differs."""
+    """Compare every file of a benchmark with its SHA-256.
+
+    Ends with status 1 where anything differs.
+    """
     from hesim_render.benchmark.folder import Benchmark
     from hesim_render.benchmark.verify import digest_of, discard_damaged, verify_benchmark
 
-    told = Told(json_, quiet)
-    with told.progress(f"verify {folder.name}") as progress:
+    console = Console(json_, quiet)
+    with console.progress(f"verify {folder.name}") as progress:
         problems = verify_benchmark(folder, progress)
     if problems:
         complain(*problems)
         removed = discard_damaged(folder, problems) if discard else []
         text = f"removed {len(removed)} clips; 'benchmark build' makes them again" if discard else ""
-        told.result(text, {"problems": problems, "removed": removed}, ExitStatus.DIFFERENT)
+        console.result(text, {"problems": problems, "removed": removed}, ExitStatus.DIFFERENT)
     benchmark = Benchmark(folder)
     count, digest = len(benchmark.manifest["clips"]), digest_of(benchmark)
     facts = {"problems": [], "clips": count, "digest": digest}
-    told.result(f"{count} clips are as they were built; digest {digest}", facts)
+    console.result(f"{count} clips are as they were built; digest {digest}", facts)
 
 
 @app.command()
@@ -140,14 +149,18 @@ def evaluate(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Measure the baselines of each task, and your own results, on the clips of a split."""
+    """Score the baselines and your own results.
+
+    On the clips of a split, for each task.
+    """
     from hesim_render.benchmark.evaluate import evaluate_benchmark, table
 
     if out is not None:
         free_place(out, overwrite, (".json",))
-    told = Told(json_, quiet)
-    with told.progress(f"evaluate {folder.name}") as progress:
+    console = Console(json_, quiet)
+    with console.progress(f"evaluate {folder.name}") as progress:
         result = evaluate_benchmark(
             folder, split=None if split == "all" else split, tasks=listed(tasks), predictions=predictions, out=out,
             progress=progress,
@@ -160,51 +173,55 @@ def evaluate(
     for name in result["unused"]:
         complain(f"{name}: belongs to no item that was scored")
     facts = {name: result[name] for name in ("benchmark", "split", "clips", "summary", "unused")}
-    told.result("\n".join(lines), {**facts, "values": out})
+    console.result("\n".join(lines), {**facts, "values": out})
 
 
 @app.command()
 def export(
     folder: _Folder,
-    layout: Annotated[str, typer.Option(help="hs-ergb, bs-ergb, highrev, efnet or raw-npz")],
-    out: Annotated[Path, typer.Option(help="folder to write")],
+    format_: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help="layout that another program loads: hs-ergb, bs-ergb, highrev, efnet, raw-npz; a few large files for "
+            "training: webdataset (tar), hdf5",
+        ),
+    ],
+    out: Annotated[
+        str, typer.Option(help="folder; of webdataset and hdf5 also an address of fsspec, such as s3://bucket/set")
+    ],
+    shard_mb: Annotated[
+        float, typer.Option(help="size at which a file of webdataset or hdf5 is closed, MB", hidden=True)
+    ] = 256.0,
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Write a benchmark in the layout that another program loads."""
-    from hesim_render.benchmark.layouts import export_benchmark
+    """Write a benchmark for another program, or training.
 
-    told = Told(json_, quiet)
-    with told.progress(f"{folder.name} → {layout}") as progress:
-        count = export_benchmark(folder, layout, out, overwrite=overwrite, progress=progress)
-    told.result(f"{count} pictures in {out}", {"folder": out, "layout": layout, "pictures": count})
-
-
-@app.command()
-def pack(
-    folder: _Folder,
-    out: Annotated[str, typer.Option(help="folder, or an address that fsspec knows, such as s3://bucket/set")],
-    format_: Annotated[str, typer.Option("--format", help="webdataset (tar) or hdf5")] = "webdataset",
-    shard_mb: Annotated[float, typer.Option(help="size at which a shard is closed, MB")] = 256.0,
-    overwrite: Overwrite = False,
-    json_: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Write the samples of a benchmark into a few large files for training, each checked after it is there."""
+    In a layout that another program loads, or as a few large files.
+    """
+    from hesim_render.benchmark.layouts import LAYOUTS, export_benchmark
     from hesim_render.benchmark.shards import pack_benchmark, verify_shards
 
-    told = Told(json_, quiet)
-    with told.progress(f"{folder.name} → {out}") as progress:
-        count = pack_benchmark(
-            folder, out, format=format_, shard_mb=shard_mb, overwrite=overwrite, progress=progress
-        )  # fmt: skip
-        problems = verify_shards(out, progress)
-    facts = {"address": out, "format": format_, "samples": count, "problems": problems}
-    if problems:
-        complain(*problems)
-        told.result("", facts, ExitStatus.DIFFERENT)
-    told.result(f"{count} samples in {out}", facts)
+    known = (*LAYOUTS, *_SHARDS)
+    if format_ not in known:
+        raise RangeError("--format", format_, f"one of {', '.join(known)}{did_you_mean(format_, known)}")
+    console = Console(json_, quiet)
+    with console.progress(f"{folder.name} → {out}") as progress:
+        if format_ in LAYOUTS:
+            count = export_benchmark(folder, format_, Path(out), overwrite=overwrite, progress=progress)
+            noun, problems = "pictures", []
+        else:
+            count = pack_benchmark(
+                folder, out, format=format_, shard_mb=shard_mb, overwrite=overwrite, progress=progress
+            )  # fmt: skip
+            noun, problems = "samples", verify_shards(out, progress)
+    facts = {"written": out, "format": format_, noun: count, "problems": problems}
+    complain(*problems)
+    text = "" if problems else f"{count} {noun} in {out}"
+    console.result(text, facts, ExitStatus.DIFFERENT if problems else ExitStatus.DONE)
 
 
 @app.command()
@@ -220,8 +237,12 @@ def peers(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Compare our sensor and other event simulators in the same light. Ends with status 1 where one of them fails."""
+    """Compare our sensor and other event simulators.
+
+    In the same light. Ends with status 1 where one of them fails.
+    """
     from hesim_render.benchmark.peers import compare_peers, peers_table
     from hesim_render.specs.files import parse_override
     from hesim_render.specs.peers import read_peers
@@ -229,9 +250,9 @@ def peers(
     if out is not None:
         free_place(out, overwrite, (".json",))
     content = read_peers(spec, dict(map(parse_override, set_ or [])))
-    told = Told(json_, quiet)
-    with told.progress(content.name) as progress:
+    console = Console(json_, quiet)
+    with console.progress(content.name) as progress:
         result = compare_peers(content, out, progress, run_programs=run_programs)
     failed = any("failed" in peer for peer in result["peers"].values()) or any("error" in row for row in result["rows"])
     text = peers_table(result) if out is None else f"{peers_table(result)}\nin {out}"
-    told.result(text, result, ExitStatus.DIFFERENT if failed else ExitStatus.DONE)
+    console.result(text, result, ExitStatus.DIFFERENT if failed else ExitStatus.DONE)

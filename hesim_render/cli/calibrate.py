@@ -1,27 +1,37 @@
-"""Captures and calibrations: ``lab`` and ``calibrate``."""
+"""Captures and calibrations: ``calibrate lab``, ``aps``, ``evs`` and ``twin``."""
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hesim_render.cli.options import SENSOR_HELP, Overwrite, SensorKeys, Without, cropped, names_of, sensor_keys_only
+from hesim_render.cli.console import Console, DryRun, Json, Quiet
+from hesim_render.cli.options import (
+    SENSOR_HELP,
+    HelpAll,
+    Overwrite,
+    SensorKeys,
+    Without,
+    cropped,
+    names_of,
+    sensor_keys_only,
+)
 from hesim_render.cli.terminal import parse_exposures, split_overrides
-from hesim_render.cli.told import DryRun, Json, Quiet, Told
+from hesim_render.cli.twin import twin
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import check_target, free_place
 
+app = typer.Typer(
+    no_args_is_help=True, help="Noise parameters of a sensor from captures, real or simulated.", rich_markup_mode=None
+)
+_Captures = Annotated[Path, typer.Argument(help="folder of a capture set")]
+_Out = Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")]
+_Report = Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")]
 
-class Part(StrEnum):
-    """Part of a sensor to calibrate."""
 
-    aps = "aps"
-    evs = "evs"
-
-
+@app.command()
 def lab(
     sensor: Annotated[str, typer.Argument(help=SENSOR_HELP, autocompletion=names_of("sensors"))],
     out: Annotated[Path, typer.Option(help="folder to write the capture set to")],
@@ -35,19 +45,23 @@ def lab(
     ] = 20,
     dark_ms: Annotated[str, typer.Option(help="dark exposures, ms")] = "1,5,20,50,80",
     lit_ms: Annotated[str, typer.Option(help="lit exposures, ms")] = "1,2,5,10,20,40,50,80",
-    illuminant: Annotated[str, typer.Option(help="light on the target (see 'list illuminants')")] = "D65",
+    illuminant: Annotated[str, typer.Option(help="light on the target (see 'info illuminants')")] = "D65",
     parts: Annotated[
-        int, typer.Option(help="parts of the dark ticks (of bright trials) counted too: tells flickering pixels")
+        int,
+        typer.Option(
+            help="parts of the dark ticks (of bright trials) counted too: tells flickering pixels", hidden=True
+        ),
     ] = 0,
-    seed: Annotated[int, typer.Option(help="of all temporal noise")] = 7,
+    seed: Annotated[int, typer.Option(help="of all temporal noise", hidden=True)] = 7,
     set_: SensorKeys = None,
     without: Without = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """A virtual calibration session: dark and lit captures to calibrate from."""
+    """Simulate dark and bright captures to calibrate from."""
     scene_changes, changes = split_overrides(set_ or [])
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     dark_us, lit_us = parse_exposures(dark_ms), parse_exposures(lit_ms)
@@ -56,23 +70,23 @@ def lab(
     from hesim_render.sensor.sensor import load_sensor
 
     loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
-    told = Told(json_, quiet, dry_run)
-    with told.stop_at_estimate(), told.progress(f"lab {sensor}") as progress:
+    console = Console(json_, quiet, dry_run)
+    with console.stop_at_estimate(), console.progress(f"lab {sensor}") as progress:
         folder = write_captures(
             loaded, out, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
             illuminant=illuminant, overwrite=overwrite, progress=progress,
-            dark_exposures_us=dark_us, lit_exposures_us=lit_us, on_estimate=told.estimated(progress),
+            dark_exposures_us=dark_us, lit_exposures_us=lit_us, on_estimate=console.estimated(progress),
         )  # fmt: skip
     sizes = {file.name: file.stat().st_size for file in sorted(folder.iterdir())}
     lines = [f"{size / 1e6:10.1f} MB  {out / name}" for name, size in sizes.items()]
-    told.result("\n".join(lines), {"captures": folder, "files_bytes": sizes})
+    console.result("\n".join(lines), {"captures": folder, "files_bytes": sizes})
 
 
-def calibrate(
-    part: Annotated[Part, typer.Argument(help="aps (frames) or evs (events)")],
+@app.command()
+def aps(
     captures: Annotated[Path, typer.Argument(help="folder of a capture set, or of EMVA 1288 captures")],
-    out: Annotated[Path, typer.Option(help="calibration to write or add to, such as calibration.yaml")],
-    report: Annotated[Path | None, typer.Option(help="HTML report of all that the calibration holds")] = None,
+    out: _Out,
+    report: _Report = None,
     sensor_file: Annotated[
         Path | None, typer.Option(help="sensor file that goes with the calibration (of EMVA 1288 captures)")
     ] = None,
@@ -81,34 +95,64 @@ def calibrate(
     ] = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Noise parameters from captures, into a file that a sensor file can point at."""
-    from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration
-    from hesim_render.calibrate.summary import summary_lines
+    """Find the noise of frame pixels from captures.
+
+    A sensor file can point at the file that is written.
+    """
+    from hesim_render.calibrate import calibrate_aps
     from hesim_render.recording.pair_set import is_pair_set
 
-    if sensor_file is not None:
-        if part is not Part.aps or not is_pair_set(captures):
+    console = Console(json_, quiet)
+    if sensor_file is None:
+        with console.progress("calibrate aps") as move:
+            calibrate_aps(captures, out, report, lambda what, part: move(part, 1.0, what), overwrite=overwrite)
+    else:
+        if not is_pair_set(captures):
             raise RangeError("--sensor-file", str(sensor_file), "none: captures of EMVA 1288 alone tell a whole sensor")
         free_place(sensor_file, overwrite)
-    run = calibrate_aps if part is Part.aps else calibrate_evs
-    told = Told(json_, quiet)
-    with told.progress(f"calibrate {part.value}") as move:
+        from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
+        from hesim_render.calibrate.aps.sensor_file import write_sensor
 
-        def show(what: str, fraction: float) -> None:
-            move(fraction, 1.0, what)
+        with console.progress("calibrate aps") as move:
+            pairs = calibrate_pairs(captures, out, report, lambda what, part: move(part, 1.0, what), overwrite)
+            write_sensor(sensor_file, out, pairs)
+    _show(console, "aps", out, report, sensor_file)
 
-        if sensor_file is None:
-            run(captures, out, report, show, overwrite=overwrite)
-        else:
-            from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
-            from hesim_render.calibrate.aps.sensor_file import write_sensor
 
-            write_sensor(sensor_file, out, calibrate_pairs(captures, out, report, show, overwrite))
-    lines = summary_lines(read_calibration(out), part.value)
-    where = [f"in {out}"]
-    where += [
-        f"{name}: {file}" for name, file in (("report", report), ("sensor file", sensor_file)) if file is not None
-    ]
-    facts = {"calibration": out, "report": report, "sensor_file": sensor_file, "part": part.value, "summary": lines}
-    told.result("\n".join([*lines, *where]), facts)
+@app.command()
+def evs(
+    captures: _Captures,
+    out: _Out,
+    report: _Report = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace a report of another calibration")] = False,
+    json_: Json = False,
+    quiet: Quiet = False,
+    help_all: HelpAll = False,
+) -> None:
+    """Find thresholds and noise of event pixels.
+
+    A sensor file can point at the file that is written.
+    """
+    from hesim_render.calibrate import calibrate_evs
+
+    console = Console(json_, quiet)
+    with console.progress("calibrate evs") as move:
+        calibrate_evs(captures, out, report, lambda what, part: move(part, 1.0, what), overwrite=overwrite)
+    _show(console, "evs", out, report)
+
+
+def _show(console: Console, part: str, out: Path, report: Path | None, sensor_file: Path | None = None) -> None:
+    """The figures of a calibration, and where they are."""
+    from hesim_render.calibrate import read_calibration
+    from hesim_render.calibrate.summary import summary_lines
+
+    lines = summary_lines(read_calibration(out), part)
+    written = {"report": report, "sensor file": sensor_file}
+    where = [f"in {out}", *(f"{name}: {file}" for name, file in written.items() if file is not None)]
+    facts = {"calibration": out, "report": report, "sensor_file": sensor_file, "part": part, "summary": lines}
+    console.result("\n".join([*lines, *where]), facts)
+
+
+app.command()(twin)

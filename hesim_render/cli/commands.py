@@ -8,23 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from hesim_render import __version__
-from hesim_render.cli import (
-    benchmark,
-    calibrate,
-    cube,
-    doctor,
-    exchange,
-    expose,
-    look,
-    measure,
-    run,
-    sensor,
-    simulate,
-    study,
-    sweep,
-    twin,
-    video,
-)
+from hesim_render.cli import benchmark, calibrate, cube, exchange, info, measure, new, simulate, study, view
 from hesim_render.cli.terminal import say
 
 app = typer.Typer(
@@ -49,13 +33,11 @@ def _app(
 
 
 for _command in (
-    doctor.doctor, doctor.list_, simulate.simulate, video.video, expose.expose, run.run, simulate.rerun, simulate.demo,
-    calibrate.lab, calibrate.calibrate, twin.twin, look.isp, look.view, exchange.export, exchange.import_, cube.cube,
-    measure.measure, study.study, sweep.sweep,
+    simulate.simulate, view.view, view.isp, exchange.export, exchange.import_, measure.measure, cube.cube, study.study,
+    simulate.demo, info.info, new.new,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
-
-app.add_typer(sensor.app, name="sensor")
+app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(benchmark.app, name="benchmark")
 
 

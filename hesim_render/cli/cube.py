@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.options import AllowOutside, Overwrite, Region, SensorFile, cropped, names_of
+from hesim_render.cli.options import AllowOutside, HelpAll, Overwrite, Region, SensorFile, cropped, names_of
 from hesim_render.cli.terminal import say, split_overrides
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import free_place
@@ -22,7 +22,7 @@ def cube(
     scene: Annotated[
         str,
         typer.Argument(
-            help="a name (see 'list scenes') or the path of a scene file", autocompletion=names_of("scenes")
+            help="a name (see 'info scenes') or the path of a scene file", autocompletion=names_of("scenes")
         ),
     ],
     sensor: SensorFile,
@@ -34,7 +34,7 @@ def cube(
     end_us: Annotated[float | None, typer.Option(help="end of the window, µs; default: an instant")] = None,
     samples: Annotated[int, typer.Option(help="rays per pixel, four bands and slice of time")] = 64,
     roi: Region = None,
-    seed: Annotated[int, typer.Option(help="of the render")] = 7,
+    seed: Annotated[int, typer.Option(help="of the render", hidden=True)] = 7,
     set_: Annotated[
         list[str] | None,
         typer.Option(
@@ -43,8 +43,12 @@ def cube(
     ] = None,
     allow_outside: AllowOutside = False,
     overwrite: Overwrite = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Render the spectral radiance on the pixels of a sensor: an instant, or the mean over a window of time."""
+    """Render the spectral radiance on a sensor's pixels.
+
+    At an instant, or the mean over a window of time.
+    """
     wavelengths = parse_bands(bands)
     free_place(out, overwrite, (".exr",))
     import hesim_render as hr
@@ -63,18 +67,18 @@ def cube(
         f"standard error of a pixel {100 * share:.2g} % of it (rms), in {out}")  # fmt: skip
 
 
-def parse_bands(text: str) -> list[float]:
+def parse_bands(text: str, name: str = "--bands") -> list[float]:
     """Wavelengths of ``400:700:10`` or ``450,550,650``, nm."""
     expected = "FIRST:LAST:STEP or a list with commas, in nm, such as 400:700:10"
     if re.fullmatch(r"[0-9.:,eE+ -]+", text) is None:
-        raise RangeError("--bands", text, expected)
+        raise RangeError(name, text, expected)
     try:
         if ":" not in text:
             return [float(part) for part in text.split(",")]
         first, last, step = (float(part) for part in text.split(":"))
     except ValueError:
-        raise RangeError("--bands", text, expected) from None
+        raise RangeError(name, text, expected) from None
     if not (step > 0 and last >= first and (last - first) / step < _MOST_BANDS):
-        raise RangeError("--bands", text, f"{expected}, at most {_MOST_BANDS} bands")
+        raise RangeError(name, text, f"{expected}, at most {_MOST_BANDS} bands")
     count = math.floor((last - first) / step + 1e-9) + 1
     return [first + step * number for number in range(count)]

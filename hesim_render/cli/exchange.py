@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.options import SENSOR_HELP, Overwrite, Region, check_output, cropped, names_of
-from hesim_render.cli.simulate import tell_recording
+from hesim_render.cli.console import Console, Json, Quiet
+from hesim_render.cli.options import SENSOR_HELP, HelpAll, Overwrite, Region, check_output, cropped, names_of
+from hesim_render.cli.simulate import show_recording
 from hesim_render.cli.terminal import parse_size
-from hesim_render.cli.told import Json, Quiet, Told
 from hesim_render.core.errors import ConflictError
 
 _EXPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "dsec-gzip", "npz", "txt", "nmnist", "tiff", "png",
@@ -49,11 +49,15 @@ def export(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:  # fmt: skip
-    """Write the events, the RAW frames or the geometric truth of a recording in the format of another program."""
+    """Write a recording in the format of another program.
+
+    Its events, its RAW frames or its geometric truth.
+    """
     from hesim_render.recording.recording import Recording
 
-    loaded, told = Recording.load(recording), Told(json_, quiet)
+    loaded, console = Recording.load(recording), Console(json_, quiet)
     if format in _GEOMETRY:
         from hesim_render.recording.exports import check_name
         from hesim_render.recording.truth_export import export_truth
@@ -64,7 +68,7 @@ def export(
 
             loaded.truth = loaded.truth_with(load_scene(scene))
         written = export_truth(loaded, format, out, every_us=every_us, overwrite=overwrite)
-        told.result(f"{format} in {written}", {"format": format, "written": written})
+        console.result(f"{format} in {written}", {"format": format, "written": written})
         return
     for name, value in (("--every-us", every_us), ("--scene", scene)):
         if value is not None:
@@ -73,12 +77,12 @@ def export(
     counts = loaded.manifest["counts"]
     if format in _WHOLE:
         facts = {"format": format, "written": written, "events": counts["events"], "frames": counts["frames"]}
-        told.result(f"{format} of {counts['frames']} frames and {counts['events']} events in {written}", facts)
+        console.result(f"{format} of {counts['frames']} frames and {counts['events']} events in {written}", facts)
         return
     noun = "frame" if written.is_dir() else "event"
     count = counts[f"{noun}s"]
     facts = {"format": format, "written": written, f"{noun}s": count}
-    told.result(f"{count} {noun}{'' if count == 1 else 's'} in {written}", facts)
+    console.result(f"{count} {noun}{'' if count == 1 else 's'} in {written}", facts)
 
 
 def import_(
@@ -108,11 +112,15 @@ def import_(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Write the events of another program in the layout of events.h5, or a capture of a real sensor as a recording."""
+    """Read files of another program, or of a real sensor.
+
+    Events are written in the layout of events.h5; with --sensor, a capture of a real sensor becomes a recording.
+    """
     from hesim_render.exchange import is_event_file, open_events
 
-    told = Told(json_, quiet)
+    console = Console(json_, quiet)
     if sensor is None:
         from hesim_render.recording.exports import import_events
 
@@ -125,7 +133,7 @@ def import_(
         for block in stream:
             count, on = count + block.size, on + int((block["polarity"] > 0).sum())
         rows, cols = stream.shape
-        told.result(
+        console.result(
             f"{count} events ({on} ON, {count - on} OFF) of {cols}x{rows} px in {written}",
             {"written": written, "events": count, "events_on": on, "events_off": count - on,
              "event_grid": {"width": cols, "height": rows}},
@@ -146,4 +154,4 @@ def import_(
         out, loaded, events=events[0] if events else None, frames=frames, trigger_channel=trigger_channel,
         overwrite=overwrite,
     )  # fmt: skip
-    tell_recording(told, made)
+    show_recording(console, made)

@@ -42,7 +42,10 @@ def measure(
     out: Annotated[Path | None, typer.Option(help="CSV file of frequency and response")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace an existing file")] = False,
 ) -> None:
-    """Measure the spatial frequency response (MTF) of a recording on a slanted edge."""
+    """Measure the MTF of a recording on a slanted edge.
+
+    MTF is the spatial frequency response.
+    """
     from hesim_render.core.output import free_place, replacing
     from hesim_render.measure import measure_mtf
     from hesim_render.recording.recording import Recording

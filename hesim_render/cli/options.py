@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hesim_render.cli.terminal import say
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import check_target
 from hesim_render.core.region import parse_roi
@@ -33,7 +35,30 @@ def _noise_terms(incomplete: str) -> list[str]:
     return [name for name in TERMS if name.startswith(incomplete)]
 
 
-SENSOR_HELP = "a name (see 'list sensors') or the path of a sensor file"
+def full_help(context: Any) -> str:
+    """The help of a command with its rare options, as `--help-all` prints it."""
+    command = copy(context.command)
+    command.params = [copy(each) for each in command.params]
+    for each in command.params:
+        each.hidden = False
+    return command.get_help(context)
+
+
+def _print_full_help(context: typer.Context, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        say(full_help(context))
+        raise typer.Exit
+
+
+#: Rare options have ``hidden=True``; a command that has some takes this one as its last.
+HelpAll = Annotated[
+    bool,
+    typer.Option(
+        "--help-all", is_eager=True, callback=_print_full_help, help="Show all options, also rare ones, and exit."
+    ),
+]
+
+SENSOR_HELP = "a name (see 'info sensors') or the path of a sensor file"
 
 #: Options that several commands share.
 SensorFile = Annotated[str, typer.Option(help=SENSOR_HELP, autocompletion=names_of("sensors"))]
@@ -47,18 +72,21 @@ Without = Annotated[
     list[str] | None,
     typer.Option(
         metavar="TERM",
-        help="switch one noise term or effect of the lens off, as aps.read (see 'list noise', 'list lens'); repeatable",
+        help="switch one noise term or effect of the lens off, as aps.read (see 'info noise', 'info lens'); repeatable",
+        hidden=True,
         autocompletion=_noise_terms,
     ),
 ]
 Truth = Annotated[
     str | None,
-    typer.Option(metavar="KIND,KIND…", help="ground truth to write: depth, flow, poses, … or all (see 'list truth')"),
+    typer.Option(metavar="KIND,KIND…", help="ground truth to write: depth, flow, poses, … or all (see 'info truth')"),
 ]
 #: Runs with a longer estimate need a confirmation.
 LONG_MINUTES = 30
-Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes")]
-AllowOutside = Annotated[bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder")]
+Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes", hidden=True)]
+AllowOutside = Annotated[
+    bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder", hidden=True)
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an existing output")]
 
 

@@ -1,4 +1,4 @@
-"""Scenes into recordings: ``simulate`` and ``demo``."""
+"""Recordings: ``simulate`` of a scene, video, cube, run file or recording, and ``demo``."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hesim_render.cli.console import Console, DryRun, Json, Quiet, recording_facts
 from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.cli.inputs import InputKind, check_options, input_kind, with_values
 from hesim_render.cli.options import (
     LONG_MINUTES,
+    SENSOR_HELP,
     AllowOutside,
     Clean,
+    HelpAll,
     Overwrite,
     Region,
-    SensorFile,
     Truth,
     Without,
     Yes,
@@ -26,7 +29,6 @@ from hesim_render.cli.options import (
     names_of,
 )
 from hesim_render.cli.terminal import split_overrides, summary
-from hesim_render.cli.told import DryRun, Json, Quiet, Told, recording_facts
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.guard import printable
 from hesim_render.core.output import free_place, replacing
@@ -38,88 +40,232 @@ _DEMO_RUNS = (("colorchecker", "eiger"), ("rotating-star", "gen2"))
 
 
 def simulate(
-    scene: Annotated[
+    given: Annotated[
         str,
         typer.Argument(
-            help="a name (see 'list scenes') or the path of a scene file", autocompletion=names_of("scenes")
+            metavar="INPUT",
+            help="a scene (a name, see 'info scenes', or a file), a video (a file, a folder of numbered pictures, "
+            ".npy), a hyperspectral cube (.hdr, .mat, .h5, .exr, .npy, a folder of CAVE), a run file, or a recording "
+            "of a scene to make again",
+            autocompletion=names_of("scenes"),
         ),
     ],
-    sensor: SensorFile,
-    out: Annotated[Path, typer.Option(help="folder to write the recording to")],
-    duration: Annotated[float, typer.Option(help="simulated time, s")] = 0.1,
+    out: Annotated[Path, typer.Option(help="folder to write to; the same command goes on with a run that was ended")],
+    sensor: Annotated[str | None, typer.Option(help=SENSOR_HELP, autocompletion=names_of("sensors"))] = None,
+    duration: Annotated[float | None, typer.Option(help="simulated time, s; default 0.1, of a video all of it")] = None,
     roi: Region = None,
-    seed: Annotated[int, typer.Option(help="of all noise and of the render")] = 7,
+    seed: Annotated[int | None, typer.Option(help="of all noise and of the render; default 7")] = None,
     quality: Annotated[
         float | None, typer.Option(help="error of the render as a part of the sensor's noise (default 0.5)")
     ] = None,
-    exact: Annotated[bool, typer.Option("--exact", help="render every pixel of every slice, all alike")] = False,
-    samples: Annotated[int | None, typer.Option(help="with --exact: rays per pixel and slice of time")] = None,
-    yes: Yes = False,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="render every pixel of every slice, all alike", hidden=True)
+    ] = False,
+    samples: Annotated[
+        int | None, typer.Option(help="with --exact: rays per pixel and slice of time", hidden=True)
+    ] = None,
     truth: Truth = None,
     truth_every_us: Annotated[
         int | None,
-        typer.Option(help="with --truth: interval between descriptions of event pixels (default: one for each frame)"),
+        typer.Option(
+            help="with --truth: interval between descriptions of event pixels (default: one for each frame)",
+            hidden=True,
+        ),
     ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="change a key of the scene file, or with sensor. of the sensor file"
+            "--set",
+            metavar="KEY=VALUE",
+            help="change a key of the input (docs/cli.md), or with sensor. of the sensor file; repeatable",
         ),
     ] = None,
     clean: Clean = False,
     without: Without = None,
     allow_outside: AllowOutside = False,
-    look: Annotated[
-        bool, typer.Option("--look", help="only show the framing: a quick picture without light, OUT.png")
+    scene_file: Annotated[
+        str | None,
+        typer.Option("--scene", help="of a recording: the scene file, if it needs files that it lacks", hidden=True),
+    ] = None,
+    framing: Annotated[
+        bool,
+        typer.Option("--framing", help="only show the framing: a quick picture without light, OUT.png", hidden=True),
     ] = False,
+    yes: Yes = False,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Render a scene and record it: RAW frames, events and their ground truth.
+    """Record a scene, a video or a hyperspectral cube.
+
+    The recording has RAW frames, events and their ground truth. A run file also develops, exports and shows it. A
+    recording is made again from its recording.json.
 
     Ends with status 3 where the audit finds that the recording is worse than --quality asks for.
     """
-    check_duration(duration)
-    scene_changes, sensor_changes = split_overrides(set_ or [])
-    told = Told(json_, quiet, dry_run)
-    if look:
+    keys, sensor_keys = split_overrides(set_ or [])
+    kind = input_kind(given, keys)
+    check_options(kind, {
+        "--sensor": sensor, "--duration": duration, "--roi": roi, "--seed": seed, "--quality": quality,
+        "--exact": exact, "--samples": samples, "--truth": truth, "--truth-every-us": truth_every_us, "--set": set_,
+        "--clean": clean, "--without": without, "--allow-outside": allow_outside, "--scene": scene_file,
+        "--framing": framing,
+    })  # fmt: skip
+    if duration is not None:
+        check_duration(duration)
+    console = Console(json_, quiet, dry_run)
+    limits: dict[str, Any] = {"max_minutes": None if yes else LONG_MINUTES, "overwrite": overwrite}
+    common = _given(seed=seed, clean=clean, without=without or [], duration_s=duration)
+    rendered = _given(quality=quality, exact=exact, samples=samples, truth=listed(truth), truth_every_us=truth_every_us)
+    if kind is InputKind.recording:
+        _again(console, Path(given), out, scene_file, allow_outside, limits)
+    elif kind is InputKind.run:
+        changes = keys | common | rendered | _given(sensor=sensor, roi=roi)
+        _run(console, Path(given), out, changes, sensor_keys, allow_outside, limits)
+    elif sensor is None:
+        raise ConflictError("--sensor", None, "Missing option '--sensor': the name or the file of one (info sensors)")
+    elif framing:
         if dry_run:
-            raise ConflictError("--look", look, "give --look or --dry-run, not both")
-        _look(told, scene, sensor, out, scene_changes, sensor_changes, roi, allow_outside, overwrite)
-        return
-    recording = _simulate(
-        told, scene, sensor, out, scene_changes=scene_changes, sensor_changes=sensor_changes, roi=roi,
-        overwrite=overwrite, duration_s=duration, seed=seed, quality=quality, exact=exact, samples=samples,
-        max_minutes=None if yes else LONG_MINUTES,
-        clean=clean, without=without or (), allow_outside=allow_outside,
-        truth=listed(truth), truth_every_us=truth_every_us,
-    )  # fmt: skip
-    tell_recording(told, recording)
+            raise ConflictError("--framing", framing, "give --framing or --dry-run, not both")
+        _framing(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite)
+    elif kind is InputKind.scene:
+        recording = _scene(
+            console, given, sensor, out, scene_keys=keys, sensor_keys=sensor_keys, roi=roi,
+            allow_outside=allow_outside, **limits, **common, **rendered,
+        )  # fmt: skip
+        show_recording(console, recording)
+    else:
+        _pictures(console, kind, given, sensor, out, keys, sensor_keys, roi, {**limits, **common})
 
 
-def tell_recording(told: Told, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None) -> None:
+def _given(**options: Any) -> dict[str, Any]:
+    """The options that were given, so that the others keep their defaults."""
+    return {name: value for name, value in options.items() if value not in (None, False, [])}
+
+
+def show_recording(
+    console: Console, recording: Recording, more: str = "", facts: Mapping[str, Any] | None = None
+) -> None:
     """The result of a run: its recording, with the status that the audit gives."""
     from hesim_render.recording.quality import is_short_of_wish
 
     short = is_short_of_wish(recording.manifest["settings"].get("render", {}).get("audit"))
     status = ExitStatus.NOT_MET if short else ExitStatus.DONE
-    told.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
+    console.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
 
 
-def _look(
-    told: Told,
+def _scene(
+    console: Console,
     scene: str,
     sensor: str,
     out: Path,
-    scene_changes: dict[str, Any],
-    sensor_changes: dict[str, Any],
+    *,
+    scene_keys: dict[str, Any] | None = None,
+    sensor_keys: dict[str, Any] | None = None,
+    roi: str | None = None,
+    overwrite: bool = False,
+    allow_outside: bool = False,
+    **options: Any,
+) -> Recording:
+    """The recording of a scene."""
+    check_output(out, overwrite)
+    import hesim_render as hr
+
+    loaded_sensor = cropped(hr.load_sensor(sensor, sensor_keys), roi)
+    loaded_scene = hr.load_scene(scene, scene_keys, allow_outside=allow_outside)
+    with console.stop_at_estimate(), console.progress(f"{scene} → {sensor}") as progress:
+        return hr.simulate(
+            loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
+            on_estimate=console.estimated(progress), resume=True, **options,
+        )  # fmt: skip
+
+
+def _pictures(
+    console: Console,
+    kind: InputKind,
+    given: str,
+    sensor: str,
+    out: Path,
+    keys: dict[str, Any],
+    sensor_keys: dict[str, Any],
+    roi: str | None,
+    options: dict[str, Any],
+) -> None:
+    """Record a video or a hyperspectral cube."""
+    check_output(out, options["overwrite"])
+    import hesim_render as hr
+
+    loaded = cropped(hr.load_sensor(sensor, sensor_keys), roi)
+    options |= with_values(keys)
+    with console.stop_at_estimate(), console.progress(f"{Path(given).name} → {sensor}") as progress:
+        options |= {"out": out, "progress": progress, "on_estimate": console.estimated(progress)}
+        if kind is InputKind.video:
+            recording = hr.simulate_video(given, loaded, resume=True, **options)
+        else:
+            del options["max_minutes"]  # a cube takes no rays
+            recording = hr.simulate_cube(given, loaded, **options)
+    notes = recording.manifest["settings"].get("video", {}).get("notes", [])
+    show_recording(console, recording, "".join(f"\nnote: {text}" for text in notes))
+
+
+def _run(
+    console: Console,
+    file: Path,
+    out: Path,
+    changes: dict[str, Any],
+    sensor_keys: dict[str, Any],
+    allow_outside: bool,
+    limits: dict[str, Any],
+) -> None:
+    """Do what the file of a run asks for, with other values of its keys and of those of the sensor file."""
+    from hesim_render.capture.run_file import run
+    from hesim_render.specs.files import load_yaml
+
+    if sensor_keys:
+        of_file = changes.get("set", load_yaml(file).get("set")) or {}
+        changes["set"] = {**of_file, **{f"sensor.{key}": value for key, value in sensor_keys.items()}}
+    with console.stop_at_estimate(), console.progress(file.name) as progress:
+        made = run(
+            file, out, overrides=changes, allow_outside=allow_outside, progress=progress,
+            on_estimate=console.estimated(progress), **limits,
+        )  # fmt: skip
+    files = "".join(f"\n  {name}: {path}" for name, path in list(made.written.items())[1:])
+    kept = f"\n  made by an earlier run: {', '.join(made.kept)}" if made.kept else ""
+    show_recording(console, made.recording, files + kept, {"written": made.written, "kept": list(made.kept)})
+
+
+def _again(
+    console: Console, recording: Path, out: Path, scene: str | None, allow_outside: bool, limits: dict[str, Any]
+) -> None:
+    """Make a recording again: the same bytes, on the same versions and backend."""
+    check_output(out, limits["overwrite"])
+    from hesim_render.capture.again import simulate_again
+    from hesim_render.recording.recording import Recording
+    from hesim_render.sources.scene import load_scene
+
+    loaded = Recording.load(recording)
+    given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
+    with console.stop_at_estimate(), console.progress(f"{recording} again") as progress:
+        again = simulate_again(
+            loaded, out, given, progress=progress, on_estimate=console.estimated(progress), resume=True, **limits
+        )
+    show_recording(console, again)
+
+
+def _framing(
+    console: Console,
+    scene: str,
+    sensor: str,
+    out: Path,
+    scene_keys: dict[str, Any],
+    sensor_keys: dict[str, Any],
     roi: str | None,
     allow_outside: bool,
     overwrite: bool,
 ) -> None:
-    """Write the picture of ``--look``."""
+    """Write the picture of ``--framing``."""
     target = out if out.suffix == ".png" else out.with_name(f"{out.name}.png")
     free_place(target, overwrite)
     from PIL import Image
@@ -127,15 +273,15 @@ def _look(
     import hesim_render as hr
     from hesim_render.sources.render.look import look
 
-    loaded = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
-    found = look(loaded, cropped(hr.load_sensor(sensor, sensor_changes), roi))
+    loaded = hr.load_scene(scene, scene_keys, allow_outside=allow_outside)
+    found = look(loaded, cropped(hr.load_sensor(sensor, sensor_keys), roi))
     with replacing(target) as unfinished:
         Image.fromarray(found.picture).save(unfinished, format="PNG")
     for name, materials in found.materials.items():
-        told.text(f"materials of {name}:")
+        console.text(f"materials of {name}:")
         for material in materials:
-            told.text(f"  {printable(str(material))}")
-    told.result(
+            console.text(f"  {printable(str(material))}")
+    console.result(
         f"{found.target or 'the scene has no target'}\nframing in {target}",
         {
             "picture": target, "target": None if found.target is None else str(found.target),
@@ -144,77 +290,25 @@ def _look(
     )  # fmt: skip
 
 
-def rerun(
-    recording: Annotated[Path, typer.Argument(help="folder of a recording of a scene")],
-    out: Annotated[Path, typer.Option(help="folder to write the new recording to")],
-    scene: Annotated[
-        str | None, typer.Option(help="the scene file, if it needs files that the recording does not hold")
-    ] = None,
-    yes: Yes = False,
-    allow_outside: AllowOutside = False,
-    overwrite: Overwrite = False,
-    dry_run: DryRun = False,
-    json_: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Make a recording again from its recording.json: the same bytes, on the same versions and backend."""
-    check_output(out, overwrite)
-    from hesim_render.capture.again import simulate_again
-    from hesim_render.recording.recording import Recording
-    from hesim_render.sources.scene import load_scene
-
-    loaded = Recording.load(recording)
-    given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
-    told = Told(json_, quiet, dry_run)
-    with told.stop_at_estimate(), told.progress(f"{recording} again") as progress:
-        again = simulate_again(
-            loaded, out, given, overwrite=overwrite, progress=progress, on_estimate=told.estimated(progress),
-            max_minutes=None if yes else LONG_MINUTES, resume=True,
-        )  # fmt: skip
-    tell_recording(told, again)
-
-
 def demo(
     out: Annotated[Path, typer.Option(help="folder for the two recordings (replaced if already there)")] = Path("demo"),
 ) -> None:
-    """Two small recordings with pictures: a ColorChecker, and a moving scene."""
+    """Make two small recordings with pictures.
+
+    A ColorChecker, and a moving scene.
+    """
     from hesim_render.recording.quality import is_short_of_wish
 
-    told = Told()
+    console = Console()
     runs = {out / f"{scene}-{sensor}": (scene, sensor) for scene, sensor in _DEMO_RUNS}
     for target in runs:
         check_output(target, overwrite=True)
     audits = {}
     for target, (scene, sensor) in runs.items():
-        recording = _simulate(told, scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        recording = _scene(console, scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
         audits[target.name] = recording.manifest["settings"].get("render", {}).get("audit")
-        told.text(summary(recording) + "\n")
+        console.text(summary(recording) + "\n")
     still, moving = runs
-    told.text(f"Look at {still / 'preview.png'} (24 measured patches)")
+    console.text(f"Look at {still / 'preview.png'} (24 measured patches)")
     status = ExitStatus.NOT_MET if any(map(is_short_of_wish, audits.values())) else ExitStatus.DONE
-    told.result(f"    and {moving / 'preview.gif'} (events of a moving scene).", {}, status)
-
-
-def _simulate(
-    told: Told,
-    scene: str,
-    sensor: str,
-    out: Path,
-    *,
-    scene_changes: dict[str, Any] | None = None,
-    sensor_changes: dict[str, Any] | None = None,
-    roi: str | None = None,
-    overwrite: bool = False,
-    allow_outside: bool = False,
-    **options: Any,
-) -> Recording:
-    check_output(out, overwrite)
-    import hesim_render as hr
-
-    loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
-    loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
-    with told.stop_at_estimate(), told.progress(f"{scene} → {sensor}") as progress:
-        return hr.simulate(
-            loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
-            on_estimate=told.estimated(progress), resume=True, **options,
-        )  # fmt: skip
+    console.result(f"    and {moving / 'preview.gif'} (events of a moving scene).", {}, status)

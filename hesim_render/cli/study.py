@@ -1,16 +1,16 @@
-"""Studies of filter sets: ``study``."""
+"""Comparisons of filter sets, designs of filters, and sweeps: ``study``."""
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hesim_render.cli.options import Overwrite
-from hesim_render.cli.told import Json, Quiet, Told
-from hesim_render.core.errors import RangeError
+from hesim_render.cli.console import Console, DryRun, Json, Quiet
+from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.cli.options import HelpAll, Overwrite, names_of
+from hesim_render.core.errors import ConflictError
 from hesim_render.core.output import check_target
 
 #: Columns of the summary on the terminal.
@@ -24,42 +24,66 @@ _SHOWN = {
 _MOST = 40
 
 
-class StudyKind(StrEnum):
-    """What can be studied."""
-
-    cfa = "cfa"
-    design = "design"
-
-
 def study(
-    kind: Annotated[StudyKind, typer.Argument(help="cfa (compare colour filter arrays) or design (of filters)")],
-    spec: Annotated[str, typer.Argument(metavar="SPEC", help="name of a shipped study or design, or a file")],
-    out: Annotated[Path, typer.Option(help="folder to write tables and report to")],
+    spec: Annotated[
+        str,
+        typer.Argument(
+            metavar="SPEC",
+            help="a comparison of filter sets, a design of filters or a sweep: a name (see 'info studies') or a file",
+            autocompletion=names_of("studies"),
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="folder of tables and report; a sweep that was ended goes on there")],
     surfaces: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME or FILE", help="what cfa looks at, in place of the study's own: a scene, a cube, patches"
+            metavar="NAME or FILE",
+            help="what a comparison looks at, in place of its own: a scene, a cube, patches; repeatable",
         ),
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a key of the file; repeatable")
     ] = None,
     overwrite: Overwrite = False,
+    dry_run: DryRun = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Compare filter sets, or design filters: colour, noise and event figures, as tables and a report."""
-    from hesim_render.specs.files import parse_override
-    from hesim_render.specs.study import read_study, surfaces_of
+    """Compare filter sets, design filters, or vary any keys.
 
+    The kind is that of the file. Results are tables and, but for sweeps, a report.
+
+    Ends with status 3 where the audits find runs of a sweep that are worse than it asks for.
+    """
+    from hesim_render.specs.files import parse_override
+    from hesim_render.specs.kinds import StudyKind, study_kind
+    from hesim_render.specs.study import surfaces_of
+
+    kind = study_kind(spec)
+    for name, value, taken in (
+        ("--surfaces", surfaces, kind is StudyKind.comparison),
+        ("--overwrite", overwrite, kind is not StudyKind.sweep),
+        ("--dry-run", dry_run, kind is StudyKind.sweep),
+    ):
+        if value and not taken:
+            raise ConflictError(name, value, f"{name}: not for a {kind.value}, which {spec} is")
     keys = dict(map(parse_override, set_ or []))
-    if kind is StudyKind.design:
+    console = Console(json_, quiet, dry_run)
+    if kind is StudyKind.sweep:
+        _sweep(console, spec, out, keys)
+    elif kind is StudyKind.design:
+        _design(console, spec, out, keys, overwrite)
+    else:
         if surfaces:
-            raise RangeError("--surfaces", ", ".join(surfaces), "none in a design, which has fit and judge in its file")
-        _design(Told(json_, quiet), spec, out, keys, overwrite)
-        return
-    if surfaces:
-        keys["surfaces"] = [surfaces_of(text) for text in surfaces]
+            keys["surfaces"] = [surfaces_of(text) for text in surfaces]
+        _compare(console, spec, out, keys, overwrite)
+
+
+def _compare(console: Console, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
+    """Figures of filter sets."""
+    from hesim_render.specs.study import read_study
+
     chosen = read_study(spec, keys)
     from hesim_render.studies.headings import NOTE, level_text
     from hesim_render.studies.run import MARKER
@@ -67,8 +91,7 @@ def study(
     check_target(out, MARKER, overwrite)
     import hesim_render as hr
 
-    told = Told(json_, quiet)
-    with told.progress(f"study {kind.value}") as progress:
+    with console.progress(chosen.name) as progress:
         table = hr.study(chosen, out=out, overwrite=overwrite, progress=progress)
     shown = {name: title for name, title in _SHOWN.items() if name in table.columns}
     every = ("surfaces", "illuminant", "illuminance_lux", "sensor", "crosstalk", "equal")
@@ -80,16 +103,16 @@ def study(
             cells["white_saturation"] = level_text(row, cells["white_saturation"])
         lines.append(list(cells.values()))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    told.text(
+    console.text(
         "\n".join(
             "  ".join(f"{cell:<{width}}" for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
         )
     )
     if len(table) > _MOST:
-        told.text(f"and {len(table) - _MOST} more rows")
+        console.text(f"and {len(table) - _MOST} more rows")
     if "ysnr_noise_aware" in shown:
-        told.text(NOTE)
-    told.result(
+        console.text(NOTE)
+    console.result(
         f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}",
         {"results": out / "results.csv", "report": out / "report.html", "rows": list(table)},
     )
@@ -101,16 +124,18 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, int | float) else str(value)
 
 
-def _design(told: Told, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
+def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
     from hesim_render.specs.design import read_design
     from hesim_render.studies.design_run import MARKER, design
 
     chosen = read_design(spec, keys)
     check_target(out, MARKER, overwrite)
-    with told.progress("study design") as progress:
+    with console.progress(chosen.name) as progress:
         found = design(chosen, out=out, overwrite=overwrite, progress=progress)
     costs = found.result.costs
-    told.text(f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs))
+    console.text(
+        f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs)
+    )
     for verdict in found.verdicts:
         aware, free = (
             ", ".join(
@@ -118,13 +143,35 @@ def _design(told: Told, spec: str, out: Path, keys: dict[str, Any], overwrite: b
             )
             for start in ("ysnr_noise_aware_ratio", "ysnr_ratio")
         )
-        told.text(
+        console.text(
             f"against {verdict['against']}: cost {verdict['cost']:.3f} in place of {verdict['cost_against']:.3f} "
             f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), noise-aware "
             f"YSNR times {aware}; noise-free: mean ΔE2000 {verdict['delta_e_mean']:.3f} in place of "
             f"{verdict['delta_e_mean_against']:.3f}, YSNR with the matrix of colour times {free}"
         )
-    told.result(
+    console.result(
         f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",
         {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": found.verdicts},
     )
+
+
+def _sweep(console: Console, spec: str, out: Path, keys: dict[str, Any]) -> None:
+    """Every combination of varied keys; runs that are there are not repeated."""
+    from hesim_render.recording.quality import is_short_of_wish, verdict_lines
+    from hesim_render.specs.sweep import read_sweep
+    from hesim_render.studies.sweep import VERDICT, check_sweep, sweep
+
+    chosen = read_sweep(spec, keys)
+    if console.dry_run:
+        total, missing = check_sweep(chosen, out)
+        text = f"{total} runs, {missing} of them not yet made; nothing was written (--dry-run)"
+        console.result(text, {"dry_run": True, "runs": total, "missing": missing})
+        return
+    with console.progress(chosen.name) as progress:
+        table = sweep(chosen, out=out, progress=progress)
+    verdicts = table[VERDICT].tolist() if VERDICT in table.columns else []
+    audits: dict[str, dict[str, object] | None] = {f"row {k + 1}": {"verdict": each} for k, each in enumerate(verdicts)}
+    short = [name for name, audit in audits.items() if is_short_of_wish(audit)]
+    lines = [f"{len(table)} runs in {out / 'results.csv'}", *(f"  {line}" for line in verdict_lines(audits, "runs"))]
+    facts = {"results": out / "results.csv", "runs": len(table), "not_met": short}
+    console.result("\n".join(lines), facts, ExitStatus.NOT_MET if short else ExitStatus.DONE)

@@ -1,4 +1,4 @@
-"""A calibrated sensor beside captures that it was not fitted on: ``twin``."""
+"""A calibrated sensor beside captures that it was not fitted on: ``calibrate twin``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from hesim_render.cli.console import Console, Json, Quiet
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.options import Overwrite
-from hesim_render.cli.told import Json, Quiet, Told
+from hesim_render.cli.options import HelpAll, Overwrite
 
 
 def twin(
@@ -19,13 +19,17 @@ def twin(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Calibrate on half of EMVA 1288 captures, simulate the rest, compare: pass or fail for each statistic."""
+    """Calibrate on half of the captures, test on the rest.
+
+    The other half is simulated, and each statistic passes or fails.
+    """
     from hesim_render.twin import make_twin
     from hesim_render.twin.page import check_line
 
-    told = Told(json_, quiet)
-    with told.progress("twin") as move:
+    console = Console(json_, quiet)
+    with console.progress("twin") as move:
         found = make_twin(
             captures, out, seed=seed, overwrite=overwrite, progress=lambda what, fraction: move(fraction, 1.0, what)
         )
@@ -33,4 +37,4 @@ def twin(
     passed = sum(check.passed for check in found.checks)
     text = "\n".join([*lines, f"{passed} of {len(lines)} pass", f"in {out}"])
     facts = {"twin": found.folder, "passed": found.passed, "checks": {c.name: c.passed for c in found.checks}}
-    told.result(text, facts, ExitStatus.DONE if found.passed else ExitStatus.NOT_MET)
+    console.result(text, facts, ExitStatus.DONE if found.passed else ExitStatus.NOT_MET)

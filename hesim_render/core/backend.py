@@ -81,7 +81,7 @@ print("ok")
 
 
 @dataclass(frozen=True)
-class Candidate:
+class BackendCandidate:
     """One library (or the GPU) and the result of its probe."""
 
     backend: str  # "llvm" or "cuda"
@@ -133,23 +133,23 @@ def _extra_library() -> tuple[str, tuple[str, ...]] | None:
     return str(library[-1]), tuple(preload)
 
 
-def candidates() -> list[Candidate]:
+def candidates() -> list[BackendCandidate]:
     """Everything that could run Dr.Jit here, best first; nothing has been loaded yet."""
     forced = os.environ.get(BACKEND_VARIABLE, "").lower()
     if forced not in ("", "llvm", "cuda"):
         raise BackendError(f"{BACKEND_VARIABLE} is {forced!r}; expected 'llvm' or 'cuda'")
-    found: list[Candidate] = []
+    found: list[BackendCandidate] = []
     if forced != "llvm" and _has_cuda():
-        found.append(Candidate("cuda", "GPU", ""))
+        found.append(BackendCandidate("cuda", "GPU", ""))
     if forced != "cuda":
         given = os.environ.get("DRJIT_LIBLLVM_PATH")
         extra = _extra_library()
         if given and given != _chosen_here:
             preload = extra[1] if extra and given == extra[0] else ()  # inherited from a parent that chose it
-            found.append(Candidate("llvm", "DRJIT_LIBLLVM_PATH", given, preload))
-        found += [Candidate("llvm", "system", str(path)) for path in _system_libraries()]
+            found.append(BackendCandidate("llvm", "DRJIT_LIBLLVM_PATH", given, preload))
+        found += [BackendCandidate("llvm", "system", str(path)) for path in _system_libraries()]
         if extra:
-            found.append(Candidate("llvm", "'llvm' extra", extra[0], extra[1]))
+            found.append(BackendCandidate("llvm", "'llvm' extra", extra[0], extra[1]))
     return found
 
 
@@ -165,7 +165,7 @@ def _cache_file() -> Path:
     return Path(root) / "hesim_render" / "backend.json"
 
 
-def _cache_key(candidate: Candidate) -> str | None:
+def _cache_key(candidate: BackendCandidate) -> str | None:
     """Everything a verdict depends on, as a key; None if it cannot be determined, so that the verdict is not cached."""
     try:
         if candidate.backend == "cuda":
@@ -180,16 +180,16 @@ def _cache_key(candidate: Candidate) -> str | None:
     return "|".join((candidate.backend, identity, str(drjit.origin if drjit else ""), sys.version))
 
 
-def probe(candidate: Candidate) -> Candidate:
+def probe(candidate: BackendCandidate) -> BackendCandidate:
     """Run a kernel with `candidate` in a child process, and return the candidate with the result."""
     if candidate.path and not os.path.exists(candidate.path):
-        return Candidate(**{**candidate.__dict__, "reason": "no such file"})
+        return BackendCandidate(**{**candidate.__dict__, "reason": "no such file"})
     command = python_command(_PROBE, candidate.backend, candidate.path, *candidate.preload)
     environment = {k: v for k, v in child_environment().items() if k != "DRJIT_LIBLLVM_PATH"}
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Candidate(**{**candidate.__dict__, "reason": f"probe did not finish: {error}"})
+        return BackendCandidate(**{**candidate.__dict__, "reason": f"probe did not finish: {error}"})
     lines = child.stdout.split()
     version = lines[0] if lines else ""
     works = child.returncode == 0 and lines[-1:] == ["ok"]
@@ -198,10 +198,10 @@ def probe(candidate: Candidate) -> Candidate:
         last = (child.stderr.strip().splitlines() or [""])[-1]
         died = f"killed by signal {-child.returncode}" if child.returncode < 0 else ""
         reason = "; ".join(part for part in (died, last) if part) or f"exit status {child.returncode}"
-    return Candidate(**{**candidate.__dict__, "version": version, "works": works, "reason": reason})
+    return BackendCandidate(**{**candidate.__dict__, "version": version, "works": works, "reason": reason})
 
 
-def _probe_cached(candidate: Candidate) -> Candidate:
+def _probe_cached(candidate: BackendCandidate) -> BackendCandidate:
     """As `probe`, remembering libraries that worked (a failure is always tried again)."""
     key = _cache_key(candidate)
     file = _cache_file()
@@ -210,7 +210,7 @@ def _probe_cached(candidate: Candidate) -> Candidate:
     except (OSError, ValueError):
         cache = {}
     if key is not None and key in cache:
-        return Candidate(**{**candidate.__dict__, "version": cache[key], "works": True})
+        return BackendCandidate(**{**candidate.__dict__, "version": cache[key], "works": True})
     result = probe(candidate)
     if result.works and key is not None:
         cache[key] = result.version
@@ -233,14 +233,14 @@ def _loaded_llvm() -> list[str]:
     return sorted({line.split(maxsplit=5)[5] for line in lines if "libLLVM" in line})
 
 
-def _adopt(chosen: Candidate) -> Candidate:
+def _adopt(chosen: BackendCandidate) -> BackendCandidate:
     """Set up the chosen library; if Dr.Jit was imported before, check that it took a working one."""
     if chosen.backend == "cuda" or "drjit" not in sys.modules:
         return chosen
     loaded = _loaded_llvm()
     if any(os.path.realpath(path) == os.path.realpath(chosen.path) for path in loaded):
         return chosen
-    early = [_probe_cached(Candidate("llvm", "taken by Dr.Jit", path)) for path in loaded]
+    early = [_probe_cached(BackendCandidate("llvm", "taken by Dr.Jit", path)) for path in loaded]
     if early and all(candidate.works for candidate in early):
         return early[0]
     took = f"took {early[0].describe()}, which does not work ({early[0].reason})" if early else "found no LLVM"
@@ -259,7 +259,7 @@ def install_hint() -> str:
 
 
 @functools.cache
-def select() -> Candidate:
+def select() -> BackendCandidate:
     """First candidate that works; its library is set up for Dr.Jit in this process.
 
     Raises

@@ -103,13 +103,13 @@ def inside(folder: Path, name: str, *, file: str | Path | None = None, key: str 
     SpecError
         If the name or a link leads out of the folder, or to something other than a plain file.
     """
-    told = folder / name if file is None else file
-    with reading(told):
+    named = folder / name if file is None else file
+    with reading(named):
         if leads_out(folder, name):
-            raise SpecError(f"{name!r} leads out of its folder {folder.resolve()}", file=told, key=key)
+            raise SpecError(f"{name!r} leads out of its folder {folder.resolve()}", file=named, key=key)
         path = (folder / name).resolve()
         if not path.is_file():
-            raise SpecError(f"no such file: {folder / name}" if key else "no such file", file=told, key=key)
+            raise SpecError(f"no such file: {folder / name}" if key else "no such file", file=named, key=key)
     return path
 
 

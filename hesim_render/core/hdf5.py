@@ -68,7 +68,7 @@ class Disk:
         """Nothing is buffered."""
 
     @contextlib.contextmanager
-    def told(self) -> Iterator[None]:
+    def own_errors(self) -> Iterator[None]:
         """Raise an error of the disk in place of the error that HDF5 makes of it."""
         try:
             yield
@@ -93,7 +93,7 @@ def new_file(path: Path) -> Iterator[h5py.File]:
     disk = Disk(path)
     file = h5py.File(disk, "w")
     try:
-        with disk.told():
+        with disk.own_errors():
             yield file
             file.close()
             disk.close()

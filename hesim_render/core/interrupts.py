@@ -23,7 +23,7 @@ def interrupts_held() -> Iterator[None]:
             before = signal.getsignal(number)
             if callable(before):
                 handlers[number] = before
-                signal.signal(number, lambda *told: held.append(told))
+                signal.signal(number, lambda *arguments: held.append(arguments))
     try:
         yield
     finally:

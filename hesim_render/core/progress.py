@@ -43,7 +43,7 @@ class Pace:
         self.estimate_s: float | None = None
         self.what = ""
         self.fraction = 0.0
-        self._is_told = False
+        self._is_announced = False
 
     @property
     def elapsed_s(self) -> float:
@@ -79,12 +79,12 @@ class Pace:
 
     def late_note(self) -> str | None:
         """A note about a run that takes `LATE` times its estimate; once, None before and after."""
-        if self._is_told or self.estimate_s is None:
+        if self._is_announced or self.estimate_s is None:
             return None
         taken = self._clock() - self._expected_at_s
         if taken < max(LATE * self.estimate_s, _LEAST_LATE_S):
             return None
-        self._is_told = True
+        self._is_announced = True
         return (
             f"takes longer than its estimate: {in_words(taken)} so far, estimated were {in_words(self.estimate_s)}; "
             + self.describe()
@@ -242,8 +242,8 @@ class _Notebook:
         self._handle = display(HTML(self._text(Pace())), display_id=True)
 
     def _text(self, pace: Pace) -> str:
-        told = f"{self._title}: {pace.describe()}, {in_words(pace.elapsed_s)} so far"
-        return f"<progress value='{pace.fraction:.3f}' max='1'></progress> {html.escape(told)}{self._notes}"
+        status = f"{self._title}: {pace.describe()}, {in_words(pace.elapsed_s)} so far"
+        return f"<progress value='{pace.fraction:.3f}' max='1'></progress> {html.escape(status)}{self._notes}"
 
     def show(self, pace: Pace) -> None:
         self._handle.update(self._html(self._text(pace)))

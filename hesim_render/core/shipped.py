@@ -6,12 +6,21 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+#: Kinds of shipped files and their folders: in ``shipped`` of an installed package, at the top of the source tree.
+FOLDERS = {
+    "scenes": "scenes",
+    "sensors": "sensors",
+    "studies": "studies",
+    "filter_sets": "studies/filter_sets",
+    "palettes": "studies/palettes",
+}
+
 
 def data_folder(kind: str) -> Path:
-    """Folder of the shipped files: ``scenes`` or ``sensors`` (inside the wheel, or beside the sources)."""
+    """Folder of the shipped files of a kind, one of `FOLDERS`."""
     package = Path(__file__).resolve().parent.parent
-    inside = package / kind
-    return inside if inside.is_dir() else package.parent / kind
+    installed = package / "shipped"
+    return (installed if installed.is_dir() else package.parent) / FOLDERS[kind]
 
 
 def list_names(kind: str) -> list[str]:

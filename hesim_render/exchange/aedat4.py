@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading, require_memory
-from hesim_render.exchange.flatbuffer import Table
+from hesim_render.exchange.flatbuffer import FlatTable
 from hesim_render.exchange.stream import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -147,7 +147,7 @@ def read_header(path: Path) -> tuple[tuple[int, int], int, int, int, int]:
             raise SpecError("is not an AEDAT4 file (it does not begin with #!AER-DAT4.0)", file=path)
         (size,) = struct.unpack("<I", _exactly(file, 4, path))
         require_memory(size, "the header", path, 1 << 26)
-        header = Table.root(_exactly(file, size, path), b"IOHE")
+        header = FlatTable.root(_exactly(file, size, path), b"IOHE")
         table = header.number(1, "<q", -1)
         end = path.stat().st_size if table < 0 else table
         if end > path.stat().st_size:
@@ -167,8 +167,8 @@ def _events_stream(info: str, path: Path) -> tuple[tuple[int, int], int]:
         if found.get("typeIdentifier") == "EVTS":
             name, cols, rows = node.get("name", ""), found.get("sizeX", ""), found.get("sizeY", "")
             if not all(re.fullmatch(r"\d{1,6}", value) for value in (name, cols, rows)):
-                told = printable(f"{name!r} of {cols!r} x {rows!r}")
-                raise SpecError(f"has a stream of events without number and size ({told[:80]})", file=path)
+                entry = printable(f"{name!r} of {cols!r} x {rows!r}")
+                raise SpecError(f"has a stream of events without number and size ({entry[:80]})", file=path)
             return (int(rows), int(cols)), int(name)
     raise SpecError("has no stream of events", file=path)
 
@@ -193,7 +193,7 @@ def read(path: Path, number: int, compression: int, begin: int, end: int) -> Ite
             content = _unpacked(_exactly(file, size, path), compression, path)
             if len(content) < 4:
                 raise SpecError("a packet of events is empty", file=path)
-            made = Table.root(content[4:], b"EVTS").structures(0, _EVENT)
+            made = FlatTable.root(content[4:], b"EVTS").structures(0, _EVENT)
             events = np.empty(made.size, dtype=EVENT_DTYPE)
             # a negative coordinate becomes one above 32767, which no grid has
             events["t_us"], events["x"], events["y"] = made["t_us"], made["x"], made["y"]

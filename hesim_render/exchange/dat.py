@@ -85,10 +85,10 @@ def read_header(path: Path) -> tuple[tuple[int, int] | None, int]:
         file.seek(begin)
         kind = file.read(2)
     if len(kind) < 2 or kind[0] not in (_OLD_EVENTS, _EVENTS) or kind[1] != _ENTRY.itemsize:
-        told = " of ".join(map(str, kind)) or "nothing"
+        kinds = " of ".join(map(str, kind)) or "nothing"
         raise SpecError(
-            f"holds entries of type {told} bytes at byte {begin}; expected type {_OLD_EVENTS} or {_EVENTS} (events) of "
-            f"{_ENTRY.itemsize}",
+            f"holds entries of type {kinds} bytes at byte {begin}; expected type {_OLD_EVENTS} or {_EVENTS} (events) "
+            f"of {_ENTRY.itemsize}",
             file=path,
         )
     return _shape(keys, path), begin + 2
@@ -99,8 +99,8 @@ def _shape(keys: dict[str, str], path: Path) -> tuple[int, int] | None:
     if not (width or height):
         return None
     if not all(side.isdecimal() and len(side) < 6 and 0 < int(side) <= LARGEST_SIDE for side in (width, height)):
-        told = printable(f"{width}x{height}")
-        raise SpecError(f"has the size {told}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
+        shown = printable(f"{width}x{height}")
+        raise SpecError(f"has the size {shown}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
     return int(height), int(width)
 
 

@@ -109,8 +109,8 @@ def _columns(file: Any, path: Path, count: int | None) -> tuple[dict[str, Any], 
     columns = {name: _column(file, f"events/{name}", path, kind) for name, kind in COLUMNS.items()}
     sizes = {name: column.shape[0] for name, column in columns.items()}
     if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{name} {size}" for name, size in sizes.items())
-        raise SpecError(f"the columns of events are of different lengths ({told})", file=path)
+        lengths = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise SpecError(f"the columns of events are of different lengths ({lengths})", file=path)
     total = sizes["t"]
     if count is not None and count != total:
         raise SpecError(f"holds {total} events; the recording has {count}", file=path)

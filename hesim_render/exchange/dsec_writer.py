@@ -75,7 +75,7 @@ class EventFileWriter:
         self._pending.append(events)
         self._pending_count += events.size
         if self._pending_count >= _CHUNK:
-            with self._disk.told():
+            with self._disk.own_errors():
                 self._flush()
 
     def _flush(self) -> None:
@@ -98,7 +98,7 @@ class EventFileWriter:
 
     def close(self) -> None:
         """Write the pending events and the millisecond index."""
-        with self._disk.told():
+        with self._disk.own_errors():
             self._flush()
             missing = self._duration_us // 1000 + 2 - self._first_of_ms.size
             rest = np.full(max(0, missing), self._written, dtype=np.uint64)

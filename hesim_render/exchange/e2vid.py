@@ -100,8 +100,8 @@ def read_arrays_header(path: Path) -> tuple[tuple[int, int] | None, dict[str, st
         require_names(archive, path, names.values())
     headers = {name: member_header(path, name) for name in names.values()}
     if len(shapes := {shape for shape, _ in headers.values()}) > 1 or len(next(iter(shapes))) != 1:
-        told = ", ".join(f"{name} {shape}" for name, (shape, _) in headers.items())
-        raise SpecError(f"must hold four lists of one length ({told})", file=path)
+        shapes_text = ", ".join(f"{name} {shape}" for name, (shape, _) in headers.items())
+        raise SpecError(f"must hold four lists of one length ({shapes_text})", file=path)
     for key, name in names.items():
         kind = headers[name][1].kind
         if kind not in ("uib" if key == "p" else "ui"):

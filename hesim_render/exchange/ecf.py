@@ -131,8 +131,8 @@ class _Chunk:
     def __init__(self, data: bytes, count: int, path: Path, where: str) -> None:
         self._data, self._count, self._path, self._where, self._at = data, count, path, where, 0
 
-    def problem(self, told: str) -> SpecError:
-        return SpecError(f"{self._where} {told}; the file is damaged", file=self._path)
+    def problem(self, message: str) -> SpecError:
+        return SpecError(f"{self._where} {message}; the file is damaged", file=self._path)
 
     def numbers(self, kind: str, count: int) -> NDArray:
         """The next numbers."""

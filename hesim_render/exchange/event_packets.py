@@ -102,8 +102,8 @@ def _words(path: Path, topic: str) -> Iterator[NDArray[np.uint16]]:
         shape, words = _parts(data, path)
         first = first or shape
         if shape != first:
-            told = f"packet {number} is of {shape[1]}x{shape[0]} px; the first one of {first[1]}x{first[0]}"
-            raise SpecError(told, file=path)
+            problem = f"packet {number} is of {shape[1]}x{shape[0]} px; the first one of {first[1]}x{first[0]}"
+            raise SpecError(problem, file=path)
         if words.size:
             yield words
 
@@ -124,8 +124,8 @@ def _parts(data: bytes, path: Path) -> tuple[tuple[int, int], NDArray[np.uint16]
         raise SpecError("a packet of events ends early; the file is damaged", file=path) from None
     encoding = name.rstrip(b"\0").decode("ascii", "replace")
     if encoding != _ENCODING:
-        told = f"has packets of encoding {printable(encoding[:40])!r}; expected {_ENCODING}"
-        raise SpecError(told, file=path)
+        problem = f"has packets of encoding {printable(encoding[:40])!r}; expected {_ENCODING}"
+        raise SpecError(problem, file=path)
     if not (0 < rows <= _LARGEST_SIDE and 0 < cols <= _LARGEST_SIDE):
         raise SpecError(f"has the size {cols}x{rows}; expected 1x1 to {_LARGEST_SIDE}x{_LARGEST_SIDE} px", file=path)
     if is_big or size % 2 or len(data) < place + 4 + size:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Table:
+class FlatTable:
     """A table in a buffer.
 
     Parameters
@@ -29,7 +29,7 @@ class Table:
         self._fields = [self._at(fields + at, "<H") for at in range(4, size - 1, 2)]
 
     @classmethod
-    def root(cls, data: bytes, identifier: bytes) -> Table:
+    def root(cls, data: bytes, identifier: bytes) -> FlatTable:
         """The root table of a buffer without a size in front, which must have an identifier of 4 bytes."""
         if data[4:8] != identifier:
             raise ValueError(f"a part says {data[4:8]!r}; expected {identifier!r}")

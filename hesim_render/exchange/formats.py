@@ -98,8 +98,8 @@ def open_events(
         raise RangeError("format", format, f"one of {', '.join(READABLE)}")
     found = _detect(file)
     if format is not None and found != format:
-        told = f"which is {found}" if found else "which has another begin"
-        raise SpecError(f"was to be read as {format}, {told}", file=file)
+        actual = f"which is {found}" if found else "which has another begin"
+        raise SpecError(f"was to be read as {format}, {actual}", file=file)
     if found is None:
         raise SpecError(f"is of no known event format; expected one of {', '.join(READABLE)}", file=file)
     stream = _OPENERS[found](file)

@@ -357,8 +357,10 @@ def _content(chunk: Any, path: Path) -> bytes:
     else:
         raise SpecError(f"has parts packed by {chunk.compression[:40]!r}; expected zstd or lz4", file=path)
     if len(data) != most:
-        told = f"has a part that unpacks to {len(data)} bytes{' or more' if len(data) > most else ''}; it says {most}"
-        raise SpecError(told, file=path)
+        problem = (
+            f"has a part that unpacks to {len(data)} bytes{' or more' if len(data) > most else ''}; it says {most}"
+        )
+        raise SpecError(problem, file=path)
     if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
         raise SpecError("has a part whose checksum is wrong; the file is damaged", file=path)
     return data

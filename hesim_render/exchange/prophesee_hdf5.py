@@ -47,8 +47,8 @@ def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """
     rows, cols = stream.shape
     if max(stream.shape) > ecf.LARGEST_SIDE:
-        told = f"ECF addresses at most {ecf.LARGEST_SIDE} rows and columns, not {cols}x{rows} px"
-        raise SpecError(told, file=target)
+        problem = f"ECF addresses at most {ecf.LARGEST_SIDE} rows and columns, not {cols}x{rows} px"
+        raise SpecError(problem, file=target)
     text = h5py.string_dtype("ascii")
     with new_file(Path(file.name)) as made:
         for key, value in {
@@ -76,6 +76,7 @@ def _packed_records(made: Any) -> Any:
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     layout.set_chunk((_CHUNK,))
     layout.set_filter(ecf.FILTER, h5py.h5z.FLAG_OPTIONAL, ())
+    layout.set_obj_track_times(False)  # the same events give the same bytes at any time
     space = h5py.h5s.create_simple((0,), (h5py.h5s.UNLIMITED,))
     return h5py.h5d.create(
         made.create_group("CD").id, b"events", h5py.h5t.py_create(_RECORD, logical=True), space, layout
@@ -220,8 +221,8 @@ def read_triggers(path: Path) -> NDArray:
             return no_triggers()
         stored = _records(file, TRIGGERS, ("p", "t", "id"), path)
         if _is_packed(stored) or stored.shape[0] > MOST_TRIGGERS:
-            told = f"{TRIGGERS} is packed with ECF, or has more than {MOST_TRIGGERS} edges"
-            raise SpecError(told, file=path)
+            problem = f"{TRIGGERS} is packed with ECF, or has more than {MOST_TRIGGERS} edges"
+            raise SpecError(problem, file=path)
         _chunk_of(stored)
         rows = stored[:]
     if rows.size and not 0 <= rows["id"].min() <= rows["id"].max() < 256:

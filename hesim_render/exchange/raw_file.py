@@ -143,8 +143,8 @@ def _shape(keys: dict[str, str], details: list[str], path: Path) -> tuple[int, i
     if not (width or height):
         return None
     if not (width.isdecimal() and height.isdecimal() and 0 < int(width) <= LARGEST_SIDE >= int(height) > 0):
-        told = printable(f"{width}x{height}")
-        raise SpecError(f"has the size {told}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
+        shown = printable(f"{width}x{height}")
+        raise SpecError(f"has the size {shown}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
     return int(height), int(width)
 
 

@@ -112,8 +112,8 @@ def merged(
     if times.size and (times[0] < 0 or np.any(times[1:] < times[:-1])):
         raise SpecError("has triggers that are not in order of time", file=file)
     if times.size and triggers["channel"].max() >= channels:
-        told = f"has a trigger on line {triggers['channel'].max()}; the format has lines 0 to {channels - 1}"
-        raise SpecError(told, file=file)
+        problem = f"has a trigger on line {triggers['channel'].max()}; the format has lines 0 to {channels - 1}"
+        raise SpecError(problem, file=file)
     done, row = 0, 0
     for events in blocks:
         last = int(np.searchsorted(times, events["t_us"][-1], side="right"))

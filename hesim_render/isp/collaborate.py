@@ -33,7 +33,7 @@ _BAND_ROWS, _AT_ONCE = 16, 2048
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class SampleBlocks:
     """Samples in blocks, each with a noise of standard deviation 1.
 
     Parameters
@@ -63,7 +63,7 @@ class Blocks:
 
 
 def one_pass(
-    blocks: Blocks, pilot: NDArray[np.float32] | None = None
+    blocks: SampleBlocks, pilot: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """One pass over all patches.
 

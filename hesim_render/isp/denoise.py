@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from hesim_render.isp import collaborate, kriging
 from hesim_render.isp.blocks import block_of, bordered, join, split
-from hesim_render.isp.collaborate import Blocks
+from hesim_render.isp.collaborate import SampleBlocks
 from hesim_render.isp.frame_noise import FrameNoise
 from hesim_render.isp.stabilise import Stabiliser
 
@@ -103,12 +103,12 @@ def _over_phases(
     return np.where(weight > 0, total / np.maximum(weight, np.float32(1e-12)), stable)
 
 
-def _blocks(stable: NDArray[np.float32], block: NDArray, amplitude: NDArray) -> Blocks:
+def _blocks(stable: NDArray[np.float32], block: NDArray, amplitude: NDArray) -> SampleBlocks:
     places = np.argwhere(block >= 0)
     planes = split(np.ascontiguousarray(stable), block.shape)[block.ravel() >= 0]
     values = np.ascontiguousarray(planes.transpose(1, 2, 0))
     channel = block[block >= 0]
-    return Blocks(values, places.astype(np.float64), block.shape, channel, amplitude[channel])
+    return SampleBlocks(values, places.astype(np.float64), block.shape, channel, amplitude[channel])
 
 
 def _image(values: NDArray[np.float32], block: NDArray, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -152,7 +152,7 @@ def _reduced_means(means: NDArray[np.float32], pitch_px: tuple[int, ...], amplit
     square = np.zeros((2, 2), dtype=np.int64)
     places = np.argwhere(square >= 0)
     count = len(means)
-    blocks = Blocks(
+    blocks = SampleBlocks(
         np.concatenate([split(mean, square.shape) for mean in means]).transpose(1, 2, 0).copy(),
         np.tile(places * np.array(pitch_px, dtype=np.float64), (count, 1)),
         (2 * pitch_px[0], 2 * pitch_px[1]),

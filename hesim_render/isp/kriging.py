@@ -56,7 +56,7 @@ class Prior:
     smooth: bool = False
     grey: bool = False
 
-    def told_apart(self, channel: NDArray) -> NDArray:
+    def distinguished(self, channel: NDArray) -> NDArray:
         """Channel numbers, all equal where the prior does not distinguish colours."""
         return np.zeros_like(channel) if self.grey else channel
 
@@ -81,7 +81,7 @@ class _Equations:
     """The kriging equations of samples at `at` [n, 2], with planes of every colour as drift, and their inverse."""
 
     def __init__(self, at: NDArray, channel: NDArray, prior: Prior, scale: NDArray) -> None:
-        self._at, self._channel, self._prior = at, prior.told_apart(channel), prior
+        self._at, self._channel, self._prior = at, prior.distinguished(channel), prior
         self._names = np.unique(self._channel)
         self._moves = [axis for axis in range(2) if np.ptp(at[:, axis]) > 0]
         self._centre, self._scale = at.mean(axis=0), scale
@@ -103,8 +103,8 @@ class _Equations:
 
     def weights(self, at: NDArray, channel: NDArray) -> NDArray[np.float64]:
         """Weight of each sample for targets at `at` [m, 2]; [n, m]."""
-        told = self._prior.told_apart(channel)
-        return self.inverse @ np.vstack([self._covariance(at, told), self._planes(at, told).T])
+        channel = self._prior.distinguished(channel)
+        return self.inverse @ np.vstack([self._covariance(at, channel), self._planes(at, channel).T])
 
 
 def _inverse(system: NDArray) -> NDArray[np.float64]:

@@ -252,7 +252,7 @@ class ColourMatrix(Strict):
         state.image = colour.colour_matrix(state.image, matrix)
 
 
-class Exposure(Strict):
+class ToneExposure(Strict):
     """`tone.exposure`: a given gain, or (``auto``) the one that brings the brightest half percent to white."""
 
     step: Literal["exposure"]
@@ -310,7 +310,7 @@ Step = Annotated[
     | Demosaic
     | NoiseReduction
     | ColourMatrix
-    | Exposure
+    | ToneExposure
     | Tone
     | Encode,
     Field(discriminator="step"),

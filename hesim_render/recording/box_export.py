@@ -81,7 +81,7 @@ def classes(names: tuple[str, ...]) -> tuple[list[str], NDArray[np.int64]]:
 def _event_boxes(
     recording: Recording, truth: SceneTruth, every_us: int | None, kind: np.dtype
 ) -> tuple[NDArray, NDArray[np.int64], dict[str, Any]]:
-    """Boxes on the event grid as records, their times, and what is told about them."""
+    """Boxes on the event grid as records, their times, and their description."""
     step = every_us or min(BOXES_EVERY_US, recording.duration_us)
     times = np.arange(0, recording.duration_us + 1, step, dtype=np.int64)
     names, class_of = classes(truth.names.objects)
@@ -93,27 +93,27 @@ def _event_boxes(
         for column, key in enumerate("xywh"):
             rows[key] = boxes[:, column]
         parts.append(rows)
-    told = {"every_us": int(step), "classes": names, "tracks": dict(enumerate(truth.names.objects[1:], start=1))}
-    return np.concatenate(parts), times, told
+    facts = {"every_us": int(step), "classes": names, "tracks": dict(enumerate(truth.names.objects[1:], start=1))}
+    return np.concatenate(parts), times, facts
 
 
 def write_prophesee_boxes(
     recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None
 ) -> dict[str, Any]:
     """``recording_bbox.npy`` for ``recording_td.dat``."""
-    rows, _, told = _event_boxes(recording, truth, every_us, PROPHESEE_BOX)
+    rows, _, facts = _event_boxes(recording, truth, every_us, PROPHESEE_BOX)
     np.save(folder / "recording_bbox.npy", rows)
-    return told
+    return facts
 
 
 def write_dsec_det(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``object_detections/left/tracks.npy``, with the times of the boxes as those of images."""
-    rows, times, told = _event_boxes(recording, truth, every_us, DSEC_BOX)
+    rows, times, facts = _event_boxes(recording, truth, every_us, DSEC_BOX)
     for name in ("object_detections/left", "images"):
         (folder / name).mkdir(parents=True)
     np.save(folder / "object_detections" / "left" / "tracks.npy", rows)
     (folder / "images" / "timestamps.txt").write_text("".join(f"{t}\n" for t in times), encoding="ascii")
-    return told
+    return facts
 
 
 def write_coco(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:

@@ -25,7 +25,7 @@ CAMERA_SUFFIXES = (
 _LETTERS = "RGBCMYW"
 #: Memory of a pixel: its value and its colour, in the file's frame and in the region, bytes.
 _PIXEL_BYTES = 8
-#: Black levels further apart are told, DN.
+#: Black levels further apart are noted, DN.
 _NEAR_DN = 1.0
 
 
@@ -51,8 +51,8 @@ def read_camera_raw(file: Path, sensor: Sensor) -> NDArray[np.uint16]:
     try:
         opened = rawpy.imread(str(file))
     except (rawpy.LibRawError, OSError) as error:
-        told = printable(str(error.args[0] if error.args else error))
-        raise SpecError(f"cannot be read as a RAW file of a camera ({told})", file=file) from None
+        reason = printable(str(error.args[0] if error.args else error))
+        raise SpecError(f"cannot be read as a RAW file of a camera ({reason})", file=file) from None
     with opened as raw:
         require_picture(raw.sizes.raw_width, raw.sizes.raw_height, _PIXEL_BYTES, file)
         try:

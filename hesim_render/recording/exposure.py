@@ -11,14 +11,14 @@ from hesim_render.recording.recording import Recording
 
 #: Share of the pixels of a frame that is judged as dark where its signal is below the read noise.
 _DARK_SHARE = 0.99
-#: Share of saturated pixels that is told.
+#: Share of saturated pixels that gives a warning.
 _WHITE_SHARE = 0.5
 
 
 def warn_of_exposure(recording: Recording) -> Recording:
     """The recording; warns, by its middle frame, if nearly all signal is below the read noise, or most is saturated.
 
-    A scene without light is dark by intent, which is not told.
+    A scene without light is dark by intent, which gives no warning.
     """
     if not len(recording.frames):
         return recording

@@ -34,14 +34,15 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
         If there is no scene (a video), `scene` is another one, or it names files that a manifest does not hold.
     """
     file = None if folder is None else folder / manifests.MANIFEST_NAME
-    told = manifest["scene"]
-    if told is None:
+    section = manifest["scene"]
+    if section is None:
         raise SpecError("the recording was made from a video, which has no geometry", file=file)
     if scene is None:
-        scene = scene_of(told, file, "recording.truth_with(load_scene(PATH))")
-    elif content_hash(scene.spec) != told["sha256"]:
+        scene = scene_of(section, file, "recording.truth_with(load_scene(PATH))")
+    elif content_hash(scene.spec) != section["sha256"]:
         raise SpecError(
-            f"scene {scene.name!r} is not the one of the recording, {told['name']!r}, or was changed since", file=file
+            f"scene {scene.name!r} is not the one of the recording, {section['name']!r}, or was changed since",
+            file=file,
         )
     spec, roi = manifests.sensor_spec(manifest, folder), manifest["roi"]
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
@@ -49,12 +50,12 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     return SceneTruth(scene, sensor)
 
 
-def scene_of(told: Mapping[str, Any], file: Path | None, remedy: str) -> Scene:
+def scene_of(section: Mapping[str, Any], file: Path | None, remedy: str) -> Scene:
     """The scene that a manifest holds.
 
     Parameters
     ----------
-    told : the manifest's section on the scene.
+    section : the manifest's section on the scene.
     file : the manifest, for errors.
     remedy : how a scene that needs other files can be given.
 
@@ -63,15 +64,15 @@ def scene_of(told: Mapping[str, Any], file: Path | None, remedy: str) -> Scene:
     SpecError
         If the scene needs files that a manifest does not hold, or is not valid.
     """
-    if told.get("files_sha256"):
+    if section.get("files_sha256"):
         raise SpecError(
-            f"the scene needs files that are not in the recording ({', '.join(sorted(told['files_sha256']))}): give "
+            f"the scene needs files that are not in the recording ({', '.join(sorted(section['files_sha256']))}): give "
             f"the scene, {remedy}",
             file=file,
             key="scene.files_sha256",
         )
     try:
-        return Scene(SceneSpec.model_validate(told["spec"]))
+        return Scene(SceneSpec.model_validate(section["spec"]))
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         key = ".".join(["scene", "spec", *map(str, problem["loc"])])

@@ -116,8 +116,8 @@ def _events(file: str | Path, sensor: Sensor) -> EventStream:
     stream = open_events(file, shape=grid, keep_stated=True)
     if stream.shape != grid:
         (rows, cols), (wanted_rows, wanted_cols) = stream.shape, grid
-        told = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"
-        raise SpecError(told, file=file)
+        problem = f"is of {cols}x{rows} px; the event grid of {sensor.spec.name} has {wanted_cols}x{wanted_rows}"
+        raise SpecError(problem, file=file)
     return stream
 
 
@@ -162,8 +162,8 @@ def _frames(frames: Sequence[str | Path], sensor: Sensor) -> Iterator[NDArray[np
         if encoding.startswith("bayer_") and encoding.removesuffix("8").removesuffix("16") != own.removesuffix("16"):
             raise SpecError(f"has images of encoding {encoding}; the region of the sensor is {own}", file=messages)
         if raw.shape != sensor.layout.shape:
-            told = f"has an image of {raw.shape[1]}x{raw.shape[0]} px"
-            raise SpecError(f"{told}; the region has {sensor.cols}x{sensor.rows}", file=messages)
+            problem = f"has an image of {raw.shape[1]}x{raw.shape[0]} px"
+            raise SpecError(f"{problem}; the region has {sensor.cols}x{sensor.rows}", file=messages)
         yield _checked(raw, sensor, messages)
 
 

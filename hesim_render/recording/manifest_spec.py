@@ -26,19 +26,19 @@ from hesim_render.specs.geometry import Region
 _LATEST_US = 2**53  # 285 years
 
 
-class _Open(BaseModel):
+class _OpenSection(BaseModel):
     """A part to which a run may add any keys; the keys that are read are validated."""
 
     model_config = ConfigDict(extra="allow")
 
 
-class _StatedError(_Open):
+class _StatedError(_OpenSection):
     rms: float
     p95: float
     p99: float
 
 
-class _AuditedPart(_Open):
+class _AuditedPart(_OpenSection):
     off: float
     off_at_most: float
     true_events: int | None = None
@@ -56,7 +56,7 @@ class _AuditedPart(_Open):
         return self
 
 
-class _Audit(_Open):
+class _Audit(_OpenSection):
     tolerance_noise: float
     verdict: Literal["met", "not shown", "not met"]
     quality_needed: float | None = None
@@ -71,18 +71,18 @@ class _Audit(_Open):
         return self
 
 
-class _Render(_Open):
+class _Render(_OpenSection):
     error_noise: dict[str, _StatedError | None]
     quality: float | None = None
     audit: _Audit | None = None
 
 
-class _Video(_Open):
+class _Video(_OpenSection):
     source: str
     notes: list[str] = []
 
 
-class _Settings(_Open):
+class _Settings(_OpenSection):
     clean: bool = False
     without: list[str] = []
     render: _Render | None = None
@@ -109,7 +109,7 @@ class _Lens(Strict):
     f_number: PositiveFloat
     focal_length_mm: PositiveFloat
     magnification: NonNegativeFloat
-    axis_mm: tuple[float, float] = Field((0.0, 0.0), description="recordings of before it was told have it there")
+    axis_mm: tuple[float, float] = Field((0.0, 0.0), description="default of recordings that lack it")
     effects: dict[str, Any] = Field({}, description="aberrations that are on, as in the sensor file")
 
 

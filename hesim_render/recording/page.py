@@ -97,12 +97,12 @@ def _render(render: dict[str, Any] | None) -> list[str]:
     head = ("", "rms", "95 % below", "99 % below")
     if not rows:
         return []
-    told = [line for line in render_lines(render) if not line.startswith("render,")]
-    told = told or ["No audit: nothing was rendered again to compare with."]
+    verdicts = [line for line in render_lines(render) if not line.startswith("render,")]
+    verdicts = verdicts or ["No audit: nothing was rendered again to compare with."]
     return [
         "<h2>Error of the render, over the sensor's noise</h2>",
         table(head, rows),
-        *(f"<p{' class=findings' if line.startswith('NOT MET') else ''}>{escape(line)}</p>" for line in told),
+        *(f"<p{' class=findings' if line.startswith('NOT MET') else ''}>{escape(line)}</p>" for line in verdicts),
     ]
 
 

@@ -56,10 +56,10 @@ class Series:
 
     def error(self, text: str) -> SpecError:
         """An error of these frames, with file and line."""
-        return SpecError(f"{self.told}: {text}", file=self.where, line=self.line)
+        return SpecError(f"{self.label}: {text}", file=self.where, line=self.line)
 
     @property
-    def told(self) -> str:
+    def label(self) -> str:
         light = "dark" if not self.lit else "lit" if self.photons is None else f"{self.photons:g} photons"
         return f"{light}, {self.exposure_s * 1e6:g} µs"
 
@@ -178,12 +178,12 @@ def _listed(folder: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
             bits, width, height = _numbers(file, line, rest, 3, "n <bits> <width> <height>")
             whole = all(value == int(value) for value in (bits, width, height))
             if not (whole and 1 <= bits <= 16 and width * height <= MOST_PIXELS):
-                told = f"expected 1 to 16 bit and at most {MOST_PIXELS} pixels, whole numbers"
-                raise SpecError(f"{printable(rest.strip())}: {told}", file=file, line=line)
+                expected = f"expected 1 to 16 bit and at most {MOST_PIXELS} pixels, whole numbers"
+                raise SpecError(f"{printable(rest.strip())}: {expected}", file=file, line=line)
             bit_depth, shape = int(bits), (int(height), int(width))
         elif kind in "bd":
-            count, told = (2, "b <exposure ns> <photons>") if kind == "b" else (1, "d <exposure ns>")
-            values = _numbers(file, line, rest, count, told)
+            count, form = (2, "b <exposure ns> <photons>") if kind == "b" else (1, "d <exposure ns>")
+            values = _numbers(file, line, rest, count, form)
             series.append(Series(kind == "b", values[0] * _S_PER_NS, (*values, None)[1], (), file, line))
         elif kind == "i":
             if not series:
@@ -273,13 +273,13 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
         if entry.exposure_s not in dark:
             raise entry.error("no dark pair of this exposure")
     if len(pairs[True]) < _FEWEST_EXPOSURES:
-        told = f"{len(pairs[True])} lit pairs; EMVA 1288 asks for 50, and {_FEWEST_EXPOSURES} are the fewest"
-        raise SpecError(told, file=file)
+        problem = f"{len(pairs[True])} lit pairs; EMVA 1288 asks for 50, and {_FEWEST_EXPOSURES} are the fewest"
+        raise SpecError(problem, file=file)
     spatial = {}
     for lit, name in ((True, "lit"), (False, "dark")):
         found = [entry for entry in series if entry.lit == lit and len(entry.files) > 2]
         if len(found) != 1:
-            where = f", at {' and '.join(s.told for s in found)}" if found else ""
+            where = f", at {' and '.join(s.label for s in found)}" if found else ""
             raise SpecError(
                 f"{len(found)} {name} series of more than two frames{where}; one is needed, for DSNU and PRNU",
                 file=file,

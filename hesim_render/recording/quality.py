@@ -55,12 +55,12 @@ def verdict_lines(audits: Mapping[str, dict[str, Any] | None], noun: str) -> lis
     unknown = sum(audit is not None and audit.get("verdict") == "not shown" for audit in audits.values())
     lines = []
     if short:
-        told = ", ".join(list(short)[:_MOST_NAMED]) + (", …" if len(short) > _MOST_NAMED else "")
+        names = ", ".join(list(short)[:_MOST_NAMED]) + (", …" if len(short) > _MOST_NAMED else "")
         quality = [audit["quality_needed"] for audit in short.values() if audit.get("quality_needed")]
         samples = [audit["samples_needed"] for audit in short.values() if audit.get("samples_needed")]
         remedies = [f"quality {min(quality):g} would do"] if quality else []
         remedies += [f"{max(samples)} samples would do"] if samples else []
-        text = f"NOT MET: {len(short)} of {len(audits)} {noun} are worse than asked for ({told})"
+        text = f"NOT MET: {len(short)} of {len(audits)} {noun} are worse than asked for ({names})"
         lines.append("; ".join([text, *remedies]))
     if unknown:
         lines.append(
@@ -77,10 +77,10 @@ def _events(part: dict[str, Any]) -> str:
         return ""
     if _saw_too_little(part):
         none = part["missed"] == part["extra"] == 0
-        told = "none was missed and none is too many" if none else (
+        verdict = "none was missed and none is too many" if none else (
             f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} too many"
         )  # fmt: skip
-        return f"; of {max(true or 0, found or 0):.0f} signal events that were seen {told}, too few for a bound"
+        return f"; of {max(true or 0, found or 0):.0f} signal events that were seen {verdict}, too few for a bound"
     return (
         f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
         f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"

@@ -55,7 +55,7 @@ def _png(file: Path, shape: tuple[int, int]) -> NDArray[np.uint16]:
 
     with reading(file, "as a PNG file"), Image.open(file, formats=["PNG"]) as image:
         if image.size != shape[::-1] or image.mode not in ("L", "I;16"):
-            told = f"is a {image.mode} picture of {image.size[0]}x{image.size[1]} px"
-            raise SpecError(f"{told}; expected a grey one of {shape[1]}x{shape[0]} px", file=file)
+            problem = f"is a {image.mode} picture of {image.size[0]}x{image.size[1]} px"
+            raise SpecError(f"{problem}; expected a grey one of {shape[1]}x{shape[0]} px", file=file)
         require_memory(2 * shape[0] * shape[1], "the picture", file)
         return np.asarray(image).astype(np.uint16)

@@ -74,8 +74,8 @@ def export_truth(
     folder = OutputFolder(out, MARKER, overwrite)
     try:
         with output_errors(folder.target):
-            told = write(recording, truth, folder.path, every_us)
-            text = json.dumps({"format": format_, **told}, indent=2, ensure_ascii=False)
+            facts = write(recording, truth, folder.path, every_us)
+            text = json.dumps({"format": format_, **facts}, indent=2, ensure_ascii=False)
             (folder.path / MARKER).write_text(text + "\n", encoding="utf-8")
         return folder.commit()
     except BaseException:

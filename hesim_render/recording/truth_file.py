@@ -79,7 +79,7 @@ class TruthRequest:
 
 
 def write_truth(
-    path: Path, truth: SceneTruth, request: TruthRequest, told: Callable[[int, int], None] | None = None
+    path: Path, truth: SceneTruth, request: TruthRequest, progress: Callable[[int, int], None] | None = None
 ) -> None:
     """Write the file.
 
@@ -88,7 +88,7 @@ def write_truth(
     path : the file.
     truth : the scene.
     request : what is written.
-    told : called with numbers of images done and of all.
+    progress : called with numbers of images done and of all.
     """
     with new_file(path) as file:
         file.attrs.update({"layout": _LAYOUT, "kinds": ",".join(request.geometry), "times": "µs", "lengths": "m"})
@@ -106,8 +106,8 @@ def write_truth(
             for number in range(len(times)):
                 _write_images(file[name], truth, grid, request.kinds, rows, number)
                 done += 1
-                if told is not None:
-                    told(done, total)
+                if progress is not None:
+                    progress(done, total)
         _write_series(file, truth, request)
 
 

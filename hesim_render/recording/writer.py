@@ -169,18 +169,18 @@ class RecordingWriter:
         for manifest in (self._manifest, *([self._folder.manifest] if self._folder is not None else [])):
             manifest["settings"] = {**manifest["settings"], **settings}
 
-    def write_truth(self, truth: SceneTruth, told: Callable[[int, int], None] | None = None) -> None:
+    def write_truth(self, truth: SceneTruth, progress: Callable[[int, int], None] | None = None) -> None:
         """Write the geometric truth that the settings ask for, after the last frame; nothing in memory, where
         `Recording.truth` computes it.
 
         Parameters
         ----------
         truth : the scene that was rendered, and its sensor.
-        told : called with numbers of images done and of all.
+        progress : called with numbers of images done and of all.
         """
         if self._folder is not None:
             request = TruthRequest.of(self._folder.manifest)
-            self._folder.write_in(TRUTH_FILE, lambda path: write_truth(path, truth, request, told))
+            self._folder.write_in(TRUTH_FILE, lambda path: write_truth(path, truth, request, progress))
 
     def finish(self) -> Recording:
         """Finish and return the recording. A folder is now complete and has its final name."""

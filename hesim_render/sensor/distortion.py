@@ -110,13 +110,13 @@ class Distortion:
         radius, _ = self._radii
         seen = self._at_radius(self._fold)
         if seen <= self.farthest:
-            told = (
+            manner = (
                 f"folds at {np.degrees(np.arctan(self._fold)):.3g}° off the axis, where"
                 if self._fold < radius[-1]
                 else f"would show directions of more than {MOST_DEG:g}° to the axis:"
             )
             raise SpecError(
-                f"the model {told} the image is {seen:.4g} image distances off the axis, and the picture's farthest "
+                f"the model {manner} the image is {seen:.4g} image distances off the axis, and the picture's farthest "
                 f"corner lies at {self.farthest:.4g}: use weaker coefficients, a longer focal length or a smaller "
                 "picture",
                 key="lens.distortion",
@@ -190,8 +190,8 @@ class Distortion:
         model = cls.of(spec, 0.0)
         if tangent > model._fold:
             asked, fold = np.degrees(np.arctan([tangent, model._fold]))
-            told = f"horizontal_fov_deg asks for {asked:.3g}° off the axis, and the model folds at {fold:.3g}°"
-            raise SpecError(told, key="lens.distortion")
+            problem = f"horizontal_fov_deg asks for {asked:.3g}° off the axis, and the model folds at {fold:.3g}°"
+            raise SpecError(problem, key="lens.distortion")
         return float(model._formula(np.array(tangent), np.zeros(()))[0])
 
     def _formula(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:

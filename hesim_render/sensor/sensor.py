@@ -254,7 +254,7 @@ class Sensor(PlainState):
 
 
 def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Sensor:
-    """Load a shipped sensor by name (``hesim-render list sensors``), or a sensor file by path.
+    """Load a shipped sensor by name (``hesim-render info sensors``), or a sensor file by path.
 
     Parameters
     ----------

@@ -145,7 +145,7 @@ class Scene:
 def load_scene(
     name_or_path: str | Path, overrides: Mapping[str, Any] | None = None, *, allow_outside: bool = False
 ) -> Scene:
-    """Load a shipped scene by name (``hesim-render list scenes``), or a scene file by path.
+    """Load a shipped scene by name (``hesim-render info scenes``), or a scene file by path.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ class CostSpec(Strict):
         return self
 
 
-class LightsSpec(NamesFiles):
+class DesignLightsSpec(NamesFiles):
     """Reflectances under lights."""
 
     reflectances: str
@@ -64,7 +64,7 @@ class DesignSpec(NamesFiles):
     transmittance_max: float = Field(0.95, gt=0, le=1)
     transmittance_min: float = Field(0.0, ge=0, lt=1, description="what passes a filter where it is darkest")
     slope_max_per_nm: float = Field(0.03, gt=0, le=1, description="steepest change of the transmittance")
-    fit: LightsSpec
+    fit: DesignLightsSpec
     illuminance_lux: list[_Lux] = Field([20.0, 1000.0], min_length=1)
     exposure_us: int | None = Field(None, ge=1, le=10**9, description="default that of the sensor")
     area_px: float = Field(4.0, gt=0, le=1e6)
@@ -72,7 +72,7 @@ class DesignSpec(NamesFiles):
     starts: int = Field(4, ge=1, le=1000)
     steps: int = Field(125, ge=1, le=100_000, description="of the optimiser, for each start")
     seed: int = Field(1, ge=0, lt=2**63)
-    judge: LightsSpec = Field(description="what the result is judged on; should not be what it was fitted to")
+    judge: DesignLightsSpec = Field(description="what the result is judged on; should not be what it was fitted to")
     compare: list[SetUseSpec] = Field([], description="sets that the result is compared with; none: that of the start")
     demosaic: bool = Field(True, description="judge it after demosaicing, too")
     repeats: int = Field(8, ge=2, le=1000, description="noisy frames of the judgement")
@@ -96,5 +96,5 @@ def read_design(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     SpecError
         With file, line and key of all that is wrong.
     """
-    file = locate(name_or_path, "design_specs")
+    file = locate(name_or_path, "studies")
     return validate(DesignSpec, load_yaml(file), file, overrides or {})

@@ -95,9 +95,9 @@ def locate(name_or_path: str | Path, kind: str) -> Path:
     if os.path.isfile(given):
         return given
     names = list_names(kind)
+    one = "study" if kind == "studies" else kind[:-1].replace("_", " ")
     raise SpecError(
-        f"no {kind[:-1]} named {str(name_or_path)!r}; shipped are {', '.join(names)}"
-        f"{did_you_mean(str(name_or_path), names)}"
+        f"no {one} named {str(name_or_path)!r}; shipped are {', '.join(names)}{did_you_mean(str(name_or_path), names)}"
     )
 
 

@@ -9,7 +9,7 @@ from hesim_render.core.shipped import data_folder
 _HEAD = """\
 # A sensor file. Every number here is a placeholder: replace it by a figure of your sensor, and note under `sources`
 # where that is from, or under `assumptions` why you assumed it. docs/sensors.md has all keys. To look at the result:
-#     hesim-render sensor describe THIS_FILE --out curves.png
+#     hesim-render info THIS_FILE --out curves.png
 schema_version: 1
 name: {name}
 description: "{description}"
@@ -60,7 +60,7 @@ _EVS = """
 evs:                           # pixels that give events
   reference: last_event        # asynchronous pixels; for comparisons at a fixed tick see docs/sensors.md
   window_us: 1
-  data_sheet:                  # turned into the parameters of the model; `sensor describe` shows them
+  data_sheet:                  # turned into the parameters of the model; `info` shows them
     light: LED-B2              # light of the illuminances below, which are those on the sensor itself
     threshold_on_percent: 25   # contrast (brighter - darker)/darker that half of the pixels answer to
     threshold_off_percent: 25

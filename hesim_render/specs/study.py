@@ -187,5 +187,5 @@ def read_study(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     SpecError
         With file, line and key of all that is wrong.
     """
-    file = locate(name_or_path, "study_specs")
+    file = locate(name_or_path, "studies")
     return validate(StudySpec, load_yaml(file), file, overrides or {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -119,13 +120,13 @@ class SweepSpec(NamesFiles):
         return self
 
 
-def read_sweep(name_or_path: str | Path) -> SweepSpec:
-    """A sweep's file.
+def read_sweep(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> SweepSpec:
+    """A sweep's file, by shipped name or path, perhaps with other values of dotted keys.
 
     Raises
     ------
     SpecError
         With file, line and key of all that is wrong.
     """
-    file = locate(name_or_path, "sweep_specs")
-    return validate(SweepSpec, load_yaml(file), file, {})
+    file = locate(name_or_path, "studies")
+    return validate(SweepSpec, load_yaml(file), file, overrides or {})

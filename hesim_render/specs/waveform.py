@@ -58,7 +58,7 @@ class TableWaveformSpec(Strict):
         return self
 
     def load(self) -> waveform.Waveform:
-        return waveform.Table(self.t_us, self.value, self.repeat)
+        return waveform.TableWaveform(self.t_us, self.value, self.repeat)
 
 
 WaveformSpec = Annotated[MainsSpec | PwmSpec | TableWaveformSpec, Field(discriminator="type")]

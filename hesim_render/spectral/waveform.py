@@ -165,7 +165,7 @@ class Pwm:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableWaveform:
     """Measured power, linear between its samples and divided by its own time mean.
 
     Parameters

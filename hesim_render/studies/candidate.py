@@ -84,7 +84,7 @@ def candidates(spec: StudySpec) -> list[Candidate]:
     ------
     SpecError
         If a file is not valid, a set does not fit a sensor, or cannot tell three primaries apart where colour is
-        wanted; all sets are told together.
+        wanted; all sets are reported together.
     """
     palettes: dict[str, PaletteSpec] = {}
 

@@ -248,13 +248,13 @@ class Problem:
         return found
 
 
-def optimise(problem: Problem, told: Callable[[float, float, str], None] | None = None) -> DesignResult:
+def optimise(problem: Problem, progress: Callable[[float, float, str], None] | None = None) -> DesignResult:
     """The filters with the least cost over several starts, by L-BFGS-B [byrd1995] within bounds.
 
     Parameters
     ----------
     problem : the design.
-    told : called with (done, total, what).
+    progress : called with (done, total, what).
 
     Returns
     -------
@@ -265,8 +265,8 @@ def optimise(problem: Problem, told: Callable[[float, float, str], None] | None 
     spec = problem.spec
     best, costs, evaluations = None, [], 0
     for number, start in enumerate(problem.starts()):
-        if told is not None:
-            told(number, spec.starts, f"start {number + 1} of {spec.starts}")
+        if progress is not None:
+            progress(number, spec.starts, f"start {number + 1} of {spec.starts}")
         found = minimize(
             problem, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * start.size,
             options={"maxiter": spec.steps, "maxfun": 4 * spec.steps, "ftol": 1e-10, "gtol": 1e-8},

@@ -81,9 +81,9 @@ def design(
         read = spec if isinstance(spec, DesignSpec) else read_design(spec)
     folder = OutputFolder(out, MARKER, overwrite)
     try:
-        with shown(progress, read.name) as told:
+        with shown(progress, read.name) as report:
             problem = Problem(read)
-            result = optimise(problem, told)
+            result = optimise(problem, report)
             _write_yaml(folder.path / "palette.yaml", designed_palette(problem, result))
             palette = read_palette(folder.path / "palette.yaml")
             filters = designed_set(problem, result)
@@ -92,7 +92,7 @@ def design(
             sensor |= {"description": palette.description, "sources": {}, "assumptions": palette.assumptions}
             _write_yaml(folder.path / "sensor.yaml", sensor)
             judged = _judgement(read, problem, folder.path)
-            found = run_study(judged, told)
+            found = run_study(judged, report)
         verdicts = _verdicts(read, found.table)
         with output_errors(folder.target):
             found.table.write(folder.path / "results.csv")

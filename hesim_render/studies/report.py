@@ -114,8 +114,8 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
         parts.append(table(["", "designed", str(verdict["against"]), "95 % interval or ratio"], rows))
     if tile is not None:
         parts.append(f"<p>Designed tile:</p><pre>{escape(tile)}</pre>")
-    told = ", ".join(f"{number(before)} to {number(after)}" for before, after in costs)
-    parts.append(f"<p>Cost of the optimiser, before and after, for each start: {told}.</p>")
+    changes = ", ".join(f"{number(before)} to {number(after)}" for before, after in costs)
+    parts.append(f"<p>Cost of the optimiser, before and after, for each start: {changes}.</p>")
     return "\n".join(parts)
 
 

@@ -63,8 +63,8 @@ def study(
         read = spec if isinstance(spec, StudySpec) else read_study(spec)
     folder = None if out is None else OutputFolder(out, MARKER, overwrite)
     try:
-        with shown(progress, read.name) as told:
-            result = run_study(read, told)
+        with shown(progress, read.name) as report:
+            result = run_study(read, report)
         if folder is not None:
             with output_errors(folder.target):
                 result.table.write(folder.path / "results.csv")

@@ -24,7 +24,7 @@ from hesim_render.specs.filter_set import read_filter_set, read_palette
 from hesim_render.specs.study import StudySpec
 from hesim_render.specs.sweep import RangeSpec, SweepSpec, read_sweep
 from hesim_render.studies.run import study
-from hesim_render.studies.sweep_metrics import Figures, changed_pipeline
+from hesim_render.studies.sweep_metrics import RunFigures, changed_pipeline
 from hesim_render.studies.table import Cell, Table
 
 #: File that marks the folder of a sweep.
@@ -54,11 +54,11 @@ class Run:
     def cells(self) -> dict[str, Cell]:
         """The run's own columns; values that are no numbers or texts as JSON."""
         named = {key: value for key, value in (("scene", self.scene), ("sensor", self.sensor)) if value}
-        told = {
+        varied = {
             key: value if isinstance(value, str | float | int | bool | None) else json.dumps(value)
             for key, value in self.changes
         }
-        return {**named, **told, "seed": self.seed}
+        return {**named, **varied, "seed": self.seed}
 
     def keys(self, prefix: str) -> dict[str, Any]:
         """Values of the keys with a prefix, without it; with an empty one, of those that have neither."""
@@ -125,10 +125,10 @@ def sweep(
     first = _first_of_each(runs)
     order = sorted(range(len(runs)), key=lambda k: (first[runs[k].simulation], k))
     found: dict[int, list[dict[str, Cell]]] = {}
-    with shown(progress, read.name) as told:
+    with shown(progress, read.name) as report:
         for done, k in enumerate(order):
-            if told is not None:
-                told(done, len(runs), f"run {done + 1} of {len(runs)}")
+            if report is not None:
+                report(done, len(runs), f"run {done + 1} of {len(runs)}")
             found[k] = _rows(made, runs[k], folder)
     table = Table(run.cells | row for k, run in enumerate(runs) for row in found[k])
     table.write(folder / "results.csv", overwrite=True)
@@ -172,7 +172,7 @@ def _first_of_each(runs: Sequence[Run]) -> dict[str, int]:
 
 def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str, Cell]]:
     """Rows of a run, from its file if there is one."""
-    told = ", ".join(f"{key}={value}" for key, value in run.cells.items())
+    combination = ", ".join(f"{key}={value}" for key, value in run.cells.items())
     try:
         file = _file_of(folder, made, run)
         if file.is_file():
@@ -186,7 +186,7 @@ def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str
     except OutputError:
         raise
     except HesimError as error:
-        raise SpecError(f"run with {told}: {str(error).splitlines()[0]}") from None
+        raise SpecError(f"run with {combination}: {str(error).splitlines()[0]}") from None
     with replacing(file) as unfinished:
         unfinished.write_text(json.dumps({"run": run.cells, "rows": rows}) + "\n", encoding="utf-8")
     return rows
@@ -218,7 +218,7 @@ class _Recordings:
     def rows(self, run: Run) -> list[dict[str, Cell]]:
         """The one row of a run."""
         recording = self._recording(run)
-        figures = Figures(recording, self._developed(run))
+        figures = RunFigures(recording, self._developed(run))
         audit = recording.manifest["settings"].get("render", {}).get("audit", {})
         row: dict[str, Cell] = {name: cell for metric in self._spec.wanted for name, cell in figures(metric).items()}
         return [row | {VERDICT: audit.get("verdict", "not audited")}]
@@ -229,7 +229,7 @@ class _Recordings:
     def _recording(self, run: Run) -> Recording:
         if self._last is not None and self._last[0] == run.simulation:
             return self._last[1]
-        self._developed(run)  # a mistake there is told before a long simulation
+        self._developed(run)  # a mistake there is reported before a long simulation
         spec = self._spec
         sensor = load_sensor(spec.beside(run.sensor), run.keys(_SENSOR))
         if spec.roi is not None:
@@ -250,7 +250,7 @@ class _Studies:
     def __init__(self, spec: SweepSpec) -> None:
         assert spec.study is not None
         self._spec = spec
-        self._file = locate(spec.beside(spec.study), "study_specs")
+        self._file = locate(spec.beside(spec.study), "studies")
 
     def _study(self, run: Run) -> StudySpec:
         """The study with the keys of a run; those that begin with sensor. change its sensors."""

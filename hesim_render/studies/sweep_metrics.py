@@ -59,7 +59,7 @@ def changed_pipeline(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline
 
 
 @dataclass(frozen=True, eq=False)
-class Figures:
+class RunFigures:
     """Figures of a recording.
 
     Parameters
@@ -192,7 +192,7 @@ class Figures:
         """Mean ΔE2000 between the pictures, before codes are made of them."""
         if self.picture is None:
             return None
-        linear = Figures(self.recording, self.pipeline.without(_ENCODE))
+        linear = RunFigures(self.recording, self.pipeline.without(_ENCODE))
         return linear.against_clean(delta_e)
 
     @property
@@ -220,7 +220,7 @@ def _with_white_at_1(picture: NDArray) -> NDArray[np.float64]:
     return picture.astype(np.float64) / top
 
 
-def _at(level: float) -> Callable[[Figures], Cell]:
+def _at(level: float) -> Callable[[RunFigures], Cell]:
     return lambda figures: None if figures.edge is None else _number(figures.edge.frequency_at(level))
 
 
@@ -229,7 +229,7 @@ def _number(value: float) -> float | None:
 
 
 #: Column and value of each metric.
-_METRICS: dict[str, tuple[str, Callable[[Figures], Cell | dict[str, Cell]]]] = {
+_METRICS: dict[str, tuple[str, Callable[[RunFigures], Cell | dict[str, Cell]]]] = {
     "frames": ("frames", lambda figures: len(figures.recording.frames)),
     "electrons": ("electrons_mean", lambda figures: figures.electrons),
     "raw_mean": ("raw_mean_dn", lambda figures: figures.raw_mean),

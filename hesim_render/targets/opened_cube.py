@@ -55,9 +55,7 @@ class CubeFile:
             If it does.
         """
         if self.is_absolute:
-            raise SpecError(
-                "holds radiance, as it says, and no reflectance (quantity: radiance, --radiance)", file=self.file
-            )
+            raise SpecError("holds radiance, as it says, and no reflectance (quantity: radiance)", file=self.file)
 
     def whole(self) -> NDArray[np.float32]:
         """All rows; refused if they do not fit into memory."""

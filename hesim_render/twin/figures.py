@@ -21,7 +21,7 @@ _BOX = 15
 
 
 @dataclass(frozen=True)
-class Spectrum:
+class SpatialSpectrum:
     """Power of the mean image in bands of frequency, rows or columns.
 
     Attributes
@@ -36,7 +36,7 @@ class Spectrum:
     error: NDArray[np.float64]
 
 
-def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int) -> Spectrum:
+def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int) -> SpatialSpectrum:
     """Spectrum along rows (axis 1) or columns (axis 0) of a mean image, as EMVA 1288 takes it.
 
     Each line is transformed, and the mean of their powers is taken.
@@ -63,10 +63,10 @@ def spectrum(image: NDArray, noise_pixel: float, noise_shared: float, axis: int)
     own = (2 * pattern * noise_pixel + noise_pixel**2) / (count * number)
     shared = (2 * pattern * noise_shared + noise_shared**2 + 2 * noise_pixel * noise_shared / count) / number
     cycles = np.array([(group.mean() + 1) / size for group in groups])
-    return Spectrum(cycles, banded, np.sqrt(own + shared))
+    return SpatialSpectrum(cycles, banded, np.sqrt(own + shared))
 
 
-def spectra(series: Long, scale: float) -> dict[str, Spectrum]:
+def spectra(series: Long, scale: float) -> dict[str, SpatialSpectrum]:
     """Both spectra of a long series.
 
     Parameters

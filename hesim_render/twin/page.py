@@ -18,22 +18,22 @@ _LOG_FROM = 10.0
 
 def check_line(check: Check) -> str:
     """A check in one line."""
-    told = f"{'pass' if check.passed else 'FAIL'}  {check.name:<34}"
+    verdict = f"{'pass' if check.passed else 'FAIL'}  {check.name:<34}"
     limit = f"(limit {check.limit:.1f})"
     if check.z.size == 1:
         values = f"{float(check.real[0]):.4g} and {float(check.twin[0]):.4g} {check.unit}"
-        return f"{told} z {check.worst:+.1f} {limit}; {values}"
+        return f"{verdict} z {check.worst:+.1f} {limit}; {values}"
     place = f"{check.places[np.argmax(np.abs(check.z))]:.4g} {check.place}"
     rms = f"rms z {check.rms:.2f} (limit {check.most_rms:.2f})"
-    return f"{told} worst z {check.worst:+.1f} {limit} of {check.z.size}, at {place}; {rms}"
+    return f"{verdict} worst z {check.worst:+.1f} {limit} of {check.z.size}, at {place}; {rms}"
 
 
 def _row(check: Check) -> tuple[str, ...]:
-    told = "pass" if check.passed else "FAIL"
+    verdict = "pass" if check.passed else "FAIL"
     alone = check.z.size == 1
     values = (number(float(check.real[0])), number(float(check.twin[0]))) if alone else ("", "")
     scores = f"{check.worst:+.2f}", f"{check.limit:.2f}", f"{check.rms:.2f}", f"{check.most_rms:.2f}"
-    return check.name, told, str(check.z.size), *scores, *values, check.unit
+    return check.name, verdict, str(check.z.size), *scores, *values, check.unit
 
 
 def page(checks: Sequence[Check], findings: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from hesim_render.sensor.sensor import load_sensor
 from hesim_render.specs.calibration import read_maps
 from hesim_render.twin.comparison import ALARM, Check, Half, compare
 from hesim_render.twin.page import page
-from hesim_render.twin.simulated import Bench
+from hesim_render.twin.simulated import TwinBench
 
 RESULT_NAME = "twin.json"
 
@@ -81,7 +81,7 @@ def make_twin(
             calibration = folder.path / "calibration.yaml"
             result = calibrate_pairs(fitted, calibration, progress=progress)
             sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
-            bench = Bench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_relative"], seed)
+            bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_relative"], seed)
             real = Half(
                 pair_levels(held, held.lit, progress), pair_levels(held, held.dark, progress),
                 long_series(held, False, progress), long_series(held, True, progress),
@@ -91,9 +91,9 @@ def make_twin(
                 bench.long(held, True),
             )  # fmt: skip
             checks = compare(result, held, real, twin)
-            told = [finding.text for finding in findings(result)]
+            texts = [finding.text for finding in findings(result)]
             (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
-            (folder.path / "twin.html").write_text(page(checks, told), encoding="utf-8")
+            (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
         return Twin(folder.commit(), checks)
     except BaseException:
         folder.discard()

@@ -17,7 +17,7 @@ from hesim_render.recording.pair_set import PairSet, Series
 from hesim_render.sensor.sensor import Sensor
 
 
-class Bench:
+class TwinBench:
     """The twin before the light of the captures.
 
     Parameters
@@ -81,7 +81,7 @@ def _light(like: PairSet, entry: Series) -> float:
 class _SimulatedStack:
     """Frames of a long series in the form that `measure` reads."""
 
-    def __init__(self, bench: Bench, light: float, entry: Series, shape: tuple[int, int]) -> None:
+    def __init__(self, bench: TwinBench, light: float, entry: Series, shape: tuple[int, int]) -> None:
         self._bench, self._light, self._entry = bench, light, entry
         self.file: Path = entry.where
         self.shape: tuple[int, int, int, int] = (1, len(entry.files), *shape)

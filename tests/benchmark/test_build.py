@@ -22,7 +22,7 @@ from hesim_render.benchmark.card import card, spread
 from hesim_render.benchmark.clip import CLIP_FILE, build_clip, clip_folder
 from hesim_render.benchmark.forecast import estimate_build
 from hesim_render.benchmark.local import LocalWorkers
-from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.benchmark.verify import digest_of, discard_damaged
 from hesim_render.benchmark.worker import attempt, order_of
 from hesim_render.capture.simulate import flux_source
@@ -65,7 +65,7 @@ def test_the_blurred_frame_is_the_integral_of_the_sharp_flux(tmp_path):
         scenes={"given": [{"scene": "rotating-star", "split": "train"}]}, quality=0.5, truth=[],
         sharp={"times_us": times, "window_us": 500}, noise=[{"name": "clean", "clean": True}],
     )  # fmt: skip
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     build_clip(plan, plan.clips[0], tmp_path)
     folder = clip_folder(tmp_path, plan.clips[0])
     frame = hr.Recording.load(folder / "recording").frames[0]
@@ -96,7 +96,7 @@ def test_sharp_images_are_those_of_a_renderer_of_their_own(tmp_path):
         sensors=[{"sensor": "reference-mono", "roi": "16x12", "set": keys}],
         sharp={"times_us": [8000], "window_us": 500},
     )  # fmt: skip
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     build_clip(plan, plan.clips[0], tmp_path)
     with h5py.File(clip_folder(tmp_path, plan.clips[0]) / "sharp.h5") as file:
         made = file["flux_e_per_s"][0]
@@ -288,14 +288,14 @@ def fake(monkeypatch, bad=-1, wrong=-1, fatal=False, before=False):
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_clip_at_which_workers_die_three_times_is_given_up(monkeypatch, count):
     fake(monkeypatch, bad=2)
-    clips, told = Plan(generated(6)).clips, []
+    clips, told = BenchmarkPlan(generated(6)).clips, []
     failed = LocalWorkers("{}", count).run(clips, told.append)
     assert failed == {clips[2].name: "its worker died 3 times (last: signal 9)"}
     assert sorted(answer["name"] for answer in told) == sorted(clip.name for clip in clips)
 
 
 def test_a_wrong_clip_does_not_stop_the_others_but_a_fatal_one_does(monkeypatch):
-    clips = Plan(generated(6)).clips
+    clips = BenchmarkPlan(generated(6)).clips
     fake(monkeypatch, wrong=1)
     assert LocalWorkers("{}", 2).run(clips, lambda answer: None) == {clips[1].name: "is wrong"}
     fake(monkeypatch, wrong=1, fatal=True)
@@ -308,11 +308,11 @@ def test_a_wrong_clip_does_not_stop_the_others_but_a_fatal_one_does(monkeypatch)
 def test_workers_that_cannot_start_are_one_error(monkeypatch):
     fake(monkeypatch, before=True)
     with pytest.raises(BackendError, match="status 5"):
-        LocalWorkers("{}", 2).run(Plan(generated(3)).clips, lambda answer: None)
+        LocalWorkers("{}", 2).run(BenchmarkPlan(generated(3)).clips, lambda answer: None)
 
 
 def test_a_worker_of_another_version_is_refused():
-    plan = Plan(small())
+    plan = BenchmarkPlan(small())
     order = order_of(plan.spec, __import__("pathlib").Path("/nowhere")).replace(hr.__version__, "9.9.9")
     assert "9.9.9" in attempt(order, plan.clips[0].as_dict())["error"]
 
@@ -331,7 +331,7 @@ def test_a_scheduler_that_dies_and_a_clip_that_kills_its_workers_are_told(monkey
 
     from hesim_render.benchmark.cluster import run_on_cluster
 
-    clips = Plan(generated(3)).clips
+    clips = BenchmarkPlan(generated(3)).clips
 
     class Answer:
         def __init__(self, key, failure):
@@ -450,7 +450,7 @@ def test_a_fault_of_ours_in_one_clip_does_not_stop_the_others(monkeypatch):
         raise KeyError("x")
 
     monkeypatch.setattr("hesim_render.benchmark.worker.build_clip", broken)
-    plan = Plan(small())
+    plan = BenchmarkPlan(small())
     answer = attempt(order_of(plan.spec, __import__("pathlib").Path("/nowhere")), plan.clips[0].as_dict())
     assert answer == {"name": plan.clips[0].name, "error": "KeyError: 'x'", "fatal": False}
 
@@ -470,7 +470,7 @@ def test_the_card_says_how_clips_differ(built):
 
 def test_a_share_of_the_clips_is_audited():
     """A quarter of 400 clips: 100 with a standard deviation of 8.7; 4.5 of these are 39 (false alarm 7e-6)."""
-    plans = [Plan(generated(400, audit=share)) for share in (0.25, 0.25, 0, 1)]
+    plans = [BenchmarkPlan(generated(400, audit=share)) for share in (0.25, 0.25, 0, 1)]
     counts = [sum(plan.is_audited(clip) for clip in plan.clips) for plan in plans]
     assert 61 <= counts[0] <= 139 and counts[1:] == [counts[0], 0, 400]
     assert [plans[0].is_audited(c) for c in plans[0].clips] == [plans[1].is_audited(c) for c in plans[1].clips]
@@ -481,7 +481,7 @@ def test_without_an_audit_a_clip_has_the_same_bits_and_says_so(tmp_path):
     for audit in (0, 1):
         sensors = [{"sensor": "reference-mono", "roi": "8x6"}]
         given = {"given": [{"scene": "flat-field", "split": "test"}]}
-        plan = Plan(small(scenes=given, sensors=sensors, truth=[], sharp=None, audit=audit))
+        plan = BenchmarkPlan(small(scenes=given, sensors=sensors, truth=[], sharp=None, audit=audit))
         build_clip(plan, plan.clips[0], tmp_path / str(audit))
         folder = clip_folder(tmp_path / str(audit), plan.clips[0])
         content = json.loads((folder / CLIP_FILE).read_text())
@@ -492,7 +492,7 @@ def test_without_an_audit_a_clip_has_the_same_bits_and_says_so(tmp_path):
 
 
 def test_the_estimate_counts_the_missing_clips():
-    plan = Plan(small(truth=[], sharp=None))
+    plan = BenchmarkPlan(small(truth=[], sharp=None))
     one, two = estimate_build(plan, plan.clips[1:]), estimate_build(plan, plan.clips[1:] * 2)
     assert two.bytes == 2 * one.bytes and two.clips == 2 and two.seconds > 1.5 * one.seconds > 0
     assert estimate_build(plan, []).seconds == 0

@@ -8,7 +8,7 @@ import pytest
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark, evaluate_benchmark
 from hesim_render.benchmark.bilinear import bilinear
-from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.pictures import ClipDevelopment
 
 BAYER = np.array([[0, 1], [1, 2]])
 
@@ -75,7 +75,7 @@ def test_methods_are_scored_against_it(clip, tmp_path):
 def test_channels_are_developed_as_a_mosaic_of_them_is(clip):
     """An even picture is the same before and after demosaicing, clipped or not."""
     clip, _ = clip
-    development, mosaic = Development(clip), clip.recording.mosaic
+    development, mosaic = ClipDevelopment(clip), clip.recording.mosaic
     for part in (0.2, 0.95):
         level = mosaic.black_level_dn + part * (mosaic.white_level_dn - mosaic.black_level_dn) * np.array([0.6, 1, 0.7])
         channel = mosaic.tiled(mosaic.tile_channel, (48, 64))

@@ -10,7 +10,7 @@ from PIL import Image
 from benchmarks import small
 from hesim_render.benchmark import Benchmark, build_benchmark, evaluate_benchmark
 from hesim_render.benchmark.evaluate import summary, table
-from hesim_render.benchmark.pictures import Development
+from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import ClipTasks, Score
 from hesim_render.core.errors import RangeError, SpecError
@@ -56,17 +56,17 @@ def test_every_task_has_scores(built, tmp_path):
 def test_a_perfect_answer_scores_perfectly(built):
     clip = next(built.clips())
     truth = clip.sharp.raw_dn(1).astype(float)
-    found = Development(clip).scores(truth, truth)
+    found = ClipDevelopment(clip).scores(truth, truth)
     assert found["psnr_db"] == found["raw_psnr_db"] == np.inf and found["ssim"] == 1 and found["delta_e"] == 0
     # twice as far off: 6.02 dB
     step = np.where(np.indices(truth.shape).sum(axis=0) % 2, 8.0, -8.0)
-    near, far = (Development(clip).scores(truth + k * step, truth)["raw_psnr_db"] for k in (1, 2))
+    near, far = (ClipDevelopment(clip).scores(truth + k * step, truth)["raw_psnr_db"] for k in (1, 2))
     assert near - far == pytest.approx(20 * np.log10(2), abs=0.05)
 
 
 def test_values_of_the_event_grid_reach_the_right_pixels(built):
     """A map that is linear in the place of the event pixels is the same function at all pixels between."""
-    development = Development(next(built.clips()))
+    development = ClipDevelopment(next(built.clips()))
     layout = development.layout
     cols = layout.shape[1]
     places = layout.evs_pixel.reshape(layout.evs_shape)
@@ -153,7 +153,7 @@ def test_exposures_of_a_still_scene_are_merged_and_light_comes_from_events(tmp_p
 
 def test_flow_of_the_event_grid_is_in_pixels_of_the_mosaic(built):
     """A flow to the next event pixel ends at the place of that pixel, whatever their pitch."""
-    development = Development(next(built.clips()))
+    development = ClipDevelopment(next(built.clips()))
     layout = development.layout
     rows, cols = layout.evs_shape
     flow = np.full((rows, cols, 2), [1.0, 2.0])

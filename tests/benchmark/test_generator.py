@@ -12,7 +12,7 @@ from benchmarks import generated, small
 from hesim_render.benchmark.draws import draws, shares
 from hesim_render.benchmark.generator import Generator
 from hesim_render.benchmark.meshes import mesh
-from hesim_render.benchmark.plan import Plan, shared_parts
+from hesim_render.benchmark.plan import BenchmarkPlan, shared_parts
 from hesim_render.benchmark.textures import KINDS, texture
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.specs.benchmark import SharpSpec, read_benchmark
@@ -22,7 +22,7 @@ from hesim_render.specs.scene import SceneSpec, read_scene
 @pytest.fixture(scope="module")
 def many():
     """24 scenes without pictures, which take most of the time."""
-    plan = Plan(generated(24, scenes={"textured": 0.1}))
+    plan = BenchmarkPlan(generated(24, scenes={"textured": 0.1}))
     return plan, [plan.scene_files(clip) for clip in plan.clips]
 
 
@@ -87,7 +87,7 @@ def test_users_parts_join_and_each_belongs_to_one_split(tmp_path):
         # a mesh of another size and place, which must be brought into the view
         (folder / f"m{number}.obj").write_text(f"v 9 0 0\nv 9 {number + 4} 0\nv 9 0 {number + 5}\nf 1 2 3\n")
     spec = generated(30, scenes={"parts": "mine", "textured": 1.0}).model_copy(update={"folder": tmp_path})
-    plan = Plan(spec)
+    plan = BenchmarkPlan(spec)
     scenes = [plan.scene_files(clip) for clip in plan.clips[:12]]
     used = Counter(part for scene in scenes for part in scene.parts if part.startswith("file:"))
     assert len(used) >= 4
@@ -246,7 +246,7 @@ def test_the_plan_has_every_combination():
         noise=[{"name": "standard"}, {"name": "clean", "clean": True}],
         sensors=[{"sensor": "gen2", "roi": "32x24"}, {"sensor": "reference-mono", "roi": "32x24"}],
     )  # fmt: skip
-    clips = Plan(spec).clips
+    clips = BenchmarkPlan(spec).clips
     assert len(clips) == spec.combinations == 3 * 2 * 2 * 2 * 2 * 2 * 2
     assert len({clip.name for clip in clips}) == len(clips)
     assert {clip.exposure_us for clip in clips if clip.exposure == 0} == {1000}
@@ -257,14 +257,14 @@ def test_the_plan_has_every_combination():
 
 def test_fewer_clips_are_drawn_from_all_scenes():
     spec = generated(10, motions={"count": 5}, clips=20)
-    clips = Plan(spec).clips
+    clips = BenchmarkPlan(spec).clips
     assert len(clips) == 20 and Counter(clip.scene for clip in clips) == dict.fromkeys(range(10), 2)
 
 
 def test_a_given_scene_in_two_splits_is_refused():
     given = [{"scene": "rotating-star", "split": "train"}, {"scene": "rotating-star", "split": "test"}]
     with pytest.raises(SpecError, match="must not leak"):
-        Plan(small(scenes={"given": given})).check()
+        BenchmarkPlan(small(scenes={"given": given})).check()
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_a_given_scene_in_two_splits_is_refused():
 )
 def test_what_cannot_be_built_is_refused_before_the_start(changes, message):
     with pytest.raises(HesimError, match=message):
-        Plan(small(**changes)).check()
+        BenchmarkPlan(small(**changes)).check()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from benchmarks import small
 from hesim_render.benchmark import clip as clips
 from hesim_render.benchmark.clip import build_clip, clip_folder
-from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.core.journal import Journal, journal_of
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 
@@ -68,7 +68,7 @@ def bytes_of(root, plan):
 @pytest.mark.parametrize("name", ["ticks", *(pytest.param(name, marks=pytest.mark.slow) for name in list(CLIPS)[1:])])
 def test_a_clip_whose_build_was_killed_has_the_bytes_of_a_whole_one(name, tmp_path):
     """Audit, labels, and the work that its manifest states are among these bytes."""
-    plan = Plan(small(**CLIPS[name]))
+    plan = BenchmarkPlan(small(**CLIPS[name]))
     blocks = build(plan, tmp_path / "whole")
     root = tmp_path / "killed"
     journal, kills = journal_of(clip_folder(root, plan.clips[0])), [max(1, int(part * blocks)) for part in KILLS[name]]

@@ -144,10 +144,10 @@ def test_the_command_packs_and_checks(built, tmp_path, capsys):
     from hesim_render import cli
 
     with pytest.raises(SystemExit) as end:
-        cli.main(["benchmark", "pack", str(built.root), "--out", str(tmp_path / "c"), "--format", "hdf5"])
+        cli.main(["benchmark", "export", str(built.root), "--out", str(tmp_path / "c"), "--format", "hdf5"])
     assert not end.value.code and "6 samples" in capsys.readouterr().out
     with pytest.raises(SystemExit) as end:
-        cli.main(["benchmark", "pack", str(built.root), "--out", str(tmp_path / "c")])
+        cli.main(["benchmark", "export", str(built.root), "--out", str(tmp_path / "c"), "--format", "webdataset"])
     assert end.value.code == 2 and "overwrite" in capsys.readouterr().err
 
 

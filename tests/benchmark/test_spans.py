@@ -21,7 +21,7 @@ from hesim_render.benchmark import build_benchmark, local, verify_benchmark
 from hesim_render.benchmark.build import UnfinishedError
 from hesim_render.benchmark.clip import build_clip, clip_folder, render_span
 from hesim_render.benchmark.local import LocalWorkers
-from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.benchmark.spans import journals_in, spans_folder, spans_of
 from hesim_render.benchmark.units import Unit, Waiting
 from hesim_render.benchmark.verify import digest_of
@@ -78,7 +78,7 @@ def bytes_of(root, plan):
 @pytest.mark.parametrize("name", CLIPS)
 def test_a_clip_finds_all_its_light_in_its_spans(name, tmp_path, blocks):
     """The spans come in any order. The first frame is traced once, and a span that is rendered again traces nothing."""
-    plan = Plan(small(**CLIPS[name]))
+    plan = BenchmarkPlan(small(**CLIPS[name]))
     clip, spans = plan.clips[0], spans_of(plan.spec.duration_us, 15_000)
     build_clip(plan, clip, tmp_path / "whole")
     whole, root = len(blocks), tmp_path / "spans"
@@ -109,7 +109,7 @@ def test_spans_are_equal_parts_none_longer_than_asked_for():
 
 
 def test_a_clip_waits_for_its_spans_and_others_do_not():
-    plan = Plan(generated(2))
+    plan = BenchmarkPlan(generated(2))
     one, other = plan.clips
     spans = ((0, 5), (5, 10))
     waiting = Waiting(plan.clips, spans)
@@ -171,7 +171,7 @@ for line in sys.stdin:
 def test_a_span_that_fails_fails_its_clip_alone(monkeypatch, count):
     """One kills its workers, one cannot be rendered; no unit is told twice, and each clip comes after its spans."""
     monkeypatch.setattr(local, "COMMAND", (sys.executable, "-c", _FAKE))
-    clips, told = Plan(generated(4)).clips, []
+    clips, told = BenchmarkPlan(generated(4)).clips, []
     failed = LocalWorkers("{}", count).run(clips, told.append, ((0, 5), (5, 10)))
     assert failed.keys() == {clips[1].name, clips[2].name} and failed[clips[2].name] == "is wrong"
     died = rf"{clips[1].name}, (0 to 5e-06|5e-06 to 1e-05) s: its worker died 3 times \(last: signal 9\)"

@@ -29,7 +29,7 @@ def test_a_recording_made_again_has_the_same_bytes(scene, sensor, given, tmp_pat
     first, again = tmp_path / "first", tmp_path / "again"
     for arguments in (
         ("simulate", scene, "--sensor", sensor, "--out", first, "--duration", 0.02, *given),
-        ("rerun", first, "--out", again),
+        ("simulate", first, "--out", again),
     ):
         with pytest.raises(SystemExit) as stop:
             main([str(argument) for argument in arguments])

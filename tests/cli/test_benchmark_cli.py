@@ -37,7 +37,7 @@ def test_a_benchmark_is_built_verified_evaluated_and_exported(spec, tmp_path, ca
     status, text, err = call(capsys, "benchmark", "evaluate", out, "--tasks", "hdr,deblur")
     assert status == 0 and "double-integral" in text and err.endswith("hdr: no clip of this split has what it needs\n")
     assert "hdr" not in call(capsys, "benchmark", "evaluate", out)[2]
-    status, text, _ = call(capsys, "benchmark", "export", out, "--layout", "highrev", "--out", tmp_path / "x")
+    status, text, _ = call(capsys, "benchmark", "export", out, "--format", "highrev", "--out", tmp_path / "x")
     assert status == 0 and text.startswith("1 pictures in")
     next(out.glob("clips/*/sharp.h5")).unlink()
     status, text, err = call(capsys, "benchmark", "verify", out)

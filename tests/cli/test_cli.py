@@ -16,7 +16,7 @@ from hesim_render import cli
 from hesim_render.capture.noise_terms import NOISE_TERMS
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core import backend
-from hesim_render.core.backend import Candidate
+from hesim_render.core.backend import BackendCandidate
 from hesim_render.core.errors import RangeError
 from hesim_render.core.region import parse_roi
 from hesim_render.core.shipped import data_folder, list_names
@@ -41,8 +41,9 @@ def fails(capsys, *arguments):
 def test_help_lists_the_commands():
     done = subprocess.run([sys.executable, "-m", "hesim_render.cli", "--help"], capture_output=True, text=True)
     assert done.returncode == 0
-    for command in ("doctor", "list", "simulate", "video", "demo", "view", "lab", "calibrate", "isp", "export", "cube"):
-        assert command in done.stdout
+    named = re.findall(r"^  ([a-z]+)  ", done.stdout.partition("Commands:")[2], re.MULTILINE)
+    assert named[0] == "simulate" and {"info", "view", "export", "calibrate", "study", "benchmark"} <= set(named)
+    assert len(named) <= 15 and "..." not in done.stdout.partition("Commands:")[2]
 
 
 def test_help_loads_nothing_heavy():
@@ -62,19 +63,19 @@ def test_no_arguments_show_the_help(capsys):
 
 @pytest.mark.parametrize("kind", ["sensors", "scenes"])
 def test_list_names_what_ships(kind, capsys):
-    status, out, _ = call(capsys, "list", kind)
+    status, out, _ = call(capsys, "info", kind)
     assert status == 0
     assert [line.split()[0] for line in out.splitlines()] == list_names(kind)
     assert all(len(line.split()) > 3 for line in out.splitlines())
 
 
 def test_list_illuminants(capsys):
-    names = call(capsys, "list", "illuminants")[1].splitlines()
+    names = call(capsys, "info", "illuminants")[1].splitlines()
     assert {"D65", "A", "FL11", "LED-B3"} <= set(names)
 
 
 def test_list_noise_names_every_term_and_the_docs_do_too(capsys):
-    names = call(capsys, "list", "noise")[1].splitlines()
+    names = call(capsys, "info", "noise")[1].splitlines()
     assert names == list(NOISE_TERMS) and "aps.read" in names and "evs.leak" in names
     docs = (data_folder("sensors").parent / "docs" / "sensors.md").read_text()
     table = docs[docs.index("## Switching noise off") : docs.index("## Changing one figure")]
@@ -82,14 +83,14 @@ def test_list_noise_names_every_term_and_the_docs_do_too(capsys):
 
 
 def test_list_alone_lists_everything(capsys):
-    status, out, err = call(capsys, "list")
+    status, out, err = call(capsys, "info", "names")
     assert status == 0 and err == ""
     for kind in ("scenes", "sensors", "illuminants", "noise", "truth"):
         below = out[out.index(f"{kind}:\n") :].splitlines()[1:]
-        assert [line.strip() for line in below[:3]] == call(capsys, "list", kind)[1].splitlines()[:3]
+        assert [line.strip() for line in below[:3]] == call(capsys, "info", kind)[1].splitlines()[:3]
 
 
-@pytest.mark.parametrize("command", ["--help", "list scenes"])
+@pytest.mark.parametrize("command", ["--help", "info scenes"])
 def test_output_that_nobody_reads_is_no_failure_and_a_full_disk_is_one_line(command):
     run = [sys.executable, "-m", "hesim_render.cli", *command.split()]
     reading, writing = os.pipe()
@@ -131,8 +132,8 @@ def test_what_no_pixel_uses_after_a_change_is_noted(capsys, tmp_path):
         ["simulate", "dark", "--sensor", "reference-mono", "--roi", "8x8", "--out", "LONG"],
         ["simulate", "LONG", "--sensor", "reference-mono", "--out", "o"],
         ["simulate", "dark", "--sensor", "LONG", "--out", "o"],
-        ["video", "LONG", "--sensor", "reference-mono", "--out", "o"],
-        ["lab", "reference-mono", "--out", "LONG"],
+        ["simulate", "LONG", "--sensor", "reference-mono", "--out", "o"],
+        ["calibrate", "lab", "reference-mono", "--out", "LONG"],
         ["demo", "--out", "LONG"],
         ["view", "LONG"],
         ["isp", "LONG"],
@@ -179,7 +180,7 @@ def test_a_long_run_says_what_to_do_in_one_reading(capsys, tmp_path):
 
 
 def test_doctor_says_what_runs(capsys):
-    status, out, _ = call(capsys, "doctor")
+    status, out, _ = call(capsys, "info")
     assert status == 0
     last = out.splitlines()[-1]
     assert last.startswith("backend") and last.endswith("_ad_spectral")
@@ -188,9 +189,9 @@ def test_doctor_says_what_runs(capsys):
 
 
 def test_doctor_says_what_to_install_where_nothing_runs(capsys, monkeypatch):
-    broken = Candidate("llvm", "system", "/nowhere/libLLVM-20.so")
+    broken = BackendCandidate("llvm", "system", "/nowhere/libLLVM-20.so")
     monkeypatch.setattr(backend, "candidates", lambda: [broken])
-    status, out, err = call(capsys, "doctor")
+    status, out, err = call(capsys, "info")
     assert status == 2 and "does not work: no such file" in out
     assert err.count("\n") == 1 and "libllvm19" in err and "pip install 'tadashi" in err
 
@@ -199,9 +200,9 @@ def test_doctor_says_what_to_install_where_nothing_runs(capsys, monkeypatch):
     ("arguments", "text"),
     [
         (["nonsense"], "No such command 'nonsense'"),
-        (["list", "cameras"], "'cameras' is not one of"),
+        (["info", "cameras"], "WHAT is 'cameras'; expected a sensor or one of machine, names, scenes"),
         (["simulate"], "Missing argument"),
-        (["simulate", "colorchecker"], "Missing option '--sensor'"),
+        (["simulate", "colorchecker", "--out", "o"], "Missing option '--sensor'"),
         (["simulate", "colorchecker", "--sensor", "eiger"], "Missing option '--out'"),
         (["simulate", "colorchecker", "--sensor", "eiger", "--out", "o", "--colour"], "No such option"),
         (["view"], "Missing argument"),
@@ -424,7 +425,8 @@ def test_the_main_job_end_to_end(capsys, tmp_path):
 def test_lab_calibrate_and_simulate_end_to_end(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     status, out, err = call(
-        capsys, "lab", "eiger", "--out", "lab", "--roi", "64x64", "--frames", "16", "--ticks", "3000", "--seed", "4",
+        capsys, "calibrate", "lab", "eiger", "--out", "lab", "--roi", "64x64", "--frames", "16", "--ticks", "3000",
+        "--seed", "4",
         "--dark-ms", "1,20,80", "--lit-ms", "1,10,20,80", "--set", "sensor.evs.contrast_threshold_on=0.15",
         "--set", "sensor.evs.contrast_threshold_off=0.15",
     )  # fmt: skip
@@ -456,17 +458,23 @@ def test_lab_calibrate_and_simulate_end_to_end(capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["lab"], "Missing argument"),
-        (["lab", "eiger"], "Missing option '--out'"),
-        (["lab", "eigr", "--out", "o"], "no sensor named 'eigr'"),
-        (["lab", "eiger", "--out", "o", "--frames", "3"], "frames is 3; expected 8 or more"),
-        (["lab", "eiger", "--out", "o", "--ticks", "0"], "ticks is 0"),
-        (["lab", "eiger", "--out", "o", "--dark-ms", "short"], "exposures is 'short'; expected times in ms"),
-        (["lab", "eiger", "--out", "o", "--dark-ms", "5"], "dark exposures"),
-        (["lab", "eiger", "--out", "o", "--set", "camera.f_number=4"], "expected a key of the sensor file"),
-        (["lab", "eiger", "--out", "o", "--illuminant", "D66"], "D66"),
-        (["lab", "eiger", "--out", "o", "--without", "aps.reed"], "noise term is 'aps.reed'"),
-        (["calibrate", "isp", "x", "--out", "c.yaml"], "'isp' is not one of"),
+        (["calibrate", "lab"], "Missing argument"),
+        (["calibrate", "lab", "eiger"], "Missing option '--out'"),
+        (["calibrate", "lab", "eigr", "--out", "o"], "no sensor named 'eigr'"),
+        (["calibrate", "lab", "eiger", "--out", "o", "--frames", "3"], "frames is 3; expected 8 or more"),
+        (["calibrate", "lab", "eiger", "--out", "o", "--ticks", "0"], "ticks is 0"),
+        (
+            ["calibrate", "lab", "eiger", "--out", "o", "--dark-ms", "short"],
+            "exposures is 'short'; expected times in ms",
+        ),
+        (["calibrate", "lab", "eiger", "--out", "o", "--dark-ms", "5"], "dark exposures"),
+        (
+            ["calibrate", "lab", "eiger", "--out", "o", "--set", "camera.f_number=4"],
+            "expected a key of the sensor file",
+        ),
+        (["calibrate", "lab", "eiger", "--out", "o", "--illuminant", "D66"], "D66"),
+        (["calibrate", "lab", "eiger", "--out", "o", "--without", "aps.reed"], "noise term is 'aps.reed'"),
+        (["calibrate", "isp", "x", "--out", "c.yaml"], "No such command 'isp'"),
         (["calibrate", "aps", "nowhere", "--out", "c.yaml"], "nowhere: no such folder of captures"),
         (["calibrate", "aps", ".", "--out", "c.yaml"], "capture.yaml: no such file"),
     ],
@@ -479,7 +487,19 @@ def test_bad_input_of_lab_and_calibrate_is_one_line_and_writes_nothing(arguments
 
 @pytest.mark.slow
 def test_lab_of_an_asynchronous_sensor_and_keeps_what_is_there(capsys, tmp_path):
-    command = ["lab", "davis346", "--out", tmp_path / "o", "--roi", "8x8", "--frames", "8", "--trials", "4"]
+    command = [
+        "calibrate",
+        "lab",
+        "davis346",
+        "--out",
+        tmp_path / "o",
+        "--roi",
+        "8x8",
+        "--frames",
+        "8",
+        "--trials",
+        "4",
+    ]
     status, out, _ = call(capsys, *command)
     assert status == 0 and "evs_noise_rate.npz" in out and "evs_s_curve.npz" in out
     assert out.count("\n") == 5 and "evs_static" not in out
@@ -528,5 +548,5 @@ def test_no_memory_and_limits_of_files_are_one_line(capsys, monkeypatch, tmp_pat
     exec(code, inside)
     monkeypatch.setattr("hesim_render.cli.commands.program", lambda: lambda **_: inside["fail"]())
     with pytest.raises(SystemExit) as end:
-        cli.main(["list"])
+        cli.main(["info", "names"])
     assert end.value.code == 2 and capsys.readouterr().err.startswith(f"hesim-render: {told}")

@@ -50,7 +50,7 @@ def test_each_effect_is_rendered(capsys, tmp_path, sensor, name):
 
 
 def test_effects_are_listed_switched_off_and_refused_in_one_line(capsys, tmp_path):
-    assert call(capsys, "list", "lens")[1].split() == [f"lens.{name}" for name in EFFECTS]
+    assert call(capsys, "info", "lens")[1].split() == [f"lens.{name}" for name in EFFECTS]
     key = ("--set", "sensor.lens.distortion={model: opencv, k1: -20}")
     told = fails(capsys, *RUN, "--sensor", "eiger", *key, "--roi", "3264x2448", "--out", tmp_path / "rec")
     assert "eiger.yaml" in told and "lens.distortion: the model folds at" in told and told.count("\n") <= 1

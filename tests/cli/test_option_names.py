@@ -9,15 +9,16 @@ from hesim_render.core.errors import ConflictError, RangeError, SpecError
 
 @pytest.mark.parametrize(("given", "name", "option"), [
     (["measure", "mtf", "r"], "filter_name", "--filter"),  # begins with the option's name
-    (["video", "v.mp4"], "duration_s", "--duration"),
-    (["expose", "c.npy"], "illuminance_lux", "--lux"),  # ends with it
+    (["simulate", "v.mp4"], "duration_s", "--duration"),
+    (["simulate", "c.npy"], "illuminance_lux", "illuminance_lux"),  # a key of --set keeps its name
+    (["calibrate", "lab", "eiger"], "dark_exposures_us", "dark_exposures_us"),
     (["benchmark", "evaluate", "b"], "split", "--split"),  # of a group
-    (["benchmark", "pack", "b"], "format", "--format"),  # whose Python name has an underscore at its end
+    (["benchmark", "export", "b"], "format", "--format"),  # whose Python name has an underscore at its end
     (["simulate", "dark"], "truth_every_us", "--truth-every-us"),
     (["simulate", "dark"], "seed", "--seed"),
     (["simulate", "dark"], "scene", "scene"),  # an argument, no option
     (["simulate", "dark"], "shape of the RAW frame", "shape of the RAW frame"),
-    (["rerun", "r"], "seed", "seed"),  # a command without it
+    (["view", "r"], "seed", "seed"),  # a command without it
     ([], "seed", "seed"),
 ])  # fmt: skip
 def test_the_option_stands_for_the_argument(given, name, option):

@@ -41,7 +41,7 @@ def write(folder, text=RUN):
 
 
 def test_a_run_is_its_commands_one_after_the_other(capsys, tmp_path):
-    status, out, err = call(capsys, "run", write(tmp_path), "--out", tmp_path / "o", "--json")
+    status, out, err = call(capsys, "simulate", write(tmp_path), "--out", tmp_path / "o", "--json")
     told = json.loads(out)
     assert status == told["status"] == ExitStatus.NOT_MET  # two rays a pixel
     assert told["kept"] == [] and "Traceback" not in err
@@ -60,14 +60,14 @@ def test_a_run_is_its_commands_one_after_the_other(capsys, tmp_path):
     # the second time all is there; what is missing is made again, and nothing else
     before = (tmp_path / "o" / "recording" / "recording.json").stat().st_mtime_ns
     (tmp_path / "o" / "events.raw").unlink()
-    told = json.loads(call(capsys, "run", tmp_path / "run.yaml", "--out", tmp_path / "o", "--json")[1])
+    told = json.loads(call(capsys, "simulate", tmp_path / "run.yaml", "--out", tmp_path / "o", "--json")[1])
     assert len(told["kept"]) == 5 and (tmp_path / "o" / "events.raw").is_file()
     assert (tmp_path / "o" / "recording" / "recording.json").stat().st_mtime_ns == before
-    dry = json.loads(call(capsys, "run", tmp_path / "run.yaml", "--out", tmp_path / "o", "--dry-run", "--json")[1])
+    dry = json.loads(call(capsys, "simulate", tmp_path / "run.yaml", "--out", tmp_path / "o", "--dry-run", "--json")[1])
     assert dry["estimate"]["text"] == "the recording is there already"
 
     # another content is refused, and replaces all of the old one where that is wanted
-    other = ["run", tmp_path / "run.yaml", "--out", tmp_path / "o", "--set", "seed=8", "--set", "export=[]"]
+    other = ["simulate", tmp_path / "run.yaml", "--out", tmp_path / "o", "--set", "seed=8", "--set", "export=[]"]
     assert "holds a run of other content" in fails(capsys, *other)
     assert call(capsys, *other, "--overwrite")[0] == ExitStatus.NOT_MET
     assert sorted(os.listdir(tmp_path / "o")) == ["pictures", "recording", "run.json"]
@@ -94,7 +94,7 @@ def test_a_run_is_its_commands_one_after_the_other(capsys, tmp_path):
 ])  # fmt: skip
 def test_mistakes_of_the_file_are_a_line_each_and_nothing_is_written(before, after, told, capsys, tmp_path):
     assert before in RUN
-    line = fails(capsys, "run", write(tmp_path, RUN.replace(before, after)), "--out", tmp_path / "o")
+    line = fails(capsys, "simulate", write(tmp_path, RUN.replace(before, after)), "--out", tmp_path / "o")
     assert told in line
     assert os.listdir(tmp_path) == ["run.yaml"]
 
@@ -106,14 +106,16 @@ def test_runs_of_videos_and_cubes(capsys, tmp_path):
     video = "video:\n  file: v.npy\n  options:\n    fps: 100\n    transfer: srgb\n    primaries: bt709\n"
     cube = "duration_s: 0.03\ncube:\n  file: c.npy\n  options:\n    wavelength_nm: [360, 830]\n    illuminance_lux: 9\n"
     for name, text, seconds in (("v", video, 0.04), ("c", cube, 0.03)):
-        given = ["run", write(tmp_path, base + text), "--out", tmp_path / name]
+        given = ["simulate", write(tmp_path, base + text), "--out", tmp_path / name]
         assert json.loads(call(capsys, *given, "--dry-run", "--json")[1])["dry_run"] and not (tmp_path / name).exists()
         assert call(capsys, *given, "--quiet") == (0, "", "")
         assert hr.Recording.load(tmp_path / name / "recording").duration_us == round(1e6 * seconds)
     wrong = write(tmp_path, base + video.replace("fps: 100", "fsp: 100"))
-    assert "run.yaml:8: fsp: unknown key (did you mean 'fps'?)" in fails(capsys, "run", wrong, "--out", tmp_path / "w")
+    assert "run.yaml:8: fsp: unknown key (did you mean 'fps'?)" in fails(
+        capsys, "simulate", wrong, "--out", tmp_path / "w"
+    )
     wrong = write(tmp_path, base + video.replace("v.npy", "w.npy"))
-    assert "video.file: w.npy: no such file" in fails(capsys, "run", wrong, "--out", tmp_path / "w")
+    assert "video.file: w.npy: no such file" in fails(capsys, "simulate", wrong, "--out", tmp_path / "w")
     assert not (tmp_path / "w").exists()
 
 
@@ -127,7 +129,7 @@ def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys
         "from hesim_render.cli import main; main(sys.argv[1:])"
     )
     child = subprocess.Popen(
-        [sys.executable, "-c", program, "run", run, "--out", tmp_path / "o"], stdout=subprocess.PIPE,
+        [sys.executable, "-c", program, "simulate", run, "--out", tmp_path / "o"], stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     while "developing" not in child.stdout.readline():
@@ -136,7 +138,7 @@ def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys
     assert child.wait(timeout=60) == 130
     assert json.loads((tmp_path / "o" / "run.json").read_text())["done"] == ["recording"]
     before = (tmp_path / "o" / "recording" / "recording.json").stat().st_mtime_ns
-    status, out, _ = call(capsys, "run", run, "--out", tmp_path / "o")
+    status, out, _ = call(capsys, "simulate", run, "--out", tmp_path / "o")
     assert status == 0 and "made by an earlier run: recording" in out and "estimate: the recording is there" in out
     assert (tmp_path / "o" / "recording" / "recording.json").stat().st_mtime_ns == before
 
@@ -160,8 +162,10 @@ def test_a_file_cannot_let_its_scene_out_of_its_folder(capsys, tmp_path):
     )
     plain = "schema_version: 1\nname: r\nscene: scene.yaml\nsensor: reference-mono\nroi: 8x8\nsamples: 2\n"
     (folder / "run.yaml").write_text(plain + "allow_outside: true\n")
-    assert "allow_outside" in fails(capsys, "run", folder / "run.yaml", "--out", tmp_path / "o")
+    assert "allow_outside" in fails(capsys, "simulate", folder / "run.yaml", "--out", tmp_path / "o")
     (folder / "run.yaml").write_text(plain)
-    assert "--allow-outside" in fails(capsys, "run", folder / "run.yaml", "--out", tmp_path / "o")
-    status, _, _ = call(capsys, "run", folder / "run.yaml", "--out", tmp_path / "o", "--allow-outside", "--dry-run")
+    assert "--allow-outside" in fails(capsys, "simulate", folder / "run.yaml", "--out", tmp_path / "o")
+    status, _, _ = call(
+        capsys, "simulate", folder / "run.yaml", "--out", tmp_path / "o", "--allow-outside", "--dry-run"
+    )
     assert status == 0

@@ -1,4 +1,4 @@
-"""``sensor describe`` and ``sensor new``, and every shipped sensor from the command line."""
+"""``info`` of a sensor and ``new``, and every shipped sensor from the command line."""
 
 import json
 
@@ -26,39 +26,39 @@ def call(capsys, *arguments):
 @pytest.mark.slow
 def test_describe_shows_figures_and_curves(capsys, tmp_path):
     file = tmp_path / "curves.png"
-    status, out, _ = call(capsys, "sensor", "describe", "imx636", "--out", file)
+    status, out, _ = call(capsys, "info", "imx636", "--out", file)
     assert status == 0
     lines = {line.split("  ")[1]: line for line in out.splitlines() if line.startswith("  ")}
     assert "(data sheet: 10 Hz)" in lines["background at 5 lx"] and " 10 Hz" in lines["background at 5 lx"]
     assert "(data sheet: 25 %)" in lines["threshold ON"]
     with Image.open(file) as picture:
         assert picture.width > 1000 and np.unique(picture.convert("L")).size > 20
-    status, _, err = call(capsys, "sensor", "describe", "imx636", "--out", file)
+    status, _, err = call(capsys, "info", "imx636", "--out", file)
     assert status == 2 and "exists" in err
-    assert call(capsys, "sensor", "describe", "eiger", "--out", file, "--overwrite")[0] == 0
-    status, _, err = call(capsys, "sensor", "describe", "eiger", "--out", tmp_path / "curves.txt")
+    assert call(capsys, "info", "eiger", "--out", file, "--overwrite")[0] == 0
+    status, _, err = call(capsys, "info", "eiger", "--out", tmp_path / "curves.txt")
     assert status == 2 and ".png or .svg or .pdf" in err and not (tmp_path / "curves.txt").exists()
 
 
 def test_describe_as_json_with_a_change(capsys):
     change = "sensor.evs.data_sheet.threshold_on_percent=40"
-    status, out, _ = call(capsys, "sensor", "describe", "imx636", "--json", "--set", change)
+    status, out, _ = call(capsys, "info", "imx636", "--json", "--set", change)
     data = json.loads(out)
     assert status == 0 and data["name"] == "imx636"
     figures = {row["name"]: row for row in data["figures"]["events"]}
     assert figures["threshold ON"]["value"] == pytest.approx(40) and figures["threshold ON"]["unit"] == "%"
     assert figures["background at 5 lx"]["data_sheet"] == 10
-    status, _, err = call(capsys, "sensor", "describe", "imx636", "--set", "light.illuminance_lux=5")
+    status, _, err = call(capsys, "info", "imx636", "--set", "light.illuminance_lux=5")
     assert status == 2 and "a key of the sensor file" in err
-    status, _, err = call(capsys, "sensor", "describe", "imx363x")
+    status, _, err = call(capsys, "info", "imx363x")
     assert status == 2 and "did you mean 'imx363'" in err
 
 
 @pytest.mark.parametrize("like", ["frames", "events", "hybrid"])
 def test_a_new_sensor_file_can_be_simulated_as_it_is(like, capsys, tmp_path):
     file = tmp_path / f"my {like}.yaml"
-    status, out, _ = call(capsys, "sensor", "new", file, "--like", like)
-    assert status == 0 and "sensor describe" in out
+    status, out, _ = call(capsys, "new", file, "--like", like)
+    assert status == 0 and "hesim-render info" in out
     text = file.read_text()
     assert text.count(" #") > 15 if like == "hybrid" else text.count(" #") > 5
     assert all(len(line) <= 120 for line in text.splitlines())
@@ -69,20 +69,20 @@ def test_a_new_sensor_file_can_be_simulated_as_it_is(like, capsys, tmp_path):
     given = ("--roi", "8x8", "--duration", 0.01, "--exact", "--samples", 4)
     status, _, err = call(capsys, "simulate", "flat-field", "--sensor", file, "--out", out_folder, *given)
     assert status in (0, 3), err
-    status, _, err = call(capsys, "sensor", "new", file)
+    status, _, err = call(capsys, "new", file)
     assert status == 2 and "exists" in err
-    status, _, err = call(capsys, "sensor", "new", tmp_path / "mine.txt")
+    status, _, err = call(capsys, "new", tmp_path / "mine.txt")
     assert status == 2 and ".yaml" in err
 
 
 def test_a_new_sensor_file_may_begin_as_a_copy(capsys, tmp_path):
     file = tmp_path / "mine.yaml"
-    status, out, _ = call(capsys, "sensor", "new", file, "--like", "imx636")
-    assert status == 0 and "sensor describe" in out
+    status, out, _ = call(capsys, "new", file, "--like", "imx636")
+    assert status == 0 and "hesim-render info" in out
     mine, shipped = read_sensor(file).model_dump(), read_sensor("imx636").model_dump()
     assert mine.pop("name") == "mine" and shipped.pop("name") == "imx636" and mine == shipped
     assert file.read_text().splitlines()[0].startswith("# A copy of imx636:")
-    status, _, err = call(capsys, "sensor", "new", tmp_path / "other.yaml", "--like", "imx63")
+    status, _, err = call(capsys, "new", tmp_path / "other.yaml", "--like", "imx63")
     assert status == 2 and "expected one of frames, events, hybrid, davis240" in err and "did you mean 'imx636'" in err
     assert not (tmp_path / "other.yaml").exists()
 
@@ -98,7 +98,7 @@ def test_a_sensor_whose_calibration_covers_a_part_is_described_by_it(capsys, tmp
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "s.yaml").write_text(text + "\nnoise: c.yaml\n")
-    status, out, err = call(capsys, "sensor", "describe", tmp_path / "s.yaml", "--json", "--out", tmp_path / "s.png")
+    status, out, err = call(capsys, "info", tmp_path / "s.yaml", "--json", "--out", tmp_path / "s.png")
     assert status == 0, err
     figures = {row["name"]: row["value"] for rows in json.loads(out)["figures"].values() for row in rows}
     assert (figures["columns"], figures["event columns"]) == (64, 32)
@@ -111,7 +111,7 @@ def test_a_sensor_whose_calibration_covers_a_part_is_described_by_it(capsys, tmp
 
 
 def test_the_list_of_sensors_is_a_table(capsys):
-    lines = {line.split()[0]: line for line in call(capsys, "list", "sensors")[1].splitlines()}
+    lines = {line.split()[0]: line for line in call(capsys, "info", "sensors")[1].splitlines()}
     assert list(lines) == list_names("sensors")
     assert {len(line[: line.index("µm")]) for line in lines.values()} == {lines["eiger"].index("µm")}
     assert "frames 3264x2448" in lines["eiger"] and "events 1632x1224" in lines["eiger"]

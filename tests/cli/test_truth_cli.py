@@ -42,7 +42,7 @@ def test_kinds_that_are_none_are_one_line(capsys, tmp_path):
 
 
 def test_kinds_are_listed_and_documented(capsys):
-    names = call(capsys, "list", "truth")[1].splitlines()
+    names = call(capsys, "info", "truth")[1].splitlines()
     assert names == list(TRUTH_KINDS)
     docs = (data_folder("sensors").parent / "docs" / "ground-truth.md").read_text()
     table = docs[docs.index("## Kinds") : docs.index("## Inertial")]

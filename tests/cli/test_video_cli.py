@@ -23,8 +23,8 @@ def clip(tmp_path_factory):
 def test_a_video_file_becomes_a_recording_with_pictures(clip, tmp_path, capsys):
     out = tmp_path / "out"
     status, text, err = call(
-        capsys, "video", clip, "--sensor", "eiger", "--roi", "128x96", "--out", out, "--slow-motion", 2,
-        "--white-lux", 800, "--set", "sensor.aps.exposure_us=4000", "--interpolation", "linear",
+        capsys, "simulate", clip, "--sensor", "eiger", "--roi", "128x96", "--out", out, "--set", "slow_motion=2",
+        "--set", "white_lux=800", "--set", "sensor.aps.exposure_us=4000", "--set", "interpolation=linear",
     )  # fmt: skip
     assert status == 0 and err == ""
     assert text.startswith("estimate: about ") and "\nbar.mp4 seen by eiger, 0.2 s" in text and "preview.png" in text
@@ -61,34 +61,34 @@ def test_a_folder_needs_its_rate_and_transfer(tmp_path, capsys):
     folder.mkdir()
     for k, picture in enumerate(moving_bar(5)):
         Image.fromarray(np.rint(255 * picture).astype(np.uint8)).save(folder / f"{k:03d}.png")
-    options = ["video", folder, "--sensor", "gen2", "--roi", "64x48", "--out", tmp_path / "out"]
-    assert "colour tags are missing: transfer; give them" in fails(capsys, *options, "--fps", 100)
-    assert "give the frame rate" in fails(capsys, *options, "--transfer", "srgb")
+    options = ["simulate", folder, "--sensor", "gen2", "--roi", "64x48", "--out", tmp_path / "out"]
+    assert "colour tags are missing: transfer; give them" in fails(capsys, *options, "--set", "fps=100")
+    assert "give the frame rate" in fails(capsys, *options, "--set", "transfer=srgb")
     assert not (tmp_path / "out").exists()
-    status, text, _ = call(capsys, *options, "--transfer", "srgb", "--fps", 100, "--clean")
+    status, text, _ = call(capsys, *options, "--set", "transfer=srgb", "--set", "fps=100", "--clean")
     assert status == 0 and "pictures seen by gen2, 0.05 s" in text
-    assert "exists" in fails(capsys, *options, "--transfer", "srgb", "--fps", 100)
+    assert "exists" in fails(capsys, *options, "--set", "transfer=srgb", "--set", "fps=100")
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["--mode", "blue"], "mode: Input should be 'matrix' or 'spectral'"),
+        (["--set", "mode=blue"], "mode: Input should be 'matrix' or 'spectral'"),
         (["--duration", "9"], "at most the video's 0.4 s"),
         (["--duration", "-1"], "--duration"),
         (["--roi", "63x48"], "multiple of the tile"),
-        (["--set", "light.illuminant=A"], "a key of the sensor file"),
-        (["--white-lux", "5", "--white-e-per-s", "5", "--white-filter", "red"], "give one of them"),
-        (["--white-e-per-s", "5", "--white-filter", "mauve"], "red, green, blue"),
-        (["--camera", "nowhere.yaml"], "nowhere.yaml"),
-        (["--illuminant", "D66"], "unknown illuminant"),
-        (["--fit", "pixel", "--roi", "256x192"], "at least the 256x192 px"),
-        (["--matrix", "rgb"], "one for YUV pictures"),
+        (["--set", "light.illuminant=A"], "light.illuminant: unknown key (did you mean 'illuminant'?)"),
+        (["--set", "white_lux=5", "--set", "white_e_per_s=5", "--set", "white_filter=red"], "give one of them"),
+        (["--set", "white_e_per_s=5", "--set", "white_filter=mauve"], "red, green, blue"),
+        (["--set", "camera=nowhere.yaml"], "nowhere.yaml"),
+        (["--set", "illuminant=D66"], "unknown illuminant"),
+        (["--set", "fit=pixel", "--roi", "256x192"], "at least the 256x192 px"),
+        (["--set", "matrix=rgb"], "one for YUV pictures"),
     ],
 )
 def test_mistakes_are_one_line(clip, arguments, text, tmp_path, capsys):
     given = ["--roi", "64x48", *arguments]
-    assert text in fails(capsys, "video", clip, "--sensor", "eiger", "--out", tmp_path / "out", *given)
+    assert text in fails(capsys, "simulate", clip, "--sensor", "eiger", "--out", tmp_path / "out", *given)
     assert not any(tmp_path.iterdir())
 
 
@@ -101,7 +101,17 @@ def test_a_camera_file_is_undone_and_travels_with_the_recording(clip, tmp_path, 
     )
     out = tmp_path / "out"
     status, *_ = call(
-        capsys, "video", clip, "--sensor", "reference-bayer", "--roi", "64x48", "--out", out, "--camera", camera
+        capsys,
+        "simulate",
+        clip,
+        "--sensor",
+        "reference-bayer",
+        "--roi",
+        "64x48",
+        "--out",
+        out,
+        "--set",
+        f"camera={camera}",
     )
     assert status == 0
     mosaic = hr.Recording.load(out).mosaic
@@ -112,17 +122,19 @@ def test_a_camera_file_is_undone_and_travels_with_the_recording(clip, tmp_path, 
 @pytest.mark.parametrize(
     "options",
     [
-        ["--white-lux", "1e300"], ["--white-lux", "1e-300"], ["--white-lux", "inf"], ["--fps", "1e-300"],
-        ["--fps", "1e-9"], ["--fps", "1e300"], ["--slow-motion", "1e-300"], ["--slow-motion", "1e300"],
-        ["--gamma", "1e300", "--transfer", "gamma"], ["--gamma", "1e-300", "--transfer", "gamma"], ["--duty", "1e-300"],
-        ["--white-e-per-s", "1e300", "--white-filter", "green"],
-        ["--interpolation", "motion", "--motion-factor", "9999"],
+        ["--set", "white_lux=1e300"], ["--set", "white_lux=1e-300"], ["--set", "white_lux=inf"],
+        ["--set", "fps=1e-300"],
+        ["--set", "fps=1e-9"], ["--set", "fps=1e300"], ["--set", "slow_motion=1e-300"], ["--set", "slow_motion=1e300"],
+        ["--set", "gamma=1e300", "--set", "transfer=gamma"],
+        ["--set", "gamma=1e-300", "--set", "transfer=gamma"], ["--set", "duty=1e-300"],
+        ["--set", "white_e_per_s=1e300", "--set", "white_filter=green"],
+        ["--set", "interpolation=motion", "--set", "motion_factor=9999"],
         ["--duration", "1e300"], ["--duration", "1e-300"],
     ],
 )  # fmt: skip
 def test_absurd_values_are_refused_before_any_work(options, tmp_path, capsys, clip):
     begin = time.process_time()
-    fails(capsys, "video", clip, "--sensor", "davis346", "--roi", "32x32", "--out", tmp_path / "o", *options)
+    fails(capsys, "simulate", clip, "--sensor", "davis346", "--roi", "32x32", "--out", tmp_path / "o", *options)
     assert time.process_time() - begin < 20 and list(tmp_path.iterdir()) == []
 
 
@@ -130,8 +142,8 @@ def test_a_video_that_takes_days_has_to_be_wanted(tmp_path, capsys):
     """Three pictures, twenty minutes each: 2.88 million comparisons of every pixel, and 72,000 frames."""
     np.save(tmp_path / "slow.npy", moving_bar(3))
     status, out, err = call(
-        capsys, "video", tmp_path / "slow.npy", "--sensor", "gen2", "--fps", 1 / 1200, "--transfer", "srgb", "--out",
-        tmp_path / "o",
+        capsys, "simulate", tmp_path / "slow.npy", "--sensor", "gen2", "--set", f"fps={1 / 1200}",
+        "--set", "transfer=srgb", "--out", tmp_path / "o",
     )  # fmt: skip
     assert status == 2 and err.startswith("hesim-render: this run takes about ") and err.count("\n") == 1
     counts = re.search(r"(\d+) pictures, (\d+) event samples, (\d+) frames", out)

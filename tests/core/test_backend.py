@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from hesim_render.core import backend
-from hesim_render.core.backend import Candidate
+from hesim_render.core.backend import BackendCandidate
 from hesim_render.core.errors import BackendError
 
 
@@ -51,18 +51,18 @@ def _compiler(request):
 
 @pytest.mark.parametrize("version", [15, 16])
 def test_fake_llvm_15_and_16_are_turned_away_by_their_version(version, fresh, tmp_path):
-    found = backend.probe(Candidate("llvm", "test", str(fake_library(tmp_path, version))))
+    found = backend.probe(BackendCandidate("llvm", "test", str(fake_library(tmp_path, version))))
     assert not found.works and found.version == f"{version}.0.7"
     assert found.reason == f"LLVM {version} is older than 17"
 
 
 def test_fake_library_without_a_version_is_turned_away(fresh, tmp_path):
-    found = backend.probe(Candidate("llvm", "test", str(fake_library(tmp_path, 0))))
+    found = backend.probe(BackendCandidate("llvm", "test", str(fake_library(tmp_path, 0))))
     assert not found.works and found.reason == "older than LLVM 16 (no LLVMGetVersion)"
 
 
 def test_fake_llvm_17_that_cannot_compile_is_turned_away_without_harm(fresh, tmp_path):
-    found = backend.probe(Candidate("llvm", "test", str(fake_library(tmp_path, 17))))
+    found = backend.probe(BackendCandidate("llvm", "test", str(fake_library(tmp_path, 17))))
     assert not found.works and found.reason
 
 
@@ -85,7 +85,7 @@ def test_nonsense_in_the_environment_falls_through(fresh, tmp_path):
     assert first.source == "DRJIT_LIBLLVM_PATH" and not backend.probe(first).works
     chosen = select_anew()
     assert chosen.works and chosen.path != str(nonsense)
-    missing = backend.probe(Candidate("llvm", "DRJIT_LIBLLVM_PATH", str(tmp_path / "gone.so")))
+    missing = backend.probe(BackendCandidate("llvm", "DRJIT_LIBLLVM_PATH", str(tmp_path / "gone.so")))
     assert not missing.works and missing.reason == "no such file"
 
 
@@ -94,7 +94,7 @@ def test_the_probe_runs_in_a_child_process(fresh, tmp_path):
     fresh.setattr(backend, "_PROBE", "import os; os.abort()")
     library = tmp_path / "libLLVM-99.so"
     library.write_bytes(b"")
-    found = backend.probe(Candidate("llvm", "test", str(library)))
+    found = backend.probe(BackendCandidate("llvm", "test", str(library)))
     assert not found.works and "killed by signal 6" in found.reason
 
 
@@ -118,7 +118,7 @@ def test_without_candidates_the_message_says_what_to_install(fresh):
 
 
 def test_failed_candidates_are_named_in_the_message(fresh, tmp_path):
-    broken = Candidate("llvm", "system", str(tmp_path / "libLLVM-20.so"))
+    broken = BackendCandidate("llvm", "system", str(tmp_path / "libLLVM-20.so"))
     fresh.setattr(backend, "candidates", lambda: [broken])
     with pytest.raises(BackendError, match=r"tried LLVM \? \(system: .*libLLVM-20\.so\): no such file"):
         select_anew()
@@ -131,10 +131,10 @@ def test_a_verdict_is_cached_by_path_size_and_time(fresh, tmp_path):
 
     def answer(candidate):
         probed.append(candidate.path)
-        return Candidate(**{**candidate.__dict__, "works": True, "version": "19.0.0"})
+        return BackendCandidate(**{**candidate.__dict__, "works": True, "version": "19.0.0"})
 
     fresh.setattr(backend, "probe", answer)
-    candidate = Candidate("llvm", "system", str(library))
+    candidate = BackendCandidate("llvm", "system", str(library))
     assert backend._probe_cached(candidate).works and backend._probe_cached(candidate).works
     assert len(probed) == 1
     library.write_bytes(b"22")

@@ -14,7 +14,7 @@ import pytest
 import hesim_render
 from benchmarks import generated
 from hesim_render.benchmark.local import LocalWorkers
-from hesim_render.benchmark.plan import Plan
+from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.benchmark.worker import order_of
 from hesim_render.core import backend, child
 from hesim_render.core.errors import OutputError
@@ -48,7 +48,7 @@ def test_the_probe_of_a_backend_runs_none(working_folder):
 
 def test_a_worker_of_a_build_runs_none_and_has_the_package_of_its_parent(working_folder):
     """The worker is a real one; that its order is of another version shows that it got as far as that."""
-    plan = Plan(generated(1))
+    plan = BenchmarkPlan(generated(1))
     order = order_of(plan.spec, Path("/nowhere")).replace(hesim_render.__version__, "9.9.9")
     with pytest.raises(OutputError, match=r"9\.9\.9"):
         LocalWorkers(order, 1, 2).run(plan.clips, lambda answer: None)

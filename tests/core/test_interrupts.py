@@ -26,7 +26,7 @@ def never():
     lock, libc = ctypes.create_string_buffer(256), ctypes.CDLL(None)
     libc.pthread_mutex_lock(lock), libc.pthread_mutex_lock(lock)
 manifest.software_versions = never
-main(["doctor"])
+main(["info"])
 """
 #: The run takes the interrupt at its next step, within Python or where native code comes back.
 _IN_PYTHON = """
@@ -90,7 +90,7 @@ def versions():
     print("there", flush=True)
     time.sleep(30)
 manifest.software_versions = versions
-main(["doctor"])
+main(["info"])
 """
     child = _start(sys.executable, "-c", lost)
     assert child.stdout.readline() == "there\n"  # it went on

@@ -13,6 +13,8 @@ import pytest
 from ruamel.yaml import YAML
 from source_trees import source_tree
 
+from hesim_render.core.shipped import FOLDERS, list_names
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 #: Steps of the Dockerfile that need root.
@@ -47,12 +49,19 @@ def test_wheel_and_source_archive_are_whole_and_pass_twine(tmp_path):
     wheel, archive = next(out.glob("*.whl")), next(out.glob("*.tar.gz"))
     subprocess.run([sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(archive)], check=True)
     names = set(zipfile.ZipFile(wheel).namelist())
-    for folder in ("scenes", "sensors", "filter_sets", "palettes", "study_specs", "design_specs", "sweep_specs"):
-        missing = {f"hesim_render/{folder}/{path.name}" for path in (ROOT / folder).glob("*.yaml")} - names
-        assert not missing
+    shipped = {path.relative_to(ROOT) for folder in FOLDERS.values() for path in (ROOT / folder).glob("*.yaml")}
+    assert {name for name in names if name.endswith(".yaml")} == {f"hesim_render/shipped/{path}" for path in shipped}
     assert "hesim_render/py.typed" in names and not [name for name in names if name.startswith("tests/")]
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    code = (
+        "from hesim_render.core.shipped import FOLDERS, list_names; print({kind: list_names(kind) for kind in FOLDERS})"
+    )
+    environment = outside() | {"PYTHONPATH": str(tmp_path / "installed")}
+    told = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert told.stdout.strip() == str({kind: list_names(kind) for kind in FOLDERS}), told.stderr
     with tarfile.open(archive) as whole:
         within = {name.partition("/")[2] for name in whole.getnames()}
+    assert set(map(str, shipped)) <= within
     assert {"mkdocs.yml", "CITATION.cff", "Dockerfile", "docs/hooks.py", "tests/package/test_pages.py"} <= within
 
 

@@ -108,4 +108,4 @@ def test_shells_complete_commands_and_names():
     assert completed("sim") == ["simulate"]
     assert completed("simulate", "color") == ["colorchecker"]
     assert completed("simulate", "dark", "--sensor", "davis3") == ["davis346"]
-    assert completed("video", "x", "--without", "evs.m") == ["evs.mismatch"]
+    assert completed("simulate", "x", "--without", "evs.m") == ["evs.mismatch"]

@@ -65,9 +65,9 @@ def test_tables_are_whole(page):
 
 
 def test_the_commands_are_found_and_a_wrong_one_is_told():
-    lines = "for x in a; do hesim-render list scenes; done\n.venv/bin/hesim-render demo --out demo\n"
+    lines = "for x in a; do hesim-render info scenes; done\n.venv/bin/hesim-render demo --out demo\n"
     lines += "hesim-render isp a \\\n  --x"
-    assert [words[0] for words in commands_of(lines)] == ["list", "demo", "isp"]
+    assert [words[0] for words in commands_of(lines)] == ["info", "demo", "isp"]
     with pytest.raises(Exception, match="wrong"):
         parsed(["simulate", "dark", "--sensor", "gen2", "--out", "o", "--wrong"])
     found = [

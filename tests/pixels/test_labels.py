@@ -6,7 +6,7 @@ import pytest
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import partners
-from hesim_render.pixels.evs.balance import Balance, Steps
+from hesim_render.pixels.evs.balance import Balance, PixelSteps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
@@ -401,7 +401,7 @@ def test_pairs_against_a_pixel_by_pixel_version_in_any_portions():
                 pixel, k = np.nonzero((t >= low) & (t < high))
                 order = np.argsort(t[pixel, k], kind="stable")
                 pixel, k = pixel[order], k[order]
-                parts.append(Steps(t[pixel, k], pixel, s[pixel, k], pixel * length + k))
+                parts.append(PixelSteps(t[pixel, k], pixel, s[pixel, k], pixel * length + k))
             cause, effect, lost = balance.take(*parts)
             found |= set(zip(cause.tolist(), effect.tolist(), strict=True))
             assert lost.size == 0
@@ -410,7 +410,7 @@ def test_pairs_against_a_pixel_by_pixel_version_in_any_portions():
 
 def steps(*given):
     """(time, pixel, sign, number) each."""
-    return Steps(*np.array(given, np.int64).reshape(-1, 4).T)
+    return PixelSteps(*np.array(given, np.int64).reshape(-1, 4).T)
 
 
 def test_pairs_of_pixels_with_a_dead_time():

@@ -74,9 +74,9 @@ def use_lens(folder):
 
 def studies(folder):
     for kind, name in (("study", "five-cfas"), ("design", "rggb-dyes"), ("sweep", "light-and-exposure")):
-        shutil.copy(_SHIPPED / f"{kind}_specs" / f"{name}.yaml", folder / f"{kind}.yaml")
-    shutil.copy(_SHIPPED / "filter_sets" / "rccb.yaml", folder / "set.yaml")
-    shutil.copy(_SHIPPED / "palettes" / "dyes.yaml", folder / "palette.yaml")
+        shutil.copy(_SHIPPED / "studies" / f"{name}.yaml", folder / f"{kind}.yaml")
+    shutil.copy(_SHIPPED / "studies" / "filter_sets" / "rccb.yaml", folder / "set.yaml")
+    shutil.copy(_SHIPPED / "studies" / "palettes" / "dyes.yaml", folder / "palette.yaml")
 
 
 def read_studies(folder):
@@ -117,10 +117,10 @@ def benchmark(folder):
 
 
 def read_plan(folder):
-    from hesim_render.benchmark.plan import Plan
+    from hesim_render.benchmark.plan import BenchmarkPlan
     from hesim_render.specs.benchmark import read_benchmark
 
-    for clip in Plan(read_benchmark(folder / "b.yaml")).clips:
+    for clip in BenchmarkPlan(read_benchmark(folder / "b.yaml")).clips:
         assert clip.name
 
 

@@ -96,7 +96,7 @@ def test_a_working_folder_with_modules_of_a_stranger(tmp_path):
     """The command starts a child that probes LLVM; it is itself started as by its script, without the folder."""
     mark = foreign_folder.fill(tmp_path)
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "hesim_render.cli", "doctor"], cwd=tmp_path, capture_output=True, text=True,
+        [sys.executable, "-P", "-m", "hesim_render.cli", "info"], cwd=tmp_path, capture_output=True, text=True,
         env={**os.environ, "PYTHONPATH": str(HERE.parents[1]), "XDG_CACHE_HOME": str(tmp_path / "cache")},
     )  # fmt: skip
     assert not mark.exists(), mark.read_text()

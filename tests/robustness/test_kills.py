@@ -31,9 +31,9 @@ COMMANDS = {
     "isp": (["isp", "rec", "--out", "out", "--overwrite"], ["--no-denoise"], "out", "isp.json"),
     "aps": (["calibrate", "aps", "set", "--out", "c.yaml", "--report", "r.html"], None, None, None),
     "evs": (["calibrate", "evs", "set", "--out", "c.yaml", "--report", "r.html"], None, None, None),
-    "lab": (["lab", "reference-mono", "--out", "out", "--roi", "16x16", "--frames", "8", "--ticks", "500", "--dark-ms",
-             "1,5", "--lit-ms", "1,5", "--overwrite"], ["--seed", "8"], "out", "capture.yaml"),
-    "video": (["video", "v.npy", "--fps", "100", "--transfer", "srgb", *PIXELS], ["--seed", "8"], "out",
+    "lab": (["calibrate", "lab", "reference-mono", "--out", "out", "--roi", "16x16", "--frames", "8", "--ticks",
+             "500", "--dark-ms", "1,5", "--lit-ms", "1,5", "--overwrite"], ["--seed", "8"], "out", "capture.yaml"),
+    "video": (["simulate", "v.npy", "--set", "fps=100", "--set", "transfer=srgb", *PIXELS], ["--seed", "8"], "out",
               "recording.json"),
     "frames": (["export", "rec", "--format", "tiff", "--out", "out", "--overwrite"], None, "out", "frames.json"),
     "events": (["export", "rec", "--format", "evt3", "--out", "out.raw", "--overwrite"], None, "out.raw", None),
@@ -41,13 +41,14 @@ COMMANDS = {
     "cube": (["cube", "flat-field", "--sensor", "reference-mono", "--roi", "8x8", "--samples", "16", "--out", "out.exr",
               "--overwrite"], ["--seed", "8"], "out.exr", None),
     "simulate": (["simulate", "flat-field", *PIXELS], ["--seed", "8"], "out", "recording.json"),
-    "rerun": (["rerun", "rec", "--out", "out", "--overwrite"], None, "out", "recording.json"),
-    "expose": (["expose", "cube.npy", "--bands", "400:700:10", "--hold", "--lux", "500", *PIXELS], ["--seed", "8"],
+    "rerun": (["simulate", "rec", "--out", "out", "--overwrite"], None, "out", "recording.json"),
+    "expose": (["simulate", "cube.npy", "--set", "wavelength_nm=400:700:10", "--set", "beyond=hold", "--set",
+                "illuminance_lux=500", *PIXELS], ["--seed", "8"],
                "out", "recording.json"),
-    "study": (["study", "cfa", "small.yaml", "--out", "out", "--overwrite"], None, "out", "results.json"),
+    "study": (["study", "small.yaml", "--out", "out", "--overwrite"], None, "out", "results.json"),
     "measure": (["measure", "mtf", "rec", "--out", "out.csv", "--overwrite"], None, "out.csv", None),
-    "describe": (["sensor", "describe", "reference-mono", "--out", "out.png", "--overwrite"], None, "out.png", None),
-    "new": (["sensor", "new", "out.yaml", "--overwrite"], None, "out.yaml", None),
+    "describe": (["info", "reference-mono", "--out", "out.png", "--overwrite"], None, "out.png", None),
+    "new": (["new", "out.yaml", "--overwrite"], None, "out.yaml", None),
 }  # fmt: skip
 
 
@@ -285,8 +286,8 @@ def test_a_killed_run_goes_on(command, number, tmp_path):
     run = ["simulate", "rotating-star", "--sensor", "gen2", "--roi", "96x64", "--duration", "0.02"]
     given = {
         "simulate": [*run, "--out", "out"],
-        "rerun": ["rerun", "whole", "--out", "out"],
-        "run": ["run", "r.yaml", "--out", "r"],
+        "rerun": ["simulate", "whole", "--out", "out"],
+        "run": ["simulate", "r.yaml", "--out", "r"],
     }[command]
     (tmp_path / "r.yaml").write_text(
         "schema_version: 1\nname: r\nscene: rotating-star\nsensor: gen2\nroi: 96x64\nduration_s: 0.02\n"
@@ -309,13 +310,24 @@ def test_a_killed_video_goes_on(command, number, tmp_path):
     """Ended twice, it ends with the bytes of one that ran through without a journal."""
     pictures = np.random.default_rng(1).integers(0, 256, (300, 48, 64, 1), np.uint8).repeat(4, 1).repeat(4, 2)
     np.save(tmp_path / "v.npy", pictures.repeat(3, 3))
-    run = ["video", "v.npy", "--fps", "100", "--transfer", "srgb", "--primaries", "bt709", "--sensor", "gen2"]
+    run = [
+        "simulate",
+        "v.npy",
+        "--set",
+        "fps=100",
+        "--set",
+        "transfer=srgb",
+        "--set",
+        "primaries=bt709",
+        "--sensor",
+        "gen2",
+    ]
     run += ["--roi", "192x128"]
     (tmp_path / "r.yaml").write_text(
         "schema_version: 1\nname: r\nvideo: {file: v.npy, options: {fps: 100, transfer: srgb, primaries: bt709}}\n"
         "sensor: gen2\nroi: 192x128\n"
     )
-    given = [*run, "--out", "out"] if command == "video" else ["run", "r.yaml", "--out", "r"]
+    given = [*run, "--out", "out"] if command == "video" else ["simulate", "r.yaml", "--out", "r"]
     finish(tmp_path, [*run, "--out", "whole"])
     ended_twice(tmp_path, command, run, given, number, 500_000, how=("-c", SHORT_PARTS))
 
@@ -329,7 +341,7 @@ def test_a_killed_sweep_goes_on(tmp_path):
             "schema_version: 1\nname: x\ndescription: d\nscenes: [flat-field]\nsensors: [reference-mono]\nroi: 16x16\n"
             "duration_s: 0.02\nvary:\n  light.illuminance_lux: [1, 10, 100]\nseeds: [1, 2]\nmetrics: [electrons]\n"
         )
-    arguments = ["sweep", "s.yaml", "--out", "out"]
+    arguments = ["study", "s.yaml", "--out", "out"]
     began = time.monotonic()
     finish(tmp_path / "whole", arguments)
     seconds, rng, killed = time.monotonic() - began, random.Random(5), 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.specs.light import LightSpec
-from hesim_render.spectral.waveform import FOLLOW_TOLERANCE, Mains, Pwm, Table
+from hesim_render.spectral.waveform import FOLLOW_TOLERANCE, Mains, Pwm, TableWaveform
 
 TABLE_US, POWER = (200.0, 900.0, 1000.0, 3000.0, 4200.0), (1.0, 4.0, 2.0, 2.0, 0.5)
 WAVEFORMS = {
@@ -12,8 +12,8 @@ WAVEFORMS = {
     "mains to zero": Mains(60, 1.0, -200),
     "pwm": Pwm(1000, 0.3, 0),
     "pwm shifted": Pwm(333.3, 0.05, 100),
-    "table": Table(TABLE_US, POWER),
-    "table repeated": Table(TABLE_US, POWER, repeat=True),
+    "table": TableWaveform(TABLE_US, POWER),
+    "table repeated": TableWaveform(TABLE_US, POWER, repeat=True),
 }
 
 
@@ -74,13 +74,13 @@ def test_pwm_mean_equals_the_overlap_with_its_pulses():
 
 def test_time_means_are_one():
     for name, w in WAVEFORMS.items():
-        if isinstance(w, Table):
+        if isinstance(w, TableWaveform):
             np.testing.assert_allclose(w.mean(200.0, 4200.0), 1, rtol=1e-12)
             continue
         period_us = 1e6 / w.frequency_hz
         np.testing.assert_allclose(w.mean(123.0, 123.0 + 3 * period_us), 1, rtol=1e-12, err_msg=name)
-    assert Pwm(100, 1.0).is_constant and Mains(50, 0).is_constant and Table((0, 5, 9), (2, 2, 2)).is_constant
-    assert np.all(Table((0, 5, 9), (2, 2, 2)).mean([0, 3], [1, 100]) == 1)
+    assert Pwm(100, 1.0).is_constant and Mains(50, 0).is_constant and TableWaveform((0, 5, 9), (2, 2, 2)).is_constant
+    assert np.all(TableWaveform((0, 5, 9), (2, 2, 2)).mean([0, 3], [1, 100]) == 1)
     assert not any(w.is_constant for w in WAVEFORMS.values())
 
 

@@ -15,6 +15,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.specs.design import DesignSpec, read_design
 from hesim_render.specs.files import list_names
 from hesim_render.specs.filter_set import read_filter_set
+from hesim_render.specs.kinds import StudyKind, study_kind
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colour_difference import delta_e_2000, lab
 from hesim_render.spectral.physical import dye_transmittance, silicon_index, thin_film_transmittance
@@ -356,7 +357,7 @@ def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
     file = tmp_path / "small.yaml"
     file.write_text(json.dumps({**SMALL, "starts": 2 if steps > 5 else 1, "steps": steps, "demosaic": steps > 5}))
     with pytest.raises(SystemExit) as stop:
-        cli.main(["study", "design", str(file), "--out", str(tmp_path / "out")])
+        cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0, capsys.readouterr().err
     assert "against Nikon" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "design.json").read_text())
@@ -435,5 +436,7 @@ def test_bad_designs_are_one_clear_line(tmp_path, changes, message):
 
 
 def test_shipped_designs_load():
-    for name in list_names("design_specs"):
+    designs = [name for name in list_names("studies") if study_kind(name) is StudyKind.design]
+    assert len(designs) == 3
+    for name in designs:
         assert Problem(read_design(name)).starts()

@@ -16,6 +16,7 @@ from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 from hesim_render.sources.crosstalk import mixed
 from hesim_render.specs.files import list_names
 from hesim_render.specs.filter_set import read_filter_set, read_palette
+from hesim_render.specs.kinds import StudyKind, study_kind
 from hesim_render.specs.study import read_study
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.studies import Table, channel_noise, with_filter_set
@@ -135,7 +136,7 @@ def test_noise_aware_figures_are_those_of_the_matrix_with_the_least_squared_erro
         "illuminance_lux: [3, 1000]\nfigures: [colour, noise]\nnoise: {repeats: 2, patch_px: 8}\n"
     )
     with pytest.raises(SystemExit) as stop:
-        cli.main(["study", "cfa", str(spec), "--out", str(tmp_path / "out"), "--json"])
+        cli.main(["study", str(spec), "--out", str(tmp_path / "out"), "--json"])
     assert not stop.value.code
     rows = json.loads(capsys.readouterr().out)["rows"]
     at = {(row["illuminance_lux"], row["filter_set"]): row for row in rows}
@@ -157,7 +158,7 @@ def test_noise_aware_figures_are_those_of_the_matrix_with_the_least_squared_erro
     # only rgbw clips at 1000 lx, and says so in the tables
     assert [key for key, row in at.items() if row["white_clipped"]] == [(1000, "rgbw")]
     with pytest.raises(SystemExit):
-        cli.main(["study", "cfa", str(spec), "--out", str(tmp_path / "out"), "--overwrite"])
+        cli.main(["study", str(spec), "--out", str(tmp_path / "out"), "--overwrite"])
     told = capsys.readouterr().out
     head, *lines = told.splitlines()
     assert head.index("YSNR noise-aware") < head.index("YSNR noise-free matrix") and "Noise-free: with" in told
@@ -233,7 +234,9 @@ def test_every_shipped_filter_set_stands_before_a_sensor():
         sensor = set_on("eiger" if spec.evs_grid else "reference-bayer", name)
         assert sensor.spec.tile == spec.tile and (sensor.spec.evs is not None) == (spec.evs_grid is not None)
         assert channel_noise(sensor, filters_of(sensor, "aps"), 1000, 4).count.sum() <= 4
-    for name in list_names("study_specs"):
+    comparisons = [name for name in list_names("studies") if study_kind(name) is StudyKind.comparison]
+    assert len(comparisons) == 5
+    for name in comparisons:
         assert len(read_study(name).filter_sets) + len(read_study(name).sensors) > 2
     palette = read_palette("dyes")
     # the infrared cut keeps what cannot be rendered out
@@ -256,7 +259,7 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
         "surfaces: [colorchecker, patches.csv]\nnoise: {repeats: 2, patch_px: 8}\n"
     )
     with pytest.raises(SystemExit) as stop:
-        cli.main(["study", "cfa", str(file), "--out", str(tmp_path / "out")])
+        cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0
     assert "4 rows in" in capsys.readouterr().out
     names = {path.name for path in (tmp_path / "out").iterdir()}
@@ -272,7 +275,7 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
     HTMLParser().feed(page)
     # again: refused, then replaced, with the same figures
     with pytest.raises(SystemExit) as stop:
-        cli.main(["study", "cfa", str(file), "--out", str(tmp_path / "out")])
+        cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 2 and "exists" in capsys.readouterr().err
     before = (tmp_path / "out" / "results.csv").read_text()
     assert study(file, out=tmp_path / "out", overwrite=True).to_csv() == before
@@ -294,7 +297,7 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
     )
     for number, more in enumerate(commands):
         with pytest.raises(SystemExit) as stop:
-            cli.main(["study", "cfa", str(file), "--out", str(tmp_path / f"more{number}"), *more])
+            cli.main(["study", str(file), "--out", str(tmp_path / f"more{number}"), *more])
         told = capsys.readouterr()
         assert stop.value.code == 0 if number == 0 else "cube.npy: wavelength_nm: says no wavelengths" in told.err
     rows = json.loads((tmp_path / "more0" / "results.json").read_text())["rows"]
@@ -304,7 +307,7 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
 BAD = [
     ({"filter_sets": ["rccc"]}, r"filter_sets\.0: rccc on reference-bayer: its filters span 2 of the 3 dimensions"),
     ({"filter_sets": ["rggb", "mono"]}, r"filter_sets\.1: mono on reference-bayer: its filters span 1 of"),
-    ({"filter_sets": ["rgb"]}, r"no filter_set named 'rgb'; shipped are .*did you mean"),
+    ({"filter_sets": ["rgb"]}, r"no filter set named 'rgb'; shipped are .*did you mean"),
     ({"filter_sets": ["cygm"], "palette": "nikon-5100"}, r"the palette 'nikon-5100' has no filter 'cyan'"),
     ({"filter_sets": ["quad-bayer-white-event"]}, r"the set has event pixels, and the sensor has no 'evs' section"),
     ({"filter_sets": ["rggb", "rggb"]}, r"two have the name 'rggb'"),

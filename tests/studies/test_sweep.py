@@ -12,11 +12,12 @@ from hesim_render import cli
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.isp import Pipeline, process
 from hesim_render.sources.render.audit.audit import Audit
-from hesim_render.specs.files import data_folder, list_names
+from hesim_render.specs.files import data_folder
+from hesim_render.specs.kinds import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep
-from hesim_render.studies.sweep_metrics import Figures
+from hesim_render.studies.sweep_metrics import RunFigures
 
 BASE = {
     "schema_version": 1, "name": "test", "scenes": ["flat-field"], "sensors": ["reference-mono"], "roi": "32x24",
@@ -132,7 +133,9 @@ def test_keys_of_the_isp_are_varied_on_one_recording(tmp_path, monkeypatch):
     assert row["picture_psnr_db"] == pytest.approx(expected, rel=1e-6)
     assert 0 < row["picture_ssim"] < 1 and row["picture_delta_e"] > 0
     # the noise-free picture is never smoothed
-    reduced = Figures(rec, Pipeline.of("black_level", "white_balance", "demosaic", "noise_reduction", "colour_matrix"))
+    reduced = RunFigures(
+        rec, Pipeline.of("black_level", "white_balance", "demosaic", "noise_reduction", "colour_matrix")
+    )
     plain_steps = Pipeline.of("black_level", "white_balance", "demosaic", "colour_matrix")
     clean = (64 + 0.25 * rec.frames[0].electrons_mean).astype(np.float32)
     np.testing.assert_allclose(reduced.clean_picture, process(clean, rec.mosaic, plain_steps), atol=1e-6)
@@ -182,7 +185,7 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
         ({"vary": {"isp.demosaic.method": ["linear"]}}, "for sweeps of recordings"),
         ({"vary": {"filter_set": ["rggb"]}}, "run with filter_set=rggb.*unknown key"),
         ({"scenes": ["flat-field"]}, "scenes: not in a sweep of a study"),
-        ({"study": "five-cfa"}, "no study_spec named 'five-cfa'.*did you mean"),
+        ({"study": "five-cfa"}, "no study named 'five-cfa'.*did you mean"),
     ):
         with pytest.raises(SpecError, match=message) as caught:
             sweep({**spec, **changes}, out=tmp_path / "bad")
@@ -192,12 +195,11 @@ def test_a_study_is_swept_over_its_keys_and_those_of_its_sensors(tmp_path, monke
 def test_ranges_and_files(tmp_path, capsys):
     assert RangeSpec(first=1, last=1000, count=4, scale="log").values() == [1, 10, 100, 1000]
     assert RangeSpec(first=0, last=1, count=5).values() == [0, 0.25, 0.5, 0.75, 1]
-    for name in list_names("sweep_specs"):
-        assert read_sweep(name).vary
+    assert study_kind("light-and-exposure") is StudyKind.sweep and read_sweep("light-and-exposure").vary
     file = tmp_path / "sweep.yaml"
     file.write_text(json.dumps({**BASE, "vary": {}, "seeds": [5], "keep": True, "options": {"samples": 512}}))
     with pytest.raises(SystemExit) as stop:
-        cli.main(["sweep", str(file), "--out", str(tmp_path / "out")])
+        cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0 and "1 runs in" in capsys.readouterr().out
     (kept,) = (tmp_path / "out" / "recordings").iterdir()
     assert hr.Recording.load(kept).manifest["seed"] == 5
@@ -212,7 +214,7 @@ def test_runs_that_miss_their_quality_are_told(tmp_path, capsys, monkeypatch):
     file.write_text(json.dumps({**BASE, **changes, "options": {"quality": 8}}))
     for _ in range(2):
         with pytest.raises(SystemExit) as stop:
-            cli.main(["sweep", str(file), "--out", str(out)])
+            cli.main(["study", str(file), "--out", str(out)])
         told = capsys.readouterr().out
         assert stop.value.code == 3 and "  NOT MET: 2 of 2 runs are worse than asked for (row 1, row 2)" in told
     assert [row["audit"] for row in json.loads((out / "results.json").read_text())["rows"]] == ["not met"] * 2

@@ -19,7 +19,7 @@ from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.twin import make_twin
 from hesim_render.twin.comparison import Check
 from hesim_render.twin.figures import bin_edges, counts_in, spectrum
-from hesim_render.twin.simulated import Bench
+from hesim_render.twin.simulated import TwinBench
 
 REAL = os.environ.get("HESIM_EMVA1288_CCD")
 #: All that the twin's model has, at once.
@@ -89,7 +89,9 @@ def test_a_wrong_twin_fails_where_it_is_wrong(captures, tmp_path, monkeypatch, n
 
 def test_the_command_tells_each_check_and_its_status(captures, tmp_path):
     out = tmp_path / "out"
-    result = CliRunner().invoke(app, ["twin", str(captures), "--out", str(out), "--seed", "3", "--json", "--quiet"])
+    result = CliRunner().invoke(
+        app, ["calibrate", "twin", str(captures), "--out", str(out), "--seed", "3", "--json", "--quiet"]
+    )
     assert result.exit_code == 0, result.output
     facts = json.loads(result.stdout)
     assert facts["passed"] and len(facts["checks"]) == 20
@@ -127,7 +129,7 @@ def test_the_bench_has_the_light_of_the_captures(captures):
     """Electrons: quantum efficiency times photons, with those of the longer exposure; none in the dark."""
     result = evaluate(read_pair_set(captures))
     assert result.curve.offset == pytest.approx(CAMERA.photons(CAMERA.late_us), rel=0.6)
-    bench = Bench(None, result, np.array([[1.0, 0.9]]), 1)
+    bench = TwinBench(None, result, np.array([[1.0, 0.9]]), 1)
     per_photon = result.responsivity.slope / result.gain.slope
     expected = per_photon * (700.0 + result.curve.offset) * np.array([[1.0, 0.9]])
     np.testing.assert_allclose(bench.electrons(700.0), expected, rtol=1e-12)

@@ -42,7 +42,7 @@ BETA_TERMS = ("read", "shot", "dark_current", "shot", "shot", "dark_current")
 
 
 @dataclass(frozen=True)
-class Pixels:
+class PixelProperties:
     """Properties of each pixel that the formulas need; numbers or arrays.
 
     Attributes
@@ -184,7 +184,12 @@ def physical_beta(system_gain_dn_per_e: float, read_noise_e: float, dark_e_per_s
 
 
 def physical_value(
-    electrons: Values, exposure_s: Values, pixels: Pixels, system_gain_dn_per_e: float, read_noise_e: float, shot: bool
+    electrons: Values,
+    exposure_s: Values,
+    pixels: PixelProperties,
+    system_gain_dn_per_e: float,
+    read_noise_e: float,
+    shot: bool,
 ) -> PixelValue:
     """Value of a pixel in the physical form. Light and dark current together are one count of K DN per electron.
 
@@ -211,7 +216,7 @@ def physical_value(
 def calibrated_value(
     electrons: Values,
     exposure_s: Values,
-    pixels: Pixels,
+    pixels: PixelProperties,
     system_gain_dn_per_e: float,
     full_scale_dn: float,
     xp: Namespace,

@@ -20,7 +20,7 @@ from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps import formulas
 from hesim_render.pixels.aps.fixed_pattern import FixedPattern
-from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, Pixels, PixelValue
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, PixelProperties, PixelValue
 from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
 from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
 from hesim_render.pixels.terms import switched_off
@@ -135,22 +135,24 @@ class ApsNoise(PlainState):
         return np.array(self.spec.beta, dtype=np.float64) * [term not in self.off for term in BETA_TERMS]
 
     @property
-    def pixels(self) -> Pixels:
+    def pixels(self) -> PixelProperties:
         """Properties of each pixel that the formulas need: maps [row, col] of the region, or numbers where all are
         equal.
         """
         beta = None if self.beta is None else tuple(np.moveaxis(self.layout.tiled(self.beta), -1, 0))
         maps = self.fixed_pattern
-        return Pixels(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
+        return PixelProperties(maps.response, maps.dark_e_per_s, maps.offset_dn, beta)
 
-    def _nominal_pixel(self, position: tuple[int, int] | None) -> Pixels:
+    def _nominal_pixel(self, position: tuple[int, int] | None) -> PixelProperties:
         """A pixel at a tile position, without any fixed pattern."""
         known = self.layout.spec.positions("aps")
         chosen = known[0] if position is None else tuple(position)
         if chosen not in known:
             raise RangeError("position", position, "(tile_row, tile_col) of a frame pixel of the tile")
         dark = 0.0 if "dark_current" in self.off else self.spec.dark_current_now_e_per_s
-        return Pixels(1.0, dark, self.spec.black_level_dn, None if self.beta is None else tuple(self.beta[chosen]))
+        return PixelProperties(
+            1.0, dark, self.spec.black_level_dn, None if self.beta is None else tuple(self.beta[chosen])
+        )
 
     # ---- the model --------------------------------------------------------------------------------
 
@@ -171,7 +173,7 @@ class ApsNoise(PlainState):
                     )
         return ""
 
-    def value(self, electrons: Values, exposure_s: Values, pixels: Pixels, xp: Namespace) -> PixelValue:
+    def value(self, electrons: Values, exposure_s: Values, pixels: PixelProperties, xp: Namespace) -> PixelValue:
         """Law of the pixels' values, without N_FP and row noise.
 
         Parameters
@@ -200,7 +202,7 @@ class ApsNoise(PlainState):
 
     def _on_host(
         self, electrons: NDArray[np.float64], exposure_us: float, position: tuple[int, int] | None
-    ) -> tuple[PixelValue, Pixels]:
+    ) -> tuple[PixelValue, PixelProperties]:
         """Law of the values of an image, or of a number at one position; and the properties of the pixels.
 
         Parameters

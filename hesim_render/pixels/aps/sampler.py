@@ -16,7 +16,7 @@ from hesim_render.core.rng import Stream, philox
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.fixed_pattern import FixedPattern
-from hesim_render.pixels.aps.formulas import Pixels
+from hesim_render.pixels.aps.formulas import PixelProperties
 from hesim_render.pixels.aps.poisson import poisson
 from hesim_render.pixels.arrays import take, to_device
 from hesim_render.pixels.normal import normal_pair
@@ -43,11 +43,11 @@ class DeviceMaps:
             uniform = np.all(beta == beta[:1, :1], axis=(0, 1))
             tiled = layout.tiled(beta)
             terms = tuple(to_device(beta[0, 0, k] if uniform[k] else tiled[..., k]) for k in range(6))
-        self._pixels = Pixels(
+        self._pixels = PixelProperties(
             to_device(maps.response), to_device(maps.dark_e_per_s), to_device(maps.offset_dn), terms
         )  # fmt: skip
 
-    def pixels(self, index: UInt32) -> Pixels:
+    def pixels(self, index: UInt32) -> PixelProperties:
         """Properties of the pixels `index` of the region. As many indices as pixels means all pixels in their order."""
         import drjit as dr
 
@@ -59,7 +59,7 @@ class DeviceMaps:
 
         own = self._pixels
         beta = None if own.beta is None else tuple(map(entries, own.beta))
-        return Pixels(entries(own.response), entries(own.dark_e_per_s), entries(own.offset_dn), beta)
+        return PixelProperties(entries(own.response), entries(own.dark_e_per_s), entries(own.offset_dn), beta)
 
     @cached_property
     def _keys(self) -> UInt32:

@@ -18,7 +18,7 @@ _ROOM = 2
 CAUSE, EFFECT = 0, 1
 
 
-class Steps(NamedTuple):
+class PixelSteps(NamedTuple):
     """Steps of pixels, [n] each, in order of time.
 
     Parameters
@@ -62,7 +62,9 @@ class Balance:
         held = np.arange(self._waiting.shape[2]) < np.abs(self._count[side, pixel])[:, None]
         return self._waiting[side, pixel][held]
 
-    def take(self, causes: Steps, effects: Steps) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def take(
+        self, causes: PixelSteps, effects: PixelSteps
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Take the next steps of both sequences.
 
         Parameters
@@ -155,7 +157,7 @@ class LastSteps:
         """True for pixels of which no step waits, and that are in the dead time of neither sequence."""
         return ~self._sign[:, pixel].any(axis=0) & (self._ready_us[pixel] <= t_us)
 
-    def take(self, causes: Steps, effects: Steps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def take(self, causes: PixelSteps, effects: PixelSteps) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Take the next steps of both sequences, as `Balance.take`. Returns numbers of the steps of each new pair."""
         pairs: list[tuple[NDArray, NDArray]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
         for own, (t_us, pixel, sign, number) in _rounds(causes, effects):
@@ -170,9 +172,9 @@ class LastSteps:
         return cause, effect
 
 
-def _rounds(causes: Steps, effects: Steps) -> Iterator[tuple[int, Steps]]:
+def _rounds(causes: PixelSteps, effects: PixelSteps) -> Iterator[tuple[int, PixelSteps]]:
     """The steps of both in rounds, in order of time; each has at most one step of a pixel, all of one sequence."""
-    every = Steps(*(np.concatenate(values) for values in zip(causes, effects, strict=True)))
+    every = PixelSteps(*(np.concatenate(values) for values in zip(causes, effects, strict=True)))
     if every.pixel.size == 0:
         return
     side = np.repeat([CAUSE, EFFECT], [causes.pixel.size, effects.pixel.size])
@@ -185,4 +187,4 @@ def _rounds(causes: Steps, effects: Steps) -> Iterator[tuple[int, Steps]]:
         for own in (CAUSE, EFFECT):
             which = here[side[here] == own]
             if which.size:
-                yield own, Steps(*(values[which] for values in every))
+                yield own, PixelSteps(*(values[which] for values in every))

@@ -30,7 +30,7 @@ _AHEAD = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class EventDefects:
+class PixelDefects:
     """Defects of the event pixels of a region.
 
     Attributes
@@ -50,7 +50,7 @@ class EventDefects:
     firing_share: NDArray[np.float64]
     change_hz: NDArray[np.float64]
 
-    def without(self, term: str) -> EventDefects:
+    def without(self, term: str) -> PixelDefects:
         """The same defects without the stuck (``stuck``), hot (``hot``) or flickering (``flickering``) pixels."""
         if term == "stuck":
             return replace(self, stuck=self.stuck[:0])
@@ -62,7 +62,7 @@ class EventDefects:
         return self.stuck.size + self.place.size > 0
 
 
-def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
+def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> PixelDefects:
     """Defects of a device: measured where a calibration has them, drawn from the device seed otherwise.
 
     Parameters
@@ -78,7 +78,7 @@ def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> EventDefects:
     return _drawn(spec.defects or EventDefectSpec(), key, device_seed)
 
 
-def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> EventDefects:
+def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> PixelDefects:
     if spec.stuck_share + spec.hot_share + spec.flickering_share == 0:
         number = np.ones(key.size)
     else:
@@ -90,7 +90,7 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
     firing, quiet = spec.flickering_firing_s or 1.0, spec.flickering_quiet_s or 1.0
     ones = np.ones(flickering.size)
     place = np.concatenate([hot, flickering])
-    return EventDefects(
+    return PixelDefects(
         stuck=stuck,
         place=place,
         key=key[place],
@@ -103,12 +103,12 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
     )
 
 
-def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32]) -> EventDefects:
+def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32]) -> PixelDefects:
     stuck = np.flatnonzero(maps["defect"].ravel() == Defect.STUCK)
     names = ("on_hz", "off_hz", "firing_share", "change_hz")
     values = np.stack([maps[f"defect_{name}"].ravel() for name in names]).astype(np.float64)
     place = np.flatnonzero((values[:2] > 0).any(axis=0))
-    return EventDefects(stuck, place, key[place], *values[:, place])
+    return PixelDefects(stuck, place, key[place], *values[:, place])
 
 
 class DefectEvents:
@@ -122,7 +122,7 @@ class DefectEvents:
         are limited.
     """
 
-    def __init__(self, defects: EventDefects, seed: int, tick_s: float | None = None) -> None:
+    def __init__(self, defects: PixelDefects, seed: int, tick_s: float | None = None) -> None:
         self._defects = defects
         total = defects.on_hz + defects.off_hz
         self._on_part = defects.on_hz / np.maximum(total, 1e-300)

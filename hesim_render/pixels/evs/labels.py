@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from hesim_render.core.device_types import Float
 from hesim_render.pixels.evs.events import Label, LabelBlock, Lost, no_events
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.partners import Partners, Told
+from hesim_render.pixels.evs.partners import Partners, StepLabels
 from hesim_render.pixels.evs.stage import EvsStage
 
 #: Terms that the noise-free stream lacks; the spread of thresholds besides in the nominal ones.
@@ -85,21 +85,21 @@ class Labeller:
         number = np.where(counted, before + np.cumsum(counted) - 1, -1)
         self._events += int(np.count_nonzero(counted))
         found = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK]).astype(np.uint8)
-        told = Told(no_events(), np.empty(0, np.int64), np.empty(0, np.uint8))
+        step = StepLabels(no_events(), np.empty(0, np.int64), np.empty(0, np.uint8))
         if self._partners is not None:
-            told = self._partners.take(stage, electrons, events, origin, number)
+            step = self._partners.take(stage, electrons, events, origin, number)
         else:
             own = clean if self._own is None else self._own.step(electrons, stage.t_us)
             place = self._key(events)
             found[np.isin(place, self._key(own))] = Label.MISMATCH
             found[np.isin(place, self._key(clean))] = Label.SIGNAL
-        found, new = found[counted], told.changed >= before
-        found[told.changed[new] - before] = told.changed_to[new]
-        unread, asleep = self._in_run(events[~through]), self._in_run(told.asleep)
+        found, new = found[counted], step.changed >= before
+        found[step.changed[new] - before] = step.changed_to[new]
+        unread, asleep = self._in_run(events[~through]), self._in_run(step.asleep)
         lost = np.concatenate([unread, asleep])
         where = np.repeat(np.array([Lost.READOUT, Lost.REFRACTORY], np.uint8), [unread.size, asleep.size])
         order = np.argsort(lost["t_us"], kind="stable")
-        changes = told.changed[~new], told.changed_to[~new]
+        changes = step.changed[~new], step.changed_to[~new]
         self._block.append(LabelBlock(found, *changes, lost[order], where[order], self._in_run(clean)))
 
     def taken(self) -> LabelBlock:

@@ -22,7 +22,7 @@ from hesim_render.core.rng import Stream, device_normal
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
-from hesim_render.pixels.evs.defects import EventDefects, defects_of
+from hesim_render.pixels.evs.defects import PixelDefects, defects_of
 from hesim_render.pixels.evs.formulas import Coefficients
 from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
@@ -99,7 +99,7 @@ class EvsNoise(PlainState):
         return leak if leak is not None and leak.process == "drift" and "leak" not in self.off else None
 
     @cached_property
-    def defects(self) -> EventDefects:
+    def defects(self) -> PixelDefects:
         """Stuck, hot and flickering pixels of this device."""
         found = defects_of(self.spec, self.layout, self.device_seed)
         for term in self.off.intersection(_DEFECTS):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.pixels.evs.balance import Steps
+from hesim_render.pixels.evs.balance import PixelSteps
 from hesim_render.pixels.evs.on_device import Map
 
 #: Levels are float32: thresholds that differ by less are the same, ln units.
@@ -53,7 +53,7 @@ class NominalSteps:
         """Numbers of the steps that are not decided yet."""
         return self._waiting.number
 
-    def take(self, steps: Steps, reference: NDArray[np.float32], level: NDArray[np.float32]) -> NDArray[np.int64]:
+    def take(self, steps: PixelSteps, reference: NDArray[np.float32], level: NDArray[np.float32]) -> NDArray[np.int64]:
         """Take all steps between two samples.
 
         Parameters

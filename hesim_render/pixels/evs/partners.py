@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
-from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, Steps
+from hesim_render.pixels.evs.balance import CAUSE, EFFECT, Balance, LastSteps, PixelSteps
 from hesim_render.pixels.evs.events import Label, Origin
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.nominal import NominalSteps
@@ -24,8 +24,8 @@ from hesim_render.pixels.evs.stage import EvsStage
 _FEW = 4096
 
 
-class Told(NamedTuple):
-    """What a step of the stage has told.
+class StepLabels(NamedTuple):
+    """Labels that a step of the stage has decided.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Partners:
         events: NDArray[np.void],
         origin: NDArray[np.int8],
         number: NDArray[np.int64],
-    ) -> Told:
+    ) -> StepLabels:
         """Take one step of the stage.
 
         Parameters
@@ -93,15 +93,15 @@ class Partners:
         self._steps += own.size
         self._stepped[steps.pixel] = self._stepped[effects.pixel] = True
         if self._with_dead_time is not None:
-            told = self._with_dead_time.take(stage, electrons, stage.t_us, effects, self._verdicts)
+            decided = self._with_dead_time.take(stage, electrons, stage.t_us, effects, self._verdicts)
         else:
             given = undecided = np.empty(0, np.int64)
             if self._nominal is not None and (steps.pixel.size or self._nominal.undecided.size):
                 given = self._nominal.take(steps, self._own.reference.numpy(), self._own.level.numpy())
             undecided = undecided if self._nominal is None else self._nominal.undecided
-            told = self._verdicts.take(cause, effect, given, undecided, self._of_events)
+            decided = self._verdicts.take(cause, effect, given, undecided, self._of_events)
         self._share_reference(stage, stage.t_us, is_first)
-        return Told(asleep, *told)
+        return StepLabels(asleep, *decided)
 
     def _share_reference(self, stage: EvsStage, t_us: int, is_first: bool) -> None:
         """Let noise-free pixels compare with the level of the real one where no step of either waits for its partner.
@@ -155,7 +155,7 @@ class _WithDeadTime:
         self._stepped = np.ones(pixels, np.bool_)
 
     def take(
-        self, stage: EvsStage, electrons: Float, t_us: int, effects: Steps, verdicts: _Verdicts
+        self, stage: EvsStage, electrons: Float, t_us: int, effects: PixelSteps, verdicts: _Verdicts
     ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         own = self._own.step(electrons, t_us)
         steps = as_steps(own, self._steps + np.arange(own.size), self._cols)
@@ -214,16 +214,16 @@ class _Verdicts:
         self._given = np.concatenate([self._given, given])
         cause, effect = self._open
         signal = np.isin(cause, self._given)
-        told = signal | (np.arange(cause.size) >= old)
+        decided = signal | (np.arange(cause.size) >= old)
         self._open, self._given = self._open[:, ~signal], self._given[~np.isin(self._given, cause[signal])]
         if self._open.shape[1] + self._given.size > self._enough:
             self._open = self._open[:, np.isin(self._open[0], undecided)]
             self._given = self._given[np.isin(self._given, pairs.waiting(CAUSE))]
             self._enough = 2 * (self._open.shape[1] + self._given.size) + _FEW
-        return effect[told], np.where(signal[told], Label.SIGNAL, Label.MISMATCH).astype(np.uint8)
+        return effect[decided], np.where(signal[decided], Label.SIGNAL, Label.MISMATCH).astype(np.uint8)
 
 
-def as_steps(events: NDArray[np.void], number: NDArray[np.int64], cols: int) -> Steps:
+def as_steps(events: NDArray[np.void], number: NDArray[np.int64], cols: int) -> PixelSteps:
     """Events as steps, with numbers that name them; `cols` of the event grid."""
     pixel = events["y"].astype(np.int64) * cols + events["x"]
-    return Steps(events["t_us"], pixel, events["polarity"].astype(np.int64), number)
+    return PixelSteps(events["t_us"], pixel, events["polarity"].astype(np.int64), number)

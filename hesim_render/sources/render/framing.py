@@ -111,9 +111,9 @@ def warn_if_unseen(spec: SceneSpec, view: View, duration_us: float) -> None:
         return
     file = f"{spec.file}: " if spec.file is not None else ""
     if all(seen.inside == 0 for seen in found):
-        told = "no part of the target is in the picture at any time of the run (see --look)"
+        told = "no part of the target is in the picture at any time of the run (see --framing)"
     elif all(seen.from_behind for seen in found if seen.inside > 0):
-        told = "the camera sees the target from behind, where it is black (see --look)"
+        told = "the camera sees the target from behind, where it is black (see --framing)"
     else:
         return
     warnings.warn(f"{file}{told}", HesimWarning, stacklevel=3)

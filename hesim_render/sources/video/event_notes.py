@@ -1,4 +1,4 @@
-"""What the rate of a video's pictures does to events, told for the way in which the pixels compare."""
+"""What the rate of a video's pictures does to events, for the way in which the pixels compare."""
 
 from __future__ import annotations
 

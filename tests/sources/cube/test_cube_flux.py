@@ -153,8 +153,9 @@ def test_recordings_of_cubes_have_frames_and_events(tmp_path, capsys):
     np.testing.assert_allclose(still.frames[0].electrons_mean, image(flux) * aps.exposure_us * 1e-6, rtol=1e-4)
     with pytest.raises(SystemExit) as stop:
         cli.main([
-            "expose", str(path), "--sensor", "gen2", "--roi", "64x48", "--out", str(tmp_path / "rec"), "--lux", "500",
-            "--bands", "360:830:10", "--pan", "300,0", "--rotate", "20", "--zoom", "1.1", "--duration", "0.12",
+            "simulate", str(path), "--sensor", "gen2", "--roi", "64x48", "--out", str(tmp_path / "rec"), "--set",
+            "illuminance_lux=500", "--set", "wavelength_nm=360:830:10", "--set", "pan_px_per_s=[300, 0]", "--set",
+            "rotation_deg_per_s=20", "--set", "zoom_per_s=1.1", "--duration", "0.12",
         ])  # fmt: skip
     shown = capsys.readouterr()
     assert stop.value.code == 0 and "cube.npy seen by gen2" in shown.out, shown.err

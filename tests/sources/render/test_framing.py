@@ -1,4 +1,4 @@
-"""What is in the picture, told before anything is rendered, and shown by ``--look``."""
+"""What is in the picture, told before anything is rendered, and shown by ``--framing``."""
 
 import time
 import warnings
@@ -132,7 +132,9 @@ def test_glass_and_metal_are_shown_in_grey(material):
 def test_an_option_shows_darkness_and_moved_cameras_and_writes_one_picture(tmp_path, capsys):
     def run(*options):
         with pytest.raises(SystemExit) as caught:
-            cli.main(["simulate", "dark", "--sensor", "davis346", "--look", "--out", str(tmp_path / "dark"), *options])
+            cli.main(
+                ["simulate", "dark", "--sensor", "davis346", "--framing", "--out", str(tmp_path / "dark"), *options]
+            )
         return caught.value.code, capsys.readouterr()
 
     code, printed = run()

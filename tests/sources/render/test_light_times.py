@@ -9,15 +9,15 @@ from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.light_times import LightTimes
-from hesim_render.spectral.waveform import Mains, Pwm, Table
+from hesim_render.spectral.waveform import Mains, Pwm, TableWaveform
 
 WAVEFORMS = {
     "mains": Mains(50, 0.9, 40),
     "full mains": Mains(50, 1.0, 0),
     "pwm": Pwm(500, 0.25, 33),
     "fast pwm": Pwm(20_000, 0.1, 0),
-    "repeating table": Table((0, 100, 300, 1000), (1, 5, 0, 2), True),
-    "table": Table((0, 100, 300, 1000), (1, 5, 0, 2), False),
+    "repeating table": TableWaveform((0, 100, 300, 1000), (1, 5, 0, 2), True),
+    "table": TableWaveform((0, 100, 300, 1000), (1, 5, 0, 2), False),
 }
 
 

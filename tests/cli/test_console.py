@@ -91,8 +91,18 @@ def test_a_long_exact_run_has_to_be_wanted(capsys, tmp_path):
 
 def test_a_dry_run_of_a_video(capsys, tmp_path):
     np.save(tmp_path / "v.npy", np.full((4, 12, 16), 90, np.uint8))
-    words = ["video", tmp_path / "v.npy", "--sensor", "reference-mono", "--roi", "16x12", "--fps", "100", "--out"]
-    words += [tmp_path / "o", "--transfer", "srgb", "--primaries", "bt709"]
+    words = [
+        "simulate",
+        tmp_path / "v.npy",
+        "--sensor",
+        "reference-mono",
+        "--roi",
+        "16x12",
+        "--set",
+        "fps=100",
+        "--out",
+    ]
+    words += [tmp_path / "o", "--set", "transfer=srgb", "--set", "primaries=bt709"]
     told = json.loads(call(capsys, *words, "--dry-run", "--json")[1])
     assert told["estimate"]["pictures"] == 4 and told["dry_run"] is True
     assert [path.name for path in tmp_path.iterdir()] == ["v.npy"]
@@ -100,34 +110,37 @@ def test_a_dry_run_of_a_video(capsys, tmp_path):
 
 def test_a_dry_run_of_a_cube(capsys, tmp_path):
     np.save(tmp_path / "c.npy", np.full((12, 16, 31), 0.3, np.float32))
-    words = [
-        "expose",
-        tmp_path / "c.npy",
-        "--bands",
-        "400:700:10",
-        "--hold",
-        "--lux",
-        "500",
-        "--sensor",
-        "reference-mono",
-    ]
+    words = ["simulate", tmp_path / "c.npy", "--set", "wavelength_nm=400:700:10", "--set", "beyond=hold"]
+    words += ["--set", "illuminance_lux=500", "--sensor", "reference-mono"]
     words += ["--roi", "16x12", "--duration", "0.1", "--out", tmp_path / "o"]
     told = json.loads(call(capsys, *words, "--dry-run", "--json")[1])
     # 30 frames a second and 1000 comparisons a second
     assert told["dry_run"] is True and told["estimate"]["text"] == "3 frames and 100 samples of event pixels; no rays"
     assert [path.name for path in tmp_path.iterdir()] == ["c.npy"]
-    assert "pan" in fails(capsys, *words, "--pan", "x", "--dry-run")
+    assert "pan" in fails(capsys, *words, "--set", "pan_px_per_s=x", "--dry-run")
     assert json.loads(call(capsys, *words, "--json")[1])["counts"]["frames"] == 3
 
 
 def test_a_dry_run_of_a_lab(capsys, tmp_path):
-    words = ["lab", "reference-mono", "--roi", "16x12", "--frames", "8", "--ticks", "500", "--out", tmp_path / "o"]
+    words = [
+        "calibrate",
+        "lab",
+        "reference-mono",
+        "--roi",
+        "16x12",
+        "--frames",
+        "8",
+        "--ticks",
+        "500",
+        "--out",
+        tmp_path / "o",
+    ]
     words += ["--dark-ms", "1,5", "--lit-ms", "1,5,9", "--dry-run", "--json"]
     told = json.loads(call(capsys, *words)[1])
     # 5 exposures of 8 frames of 192 pixels; 500 ticks lit and dark, and 50 at each of 21 contrasts of both signs
     assert told["estimate"]["text"] == "40 frames, 1.54e-05 GB; 3100 comparisons of event pixels"
     assert told["dry_run"] is True and list(tmp_path.iterdir()) == []
-    words[1] = "imx636"
+    words[2] = "imx636"
     assert "event pixels for" in json.loads(call(capsys, *words)[1])["estimate"]["text"]
     assert "frames is 2" in fails(capsys, *words, "--frames", "2")
     assert list(tmp_path.iterdir()) == []
@@ -135,8 +148,8 @@ def test_a_dry_run_of_a_lab(capsys, tmp_path):
 
 def test_lists_as_json_agree_with_the_files(capsys):
     """Only some keys of each file are parsed; the whole files say the same."""
-    for kind in ("scenes", "sensors", "study_specs", "filter_sets"):
-        found = {row["name"]: row for row in json.loads(call(capsys, "list", kind, "--json")[1])[kind]}
+    for kind in ("scenes", "sensors", "studies", "filter_sets"):
+        found = {row["name"]: row for row in json.loads(call(capsys, "info", kind, "--json")[1])[kind]}
         assert list(found) == list_names(kind)
         for name in list_names(kind)[:: 7 if kind == "scenes" else 1]:
             file = data_folder(kind) / f"{name}.yaml"
@@ -144,13 +157,13 @@ def test_lists_as_json_agree_with_the_files(capsys):
             assert found[name]["description"] == whole.get("description", "")
             keys = ("geometry", "tile", "pixels", "evs_grid")
             assert read_keys(file, keys) == {key: whole[key] for key in keys if key in whole}
-    assert found and json.loads(call(capsys, "list", "sensors", "--json")[1])["sensors"][2]["events_px"] == [128, 128]
+    assert found and json.loads(call(capsys, "info", "sensors", "--json")[1])["sensors"][2]["events_px"] == [128, 128]
 
 
 def test_listing_and_completing_load_no_renderer():
     """Names are completed while somebody waits: 20 scenes were once parsed for it, with 3 s of imports."""
     code = (
-        "import sys; from hesim_render.cli import main\ntry: main(['list', 'scenes'])\nexcept SystemExit: pass\n"
+        "import sys; from hesim_render.cli import main\ntry: main(['info', 'scenes'])\nexcept SystemExit: pass\n"
         "from hesim_render.cli.options import names_of; print(names_of('sensors')('im'))\n"
         "print([m for m in ('mitsuba', 'scipy', 'colour', 'numpy') if m in sys.modules])"
     )
@@ -171,11 +184,11 @@ def test_the_shell_completes_names(shell, answer):
 
 def test_what_is_printed_moves_no_cursor_and_is_json(capsys):
     """Names of files and texts in them are of others."""
-    from hesim_render.cli.told import Told
+    from hesim_render.cli.console import Console
 
     name = "a\x1b[2Jb\x9b1mc\u202ed\ud800 ö"
-    Told().result(f"made {name}\nof x", {})
+    Console().result(f"made {name}\nof x", {})
     assert capsys.readouterr().out == "made a\\x1b[2Jb\\x9b1mc\\u202ed\\ud800 ö\nof x\n"
-    Told(as_json=True).result("", {"name": name})
+    Console(as_json=True).result("", {"name": name})
     text = capsys.readouterr().out
     assert json.loads(text)["name"] == name and text.replace("\n", "").isprintable()

@@ -1,4 +1,4 @@
-"""What a command tells: text for people, one JSON object for programs, or nothing (``--json``, ``--quiet``)."""
+"""What a command prints: text for people, one JSON object for programs, or nothing (``--json``, ``--quiet``)."""
 
 from __future__ import annotations
 
@@ -20,9 +20,14 @@ from hesim_render.core.progress import ProgressReport, progress_report, silent_r
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
 
-Json = Annotated[bool, typer.Option("--json", help="print the result as one JSON object, and nothing else, on stdout")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="print errors and notes alone")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="check everything and print the estimate; write nothing")]
+#: Options of every command that makes something; `--help-all` shows them.
+Json = Annotated[
+    bool, typer.Option("--json", help="print the result as one JSON object, and nothing else, on stdout", hidden=True)
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="print errors and notes alone", hidden=True)]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="check everything and print the estimate; write nothing", hidden=True)
+]
 
 
 class OnlyEstimated(Exception):
@@ -30,7 +35,7 @@ class OnlyEstimated(Exception):
 
 
 @dataclass
-class Told:
+class Console:
     """How one command speaks.
 
     Parameters
@@ -88,15 +93,15 @@ class Told:
 
 
 class _StopAtEstimate(AbstractContextManager[None]):
-    def __init__(self, told: Told) -> None:
-        self._told = told
+    def __init__(self, console: Console) -> None:
+        self._console = console
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is OnlyEstimated:
-            self._told.result("nothing was written (--dry-run)", {"dry_run": True})
+            self._console.result("nothing was written (--dry-run)", {"dry_run": True})
             raise typer.Exit
 
 

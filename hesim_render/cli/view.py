@@ -1,4 +1,4 @@
-"""Looking at recordings: ``isp`` and ``view``."""
+"""Recordings as pictures and pages: ``isp`` and ``view``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from hesim_render.cli.options import Overwrite
+from hesim_render.cli.console import Console, Json, Quiet, recording_facts
+from hesim_render.cli.options import HelpAll, Overwrite
 from hesim_render.cli.terminal import summary
-from hesim_render.cli.told import Json, Quiet, Told, recording_facts
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.output import free_place, output_errors, replacing
 
@@ -26,6 +26,7 @@ def isp(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
     """Develop the RAW frames of a recording into pictures."""
     from hesim_render.isp import DENOISED_PICTURE, develop_recording, load_pipeline
@@ -34,14 +35,14 @@ def isp(
     steps = DENOISED_PICTURE if pipeline is None else load_pipeline(pipeline)
     if no_denoise:
         steps = steps.without("denoise")
-    told = Told(json_, quiet)
-    with told.progress(f"developing {recording}") as progress:
+    console = Console(json_, quiet)
+    with console.progress(f"developing {recording}") as progress:
         folder = develop_recording(recording, out, steps, progress, overwrite, calibration)
     text = f"pictures in {folder}"
     noise = json.loads((folder / MARKER).read_text(encoding="utf-8"))["noise"]
     if noise is not None and noise["maps"] == "unknown":
         text += "\nthe maps of the sensor's calibration are not in a recording: --calibration FILE takes them out"
-    told.result(text, {"pictures": folder, "noise": noise})
+    console.result(text, {"pictures": folder, "noise": noise})
 
 
 def view(
@@ -56,8 +57,12 @@ def view(
     overwrite: Overwrite = False,
     json_: Json = False,
     quiet: Quiet = False,
+    help_all: HelpAll = False,
 ) -> None:
-    """Summarise a recording, write its previews and recording.html, and open it in rerun where that is installed."""
+    """Show a recording: summary, previews, page, rerun.
+
+    Previews and recording.html are written into its folder; rerun opens where it is installed.
+    """
     from hesim_render.recording import rerun_view
     from hesim_render.recording.page import write_page
     from hesim_render.recording.recording import Recording
@@ -67,13 +72,13 @@ def view(
         raise ConflictError("--rrd", str(rrd), "give --rrd or --viewer, not both")
     if rrd is not None:
         free_place(rrd, overwrite, (".rrd",))
-    told, loaded = Told(json_, quiet), Recording.load(recording)
+    console, loaded = Console(json_, quiet), Recording.load(recording)
     assert loaded.path is not None
     with output_errors(loaded.path):
         write_previews(loaded, loaded.path)
         page = write_page(loaded, loaded.path)
     more = f"\n  page: {page}"
-    with told.progress(f"viewing {recording}") as progress:
+    with console.progress(f"viewing {recording}") as progress:
         if rrd is not None:
             with replacing(rrd) as unfinished:
                 rerun_view.write_rrd(loaded, unfinished, progress)
@@ -81,4 +86,4 @@ def view(
         elif viewer or (viewer is None and rerun_view.can_show()):
             rerun_view.show(loaded, progress)
     # a recording that misses its quality is shown all the same, with the line that says so
-    told.result(summary(loaded) + more, {**recording_facts(loaded), "page": page, "rrd": rrd})
+    console.result(summary(loaded) + more, {**recording_facts(loaded), "page": page, "rrd": rrd})
