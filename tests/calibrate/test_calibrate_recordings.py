@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from hesim_render.calibrate.recordings import calibrate_recordings, still, target
+from hesim_render.calibrate.recordings import calibrate_recordings, calibration, still
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import GROUPS, tally
 from hesim_render.core.errors import RangeError, SpecError
@@ -33,7 +33,8 @@ def sensor(seed):
                      shape=SHAPE)
         for lux, part in zip(LUX, (2.6, 3.4, 9.0), strict=True)
     ]  # fmt: skip
-    moving = target_events(rng, on, off, RISE, hz=5.0, cycles=12, shape=SHAPE, sigma=0.004)
+    moving = target_events(rng, on, off, RISE, hz=5.0, cycles=12, shape=SHAPE, sigma=0.001,
+                           drift=current * (dark + growth * 250.0))  # fmt: skip
     more = 1 + mismatch**2  # mean of 1/θ
     truth = {"theta_on": theta_on, "theta_off": theta_off, "threshold_mismatch": mismatch,
              "threshold_ratio": theta_off / theta_on, "leak_dark_hz": dark * more,
@@ -55,11 +56,10 @@ def covered(seeds):
     for seed in seeds:
         truth, events, moving = sensor(seed)
         tallies, of_target = ([tally(EventStream.of(one, SHAPE)) for one in part] for part in (events, [moving]))
-        known = target.thresholds(of_target[0], np.exp(RISE), None)
-        alone = still.balance(tallies, LUX, None)
-        balance = still.balance(tallies, LUX, known.ratio, known.entries["threshold_mismatch"]["value"])
-        entries = {**known.entries, "threshold_ratio": alone.ratio, "leak_dark_hz": balance.dark,
-                   "leak_growth_hz_per_lux": balance.growth}  # fmt: skip
+        entries = calibration.figures(tallies, of_target[0], LUX, np.exp(RISE), None)
+        entries = {name: entries[name] for name in truth}
+        entries["ratio_alone"] = still.balance(tallies, LUX).ratio
+        truth["ratio_alone"] = truth["threshold_ratio"]
         for name, entry in entries.items():
             low, high = entry["interval_95"]
             z = (entry["value"] - truth[name]) / entry["standard_error"]

@@ -49,15 +49,16 @@ def still_events(rng, theta_on, theta_off, sigma, drift, *, cutoff_hz, seconds, 
     return _events(found, shape[1])
 
 
-def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.0):
+def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.0, drift=0.0):
     """Events of pixels that see the light rise and fall by `rise` (ln) `hz` times a second, each with its own phase."""
     steps, size = 1000, theta_on.size
-    phase = rng.random(size)
+    phase = rng.integers(0, steps, size) / steps  # so that the turns are among the steps
     reference = rng.random(size) * rise
     found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
     for k in range(-2 * steps, cycles * steps):
         at = (k / steps + phase) % 1
         level = rise * (1 - np.abs(2 * at - 1)) + sigma * rng.standard_normal(size)
+        reference -= drift / steps / hz
         for sign, theta in ((1, theta_on), (-1, theta_off)):
             count = np.maximum(np.floor(sign * (level - reference) / theta), 0).astype(int)
             reference += sign * count * theta

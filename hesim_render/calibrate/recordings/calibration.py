@@ -17,6 +17,9 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import free_place, replacing
 from hesim_render.exchange import open_events
 
+#: Thresholds follow from the leak, and the leak from the thresholds.
+_ROUNDS = 3
+
 
 def calibrate_recordings(
     files: Sequence[str | Path],
@@ -84,7 +87,7 @@ def calibrate_recordings(
         tallies.append(tally(stream))
     told("fit", len(every) / (len(every) + 1))
     moving = tallies.pop() if target_file is not None else None
-    found = _figures(
+    found = figures(
         tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz
     )
     if path is not None:
@@ -95,13 +98,14 @@ def calibrate_recordings(
     return found
 
 
-def _figures(
+def figures(
     tallies: Sequence[Tally],
     moving: Tally | None,
     lux: Sequence[float] | None,
     contrast: float | None,
     cycles_hz: float | None,
 ) -> dict[str, Any]:
+    """The result of `calibrate_recordings` for tallies of still scenes and of a moving target, if there is one."""
     every = [*tallies, *([moving] if moving is not None else [])]
     limit, limited = readout_limit(every)
     for one in limited:
@@ -110,12 +114,16 @@ def _figures(
             "time; expected a recording of all events: less light, a smaller part of the sensor, or less contrast",
             file=one.source,
         )
+    of_target = target.unknown("it takes a recording of a moving target (--target)")
+    found = still.balance(tallies, lux)
     if moving is not None and contrast is not None:
-        of_target = target.thresholds(moving, contrast, cycles_hz)
-    else:
-        of_target = target.unknown("it takes a recording of a moving target (--target)")
-    mismatch = of_target.entries["threshold_mismatch"]["value"]
-    found = still.balance(tallies, lux, of_target.ratio, still.USUAL_MISMATCH if mismatch is None else mismatch)
+        leak_hz = 0.0
+        for _ in range(_ROUNDS):
+            of_target = target.thresholds(moving, contrast, cycles_hz, leak_hz)
+            if of_target.ratio["value"] is None:
+                break
+            found = still.balance_with_target(tallies, lux, moving, of_target.ratio, leak_hz)
+            leak_hz = float(np.mean([leak["value"] for leak in found.leaks]))
     entries, findings = [], []
     for k, (one, leak) in enumerate(zip(tallies, found.leaks, strict=True)):
         rates = still.group_rates(one)

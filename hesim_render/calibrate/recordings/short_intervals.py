@@ -15,6 +15,8 @@ from hesim_render.core.units import US_PER_S
 
 #: Intervals within a factor of two of the dead time that are needed to see it.
 _LEAST_INTERVALS = 100
+#: Largest density of intervals below 0.8 of the dead time, over that above: strays of the read-out.
+_STRAY = 0.03
 #: Windows that must be equally full, and part of all windows of the same recording above which it is saturated.
 _LEAST_WINDOWS, _SATURATED = 20, 0.1
 #: Fullest windows differ by no more than this part.
@@ -35,7 +37,8 @@ def dead_time(tallies: Sequence[Tally]) -> dict[str, Any]:
     place, chance = _step(counts)
     end = int(place[np.argmax(chance)])
     after = counts[end : 2 * end + 2]
-    if end < 2 or after.sum() < _LEAST_INTERVALS or counts[:end].sum() / end > 0.2 * after.mean():
+    shorter = counts[: max(1, round(0.8 * end))]
+    if end < 2 or after.sum() < _LEAST_INTERVALS or shorter.mean() > _STRAY * after.mean():
         return not_identifiable(
             "the density of the intervals has no step: short intervals are as frequent as longer ones"
         )

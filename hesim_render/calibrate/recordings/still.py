@@ -26,7 +26,7 @@ _HOT, _HOT_CHANCE = 10.0, 1e-3
 #: Relative standard deviation of thresholds over pixels, where none was measured.
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
-_RATIO_SHIFT, _LEAK_SHIFT = 0.5, 1.5
+_RATIO_SHIFT, _LEAK_SHIFT = 1.0, 3.0
 #: Range in which the ratio of the thresholds is taken to be where nothing tells it.
 _RATIO = (0.5, 2.0)
 #: Pairs of ON intervals that the local variation needs.
@@ -78,7 +78,7 @@ def rate_spread(tally: Tally, polarity: int) -> dict[str, Any]:
 
 
 def regularity(tally: Tally) -> dict[str, Any]:
-    """Local variation of the ON intervals of a pixel: 1 for a Poisson process, 0 for equal intervals."""
+    """Local variation of a pixel's ON intervals [shinomoto2003]: 1 for a Poisson process, 0 for equal intervals."""
     pairs = int(tally.pairs.sum())
     if pairs < _LEAST_PAIRS:
         return not_identifiable(f"{pairs} pairs of successive ON intervals; {_LEAST_PAIRS} are needed")
@@ -104,39 +104,31 @@ class Balance(NamedTuple):
     growth: dict[str, Any]
 
 
-def balance(
-    tallies: Sequence[Tally],
-    lux: Sequence[float] | None,
-    known_ratio: NDArray[np.float64] | None,
-    mismatch: float = USUAL_MISMATCH,
-) -> Balance:
-    """Leak and, where it is not known, the ratio of the thresholds, from the balance of the levels.
+def balance(tallies: Sequence[Tally], lux: Sequence[float] | None) -> Balance:
+    """Ratio of the thresholds and leak from the balance of the levels, without a moving target.
 
     All errors are those of a jackknife over groups of pixels, through all steps: pixels differ, and the same pixels are
     in all recordings. Pixels of low θ₋ have more of the OFF events than others, so that ρ is not exactly the ratio that
-    counts. In simulations that shifts ρ by up to 0.5, and a leak by up to 1.5 times mismatch² · ρ n₋, which count as
+    counts. In simulations that shifts ρ by up to once, and a leak by up to 3 times mismatch² · ρ n₋, which count as
     errors of their own.
 
     Parameters
     ----------
     tallies : recordings of still scenes.
     lux : illuminance of each, or None.
-    known_ratio : ρ [k] from a moving target: of all pixels, and without each group; None without a target.
-    mismatch : relative standard deviation of the thresholds over pixels.
     """
     rates = np.array([group_rates(one) for one in tallies])  # [recording, polarity, k]
-    if known_ratio is not None:
-        ratio = estimated(known_ratio[0], float(jackknife(known_ratio)), "", GROUPS)
-        return _with_ratio(rates, lux, known_ratio, ratio, mismatch)
     if lux is None:
         reason = not_identifiable("it takes the illuminances (--lux), or a moving target (--target)")
     elif len(set(lux)) < 3:
         reason = not_identifiable("it takes still scenes at three different lights, or a moving target (--target)")
     else:
         found = _three_lights(rates, np.asarray(lux, np.float64))
-        error = float(np.hypot(jackknife(found), _RATIO_SHIFT * mismatch**2 * found[0]))
+        error = float(np.hypot(jackknife(found), _RATIO_SHIFT * USUAL_MISMATCH**2 * found[0]))
         if np.isfinite(found).all() and 0 < 2 * error < found[0]:
-            return _with_ratio(rates, lux, found, estimated(found[0], error, "", GROUPS), mismatch)
+            leak = rates[:, 0] - found * rates[:, 1]
+            unknown = _LEAK_SHIFT * USUAL_MISMATCH**2 * found[0] * rates[:, 1, 0]
+            return _with_ratio(leak, unknown, lux, estimated(found[0], error, "", GROUPS))
         reason = not_identifiable(
             "OFF events are too few, or follow the light as ON events do: noise and leak do not come apart"
         )
@@ -145,17 +137,44 @@ def balance(
     return Balance(reason, leaks, *_line(rates[:, 0] - rates[:, 1], (_RATIO[1] - 1) * rates[:, 1, 0], few, lux))
 
 
-def _with_ratio(
-    rates: NDArray[np.float64],
-    lux: Sequence[float] | None,
-    ratio: NDArray[np.float64],
-    entry: dict[str, Any],
-    mismatch: float,
+def balance_with_target(
+    tallies: Sequence[Tally], lux: Sequence[float] | None, moving: Tally, ratio: dict[str, Any], leak_hz: float
 ) -> Balance:
-    leak, unknown = rates[:, 0] - ratio * rates[:, 1], _LEAK_SHIFT * mismatch**2 * ratio[0] * rates[:, 1, 0]
+    """The same with a moving target, which tells each pixel's own ratio of the thresholds.
+
+    There the levels are balanced as well: a pixel's ON events, less its leak, over its OFF events are its θ₋/θ₊. The
+    leak of the target's light is not known. It is taken as `leak_hz`, with half of its effect as an error of its own.
+
+    Parameters
+    ----------
+    tallies, lux : as for `balance`.
+    moving : recording of the target.
+    ratio : θ₋/θ₊, mean over pixels, as an entry of the result.
+    leak_hz : leak of a pixel while the target moved, Hz.
+    """
+    on, off = moving.per_pixel().astype(np.float64)
+    seen = off > 0.25 * np.median(off[off > 0])
+    own = np.where(seen, (on - leak_hz * moving.seconds) / np.maximum(off, 1.0), 0.0)
+    group = moving.group.astype(np.int64)
+    each = np.array([
+        np.bincount(group, np.where(seen, (count[0] - own * count[1]) / one.seconds, 0.0), GROUPS)
+        for one in tallies
+        for count in (one.per_pixel().astype(np.float64),)
+    ])  # fmt: skip
+    pixels = np.bincount(group[seen], minlength=GROUPS)
+    sums = np.concatenate([each.sum(axis=1, keepdims=True), each.sum(axis=1, keepdims=True) - each], axis=1)
+    leak = sums / np.append(pixels.sum(), pixels.sum() - pixels)
+    share = abs(leak_hz) * moving.seconds * float(np.mean(1 / off[seen]))
+    unknown = 0.5 * share * np.array([group_rates(one)[1, 0] for one in tallies])
+    return _with_ratio(leak, unknown, lux, ratio)
+
+
+def _with_ratio(
+    leak: NDArray[np.float64], unknown: NDArray[np.float64], lux: Sequence[float] | None, ratio: dict[str, Any]
+) -> Balance:
     errors = np.hypot(jackknife(leak), unknown)
     leaks = [estimated(one[0], float(error), "Hz", GROUPS) for one, error in zip(leak, errors, strict=True)]
-    return Balance(entry, leaks, *_line(leak, unknown, np.ones(len(leak), np.bool_), lux))
+    return Balance(ratio, leaks, *_line(leak, unknown, np.ones(len(leak), np.bool_), lux))
 
 
 def _leak_alone(rates: NDArray[np.float64], why: str) -> dict[str, Any]:

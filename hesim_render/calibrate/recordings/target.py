@@ -21,6 +21,8 @@ from hesim_render.calibrate.recordings.tally import GROUPS, Tally
 
 #: Simulated pixels, cycles before their counts begin, and most cycles that are simulated.
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
+#: Relative error of the leak in the target's light.
+_UNSURE_LEAK = 0.1
 #: Cycles, and ON and OFF events a cycle, that are needed.
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 
@@ -31,14 +33,14 @@ class Thresholds(NamedTuple):
     Parameters
     ----------
     entries : ``theta_on``, ``theta_off`` (ln units) and ``threshold_mismatch``, as entries of the result.
-    ratio : ρ = θ₋/θ₊ [k] of all pixels and without each group; None where it is not known.
+    ratio : ρ = θ₋/θ₊, as an entry of the result.
     """
 
     entries: dict[str, dict[str, Any]]
-    ratio: NDArray[np.float64] | None
+    ratio: dict[str, Any]
 
 
-def thresholds(tally: Tally, contrast: float, cycles_hz: float | None) -> Thresholds:
+def thresholds(tally: Tally, contrast: float, cycles_hz: float | None, leak_hz: float = 0.0) -> Thresholds:
     """θ₊, θ₋ and their relative mismatch over pixels, each with its interval, a jackknife over groups of pixels.
 
     Parameters
@@ -46,6 +48,7 @@ def thresholds(tally: Tally, contrast: float, cycles_hz: float | None) -> Thresh
     tally : of the recording.
     contrast : bright over dark light of the target.
     cycles_hz : bright–dark cycles of a pixel per second; None: read from the times between its turns to ON events.
+    leak_hz : leak while the target moved, Hz: half of it is in the ON events of the rise, half missing in the fall.
     """
     count = tally.per_pixel().astype(np.float64)
     both = count.min(axis=0)
@@ -54,7 +57,11 @@ def thresholds(tally: Tally, contrast: float, cycles_hz: float | None) -> Thresh
         return unknown(f"{np.count_nonzero(seen)} pixels have events of both polarities; {2 * GROUPS} are needed")
     period_s = 1 / cycles_hz if cycles_hz is not None else tally.period_s()
     cycles = tally.seconds / period_s if period_s is not None else 0.0
-    count = count[:, seen] / max(cycles, 1e-300)
+    count = count[:, seen]
+    leaked = leak_hz * tally.seconds  # in thresholds of ON events
+    share = np.array([[-0.5], [0.5 * count[1].mean() / max(count[0].mean() - leaked, 1.0)]])
+    unsure = _UNSURE_LEAK * np.abs(share[:, 0] * leaked) / count.mean(axis=1)
+    count = (count + share * leaked) / max(cycles, 1e-300)
     if cycles < _LEAST_CYCLES or count.mean(axis=1).min() < _LEAST_EVENTS:
         return unknown(
             f"a pixel sees {cycles:.3g} cycles of the target, with {count.mean(axis=1).min() if cycles else 0:.3g} "
@@ -66,7 +73,7 @@ def thresholds(tally: Tally, contrast: float, cycles_hz: float | None) -> Thresh
     parts = np.array([_moments(count[:, group != k]) for k in range(GROUPS)])
     found, slope = simulated.fit(whole)
     every = np.concatenate([found[:, None], found[:, None] + np.linalg.solve(slope, (parts - whole).T)], axis=1)
-    errors = jackknife(every)
+    errors = np.hypot(jackknife(every), np.abs(found) * np.append(unsure, 0.0))
     entries = {
         "theta_on": estimated(found[0], errors[0], "ln", GROUPS),
         "theta_off": estimated(found[1], errors[1], "ln", GROUPS),
@@ -79,12 +86,15 @@ def thresholds(tally: Tally, contrast: float, cycles_hz: float | None) -> Thresh
             "value": 0.0, "upper_limit": float(np.sqrt(max(found[2], 0.0) + 2 * errors[2])),
             "note": "the pixels scatter no more than the place of their turns makes them",
         }  # fmt: skip
-    return Thresholds(entries, every[1] / every[0])
+    ratio = every[1] / every[0]
+    error = float(np.hypot(jackknife(ratio), unsure.sum() * ratio[0]))
+    return Thresholds(entries, estimated(ratio[0], error, "", GROUPS))
 
 
 def unknown(reason: str) -> Thresholds:
     """Figures of a target that tells none, with the reason."""
-    return Thresholds(dict.fromkeys(("theta_on", "theta_off", "threshold_mismatch"), not_identifiable(reason)), None)
+    entry = not_identifiable(reason)
+    return Thresholds(dict.fromkeys(("theta_on", "theta_off", "threshold_mismatch"), entry), entry)
 
 
 def _moments(count: NDArray[np.float64]) -> NDArray[np.float64]:
