@@ -27,7 +27,9 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -37,12 +39,15 @@ from hesim_render.sources.render.audit.compare import compare_ticks
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.exact import RenderedFlux, used_responses
-from hesim_render.sources.render.reference import WindowReference
 from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, spectrum_dict
-from hesim_render.sources.render.specfilm import camera_at, perspective_dict
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.scene import SceneSpec
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+
+from mitsuba_reference import WindowReference
+from mitsuba_specfilm import camera_at, perspective_dict
 
 TICK_US, WINDOW_US = 1250.0, 1000.0
 SENSOR = {

@@ -1,6 +1,6 @@
-"""Rates of noise events of asynchronous pixels: makes the table of hesim_render/specs.
+"""Rates of noise events of asynchronous pixels: makes the table of `hesim_render.pixels.evs.noise_rates`.
 
-    python benchmarks/event_noise.py > hesim_render/specs/event_noise_table.py      (three minutes on 2 cores)
+    python benchmarks/event_noise.py hesim_render/pixels/evs/noise_rates.npz      (three minutes on 2 cores)
 
 A pixel of unit noise with thresholds a and b compares with the level at the end of its last dead time. The noise is
 white noise through two equal poles that are -3 dB at 1/period together, exact at 16 nodes a period and linear between
@@ -17,12 +17,14 @@ from __future__ import annotations
 
 import math
 import sys
-import textwrap
+from pathlib import Path
 
 import numpy as np
 
 from hesim_render.core.backend import jit
-from hesim_render.pixels.evs.reference_law import POLE, Law, Pixels, law
+from hesim_render.pixels.evs.formulas import POLE
+from hesim_render.pixels.evs.noise_rates import RateTable
+from hesim_render.pixels.evs.reference_law import Law, Pixels, law
 
 LOWER = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.25, 7.0)
 DIFFERENCE = (0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6, 3.6, 5.0, 7.5)
@@ -47,7 +49,7 @@ def simulate(entries: list[tuple[float, float, float]], start: np.ndarray, seed:
     import drjit as dr
 
     types = jit()
-    h = math.tau / math.sqrt(math.sqrt(2) - 1) / NODES
+    h = POLE / NODES
     step = math.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
     amplitude = math.sqrt(3 / (2 + (1 + h) * math.exp(-h)))
     (f00, _), (f10, f11) = (amplitude * np.linalg.cholesky(np.eye(2) - step @ step.T)).tolist()
@@ -118,8 +120,8 @@ def factors(lower: np.ndarray, difference: np.ndarray, dead: float) -> np.ndarra
     return ratio
 
 
-def main() -> None:
-    """Print the module of the table."""
+def main(path: str | Path) -> None:
+    """Write the table to a file."""
     lower, difference = np.array(LOWER)[:, None], np.array(DIFFERENCE)
     on, off = (np.broadcast_to(each, (len(LOWER), len(DIFFERENCE))).ravel() for each in (lower, lower + difference))
 
@@ -130,29 +132,10 @@ def main() -> None:
                       * np.stack([rates(dead, leak) for leak in LEAK_PERIODS], axis=-1)
                       for dead in DEAD_PERIODS], axis=2)  # fmt: skip
     without = factors(lower, difference, 0.0) * rates(0.0, LEAK_PERIODS[0])
-    write(np.log(table), np.log(without))
-
-
-def write(table: np.ndarray, without: np.ndarray) -> None:
-    """Print the module of the table."""
-    print('"""Events per period of noisy asynchronous pixels; made by ``benchmarks/event_noise.py``."""\n')
-    print("#: Lower threshold, and difference of both, over σ; dead time, in periods; leak events of a period.")
-    print(f"LOWER = {LOWER}\nDIFFERENCE = {DIFFERENCE}")
-    print(f"DEAD_PERIODS = {DEAD_PERIODS}\nLEAK_PERIODS = {LEAK_PERIODS}")
-    print("#: 1000 ln of the ON and OFF events of a period, without a dead time, [lower, difference], and with one,")
-    print("#: [lower, difference], dead time and leak in one row.\n# fmt: off\nLOG_EVENTS_NO_DEAD_TIME = (")
-    rounded = np.rint(1000 * without).astype(int), np.rint(1000 * table).astype(int)
-    for line in rounded[0]:
-        print(f"    ({', '.join(map(str, line))}),")
-    print(")\nLOG_EVENTS = (")
-    for block in rounded[1]:
-        print("    (")
-        for entry in block:
-            text = textwrap.fill(", ".join(map(str, entry.ravel())), 108)
-            print(textwrap.indent(f"({text}),", "        "))
-        print("    ),")
-    print(")")
+    rounded = (np.rint(1000 * np.log(values)).astype(np.int16) for values in (without, table))
+    axes = (np.array(values) for values in (LOWER, DIFFERENCE, DEAD_PERIODS, LEAK_PERIODS))
+    np.savez_compressed(path, **RateTable(*axes, *rounded)._asdict())
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

@@ -17,7 +17,7 @@ from hesim_render.core.backend import jit
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 #: θ₊ over the noise's σ at 0.1 lx, bandwidth of the noise (Hz), θ₋ over θ₊, mismatch of the thresholds; leak in the
 #: dark (Hz), its growth (Hz/lx), its spread, and its tail (Hz).

@@ -46,7 +46,7 @@ def build(law):
     from hesim_render.mosaic.layout import Layout
     from hesim_render.pixels.aps.model import ApsNoise
     from hesim_render.pixels.evs.model import EvsNoise
-    from hesim_render.specs.sensor import read_sensor
+    from hesim_render.sensor.reading import read_sensor
 
     spec = read_sensor("reference-mono", {**OVERRIDES, "aps.law": law})
     layout = Layout.full(spec)

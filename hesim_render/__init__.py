@@ -18,12 +18,10 @@ import importlib
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-from hesim_render import _moved
 from hesim_render.core import backend as _backend
 
 # Dr.Jit takes the first LLVM it finds when it is imported, and some abort the process: choose before.
 _backend.prepare()
-_moved.install()
 
 try:
     __version__ = version("hesim_render")
@@ -88,8 +86,6 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _moved.MOVED:
-        return importlib.import_module(f"hesim_render.{name}")
     if name == "events":  # a package of functions, used as hr.events.voxel_grid
         return importlib.import_module("hesim_render.events")
     home = _HOMES.get(name)

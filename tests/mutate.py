@@ -258,7 +258,7 @@ FIXED = (
         "calibrated sensor: θ₊ is that of the other polarity",
         "theta * (1 - rho)",
         "theta * (1 + rho)",
-        ("tests/sensor/test_calibrated_sensor.py::test_each_threshold_of_a_calibration_reaches_its_own_polarity",),
+        ("tests/calibration/test_calibrated_sensor.py::test_each_threshold_of_a_calibration_reaches_its_own_polarity",),
     ),
     Fixed(
         "row noise: the standard error of a variance",

@@ -84,7 +84,7 @@ def build_benchmark(
     with _client(scheduler) as client:
         root = opened(plan, Path(out))
         missing = [clip for clip in plan.clips if not is_complete(root, clip)]
-        expected = estimate_build(plan, missing) if estimate and missing else None
+        expected = estimate_build(plan, missing, progress=progress) if estimate and missing else None
         if expected is not None and on_estimate is not None:
             on_estimate(expected)
         begin, done = time.monotonic(), {"clips": float(len(plan.clips) - len(missing)), "seconds": 0.0, "bytes": 0}
@@ -112,8 +112,14 @@ def build_benchmark(
     return Benchmark(root)
 
 
-def check_build(spec: BenchmarkSpec, out: str | Path) -> tuple[int, list[Clip], BuildEstimate | None]:
+def check_build(
+    spec: BenchmarkSpec, out: str | Path, progress: Progress | None = None
+) -> tuple[int, list[Clip], BuildEstimate | None]:
     """What `build_benchmark` would do, with all its checks; nothing is written.
+
+    Parameters
+    ----------
+    spec, out, progress : as for `build_benchmark`.
 
     Returns
     -------
@@ -123,7 +129,7 @@ def check_build(spec: BenchmarkSpec, out: str | Path) -> tuple[int, list[Clip], 
     plan.check()
     root = _checked(plan, Path(out))
     missing = [clip for clip in plan.clips if not is_complete(root, clip)]
-    return len(plan.clips), missing, estimate_build(plan, missing) if missing else None
+    return len(plan.clips), missing, estimate_build(plan, missing, progress=progress) if missing else None
 
 
 def _client(scheduler: str | None) -> Any:

@@ -24,7 +24,8 @@ from hesim_render.benchmark.spans import (
 from hesim_render.benchmark.statistics import figures
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.simulate import flux_source, go_on, simulate
+from hesim_render.capture.scene_renderer import scene_renderer
+from hesim_render.capture.simulate import simulate
 from hesim_render.core.guard import read_text, reading
 from hesim_render.core.journal import Journal
 from hesim_render.core.output import OutputFolder, output_errors
@@ -33,6 +34,7 @@ from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
 from hesim_render.sources.protocol import FluxSource
 from hesim_render.sources.render.light_level import in_absolute_light
+from hesim_render.sources.render.renderer import SceneRenderer
 from hesim_render.sources.scene import Scene, load_scene
 from hesim_render.specs.files import content_hash
 
@@ -131,14 +133,14 @@ def render_span(plan: BenchmarkPlan, clip: Clip, span: Span, root: Path) -> Buil
         with span_journal(folder, span, _run_of(plan, clip, scene, sensor)) as journal:
             if is_rendered(journal, span):
                 return Built(clip.name, 0.0, 0)
-            flux, _ = renderer = _renderer(plan, clip, scene, sensor)
+            flux = _renderer(plan, clip, scene, sensor)
             if not flux.is_static:  # the light of a static scene is one render, of which there are no spans
-                go_on(flux, journal)
+                flux.go_on(journal)
                 last = span[1] if span[1] < spec.duration_us else float("inf")
                 noise = noise_models(sensor, level.clean, level.without)
                 Capture(flux, flux.sensor, *noise, spec.duration_us, spec.seeds[clip.seed]).render(span[0], last)
                 if spec.sharp is not None:
-                    source = _sharp_source(plan, clip, renderer, sensor)
+                    source = _sharp_source(plan, clip, flux, sensor)
                     for middle, first in windows(sensor, spec.sharp, spec.duration_us):
                         if span[0] <= middle < last:
                             sharp_flux(source, sensor, spec.sharp, first)
@@ -155,19 +157,19 @@ def _scene(plan: BenchmarkPlan, clip: Clip, folder: Path) -> tuple[Scene, tuple[
         return load_scene(generated.write(folder / SCENE)), generated.parts
 
 
-def _renderer(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> tuple[Any, dict[str, Any]]:
-    """The renderer of a clip and its settings."""
+def _renderer(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Sensor) -> SceneRenderer:
+    """The renderer of a clip."""
     spec = plan.spec
     quality = spec.quality if spec.samples is None else None
     seed = spec.seeds[clip.seed]
-    return flux_source(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples, False, None)
+    return scene_renderer(in_absolute_light(scene)[0], sensor, seed, quality, spec.samples)
 
 
-def _sharp_source(plan: BenchmarkPlan, clip: Clip, renderer: tuple[Any, dict[str, Any]], sensor: Sensor) -> FluxSource:
+def _sharp_source(plan: BenchmarkPlan, clip: Clip, renderer: SceneRenderer, sensor: Sensor) -> FluxSource:
     """The light of the sharp images: with the crosstalk that the frames of the clip have."""
     level = plan.spec.noise[clip.noise]
     aps, _ = noise_models(sensor, level.clean, level.without)
-    return with_crosstalk(renderer[0], sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
+    return with_crosstalk(renderer, sensor.layout.shape, 0.0 if aps is None else aps.crosstalk)
 
 
 def _fill(plan: BenchmarkPlan, clip: Clip, folder: Path, target: Path) -> dict[str, Any]:
@@ -179,7 +181,7 @@ def _fill(plan: BenchmarkPlan, clip: Clip, folder: Path, target: Path) -> dict[s
     # one renderer for both: what rests is rendered once
     renderer = _renderer(plan, clip, scene, sensor)
     with _journal(plan, clip, target, scene, sensor) as journal:
-        go_on(renderer[0], journal)
+        renderer.go_on(journal)
         recording = simulate(
             scene, sensor, duration_s=spec.duration_s, seed=seed, clean=level.clean, without=level.without,
             quality=spec.quality if spec.samples is None else None, samples=spec.samples, truth=spec.truth,

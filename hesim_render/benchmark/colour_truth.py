@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.benchmark.sharp import windows
-from hesim_render.capture.simulate import flux_source
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
-from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import Scene
@@ -38,7 +37,7 @@ def through_one_filter(sensor: Sensor, name: str) -> Sensor:
     rows = ["".join("F" for _ in row) for row in spec.tile_rows]
     pixel = PixelSpec.model_validate({"filter": name, "roles": ["aps"]})
     changes = {"tile": "\n".join(rows), "pixels": {"F": pixel}, "evs": None, "evs_grid": None}
-    same = Layout(spec.model_copy(update=changes), layout.row0, layout.col0, layout.rows, layout.cols)
+    same = replace(layout, spec=spec.model_copy(update=changes))
     return replace(sensor, layout=same)
 
 
@@ -70,7 +69,7 @@ def write_colours(
             file.create_dataset(name, shape, "f4", chunks=(1, *shape[1:3], 1), compression=COMPRESSION)
         for channel, seen_by in enumerate(names):
             lit, one = in_absolute_light(scene)[0], through_one_filter(sensor, seen_by)
-            source, _ = flux_source(lit, one, seed + 1 + channel, quality, None, False, None)
+            source = scene_renderer(lit, one, seed + 1 + channel, quality)
             for number, (_, begin) in enumerate(times):
                 first = begin[every // sensor.cols]
                 a, b = (np.array(half) for half in source.mean_flux(every, first, first + spec.window_us))

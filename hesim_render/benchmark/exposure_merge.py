@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.measure.pictures import psnr
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.specs.sensor import ApsSpec
+from hesim_render.specs.frame_pixels import ApsSpec
 
 #: Of μ-law tone mapping [kalantari2017].
 _MU = 5000.0

@@ -13,12 +13,11 @@ from hesim_render.benchmark.plan import BenchmarkPlan, Clip
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.overheads import noise_seconds
-from hesim_render.capture.simulate import flux_source
-from hesim_render.core.progress import in_words
+from hesim_render.capture.scene_renderer import scene_renderer
+from hesim_render.core.progress import Progress, in_words
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.change_driven.forecast import forecast
+from hesim_render.sources.demand import Demand
 from hesim_render.sources.render.light_level import in_absolute_light
 from hesim_render.sources.scene import Scene, load_scene
 
@@ -58,12 +57,13 @@ class BuildEstimate:
         return asdict(self)
 
 
-def estimate_build(plan: BenchmarkPlan, clips: list[Clip]) -> BuildEstimate:
+def estimate_build(plan: BenchmarkPlan, clips: list[Clip], progress: Progress | None = None) -> BuildEstimate:
     """Estimate time and size of clips.
 
     Parameters
     ----------
     plan, clips : what is to be built.
+    progress : called with (done, total, what).
     """
     if not clips:
         return BuildEstimate(0, 0.0, 0.0)
@@ -76,7 +76,9 @@ def estimate_build(plan: BenchmarkPlan, clips: list[Clip]) -> BuildEstimate:
     }
     sample = list(chosen.values())[:_MOST]
     seconds: list[float] = []
-    for clip in sample:
+    for number, clip in enumerate(sample):
+        if progress is not None:
+            progress(number, len(sample), "estimate")
         sensor = plan.sensor(clip)
         with tempfile.TemporaryDirectory() as folder:
             files = plan.scene_files(clip)
@@ -103,15 +105,13 @@ def _render_seconds(plan: BenchmarkPlan, clip: Clip, scene: Scene, sensor: Senso
     seed = spec.seeds[clip.seed]
     if spec.samples is not None:
         return 0.0  # most of the time of small clips is not that of rays
-    flux, _ = flux_source(in_absolute_light(scene)[0], sensor, seed, spec.quality, None, False, None)
-    parts = [part for part in getattr(flux, "sources", (flux,)) if isinstance(part, ChangeDrivenFlux)]
+    flux = scene_renderer(in_absolute_light(scene)[0], sensor, seed, spec.quality)
     level = spec.noise[clip.noise]
     capture = Capture(flux, flux.sensor, *noise_models(sensor, level.clean, level.without), spec.duration_us, seed)
     pixel, exposures = capture.frame_exposures
     blocks = capture.sample_of_event_blocks()
-    expected = forecast(
-        parts, capture.event_pixels, blocks, pixel, [*exposures, *_sharp_exposures(plan, sensor)]
-    )  # fmt: skip
+    asked = [*exposures, *_sharp_exposures(plan, sensor)]
+    expected = flux.estimate(Demand(spec.duration_us, capture.event_pixels, blocks, pixel, asked))
     return expected.seconds + noise_seconds(flux.sensor, spec.duration_us, blocks.windows, rests=flux.is_static)
 
 

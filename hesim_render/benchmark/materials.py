@@ -93,7 +93,7 @@ class Palette:
         if not solid:
             frequency = {**frequency, "glass": 0.0}
         weights = np.array(list(frequency.values()))
-        kind = "matt"
+        kind = "diffuse"
         if weights.sum() > 0:
             kind = str(self._rng.choice(list(frequency), p=weights / weights.sum()))
         if kind == "glass":
@@ -104,7 +104,7 @@ class Palette:
             inner["specular_reflectance"] = self._spectrum()
             return {"type": "twosided", "material": inner}
         colour = self._picture(name) if self._rng.random() < self._spec.textured else self._spectrum()
-        if kind == "matt":
+        if kind == "diffuse":
             inner = {"type": "diffuse", "reflectance": colour}
         elif kind == "plastic":
             inner = {"type": "plastic", "diffuse_reflectance": colour}

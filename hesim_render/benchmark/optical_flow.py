@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 from typing import Any
 
@@ -56,11 +55,13 @@ def of_pictures(method: str, first: NDArray[np.uint8], second: NDArray[np.uint8]
     method : ``farneback`` [farneback2003] (three levels, window of 15 px) or ``dis`` [kroeger2016] (preset medium).
     first, second : [row, col], 8 bit.
     """
-    cv2: Any = importlib.import_module("cv2")
+    import cv2
+
+    library: Any = cv2  # its stubs lack the second method
     if method == "farneback":
         start = np.zeros((*first.shape, 2), np.float32)
-        return cv2.calcOpticalFlowFarneback(first, second, start, 0.5, 3, 15, 3, 7, 1.5, 0)
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
+        return library.calcOpticalFlowFarneback(first, second, start, 0.5, 3, 15, 3, 7, 1.5, 0)
+    return library.DISOpticalFlow_create(library.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
 
 
 def plane_fit(events: NDArray, shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.capture.simulate import flux_source
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.schedule import BLOCK_INTERVALS, Block
 from hesim_render.sensor.sensor import Sensor
@@ -49,7 +49,7 @@ def pictures(
     times_us : begin and end of the exposures, [picture, 2], µs.
     """
     layout = sensor.layout
-    flux = flux_source(in_absolute_light(scene)[0], sensor, seed, quality, None, False, None)[0]
+    flux = scene_renderer(in_absolute_light(scene)[0], sensor, seed, quality)
     source = with_crosstalk(flux, layout.shape, sensor.evs.crosstalk)
     for sample in source.flux_of_blocks(layout.evs_pixel.ravel(), _blocks(times_us)):
         mean = 0.5 * (np.array(sample.half_a, dtype=np.float32) + np.array(sample.half_b, dtype=np.float32))

@@ -21,7 +21,7 @@ from hesim_render.benchmark.peer_run import program_of, run_peer, version_of
 from hesim_render.benchmark.plan import chosen_sensor, file_of
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
-from hesim_render.capture.simulate import flux_source
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import printable
 from hesim_render.core.output import check_place, replacing
@@ -127,7 +127,7 @@ def _version_of(peer: Peer, folder: Path) -> dict[str, str]:
 
 def _our_events(scene: Scene, sensor: Sensor, spec: PeersSpec) -> _Ours:
     begin = time.monotonic()
-    flux, _ = flux_source(in_absolute_light(scene)[0], sensor, spec.seed, spec.quality, None, False, None)
+    flux = scene_renderer(in_absolute_light(scene)[0], sensor, spec.seed, spec.quality)
     _, evs = noise_models(sensor)
     capture = Capture(flux, sensor, None, evs, spec.duration_us, spec.seed, labels=True)
     events = np.concatenate([no_events(), *(item for item in capture.run() if isinstance(item, np.ndarray))])

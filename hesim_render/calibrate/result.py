@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from hesim_render.calibration.file import file_digest, read_calibration, read_maps
+from hesim_render.calibration.spec import SCHEMA_VERSION
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.guard import read_text
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import alone_in, check_place, output_errors, replacing
-from hesim_render.specs.calibration import file_digest, read_calibration, read_maps
-from hesim_render.specs.calibration_spec import SCHEMA_VERSION
 
 __all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]
 

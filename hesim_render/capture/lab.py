@@ -26,9 +26,9 @@ from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs.stage import EvsStage
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.specs.files import content_hash, list_names
-from hesim_render.specs.sensor import read_sensor
 
 CAPTURE_NAME = "capture.yaml"
 #: Exposure sets of the paper, µs. The longer dark set of its two sensors is used for every sensor.

@@ -35,6 +35,7 @@ from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.frame import Frame
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import with_crosstalk
+from hesim_render.sources.demand import Demand
 from hesim_render.sources.protocol import FluxSource, Sample
 from hesim_render.sources.still import StillFlux
 
@@ -87,6 +88,7 @@ class Capture:
         self._evs_pixel = layout.evs_pixel.ravel() if evs is not None else np.empty(0, np.uint32)
         every = exposures(aps.spec, layout.rows, duration_us) if aps is not None else []
         self._exposures = [exposure for exposure in every if exposure.end_us > begin_us]
+        self._is_static = flux.is_static
         if flux.is_static:
             frame_source, self._event_source = self._still(frame_source)
         self._frames = OpenFrames(sensor, aps, self._exposures, frame_source, seed)
@@ -151,6 +153,12 @@ class Capture:
     def frame_exposures(self) -> tuple[NDArray[np.uint32], list[Exposure]]:
         """Mosaic indices of the frame pixels, [n], and all exposures of the run."""
         return self._aps_pixel, list(self._exposures)
+
+    @property
+    def demand(self) -> Demand:
+        """What the run asks of its source, for an estimate; blocks of a source that rests cost nothing."""
+        blocks = BlockSample([], 1.0) if self._is_static else self.sample_of_event_blocks()
+        return Demand(self._duration_us, self._evs_pixel, blocks, *self.frame_exposures)
 
     @property
     def event_flux(self) -> EventFlux:

@@ -10,6 +10,8 @@ from hesim_render.pixels.evs.model import EVS_TERMS, EvsNoise
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.specs.lens import LENS_TERMS
 
+#: Models of frame pixels and of event pixels; None for the kind that a sensor lacks.
+Noise = tuple[ApsNoise | None, EvsNoise | None]
 #: Names of all noise terms that can be switched off.
 NOISE_TERMS = (*(f"aps.{term}" for term in APS_TERMS), *(f"evs.{term}" for term in EVS_TERMS))
 #: Names of all that can be switched off in a render: noise terms, and effects of the lens.
@@ -18,7 +20,7 @@ TERMS = (*NOISE_TERMS, *LENS_TERMS)
 
 def noise_models(
     sensor: Sensor, clean: bool = False, without: Sequence[str] = (), terms: Sequence[str] = NOISE_TERMS
-) -> tuple[ApsNoise | None, EvsNoise | None]:
+) -> Noise:
     """Both noise models of a sensor, with terms switched off.
 
     Parameters

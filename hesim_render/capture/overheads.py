@@ -7,7 +7,7 @@ from dataclasses import replace
 from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs.photoreceptor import NODES_PER_CORNER_PERIOD
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.render.change_driven.forecast import Estimate
+from hesim_render.sources.demand import Demand, Estimate
 
 # Processor time of one thread of an AVX-512 server (`time.process_time`), of runs of `rotating-star`, `fan` and
 # `colorchecker` on `eiger`, `davis346` and `imx636` at 64x48 px, and of event stages of 3,000 to 49,000 pixels.
@@ -26,18 +26,14 @@ _FRAME_S, _FRAME_PIXEL_S = 2e-2, 60e-9
 _AUDIT_RAYS, _MOST_TICK_RAYS, _MOST_ASYNCHRONOUS_RAYS, _AUDIT_PART, _AUDIT_S = 8.0, 8e6, 24e6, 0.125, 0.5
 
 
-def with_overheads(
-    rays: Estimate, sensor: Sensor, duration_us: int, windows: float, frames: int, *, audited: bool, rests: bool
-) -> Estimate:
+def with_overheads(rays: Estimate, sensor: Sensor, demand: Demand, *, audited: bool, rests: bool) -> Estimate:
     """The estimate of a whole run from that of its rays.
 
     Parameters
     ----------
     rays : time and number of the rays alone.
     sensor : region read out, with its event and frame pixels.
-    duration_us : length of the run, µs.
-    windows : number of windows in which event pixels are sampled; 0 where nothing moves.
-    frames : number of frames.
+    demand : what the run asks of its source.
     audited : the run has an audit.
     rests : the light never changes, so that photoreceptors rest and windows are not rendered.
 
@@ -45,8 +41,9 @@ def with_overheads(
     -------
     The estimate, right to about a factor of two where the rays are.
     """
-    seconds = rays.seconds + _START_S + noise_seconds(sensor, duration_us, windows, rests=rests)
-    seconds += frames * (_FRAME_S + _FRAME_PIXEL_S * sensor.layout.rows * sensor.layout.cols)
+    windows = demand.blocks.windows
+    seconds = rays.seconds + _START_S + noise_seconds(sensor, demand.duration_us, windows, rests=rests)
+    seconds += len(demand.exposures) * (_FRAME_S + _FRAME_PIXEL_S * sensor.layout.rows * sensor.layout.cols)
     if not rests:
         seconds += _WINDOW_S * windows
     if audited and rays.seconds > 0:
@@ -62,7 +59,8 @@ def noise_seconds(sensor: Sensor, duration_us: int, windows: float, *, rests: bo
 
     Parameters
     ----------
-    sensor, duration_us, windows, rests : as for `with_overheads`.
+    sensor, rests : as for `with_overheads`.
+    duration_us, windows : length of the run, µs, and number of windows in which event pixels are sampled.
     """
     evs = sensor.spec.evs
     if evs is None:

@@ -10,10 +10,10 @@ from pydantic import ValidationError
 
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import require_seed, whole_us
 from hesim_render.core import backend
 from hesim_render.core.errors import RangeError
 from hesim_render.core.progress import Progress, shown
-from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.description import describe
 from hesim_render.mosaic.schedule import require_countable
 from hesim_render.recording.exposure import warn_of_exposure
@@ -80,11 +80,8 @@ def simulate_cube(
         If `out` exists or cannot be written. No partial output is left.
     """
     sensor = as_sensor(sensor)
-    if not 0 <= seed < 2**64:
-        raise RangeError("seed", seed, "0 to 2^64 - 1")
-    if not 0 < duration_s < float("inf") or round(duration_s * US_PER_S) < 1:
-        raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
-    duration_us = round(duration_s * US_PER_S)
+    require_seed(seed)
+    duration_us = whole_us(duration_s)
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
     try:
         chosen = CubeOptions.model_validate(options)

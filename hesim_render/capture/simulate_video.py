@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +13,12 @@ import numpy as np
 from hesim_render.capture.kept_run import KeptRun
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
+from hesim_render.capture.run_settings import require_seed
+from hesim_render.capture.scene_run import require_short
 from hesim_render.core import backend
-from hesim_render.core.errors import RangeError, SpecError, TooLongError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.journal import Journal, journal_of
-from hesim_render.core.progress import Progress, ProgressReport, in_words, shown
+from hesim_render.core.progress import Progress, expect, shown
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.mosaic.description import Mosaic, describe
 from hesim_render.mosaic.schedule import require_countable
@@ -28,58 +28,14 @@ from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor, as_sensor
 from hesim_render.sources.video import VideoFlux, VideoOptions
 from hesim_render.sources.video.digest import stamp_of
+from hesim_render.sources.video.estimate import VideoEstimate
 from hesim_render.sources.video.flux import Source
 from hesim_render.spectral import spectrum as spectra
 
 #: Tolerance of a duration that is given as the rounded length of the video, µs.
 _SLACK_US = 1.0
-#: Processor seconds for a pixel of a picture, of an event sample and of a frame that is read out and stored; seconds
-#: for each of these besides its pixels, and in all. From `benchmarks/video.py`, for one core of an AVX-512 server.
-_PER_PIXEL_S, _PER_ITEM_S, _IN_ALL_S = np.array([8e-9, 17e-9, 60e-9]), np.array([1e-3, 1e-3, 2e-2]), 4.0
-
 #: Estimated time of a run above which it is kept for another one to go on from, and time between its states, s.
 _LONG_S, _PART_S = 20.0, 10.0
-
-
-@dataclass(frozen=True)
-class VideoEstimate:
-    """Estimated work of a run, right to about a factor of two.
-
-    Parameters
-    ----------
-    seconds : total time, s.
-    pictures, event_samples, frames : number of each.
-    """
-
-    seconds: float
-    pictures: int
-    event_samples: int
-    frames: int
-
-    def __str__(self) -> str:
-        return (
-            f"about {in_words(self.seconds)}, {self.pictures} pictures, {self.event_samples} event samples, "
-            f"{self.frames} frames"
-        )
-
-
-def _forecast(flux: VideoFlux, sensor: Sensor, duration_us: int) -> VideoEstimate:
-    """Estimate from counts and from the measured time to read the first pictures.
-
-    Memory does not depend on the length of the run.
-    """
-    aps, evs, shape = sensor.spec.aps, sensor.spec.evs, sensor.layout.shape
-    pictures = min(flux.clock.count, int(np.searchsorted(flux.clock.middle_us, duration_us)) + 1)
-    samples = 0
-    if evs is not None:
-        samples = pictures if evs.tick_us is None else duration_us // evs.tick_us
-    frames = 0 if aps is None else int(duration_us * S_PER_US * aps.frame_rate_hz)
-    count = np.array([pictures, samples, frames], dtype=np.float64)
-    rows, cols = sensor.layout.evs_shape
-    pixels = np.array([shape[0] * shape[1], rows * cols, shape[0] * shape[1]])
-    seconds = (count * pixels * _PER_PIXEL_S).sum() / (os.cpu_count() or 1) + (count * _PER_ITEM_S).sum() + _IN_ALL_S
-    seconds += pictures * flux.seconds_per_picture(pictures)
-    return VideoEstimate(float(seconds), pictures, int(samples), frames)
 
 
 def simulate_video(
@@ -144,8 +100,7 @@ def simulate_video(
         output is left.
     """
     sensor = as_sensor(sensor)
-    if not 0 <= seed < 2**64:
-        raise RangeError("seed", seed, "0 to 2^64 - 1")
+    require_seed(seed)
     backend.jit()
     aps, evs = noise_models(sensor, clean, without)
     flux = VideoFlux(source, sensor, VideoOptions.of(**options))
@@ -153,22 +108,17 @@ def simulate_video(
         name = "array" if isinstance(source, np.ndarray) else str(source)
         duration_us = _duration_us(duration_s, flux, name)
         require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
-        expected = _forecast(flux, sensor, duration_us)
+        capture = Capture(flux, sensor, aps, evs, duration_us, seed)
+        expected = flux.estimate(capture.demand)
         if on_estimate is not None:
             on_estimate(expected)
-        if max_minutes is not None and expected.seconds > 60 * max_minutes:
-            raise TooLongError(
-                "max_minutes",
-                max_minutes,
-                f"this run takes {expected}, and one of more than {max_minutes:g} min has to be wanted: add --yes "
-                "(max_minutes=None), or ask for less: a shorter --duration or a smaller --roi",
-            )
+        if max_minutes is not None:
+            require_short(expected, max_minutes, "a shorter --duration or a smaller --roi")
         settings = {
             "clean": clean,
             "without": list(without),
             "backend": backend.select().label,
         }
-        capture = Capture(flux, sensor, aps, evs, duration_us, seed)
         with (
             RecordingWriter(
                 out,
@@ -182,8 +132,7 @@ def simulate_video(
             _journal(resume, source, flux, expected, out, writer, overwrite) as journal,
         ):
             with shown(progress, f"{Path(name).name} → {sensor.name}") as report:
-                if isinstance(report, ProgressReport):
-                    report.expect(expected.seconds)
+                expect(report, expected.seconds)
                 flux.start_digest()
                 kept = None if journal is None else KeptRun(capture, journal, _PART_S)
                 if kept is not None:
@@ -208,9 +157,7 @@ def _journal(
     if not is_kept or out is None or (expected.seconds < _LONG_S and not journal_of(out).is_file()):
         return nullcontext()
     made_by = writer.run["software"] | {"av": version("av")}
-    return Journal(
-        out, {**writer.run, "software": made_by, "video": flux.settings(), "input": stamp_of(source)}, overwrite
-    )
+    return Journal(out, {**writer.run, "software": made_by, **flux.settings, "input": stamp_of(source)}, overwrite)
 
 
 def _duration_us(duration_s: float | None, flux: VideoFlux, name: str) -> int:

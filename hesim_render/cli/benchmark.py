@@ -60,7 +60,8 @@ def build(
     content = read_benchmark(spec, dict(map(parse_override, set_ or [])))
     console = Console(json_, quiet, dry_run)
     if dry_run:
-        total, missing, expected = check_build(content, out)
+        with console.progress(content.name) as progress:
+            total, missing, expected = check_build(content, out, progress)
         text = f"{total} clips, {len(missing)} of them not yet built; nothing was written (--dry-run)"
         console.text("" if expected is None else f"estimate: {expected}")
         facts = {"dry_run": True, "clips": total, "missing": len(missing), "estimate": expected and facts_of(expected)}

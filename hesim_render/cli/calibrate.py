@@ -67,12 +67,12 @@ def lab(
     sensor_keys_only(scene_changes, "sensor.aps.read_noise_e")
     dark_us, lit_us = parse_exposures(dark_ms), parse_exposures(lit_ms)
     check_target(out, "capture.yaml", overwrite)
-    from hesim_render.capture.lab import write_captures
-    from hesim_render.sensor.sensor import load_sensor
-
-    loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
     console = Console(json_, quiet, dry_run)
     with console.stop_at_estimate(), console.progress(f"lab {sensor}") as progress:
+        from hesim_render.capture.lab import write_captures
+        from hesim_render.sensor.sensor import load_sensor
+
+        loaded = cropped(load_sensor(sensor, changes), None if roi == "full" else roi)
         folder = write_captures(
             loaded, out, frames=frames, ticks=ticks, trials=trials, parts=parts, seed=seed, without=without or (),
             illuminant=illuminant, overwrite=overwrite, progress=progress,

@@ -15,7 +15,7 @@ import typer
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.terminal import say
 from hesim_render.core.guard import printable
-from hesim_render.core.progress import ProgressReport, progress_report, silent_report
+from hesim_render.core.progress import SOON_S, ProgressReport, progress_report, silent_report
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
@@ -52,7 +52,7 @@ class Console:
 
     def progress(self, title: str) -> ProgressReport:
         """A display of the progress, to be used in a with statement."""
-        return silent_report() if self.quiet else progress_report(title)
+        return silent_report() if self.quiet else progress_report(title, first_s=SOON_S if self.dry_run else None)
 
     def text(self, text: str) -> None:
         """Print a line for people."""

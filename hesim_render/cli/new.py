@@ -37,7 +37,7 @@ def new(
     A template in which comments explain every key, or a copy of a shipped one.
     """
     free_place(out, overwrite, (".yaml", ".yml"))
-    from hesim_render.specs.sensor_template import sensor_copy, sensor_template
+    from hesim_render.sensor.template import sensor_copy, sensor_template
 
     if like in _KINDS:
         text = sensor_template(out.stem, like)

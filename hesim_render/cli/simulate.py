@@ -171,11 +171,11 @@ def _scene(
 ) -> Recording:
     """The recording of a scene."""
     check_output(out, overwrite)
-    import hesim_render as hr
-
-    loaded_sensor = cropped(hr.load_sensor(sensor, sensor_keys), roi)
-    loaded_scene = hr.load_scene(scene, scene_keys, allow_outside=allow_outside)
     with console.stop_at_estimate(), console.progress(f"{scene} → {sensor}") as progress:
+        import hesim_render as hr
+
+        loaded_sensor = cropped(hr.load_sensor(sensor, sensor_keys), roi)
+        loaded_scene = hr.load_scene(scene, scene_keys, allow_outside=allow_outside)
         return hr.simulate(
             loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
             on_estimate=console.estimated(progress), resume=True, **options,
@@ -195,11 +195,11 @@ def _pictures(
 ) -> None:
     """Record a video or a hyperspectral cube."""
     check_output(out, options["overwrite"])
-    import hesim_render as hr
-
-    loaded = cropped(hr.load_sensor(sensor, sensor_keys), roi)
-    options |= with_values(keys)
     with console.stop_at_estimate(), console.progress(f"{Path(given).name} → {sensor}") as progress:
+        import hesim_render as hr
+
+        loaded = cropped(hr.load_sensor(sensor, sensor_keys), roi)
+        options |= with_values(keys)
         options |= {"out": out, "progress": progress, "on_estimate": console.estimated(progress)}
         if kind is InputKind.video:
             recording = hr.simulate_video(given, loaded, resume=True, **options)
@@ -220,13 +220,13 @@ def _run(
     limits: dict[str, Any],
 ) -> None:
     """Do what the file of a run asks for, with other values of its keys and of those of the sensor file."""
-    from hesim_render.capture.run_file import run
-    from hesim_render.specs.files import load_yaml
-
-    if sensor_keys:
-        of_file = changes.get("set", load_yaml(file).get("set")) or {}
-        changes["set"] = {**of_file, **{f"sensor.{key}": value for key, value in sensor_keys.items()}}
     with console.stop_at_estimate(), console.progress(file.name) as progress:
+        from hesim_render.capture.run_file import run
+        from hesim_render.specs.files import load_yaml
+
+        if sensor_keys:
+            of_file = changes.get("set", load_yaml(file).get("set")) or {}
+            changes["set"] = {**of_file, **{f"sensor.{key}": value for key, value in sensor_keys.items()}}
         made = run(
             file, out, overrides=changes, allow_outside=allow_outside, progress=progress,
             on_estimate=console.estimated(progress), **limits,
@@ -241,13 +241,13 @@ def _again(
 ) -> None:
     """Make a recording again: the same bytes, on the same versions and backend."""
     check_output(out, limits["overwrite"])
-    from hesim_render.capture.again import simulate_again
-    from hesim_render.recording.recording import Recording
-    from hesim_render.sources.scene import load_scene
-
-    loaded = Recording.load(recording)
-    given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
     with console.stop_at_estimate(), console.progress(f"{recording} again") as progress:
+        from hesim_render.capture.again import simulate_again
+        from hesim_render.recording.recording import Recording
+        from hesim_render.sources.scene import load_scene
+
+        loaded = Recording.load(recording)
+        given = None if scene is None else load_scene(scene, allow_outside=allow_outside)
         again = simulate_again(
             loaded, out, given, progress=progress, on_estimate=console.estimated(progress), resume=True, **limits
         )

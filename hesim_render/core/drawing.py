@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from hesim_render.core.guard import printable
@@ -89,7 +90,7 @@ def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
                   columnspacing=1.2, handletextpad=0.4, borderpad=0.2, labelspacing=0.2, markerscale=1.8)  # fmt: skip
 
 
-def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> str:
+def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> Markup:
     """A map with a colour bar, its longer side `size_px`; colours span the 1st to the 99th percentile.
 
     Values that are not finite are grey.
@@ -111,7 +112,7 @@ def picture(title: str, values: NDArray, unit: str, size_px: int = 400) -> str:
     return svg(figure)
 
 
-def svg(figure: Figure) -> str:
+def svg(figure: Figure) -> Markup:
     """The figure as an SVG element for an HTML page, without prologue, metadata, date or styles of its own.
 
     The element needs no other file. Call this function within `report_style`, as all drawing functions.
@@ -136,4 +137,4 @@ def svg(figure: Figure) -> str:
         root.set(name, root.get(name, "").removesuffix("pt"))
     root.set("role", "img")
     ElementTree.register_namespace("", _SVG)
-    return ElementTree.tostring(root, encoding="unicode")
+    return Markup(ElementTree.tostring(root, encoding="unicode"))

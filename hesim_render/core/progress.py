@@ -24,6 +24,8 @@ _LEAST_DONE = 0.01
 _REFRESH_S = 0.5
 #: Without a terminal: seconds to the first line, growth of the interval per line, longest interval.
 _FIRST_LINE_S, _GROWTH, _LONGEST_S = 30.0, 2.0, 600.0
+#: The same where an answer is expected at once.
+SOON_S = 2.0
 
 
 class Pace:
@@ -170,9 +172,9 @@ class ProgressReport:
 class _Lines:
     """Occasional lines, for logs."""
 
-    def __init__(self, title: str, stream: TextIO) -> None:
+    def __init__(self, title: str, stream: TextIO, first_s: float | None = None) -> None:
         self._title, self._stream = title, stream
-        self._next_s = _FIRST_LINE_S
+        self._next_s = _FIRST_LINE_S if first_s is None else first_s
 
     def show(self, pace: Pace) -> None:
         now = pace.elapsed_s
@@ -285,18 +287,25 @@ def in_notebook() -> bool:
     return getattr(shell, "kernel", None) is not None
 
 
-def progress_report(title: str, stream: TextIO | None = None) -> ProgressReport:
+def progress_report(title: str, stream: TextIO | None = None, first_s: float | None = None) -> ProgressReport:
     """A report that suits the place where this runs.
 
     Parameters
     ----------
     title : title of the run.
     stream : default stderr.
+    first_s : time until the first line where `stream` is no terminal, s; default 30 s.
     """
     target, title = sys.stderr if stream is None else stream, printable(title)
     if in_notebook():
         return ProgressReport(_Notebook(title))
-    return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target))
+    return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target, first_s))
+
+
+def expect(progress: Progress | None, seconds: float) -> None:
+    """Let a report know the estimated time of the run from now on, s; a function of a caller is not told."""
+    if isinstance(progress, ProgressReport):
+        progress.expect(seconds)
 
 
 @contextlib.contextmanager

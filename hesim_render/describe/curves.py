@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.core.namespace import NUMPY
-from hesim_render.core.units import S_PER_US, US_PER_S
+from hesim_render.core.units import S_PER_US
 from hesim_render.pixels.evs import formulas
+from hesim_render.pixels.evs.formulas import POLE_HZ
+from hesim_render.pixels.evs.noise_rates import noise_rates_hz
+from hesim_render.sensor.from_data_sheet import electrons_per_s_lux, latency_us
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.specs.event_noise import noise_rates_hz
-from hesim_render.specs.from_data_sheet import electrons_per_s_lux, latency_us
 from hesim_render.spectral.spectrum import Spectrum, illuminant
 
 
@@ -99,7 +100,7 @@ class _Pixel:
         if self.spec.reference == "previous_sample":
             return np.sqrt(1 / (flux * self.spec.window_us * S_PER_US))
         assert self.spec.photoreceptor_cutoff_hz is not None
-        pole_hz = self.level(lux)[2] * self.spec.photoreceptor_cutoff_hz / math.sqrt(math.sqrt(2) - 1)
+        pole_hz = self.level(lux)[2] * self.spec.photoreceptor_cutoff_hz * POLE_HZ
         return np.sqrt(math.pi / 2 * pole_hz / flux)
 
     def latency(self, lux: float, step: float) -> float:
@@ -113,11 +114,9 @@ class _Pixel:
         if spec is None:
             return sampling
         corner = spec.cutoff_hz
-        if spec.follows_light and spec.signal_dn is not None and spec.min_cutoff_hz is not None:
-            reference = self.spec.signal_reference
-            scale = float(self.noise.signal_scale[self.position]) * reference.k_dn_per_e * reference.t_ref_us / US_PER_S
-            signal = lux * (1 + step) * self.flux * scale
-            corner = min(max(corner * signal / spec.signal_dn, spec.min_cutoff_hz), corner)
+        if spec.follows_light:
+            electrons = np.asarray(lux * (1 + step) * self.flux * (self.spec.window_us * S_PER_US))
+            corner = float(self.noise.corner_hz(electrons, self.position))
         return latency_us(corner, theta, after - before) + sampling
 
 
@@ -127,7 +126,7 @@ def event_curves(
     """Noise, noise events and latency of an event pixel against light.
 
     Rates at a fixed tick are the formulas of `hesim_render.pixels.evs.formulas`; of asynchronous pixels those of
-    `hesim_render.specs.event_noise`.
+    `hesim_render.pixels.evs.noise_rates`.
 
     Parameters
     ----------

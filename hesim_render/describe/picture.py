@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hesim_render.core.drawing import COLOURS, new_figure, report_style
 from hesim_render.core.errors import RangeError
@@ -88,21 +87,9 @@ def _against_light(axes: Axes, title: str, unit: str) -> None:
     axes.set_xticks(_LUX_TICKS)
 
 
-def _lux(sensor: Sensor) -> NDArray[np.float64]:
-    """Illuminances of the curves, lx. Of a data sheet they begin at its `dark_lux`, about the least usable light: below
-    it the model only holds the least corner of the photoreceptor, and its curves have a kink that no pixel has.
-    """
-    evs = sensor.evs.spec
-    is_derived = evs.data_sheet is not None or evs.v2e is not None
-    if not is_derived or evs.photoreceptor is None or not evs.photoreceptor.follows_light:
-        return _LUX
-    dark = evs.coefficients[0].beta2  # in lx, as the signal of a data sheet is
-    return np.append(dark, _LUX[dark < _LUX])
-
-
 def _noise(sensor: Sensor, axes: Axes) -> None:
     _against_light(axes, "Noise of ln x", "standard deviation")
-    curves = event_curves(sensor, _lux(sensor))
+    curves = event_curves(sensor, _LUX)
     if np.any(curves.sigma > 0):
         axes.plot(curves.lux, curves.sigma, color=COLOURS[0], label="model")
     axes.plot(curves.lux, curves.shot_limit, color=COLOURS[6], linestyle="--", label="shot noise of the electrons")
@@ -115,7 +102,7 @@ def _noise(sensor: Sensor, axes: Axes) -> None:
 
 def _rates(sensor: Sensor, axes: Axes) -> None:
     _against_light(axes, "Events in steady light", "events per s and pixel")
-    curves = event_curves(sensor, _lux(sensor))
+    curves = event_curves(sensor, _LUX)
     for rate, colour, label in (
         (curves.on_hz + curves.off_hz, COLOURS[7], "all events"), (curves.on_hz, COLOURS[1], "ON, with leak"),
         (curves.off_hz, COLOURS[0], "OFF"),
@@ -138,7 +125,7 @@ def _latency(sensor: Sensor, axes: Axes) -> None:
     sheet = sensor.evs.spec.data_sheet
     stated = 1.0 if sheet is None else 0.01 * sheet.speed_step_percent
     for k, step in enumerate(dict.fromkeys((0.5, stated, 3.0))):
-        curves = event_curves(sensor, _lux(sensor), step)
+        curves = event_curves(sensor, _LUX, step)
         if np.any(curves.latency_us > 0):
             axes.plot(curves.lux, curves.latency_us, color=COLOURS[k], label=f"step of {100 * step:g} %")
     for speed in sheet.speed if sheet is not None else ():

@@ -102,7 +102,7 @@ def _events(sensor: Sensor) -> list[Row]:
                 "noise bandwidth",
                 evs.photoreceptor_cutoff_hz,
                 "Hz",
-                None if sheet is None else sheet.noise_bandwidth_hz,
+                None if sheet is None else sheet.noise_cutoff_hz,
             )
         )
     if evs.refractory_period_us is not None:

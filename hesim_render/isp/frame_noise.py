@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.calibration.file import as_written, read_calibration, read_maps
+from hesim_render.calibration.measured import MeasuredMaps, measured_maps
 from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.units import S_PER_US
@@ -17,7 +19,6 @@ from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, dark_variance_dn2, light_gain_dn
 from hesim_render.pixels.aps.model import APS_TERMS, ApsNoise
 from hesim_render.recording.manifest import sensor_spec
-from hesim_render.specs.calibration import NoiseFile, as_written, read_calibration, read_maps
 from hesim_render.specs.sensor import SensorSpec
 
 Map = float | NDArray[np.float32]
@@ -134,10 +135,11 @@ class FrameNoise:
         settings, roi = manifest.get("settings", {}), manifest["roi"]
         without = (name.removeprefix("aps.") for name in settings.get("without", ()) if name.startswith("aps."))
         off = frozenset(APS_TERMS) if settings.get("clean") else frozenset(without)
-        known = spec.noise is None
+        known, measured = spec.noise is None, None
         if calibration is not None:
-            spec, known = _with_calibration(spec, Path(calibration)), True
-        return cls.of_sensor(spec, Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"]), off, known)
+            measured, known = _maps_of(spec, Path(calibration)), True
+        layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"], measured)
+        return cls.of_sensor(spec, layout, off, known)
 
     @classmethod
     def of_calibration(cls, file: str | Path, exposure_us: float) -> FrameNoise:
@@ -282,10 +284,8 @@ def _fitting(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np
     return np.broadcast_to(array, shape)
 
 
-def _with_calibration(spec: SensorSpec, path: Path) -> SensorSpec:
-    """The sensor of a recording with the path of its calibration, which the manifest does not hold."""
+def _maps_of(spec: SensorSpec, path: Path) -> MeasuredMaps:
+    """Maps of a recording's sensor, which the recording does not hold, from its calibration."""
     if spec.noise is None:
         raise SpecError("the recording's sensor has no calibration: its maps follow from its device seed", file=path)
-    here = NoiseFile(file=path.name, sha256=spec.noise.sha256, folder=path.parent)
-    here.read()
-    return spec.model_copy(update={"noise": here})
+    return measured_maps(spec.noise.model_copy(update={"file": path.name, "folder": path.parent}))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibration.measured import MeasuredMaps
 from hesim_render.core.errors import RangeError
 from hesim_render.core.plain import PlainState
 from hesim_render.specs.sensor import Role, SensorSpec
@@ -22,6 +23,8 @@ class Layout(PlainState):
     spec : the sensor file.
     row0, col0 : first row and column on the full sensor; whole tiles, so a crop keeps the tile's phase.
     rows, cols : size of the region in pixels.
+    maps : of the calibration that the sensor file names, over the region that it captured; None where there is no
+        calibration, or its maps are not at hand.
     """
 
     spec: SensorSpec
@@ -29,14 +32,15 @@ class Layout(PlainState):
     col0: int
     rows: int
     cols: int
+    maps: MeasuredMaps | None = None
 
     def __repr__(self) -> str:
         return f"<Layout {self.spec.name!r}: {self.cols}x{self.rows}+{self.col0}+{self.row0} px>"
 
     @classmethod
-    def full(cls, spec: SensorSpec) -> Layout:
+    def full(cls, spec: SensorSpec, maps: MeasuredMaps | None = None) -> Layout:
         """The whole sensor."""
-        return cls(spec, 0, 0, spec.geometry.rows, spec.geometry.cols)
+        return cls(spec, 0, 0, spec.geometry.rows, spec.geometry.cols, maps)
 
     def crop(self, width_px: int, height_px: int, x: int | None = None, y: int | None = None) -> Layout:
         """A region of this region, in whole tiles; centred where `x`, `y` are not given.
@@ -67,7 +71,7 @@ class Layout(PlainState):
             if offset < 0 or offset + size > whole:
                 raise RangeError(f"roi offset along {name}", offset, f"0 to {whole - size}, inside the sensor")
             starts.append(offset)
-        return Layout(self.spec, self.row0 + starts[1], self.col0 + starts[0], height_px, width_px)
+        return replace(self, row0=self.row0 + starts[1], col0=self.col0 + starts[0], rows=height_px, cols=width_px)
 
     @property
     def shape(self) -> tuple[int, int]:

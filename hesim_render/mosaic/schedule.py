@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.core.units import US_PER_S
-from hesim_render.specs.sensor import ApsSpec, EvsSpec
+from hesim_render.specs.event_pixels import EvsSpec
+from hesim_render.specs.frame_pixels import ApsSpec
 
 #: Longest run with events, µs (times are stored in 32 bit); without events; and most frames and comparisons.
 _MOST_EVENT_US, _MOST_US = 2**32 - 1, 10**12

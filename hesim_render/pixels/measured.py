@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibration.measured import MeasuredMaps
+from hesim_render.calibration.rates import (
+    EventDefectRates,
+    EventDefectsPerTrial,
+    RateMaps,
+    TelegraphPerFrame,
+    TelegraphRates,
+)
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs.calibration import MeasuredMaps
-from hesim_render.specs.calibration_rates import PER_INTERVAL, PER_SECOND, per_second
-from hesim_render.specs.calibration_spec import Defect
 
 #: Kinds of value (`numpy.dtype.kind`) of a map and its largest size: DN, DN, DN/s, true or false.
 _EXPECTED = {
@@ -42,14 +49,14 @@ def require_region(layout: Layout) -> None:
         If they do not; the message names the region of the maps.
     """
     if layout.spec.noise is not None:
-        _offset(layout, layout.spec.noise.measured)
+        _offset(layout, _maps_of(layout))
 
 
 def measured_part(layout: Layout) -> Layout:
     """The region that the maps of the calibration cover, if it lies inside the given one; else the given one."""
     if layout.spec.noise is None:
         return layout
-    row, col, rows, cols = _region(layout, layout.spec.noise.measured)
+    row, col, rows, cols = _region(layout, _maps_of(layout))
     inside = layout.row0 <= row and row + rows <= layout.row0 + layout.rows
     inside &= layout.col0 <= col and col + cols <= layout.col0 + layout.cols
     return layout.crop(cols, rows, col - layout.col0, row - layout.row0) if inside else layout
@@ -69,36 +76,53 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
     return {name: values.astype(np.float32) for name, values in (cut | {"n_row": maps["n_row"][rows, None]}).items()}
 
 
-def telegraph_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
-    """``telegraph_amplitude_dn``, ``…_high_share`` and ``…_change_hz`` [row, col] over the region; None if not
-    measured.
-    """
-    return _misbehaving(layout, "aps", _frame_region)
+def telegraph_rates(layout: Layout) -> TelegraphRates | None:
+    """Random telegraph noise of each pixel of the region, [row, col]; None if not measured."""
+    known = _all_of(TelegraphRates, layout, "aps", _frame_region)
+    if known is not None:
+        return known
+    counted = _all_of(TelegraphPerFrame, layout, "aps", _frame_region)
+    return None if counted is None else counted.per_second(_interval_s(layout, "aps"))
 
 
-def event_defects(layout: Layout) -> dict[str, NDArray] | None:
-    """``defect`` (its kind) and its rates in Hz [y, x] over the region; None if not measured."""
-    return _misbehaving(layout, "evs", _event_region)
+def event_defect_rates(layout: Layout) -> EventDefectRates | None:
+    """Defects of each event pixel of the region, [y, x]; None if not measured."""
+    known = _all_of(EventDefectRates, layout, "evs", _event_region)
+    if known is not None:
+        return known
+    counted = _all_of(EventDefectsPerTrial, layout, "evs", _event_region)
+    return None if counted is None else counted.per_second(_interval_s(layout, "evs"))
 
 
 _Found = tuple[Mapping[str, NDArray], tuple[int, int]]
+_Kind = TypeVar("_Kind", bound=RateMaps)
 
 
-def _misbehaving(
-    layout: Layout, section: str, cut: Callable[[Layout, _Found, tuple[str, ...]], dict[str, NDArray]]
-) -> dict[str, NDArray] | None:
-    """Maps of a section in Hz over the region, all of them or none."""
-    for names in (PER_SECOND[section], PER_INTERVAL[section]):
-        found = _read(layout, section, names)
-        if found is None or len(found[0]) < len(names):
-            continue
-        maps = cut(layout, found, names)
-        if names == PER_SECOND[section]:
-            return maps
-        assert layout.spec.noise is not None
-        # without an interval no pixel misbehaves: the calibration would have been refused
-        return per_second(section, maps, layout.spec.noise.measured.intervals_s[section] or 1.0)
-    return None
+def _all_of(
+    kind: type[_Kind],
+    layout: Layout,
+    section: str,
+    cut: Callable[[Layout, _Found, tuple[str, ...]], dict[str, NDArray]],
+) -> _Kind | None:
+    """Maps of one kind over the region, all of them or none."""
+    found = _read(layout, section, kind.names())
+    if found is None or len(found[0]) < len(kind.names()):
+        return None
+    return kind.of(cut(layout, found, kind.names()))
+
+
+def _interval_s(layout: Layout, section: str) -> float:
+    # without an interval no pixel misbehaves: the calibration would have been refused
+    return _maps_of(layout).intervals_s[section] or 1.0
+
+
+def _maps_of(layout: Layout) -> MeasuredMaps:
+    if layout.maps is None:
+        raise SpecError(
+            f"the maps of the calibration of sensor {layout.spec.name!r} are not at hand; load its file",
+            key="noise",
+        )
+    return layout.maps
 
 
 def _frame_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict[str, NDArray]:
@@ -143,7 +167,7 @@ def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping
     """Whole maps of a section, and the row and column of the mosaic in them where the region read out begins."""
     if layout.spec.noise is None:
         return None
-    measured = layout.spec.noise.measured
+    measured = _maps_of(layout)
     if section not in measured.sections:
         return None
     offset = _offset(layout, measured)

@@ -20,7 +20,7 @@ from hesim_render.recording.colour_view import colour_picture
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: Interval of boxes on the event grid, µs: that of DSEC-det.
 BOXES_EVERY_US = 50_000
@@ -79,7 +79,7 @@ def classes(names: tuple[str, ...]) -> tuple[list[str], NDArray[np.int64]]:
 
 
 def _event_boxes(
-    recording: Recording, truth: SceneTruth, every_us: int | None, kind: np.dtype
+    recording: Recorded, truth: SceneTruth, every_us: int | None, kind: np.dtype
 ) -> tuple[NDArray, NDArray[np.int64], dict[str, Any]]:
     """Boxes on the event grid as records, their times, and their description."""
     step = every_us or min(BOXES_EVERY_US, recording.duration_us)
@@ -97,16 +97,14 @@ def _event_boxes(
     return np.concatenate(parts), times, facts
 
 
-def write_prophesee_boxes(
-    recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None
-) -> dict[str, Any]:
+def write_prophesee_boxes(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``recording_bbox.npy`` for ``recording_td.dat``."""
     rows, _, facts = _event_boxes(recording, truth, every_us, PROPHESEE_BOX)
     np.save(folder / "recording_bbox.npy", rows)
     return facts
 
 
-def write_dsec_det(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def write_dsec_det(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``object_detections/left/tracks.npy``, with the times of the boxes as those of images."""
     rows, times, facts = _event_boxes(recording, truth, every_us, DSEC_BOX)
     for name in ("object_detections/left", "images"):
@@ -116,7 +114,7 @@ def write_dsec_det(recording: Recording, truth: SceneTruth, folder: Path, every_
     return facts
 
 
-def write_coco(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def write_coco(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     """``annotations/instances.json`` with boxes and masks of each frame, and the frames as 8-bit sRGB in ``images``."""
     from PIL import Image
 

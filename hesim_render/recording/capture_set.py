@@ -17,9 +17,10 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
 from hesim_render.core.npz import member_header, read_arrays, stream_member
 from hesim_render.core.units import S_PER_US
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import load_yaml, validate
-from hesim_render.specs.sensor import SensorSpec, read_sensor
+from hesim_render.specs.sensor import SensorSpec
 
 #: Largest clean signal of an event pixel: a thousand times the largest DN of 16 bits, for bright lights.
 BRIGHTEST_DN = 65535e3

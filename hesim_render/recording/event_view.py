@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hesim_render.recording.colour_view import Picture
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 ON_COLOUR = np.array([255, 150, 20], dtype=np.float32)
 OFF_COLOUR = np.array([30, 160, 255], dtype=np.float32)
@@ -45,7 +45,7 @@ def events_picture(background: Picture, events: NDArray, event_shape: tuple[int,
     return (canvas * (1 - opacity) + colour * opacity).astype(np.uint8)
 
 
-def black_picture(recording: Recording, widest_px: int = 1024) -> Picture:
+def black_picture(recording: Recorded, widest_px: int = 1024) -> Picture:
     """A black picture of the shape of a recording, at most about so wide: a background where there are no frames."""
     roi = recording.manifest["roi"]
     shrink = max(1, -(-roi["width_px"] // widest_px))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,17 +15,16 @@ from hesim_render.exchange import EVENT_FORMATS, FRAME_FORMATS, EventStream, eve
 from hesim_render.exchange.dsec import stream_events
 from hesim_render.exchange.triggers import exposure_triggers
 from hesim_render.mosaic.description import Mosaic
+from hesim_render.recording.movie import write_movie
 from hesim_render.recording.tick_files import write_tick_files
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: File that says what the frames of a folder are, and marks the folder for `overwrite`.
 FRAMES_NAME = "frames.json"
 #: Formats of events and frames together.
 WHOLE_FORMATS = ("mcap", "mcap-evt3", "raw-npz", "mp4", "mp4-colour", "mp4-events")
-#: Writers of the formats that are drawn. The package adds them, as recordings do not know their pictures.
-DRAWN: dict[str, Callable[[Recording, Path], object]] = {}
 #: Ends of the names of formats that are one file; all others are folders.
 SUFFIXES: dict[str, tuple[str, ...]] = {
     **{name: (kind.suffix,) for name, kind in EVENT_FORMATS.items()},
@@ -38,7 +36,7 @@ _FILES |= {".tif", ".exr", ".yaml", ".csv", ".json"}
 _NEED_FRAMES = (*FRAME_FORMATS, "mp4-colour")
 
 
-def event_stream(recording: Recording) -> EventStream:
+def event_stream(recording: Recorded) -> EventStream:
     """The events of a recording; from disk, one block at a time. Its triggers are the exposures of the frames' first
     rows.
     """
@@ -52,13 +50,13 @@ def event_stream(recording: Recording) -> EventStream:
     return EventStream(lambda: stream_events(file, count), grid, file, interval, lambda: _triggers(recording))
 
 
-def _triggers(recording: Recording) -> NDArray:
+def _triggers(recording: Recorded) -> NDArray:
     """Edges at the begin and the end of the exposure of each frame's first row."""
     begin = np.array([frame["exposure_start_us"] for frame in recording.manifest["frames"]], np.int64)
     return exposure_triggers(begin, begin + [frame["exposure_us"] for frame in recording.manifest["frames"]])
 
 
-def export(recording: Recording, format: str, path: str | Path, overwrite: bool = False) -> Path:
+def export(recording: Recorded, format: str, path: str | Path, overwrite: bool = False) -> Path:
     """Write the events of a recording as a file, its frames or its geometric truth as a folder; see
     `Recording.export`.
     """
@@ -82,7 +80,7 @@ def export(recording: Recording, format: str, path: str | Path, overwrite: bool 
                 )  # fmt: skip
                 _write_mcap(recording, temporary, target, packed)
             else:
-                DRAWN[format](recording, temporary)
+                write_movie(recording, temporary, format)
         return target
     return _write_frames(recording, format, path, overwrite)
 
@@ -174,7 +172,7 @@ def import_events(
     return write_events(open_events(source, format, shape), "dsec", path, overwrite)
 
 
-def _write_mcap(recording: Recording, path: Path, target: Path, packed: mcap_file.Packed | None) -> None:
+def _write_mcap(recording: Recorded, path: Path, target: Path, packed: mcap_file.Packed | None) -> None:
     """Events and frames as messages of ROS 2."""
     events = event_stream(recording) if min(recording.event_shape) > 0 else None
     frames = ((frame.t_us, frame.raw) for frame in recording.frames)
@@ -189,7 +187,7 @@ def mosaic_encoding(mosaic: Mosaic) -> str:
     return f"bayer_{letters.lower()}16" if known else "mono16"
 
 
-def _write_ticks(recording: Recording, path: str | Path, overwrite: bool) -> Path:
+def _write_ticks(recording: Recorded, path: str | Path, overwrite: bool) -> Path:
     """The npz files of H-ESIM and RGB-Event-ISP, with `FRAMES_NAME` to mark the folder."""
     tick_us = (recording.manifest["sensor"]["spec"].get("evs") or {}).get("tick_us")
     if tick_us is None and not len(recording.frames):
@@ -206,7 +204,7 @@ def _write_ticks(recording: Recording, path: str | Path, overwrite: bool) -> Pat
         raise
 
 
-def _write_frames(recording: Recording, format: str, path: str | Path, overwrite: bool) -> Path:
+def _write_frames(recording: Recorded, format: str, path: str | Path, overwrite: bool) -> Path:
     """Write all frames as files of one folder, with `FRAMES_NAME` beside them."""
     kind, mosaic = FRAME_FORMATS[format], recording.mosaic
     folder = OutputFolder(path, FRAMES_NAME, overwrite)

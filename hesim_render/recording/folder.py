@@ -19,10 +19,8 @@ from hesim_render.recording.colour_view import thumbnail
 from hesim_render.recording.dng import write_dng
 from hesim_render.recording.frame import EventTruth, Frame
 from hesim_render.recording.label_file import LabelFileWriter, write_objects
-
-#: Functions called with each complete folder before it gets its name. A module that draws pictures of recordings
-#: appends its function here, so that the writer does not need to import it.
-DRAWERS: list[Callable[[Path], object]] = []
+from hesim_render.recording.recorded import Recorded
+from hesim_render.recording.showcase import write_previews
 
 
 class FolderWriter:
@@ -122,7 +120,7 @@ class FolderWriter:
         self.write_in(name, lambda path: shutil.copyfile(source, path))
 
     def finish(self) -> Path:
-        """Write the manifest, call `DRAWERS`, and rename the folder to its final name, which is returned."""
+        """Write the manifest, draw the previews, and rename the folder to its final name, which is returned."""
         with output_errors(self._folder.target):
             self._events.close()
             if self._labels is not None:
@@ -138,8 +136,7 @@ class FolderWriter:
             }
             text = manifests.to_text(self.manifest) + "\n"
             (self._folder.path / manifests.MANIFEST_NAME).write_text(text, encoding="utf-8")
-            for draw in DRAWERS:
-                draw(self._folder.path)
+            write_previews(Recorded.load(self._folder.path), self._folder.path)
         target = self._folder.commit()
         self._finished = True
         return target

@@ -16,7 +16,7 @@ from hesim_render.recording.event_view import black_picture, events_picture
 from hesim_render.recording.preview import magnified
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: Pictures per second of the video, and time that one shows where there are no frames, µs.
 _FPS, _STEP_US = 25, 10_000
@@ -29,7 +29,7 @@ _FEWEST = 50
 _QUALITY = "18"
 
 
-def write_movie(recording: Recording, path: Path, kind: str) -> int:
+def write_movie(recording: Recorded, path: Path, kind: str) -> int:
     """Write an MP4 file (H.264) with a picture for each frame, or for each 10 ms where there are no frames.
 
     Without frames there are at most 6000 pictures: those of a recording of more than a minute show longer times.
@@ -74,7 +74,7 @@ def write_movie(recording: Recording, path: Path, kind: str) -> int:
     return count
 
 
-def _pictures(recording: Recording, kind: str) -> Iterator[Picture]:
+def _pictures(recording: Recorded, kind: str) -> Iterator[Picture]:
     time = recording.manifest["time"]
     begin_us, end_us = time["begin_us"], time["end_us"]
     if len(recording.frames):

@@ -12,13 +12,13 @@ from hesim_render.core.html import inline_picture, table
 from hesim_render.core.units import US_PER_S
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: Longer side of the picture of a frame, px.
 _THUMBNAIL_PX = 480
 
 
-def parameters(recording: Recording) -> list[tuple[str, str]]:
+def parameters(recording: Recorded) -> list[tuple[str, str]]:
     """What a recording holds, as pairs of a name and a text."""
     manifest = recording.manifest
     roi, grid, counts = manifest["roi"], manifest["event_grid"], manifest["counts"]
@@ -39,7 +39,7 @@ def parameters(recording: Recording) -> list[tuple[str, str]]:
     return [(name, printable(text)) for name, text in rows]
 
 
-def scene_name(recording: Recording) -> str:
+def scene_name(recording: Recorded) -> str:
     """Name of the scene, or of the file that stands for it: a video, a cube, or the first one of a capture."""
     settings, scene = recording.manifest["settings"], recording.manifest.get("scene")
     if "video" in settings:
@@ -52,7 +52,7 @@ def scene_name(recording: Recording) -> str:
     return str((scene or {}).get("name", "no scene file"))
 
 
-def text_summary(recording: Recording) -> str:
+def text_summary(recording: Recorded) -> str:
     """`Recording.__repr__`."""
     counts, roi, grid = (recording.manifest[key] for key in ("counts", "roi", "event_grid"))
     parts = [f"{recording.duration_us / US_PER_S:g} s"]
@@ -74,4 +74,4 @@ def frame_summary(raw: np.ndarray, rows: list[tuple[str, str]]) -> str:
     some = raw[::step, ::step].astype(np.float64)
     low, high = np.quantile(some, [0.005, 0.995]) if some.size else (0.0, 1.0)
     grey = np.clip(255 * (some - low) / max(high - low, 1.0), 0, 255).astype(np.uint8)
-    return f"{table(('', ''), rows)}{inline_picture(grey, 'RAW values')}"
+    return table(("", ""), rows) + inline_picture(grey, "RAW values")

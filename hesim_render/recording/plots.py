@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: Intervals of the curve of event rates.
 _INTERVALS = 200
@@ -26,9 +26,9 @@ _PANEL_PX = (460, 320)
 _TINTS = {"red": "#d62728", "green": "#2ca02c", "blue": "#1f77b4"}
 
 
-def figure_of(recording: Recording) -> Figure:
+def figure_of(recording: Recorded) -> Figure:
     """`Recording.plot`."""
-    draws: list[Callable[[Recording, Axes], None]] = []
+    draws: list[Callable[[Recorded, Axes], None]] = []
     pictures = middle_views(recording)
     if min(recording.event_shape) > 0:
         draws.append(draw_rates)
@@ -53,7 +53,7 @@ def figure_of(recording: Recording) -> Figure:
     return figure
 
 
-def draw_rates(recording: Recording, axes: Axes) -> None:
+def draw_rates(recording: Recorded, axes: Axes) -> None:
     """ON and OFF events per second over the recording; from disk, one interval at a time is read."""
     time = recording.manifest["time"]
     evs = recording.manifest["sensor"]["spec"].get("evs") or {}
@@ -73,7 +73,7 @@ def draw_rates(recording: Recording, axes: Axes) -> None:
     axes.legend(frameon=False)
 
 
-def draw_histogram(recording: Recording, axes: Axes) -> None:
+def draw_histogram(recording: Recorded, axes: Axes) -> None:
     """RAW values of the middle frame, of each filter."""
     frame, mosaic = recording.frames[len(recording.frames) // 2], recording.mosaic
     tile = mosaic.tile_channel

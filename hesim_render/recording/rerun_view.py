@@ -23,7 +23,7 @@ from hesim_render.recording.colour_view import colour_picture
 from hesim_render.recording.event_view import OFF_COLOUR, ON_COLOUR
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 TIMELINE = "recording"
 #: Length of a step of events, µs.
@@ -39,7 +39,7 @@ def can_show() -> bool:
     return find_spec("rerun") is not None and bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def write_rrd(recording: Recording, path: Path, progress: Progress | None = None) -> None:
+def write_rrd(recording: Recorded, path: Path, progress: Progress | None = None) -> None:
     """Write a file that rerun opens (``rerun FILE``).
 
     Parameters
@@ -59,7 +59,7 @@ def write_rrd(recording: Recording, path: Path, progress: Progress | None = None
     stream.disconnect()
 
 
-def show(recording: Recording, progress: Progress | None = None) -> None:
+def show(recording: Recorded, progress: Progress | None = None) -> None:
     """Open the viewer with a recording; it stays open when this program ends.
 
     Parameters
@@ -77,7 +77,7 @@ def show(recording: Recording, progress: Progress | None = None) -> None:
     stream.flush()
 
 
-def _stream(recording: Recording) -> Any:
+def _stream(recording: Recorded) -> Any:
     try:
         import rerun
     except ImportError:
@@ -88,7 +88,7 @@ def _stream(recording: Recording) -> Any:
     return rerun.RecordingStream("hesim_render", recording_id=name)
 
 
-def _log(stream: Any, recording: Recording, progress: Progress | None) -> None:
+def _log(stream: Any, recording: Recorded, progress: Progress | None) -> None:
     import rerun
 
     time = recording.manifest["time"]
@@ -123,7 +123,7 @@ def _at(stream: Any, t_us: float) -> None:
     stream.set_time(TIMELINE, duration=t_us * S_PER_US)
 
 
-def _log_frame(stream: Any, recording: Recording, number: int) -> None:
+def _log_frame(stream: Any, recording: Recorded, number: int) -> None:
     import rerun
 
     frame = recording.frames[number]
@@ -150,7 +150,7 @@ def _log_events(stream: Any, events: NDArray, shape: tuple[int, int], first_us: 
     stream.log("events/rate", rerun.Scalars(rates))
 
 
-def _log_poses(stream: Any, recording: Recording) -> None:
+def _log_poses(stream: Any, recording: Recorded) -> None:
     """Poses of the camera (x right, y down, z forward) and of the objects, in the world of the scene."""
     import rerun
 

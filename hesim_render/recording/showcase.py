@@ -19,7 +19,7 @@ from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
 
 if TYPE_CHECKING:
     from hesim_render.recording.frame import Frame
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 #: Length of the window of events that is shown for a moving scene, µs.
 WINDOW_US = 10_000
@@ -28,7 +28,7 @@ _ANIMATION_WIDTH_PX = 640
 _ZOOM = 8
 
 
-def write_previews(recording: Recording, folder: Path) -> list[Path]:
+def write_previews(recording: Recorded, folder: Path) -> list[Path]:
     """Write ``preview.png`` and, where they apply, ``preview.dng`` and ``preview.gif``; returns their paths.
 
     Each file replaces an earlier one in one step. A link with its name is replaced, not followed.
@@ -48,7 +48,7 @@ def write_previews(recording: Recording, folder: Path) -> list[Path]:
     return written
 
 
-def moves(recording: Recording) -> bool:
+def moves(recording: Recorded) -> bool:
     """True if the scene of a recording has motion; a video always counts as moving."""
     if "video" in recording.manifest["settings"]:
         return True
@@ -56,11 +56,11 @@ def moves(recording: Recording) -> bool:
     return bool(scene.get("spec", {}).get("motion"))
 
 
-def _middle(recording: Recording) -> Frame:
+def _middle(recording: Recorded) -> Frame:
     return recording.frames[len(recording.frames) // 2]
 
 
-def middle_views(recording: Recording) -> list[Panel]:
+def middle_views(recording: Recorded) -> list[Panel]:
     """Colour view of the middle frame and the events around it; empty where there are neither."""
     panels: list[Panel] = []
     mosaic = recording.mosaic
@@ -85,7 +85,7 @@ def middle_views(recording: Recording) -> list[Panel]:
     return panels
 
 
-def contact_sheet(recording: Recording) -> Image.Image:
+def contact_sheet(recording: Recorded) -> Image.Image:
     """Colour view, events over it, the RAW mosaic whole and magnified, with captions."""
     panels, mosaic = middle_views(recording), recording.mosaic
     roi = recording.manifest["roi"]
@@ -107,7 +107,7 @@ def contact_sheet(recording: Recording) -> Image.Image:
     return preview.contact_sheet(panels, printable(title), width_px)
 
 
-def _mosaic_panels(frame: Frame, recording: Recording, colour: Picture, width_px: int, step: int) -> list[Panel]:
+def _mosaic_panels(frame: Frame, recording: Recorded, colour: Picture, width_px: int, step: int) -> list[Panel]:
     """The RAW mosaic in the tints of its filters, and its part with the most contrast magnified."""
     mosaic = recording.mosaic
     rows, cols = frame.raw.shape
@@ -127,7 +127,7 @@ def _mosaic_panels(frame: Frame, recording: Recording, colour: Picture, width_px
     return [Panel(whole, f"RAW mosaic in the tints of its filters{shown}"), zoomed]
 
 
-def animation(recording: Recording) -> list[Picture]:
+def animation(recording: Recorded) -> list[Picture]:
     """Events over the latest frame, step by step through the recording."""
     if min(recording.event_shape) == 0:
         frames = [colour_picture(f.raw, recording.mosaic, _ANIMATION_WIDTH_PX) for f in recording.frames]
@@ -147,7 +147,7 @@ def animation(recording: Recording) -> list[Picture]:
     return pictures
 
 
-def _size(recording: Recording) -> str:
+def _size(recording: Recorded) -> str:
     roi = recording.manifest["roi"]
     return f"{roi['width_px']}x{roi['height_px']}"
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 
-def write_tick_files(recording: Recording, folder: Path, tick_us: int | None) -> int:
+def write_tick_files(recording: Recorded, folder: Path, tick_us: int | None) -> int:
     """Write ``TTTTTTTTT_aps_raw.npz`` and ``TTTTTTTTT_evs.npz``, with the time in µs in nine digits.
 
     H-ESIM has frames as ``raw`` and events as ``events``, -1, 0 or +1; RGB-Event-ISP has ``aps_raw`` and ``event_raw``,

@@ -28,7 +28,7 @@ from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 if TYPE_CHECKING:
-    from hesim_render.recording.recording import Recording
+    from hesim_render.recording.recorded import Recorded
 
 MARKER = "export.json"
 #: DSEC's flow: 16 bit, 1/128 px, zero at 2¹⁵; interval of its flow, µs.
@@ -36,7 +36,7 @@ _DSEC_ZERO, _DSEC_STEPS, DSEC_EVERY_US = 1 << 15, 128.0, 100_000
 
 
 def export_truth(
-    recording: Recording, format_: str, out: str | Path, *, every_us: int | None = None, overwrite: bool = False
+    recording: Recorded, format_: str, out: str | Path, *, every_us: int | None = None, overwrite: bool = False
 ) -> Path:
     """Write the geometric truth of a recording in a format that others read.
 
@@ -103,7 +103,7 @@ _CHANNELS = {
 }
 
 
-def _exr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def _exr(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     import OpenEXR
 
     frames = recording.manifest["frames"]
@@ -160,7 +160,7 @@ def _png16(path: Path, image: NDArray[np.uint16]) -> None:
     path.write_bytes(b"".join(bytes(packet) for packet in [*codec.encode(frame), *codec.encode(None)]))
 
 
-def _dsec_flow(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def _dsec_flow(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     step = every_us or min(DSEC_EVERY_US, recording.duration_us)
     times = np.arange(0, recording.duration_us + 1, step)
     (folder / "forward").mkdir()
@@ -196,7 +196,7 @@ def tum_lines(t_us: NDArray[np.float64], poses: NDArray[np.float64]) -> list[str
     ]
 
 
-def _tum(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def _tum(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     times = np.arange(0, recording.duration_us + 1, every_us or POSE_STEP_US, dtype=np.float64)
     files = {"camera.txt": ("camera in world", truth.camera_pose(times))}
     for number, (name, poses) in enumerate(truth.object_poses(times).items(), start=1):
@@ -216,14 +216,14 @@ def _grids(truth: SceneTruth) -> list[Grid]:
     return grids + (["events"] if 0 not in truth.sensor.layout.evs_shape else [])
 
 
-def _opencv(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def _opencv(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     names = {grid: f"camera_{grid}.yaml" for grid in _grids(truth)}
     for grid, name in names.items():
         write_opencv_camera(folder / name, truth.camera(grid))
     return {"files": {name: f"camera of the grid {grid!r}" for grid, name in names.items()}}
 
 
-def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
+def _kalibr(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int | None) -> dict[str, Any]:
     grids = _grids(truth)
     write_kalibr_camchain(folder / "camchain.yaml", [truth] * len(grids), grids)
     model = ImuModel()
@@ -240,7 +240,7 @@ def _kalibr(recording: Recording, truth: SceneTruth, folder: Path, every_us: int
 
 
 #: Writers by the name of their format.
-FORMATS: dict[str, Callable[[Recording, SceneTruth, Path, int | None], dict[str, Any]]] = {
+FORMATS: dict[str, Callable[[Recorded, SceneTruth, Path, int | None], dict[str, Any]]] = {
     "exr": _exr,
     "dsec-flow": _dsec_flow,
     "tum": _tum,

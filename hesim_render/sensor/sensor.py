@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.calibration.measured import MeasuredMaps
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.html import table
 from hesim_render.core.plain import PlainState
@@ -20,10 +21,11 @@ from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.measured import measured_part, require_region
 from hesim_render.sensor import lens as optics
 from hesim_render.sensor.lens import Lens
+from hesim_render.sensor.reading import read_sensor_file
 from hesim_render.specs.files import load_yaml, locate
 from hesim_render.specs.lens import LensSpec
 from hesim_render.specs.problems import line_of
-from hesim_render.specs.sensor import SensorSpec, read_sensor
+from hesim_render.specs.sensor import SensorSpec
 from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 
 
@@ -59,19 +61,20 @@ class Sensor(PlainState):
     file: str = field(default="", compare=False)
 
     @classmethod
-    def from_spec(cls, spec: SensorSpec, file: str = "") -> Sensor:
+    def from_spec(cls, spec: SensorSpec, file: str = "", maps: MeasuredMaps | None = None) -> Sensor:
         """The whole sensor that a specification describes, with its own lens.
 
         Parameters
         ----------
         spec : validated content of a sensor file.
         file : name or path of that file, for error messages.
+        maps : of the calibration that it names.
 
         Returns
         -------
         The sensor, with all rows and columns read out.
         """
-        return cls(Layout.full(spec), Lens.of(spec), file)
+        return cls(Layout.full(spec, maps), Lens.of(spec), file)
 
     def __repr__(self) -> str:
         layout, geometry, lens = self.layout, self.spec.geometry, self.lens
@@ -276,7 +279,8 @@ def load_sensor(name_or_path: str | Path, overrides: Mapping[str, Any] | None = 
     SpecError
         If the file is not valid; the message names file, line and key.
     """
-    return Sensor.from_spec(read_sensor(name_or_path, overrides), str(name_or_path))
+    spec, maps = read_sensor_file(name_or_path, overrides)
+    return Sensor.from_spec(spec, str(name_or_path), maps)
 
 
 def as_sensor(given: Sensor | str | Path) -> Sensor:

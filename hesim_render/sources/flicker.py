@@ -13,7 +13,7 @@ less; in each cell of time (`schedule.CELL_US`) the kind with fewer pieces is us
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,37 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Halves
 from hesim_render.mosaic.schedule import CELL_US, Block, blocks_of_run
-from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.protocol import AuditableFlux, FluxSource, Sample
-from hesim_render.sources.scene import Scene
 from hesim_render.sources.still import Kept
 from hesim_render.spectral.waveform import Waveform
 
 #: Largest number of samples while an event window passes over a jump of the light.
 _WINDOW_STEPS = 8
-
-
-def flickering(
-    scene: Scene, make: Callable[[Scene, Waveform | None], FluxSource], window_us: float = 1.0
-) -> FluxSource:
-    """The source of a scene's flux, with steady or flickering lights.
-
-    Parameters
-    ----------
-    scene : with or without waveforms.
-    make : builds the source of one part of the scene; called once where no light flickers. The second argument is the
-        waveform of the part's lights, None if they are steady.
-    window_us : length of the window in which event pixels integrate, µs. Samples follow a jump of the light through it.
-
-    Returns
-    -------
-    A `FluxSource`.
-    """
-    parts = light_parts(scene)
-    if len(parts) == 1 and parts[0][0] is None:
-        return make(parts[0][1], None)
-    waveforms = [waveform for waveform, _ in parts]
-    return FlickerFlux(waveforms, [make(part, waveform) for waveform, part in parts], window_us)
 
 
 class FlickerFlux:
@@ -67,7 +42,6 @@ class FlickerFlux:
     Attributes
     ----------
     sources : as given.
-    sensor, view : those of the first source, where it has any.
     is_static : False.
     """
 
@@ -76,7 +50,6 @@ class FlickerFlux:
     ) -> None:
         self.sources, self._waveforms, self._window_us = tuple(sources), tuple(waveforms), window_us
         first = self.sources[0]
-        self.sensor, self.view = getattr(first, "sensor", None), getattr(first, "view", None)
         self.is_static = False
         self._still = Kept(self.sources) if first.is_static else None
         self._is_whole = all(

@@ -52,9 +52,9 @@ class _Ranges(Strict):
 class MaterialShares(Strict):
     """Relative frequencies of the materials of surfaces."""
 
-    matt: float = Field(4.0, ge=0)
-    plastic: float = Field(1.0, ge=0, description="matt below a smooth coat")
-    rough_plastic: float = Field(1.0, ge=0, description="matt below a rough coat")
+    diffuse: float = Field(4.0, ge=0)
+    plastic: float = Field(1.0, ge=0, description="diffuse below a smooth coat")
+    rough_plastic: float = Field(1.0, ge=0, description="diffuse below a rough coat")
     metal: float = Field(0.5, ge=0, description="rough metal")
     glass: float = Field(0.0, ge=0, description="takes several times as long as the others")
 

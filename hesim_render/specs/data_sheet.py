@@ -46,7 +46,7 @@ class DataSheetSpec(Strict):
         None, ge=1e-6, le=1e6, description="illuminance with as much photocurrent as the dark current; from two "
         "background rates otherwise"
     )  # fmt: skip
-    noise_bandwidth_hz: float | None = Field(
+    noise_cutoff_hz: float | None = Field(
         None, ge=1e-2, le=1e6, description="-3 dB frequency of the noise in bright light; default that of the speed. "
         "In dim light the speed limits it"
     )  # fmt: skip
@@ -63,8 +63,8 @@ class DataSheetSpec(Strict):
             raise ValueError("background at one illuminance needs dark_lux, or a second illuminance")
         if self.speed and self.dark_lux is None:
             raise ValueError("speed needs dark_lux: the pixel's speed in the dark is that of its dark current")
-        if self.noise_bandwidth_hz is None and not self.speed:
-            raise ValueError("noise_bandwidth_hz is needed where no speed is given")
+        if self.noise_cutoff_hz is None and not self.speed:
+            raise ValueError("noise_cutoff_hz is needed where no speed is given")
         if self.speed and len(self.background) == 2:
             raise ValueError("background at two illuminances does not go with speed, which tells how the noise follows "
                              "the light: leave one of them out, or the speed")  # fmt: skip

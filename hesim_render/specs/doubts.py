@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 from hesim_render.core.units import S_PER_US
 
 if TYPE_CHECKING:
-    from hesim_render.specs.sensor import ApsSpec, EvsSpec, SensorSpec
+    from hesim_render.specs.frame_pixels import ApsSpec
+from hesim_render.specs.event_pixels import EvsSpec
+from hesim_render.specs.sensor import SensorSpec
 
 #: Shortest exposure that is not doubted, µs: shutters of cameras take about 10 µs at least.
 _SHORTEST_US = 10

@@ -125,6 +125,13 @@ def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> None:
             node[keys[-1]] = value
 
 
+def as_read(value: Any) -> Any:
+    """A copy as if it had been read from a file, so that changes by `--set` reach into it."""
+    if isinstance(value, dict):
+        return CommentedMap({key: as_read(inner) for key, inner in value.items()})
+    return CommentedSeq([as_read(inner) for inner in value]) if isinstance(value, list) else value
+
+
 def _item(node: CommentedSeq, key: str, dotted: str) -> Any:
     try:
         return node[int(key)]

@@ -13,9 +13,11 @@ class PhotoreceptorSpec(Strict):
     cutoff_hz: float = Field(
         ge=1e-3, le=1e6, description="corner at signal_dn and above, where the bias current limits it"
     )
-    follows_light: bool = Field(True, description="below signal_dn the corner is proportional to the signal")
+    follows_light: bool = Field(True, description="below signal_dn the corner falls with the signal")
     signal_dn: float | None = Field(None, ge=1e-9, le=1e9, description="signal of which the corner is cutoff_hz")
-    min_cutoff_hz: float | None = Field(None, ge=1e-3, le=1e6, description="corner in the dark")
+    min_cutoff_hz: float | None = Field(
+        None, ge=1e-3, le=1e6, description="corner in the dark; up to signal_dn it rises on a straight line"
+    )
     filters_noise: bool = Field(
         False, description="the noise (last_event) passes it too: below photoreceptor_cutoff_hz its bandwidth is the "
         "corner, and its variance falls with it"

@@ -39,7 +39,7 @@ OUTSIDE = "lies outside of the scene's folder; put it there, or let it (--allow-
 
 
 class ObjectSpec(Strict):
-    """A solid beside or in front of the target: matt, with a picture on it, or of a material of Mitsuba."""
+    """A solid beside or in front of the target: diffuse, with a picture on it, or of a material of Mitsuba."""
 
     name: str = Field(min_length=1)
     shape: Literal["sphere", "box", "rectangle", "mesh"]

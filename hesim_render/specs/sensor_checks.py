@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.specs.event_pixels import EvsSpec
 from hesim_render.spectral.spectrum import RENDERABLE_NM, Spectrum, constant, coverage
 
 if TYPE_CHECKING:
@@ -71,6 +72,8 @@ def _roles(spec: SensorSpec) -> Iterator[str]:
     elif spec.evs_grid.rows_per_tile * spec.evs_grid.cols_per_tile != len(evs):
         grid = f"{spec.evs_grid.rows_per_tile}×{spec.evs_grid.cols_per_tile}"
         yield f"evs_grid: {grid} does not hold the tile's {len(evs)} event pixels"
+    if not isinstance(spec.evs, EvsSpec):
+        return  # the rest follows from a data sheet
     if len(spec.evs.coefficients) not in (1, len(evs)):
         yield f"evs.coefficients: expected 1 entry or {len(evs)}, one per event position"
     reference = spec.evs.signal_reference.filter

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from itertools import groupby
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from hesim_render.core.drawing import report_style
-from hesim_render.core.html import PAGE_STYLE, inline_picture, number, row_of, table
+from hesim_render.core.html import filled, inline_picture, number
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
 from hesim_render.studies.cfa import StudyResult
@@ -50,7 +50,7 @@ _SIMULATED = "_simulated"
 _MOST_GROUPS = 24
 
 
-def report_page(spec: StudySpec, result: StudyResult, summary: str = "") -> str:
+def report_page(spec: StudySpec, result: StudyResult, summary: Markup | None = None) -> str:
     """The page of a study.
 
     Parameters
@@ -62,28 +62,25 @@ def report_page(spec: StudySpec, result: StudyResult, summary: str = "") -> str:
     -------
     HTML.
     """
-    parts = [f"<h1>{escape(spec.name)}</h1>", f"<p>{escape(spec.description)}</p>" if spec.description else ""]
-    parts.append(summary)
     with report_style():
-        parts += ["<h2>Filter sets</h2>", row_of(*map(response_plot, _first_of_each_set(result.seen)))]
-        parts += _groups(result.table)
-        parts += _patches(result.seen)
-    if result.pictures:
-        parts.append("<h2>Patterns after demosaicing</h2>")
-        figures = (
-            f"{inline_picture(encode_srgb(image), text)}<figcaption>{escape(text)}</figcaption>"
-            for text, image in result.pictures
-        )
-        parts.append(row_of(*figures))
-    parts.append(_method(spec))
-    body = "\n".join(part for part in parts if part)
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{escape(spec.name)}</title><style>{PAGE_STYLE}</style></head><body>{body}</body></html>\n"
+        responses = [*map(response_plot, _first_of_each_set(result.seen))]
+        groups = _grouped(result.table, ("surfaces", "illuminant"))
+        drawn = [_group(*group, _levels(result.table)) for group in groups[:_MOST_GROUPS]]
+        patches = _patches(result.seen)
+    noisy = (
+        f"Simulated figures are means of {spec.noise.repeats} noisy frames, with 95 % intervals (Student's t)."
+        if spec.noise.repeats
+        else "Noise figures are closed forms."
     )
+    return filled(
+        "studies/report.html", title=spec.name, description=spec.description, summary=summary or "",
+        responses=responses, groups=drawn, has_more=len(groups) > _MOST_GROUPS, patches=patches,
+        pictures=[(text, inline_picture(encode_srgb(image), text)) for text, image in result.pictures],
+        matrix=spec.matrix, area_px=f"{spec.area_px:g}", noisy=noisy, note=NOTE,
+    )  # fmt: skip
 
 
-def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float64], tile: str | None) -> str:
+def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float64], tile: str | None) -> Markup:
     """HTML of how a designed set compares with others.
 
     Parameters
@@ -92,7 +89,7 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
     costs : of each start before and after, [start, 2].
     tile : the designed tile, where shares were varied.
     """
-    parts = ["<h2>Verdict</h2>"]
+    found = []
     named = {"delta_e_mean": "mean ΔE2000 without noise", "mtf50_cy_per_px": "MTF50, cy/px",
              "false_colour": "false colour, C*ab", "zone_plate_colour": "zone plate, C*ab",
              "picture_error_simulated": "rms error with noise"}  # fmt: skip
@@ -111,12 +108,9 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
             for key, title in named.items()
             if key in verdict
         ]
-        parts.append(table(["", "designed", str(verdict["against"]), "95 % interval or ratio"], rows))
-    if tile is not None:
-        parts.append(f"<p>Designed tile:</p><pre>{escape(tile)}</pre>")
-    changes = ", ".join(f"{number(before)} to {number(after)}" for before, after in costs)
-    parts.append(f"<p>Cost of the optimiser, before and after, for each start: {changes}.</p>")
-    return "\n".join(parts)
+        found.append((str(verdict["against"]), rows))
+    changes = [f"{number(before)} to {number(after)}" for before, after in costs]
+    return filled("studies/verdict.html", verdicts=found, tile=tile, costs=changes)
 
 
 def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
@@ -126,35 +120,33 @@ def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
     return list(found.values())
 
 
-def _groups(rows: Table) -> list[str]:
-    """Drawings and tables of each group of rows in which only sensors, filter sets and crosstalk differ."""
-    lights, levels = ("surfaces", "illuminant"), ["illuminance_lux", "equal"]
+def _levels(rows: Table) -> list[str]:
+    """Columns that tell the levels of a group apart."""
     of_sensor: dict[Cell, set[Cell]] = {}
     for row in rows:
         of_sensor.setdefault(row["sensor"], set()).add(row.get("nominal_exposure_us"))
-    if max(map(len, of_sensor.values())) > 1:  # else each sensor has its own exposure
-        levels.append("nominal_exposure_us")
-    parts = []
-    for number_, ((surfaces, light), group) in enumerate(_grouped(rows, lights)):
-        if number_ == _MOST_GROUPS:
-            parts.append("<p>More groups of rows are in results.csv.</p>")
-            break
-        parts.append(f"<h2>{escape(f'{surfaces}, {light}')}</h2>")
-        inner = _grouped(group, levels)
-        plots = [
-            pareto_plot(some, _level(levels, values))
-            for values, some in inner
-            if any(row.get(PARETO[0]) is not None and row.get(PARETO[1]) is not None for row in some)
-        ]
-        parts.append(row_of(*plots) if plots else "")
-        named = [name for name in _NAMES if name != "exposure_us" and name in group.columns]
-        first = {tuple(row[name] for name in named): row for row in reversed(list(group))}
-        for values, some in inner:
-            tables = [_captioned(title, _table(some, columns)) for title, columns in _OF_LEVEL]
-            if any(tables):
-                parts += [f"<h3>{escape(_level(levels, values))}</h3>", *tables]
-        parts.append(_captioned("Colour, without noise", _table(Table(reversed(first.values())), _COLOUR)))
-    return parts
+    # where each sensor has its own exposure, it is no level
+    return ["illuminance_lux", "equal", *(["nominal_exposure_us"] if max(map(len, of_sensor.values())) > 1 else [])]
+
+
+def _group(named: tuple[Cell, ...], group: Table, levels: Sequence[str]) -> dict[str, object]:
+    """Drawings and tables of rows in which only sensors, filter sets and crosstalk differ."""
+    inner = _grouped(group, levels)
+    plots = [
+        pareto_plot(some, _level(levels, values))
+        for values, some in inner
+        if any(row.get(PARETO[0]) is not None and row.get(PARETO[1]) is not None for row in some)
+    ]
+    tables = [
+        (_level(levels, values), [(title, *found) for title, columns in _OF_LEVEL if (found := _table(some, columns))])
+        for values, some in inner
+    ]
+    own = [name for name in _NAMES if name != "exposure_us" and name in group.columns]
+    first = {tuple(row[name] for name in own): row for row in reversed(list(group))}
+    return {
+        "title": ", ".join(map(str, named)), "plots": plots, "levels": [level for level in tables if level[1]],
+        "colour": _table(Table(reversed(first.values())), _COLOUR),
+    }  # fmt: skip
 
 
 def _grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
@@ -171,15 +163,11 @@ def _level(keys: Sequence[str], values: Sequence[Cell]) -> str:
     return text + (f", {named['nominal_exposure_us']:g} µs" if named.get("nominal_exposure_us") else "")
 
 
-def _captioned(title: str, html: str) -> str:
-    return html and f"<p><b>{escape(title)}</b></p>{html}"
-
-
-def _table(rows: Table, columns: Mapping[str, str]) -> str:
-    """A table of some figures; empty if no row has any of them."""
+def _table(rows: Table, columns: Mapping[str, str]) -> tuple[list[str], list[list[str]]] | None:
+    """Head and lines of a table of some figures; None if no row has any of them."""
     known = [name for name in columns if name in rows.columns and any(row[name] is not None for row in rows)]
     if not known:
-        return ""
+        return None
     names = [
         name for name in _NAMES
         if name in rows.columns and (name == "filter_set" or len({row[name] for row in rows}) > 1)
@@ -198,7 +186,7 @@ def _table(rows: Table, columns: Mapping[str, str]) -> str:
                     text += f" ({number(low)} to {number(high)})"
             cells.append(text)
         lines.append(cells)
-    return table([*(_NAMES[name] for name in names), *(columns[name] for name in known)], lines)
+    return [*(_NAMES[name] for name in names), *(columns[name] for name in known)], lines
 
 
 def _in_ms(value: Cell) -> Cell:
@@ -211,36 +199,13 @@ def _cell(value: object) -> str:
     return number(float(value)) if isinstance(value, int | float) else str(value)
 
 
-def _patches(seen: Sequence[Seen]) -> list[str]:
+def _patches(seen: Sequence[Seen]) -> list[tuple[str, list[tuple[str, Markup]]]]:
+    """Of all that share surfaces and light: a drawing of their patches, and each chart with its caption."""
     coloured = [each for each in seen if each.colour is not None]
-    if not coloured:
-        return []
-    parts = ["<h2>Colours</h2>"]
-    key = lambda each: (each.surfaces, each.light_name)  # noqa: E731
-    for _, group in groupby(coloured, key=key):
+    found = []
+    for _, group in groupby(coloured, key=lambda each: (each.surfaces, each.light_name)):
         some = list(group)
-        parts.append(row_of(patch_plot(some)))
         named = zip(some, seen_labels(some), strict=True)
-        charts = (
-            f"{inline_picture(chart_picture(each), text)}<figcaption>{escape(text)}</figcaption>"
-            for each, text in named
-        )
-        parts.append(row_of(*charts))
-    parts.append(
-        "<p>Upper left half of a patch: its true colour. Lower right half: after the matrix of the filter set, without "
-        "noise.</p>"
-    )
-    return parts
-
-
-def _method(spec: StudySpec) -> str:
-    noisy = (
-        f"Simulated figures are means of {spec.noise.repeats} noisy frames, with 95 % intervals (Student's t)."
-        if spec.noise.repeats
-        else "Noise figures are closed forms."
-    )
-    return (
-        f"<h2>Method</h2><p>Matrix: {escape(spec.matrix)}. Output pixels are those of {spec.area_px:g} pixels of the "
-        f"mosaic. YSNR and SNR10 are of the luminance 0.299 R + 0.587 G + 0.114 B on an 18 % grey card, without fixed "
-        f"patterns. {noisy} {NOTE}</p>"
-    )
+        charts = [(text, inline_picture(chart_picture(each), text)) for each, text in named]
+        found.append((patch_plot(some), charts))
+    return found

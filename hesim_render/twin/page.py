@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, points, report_style, svg
-from hesim_render.core.html import PAGE_STYLE, number, row_of, table, tick_text
+from hesim_render.core.html import filled, number, tick_text
 from hesim_render.twin.comparison import Check
 
 _SIZE_PX = (440, 340)
@@ -38,22 +37,11 @@ def _row(check: Check) -> tuple[str, ...]:
 
 def page(checks: Sequence[Check], findings: Sequence[str]) -> str:
     """The HTML page; it needs no other file."""
-    rows = [_row(check) for check in checks]
-    head = ("statistic", "", "values", "worst z", "limit", "rms z", "limit", "captures", "twin", "unit")
-    passed = sum(check.passed for check in checks)
     with report_style():
-        drawn = row_of(*(_overlay(check) for check in checks if check.z.size > 1))
-    listed = "".join(f"<li>{escape(text)}</li>" for text in findings)
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Twin</title>'
-        f"<style>{PAGE_STYLE}</style></head><body><h1>Twin of a sensor</h1>"
-        "<p>Calibrated on every second exposure and half of the long series; compared with the rest, which it was not "
-        "fitted on. z is the difference over its error, which has the noise of both and of the fit, and what the "
-        f"fitted half shows of changes between exposures. {passed} of {len(checks)} statistics pass.</p>"
-        f"{table(head, rows)}"
-        f"<h2>What the sensor has beyond a linear model</h2><ul>{listed}</ul><h2>Captures and twin</h2>{drawn}"
-        "</body></html>\n"
-    )
+        drawings = [_overlay(check) for check in checks if check.z.size > 1]
+    passed = sum(check.passed for check in checks)
+    return filled("twin/page.html", title="Twin", rows=[*map(_row, checks)], passed=passed, findings=findings,
+                  drawings=drawings)  # fmt: skip
 
 
 def _overlay(check: Check) -> str:

@@ -13,11 +13,11 @@ from hesim_render.calibrate.aps.pairs_output import calibrate_pairs
 from hesim_render.calibrate.aps.sensor_file import write_sensor
 from hesim_render.calibrate.moments import Progress
 from hesim_render.calibrate.result import plain
+from hesim_render.calibration.file import read_maps
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.recording.pair_set import read_pair_set
 from hesim_render.sensor.sensor import load_sensor
-from hesim_render.specs.calibration import read_maps
 from hesim_render.twin.comparison import ALARM, Check, Half, compare
 from hesim_render.twin.page import page
 from hesim_render.twin.simulated import TwinBench

@@ -25,7 +25,7 @@ from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import BenchmarkPlan
 from hesim_render.benchmark.verify import digest_of, discard_damaged
 from hesim_render.benchmark.worker import attempt, order_of
-from hesim_render.capture.simulate import flux_source
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import BackendError, OutputError, RangeError, SpecError
 from hesim_render.sources.render.light_level import in_absolute_light
 
@@ -102,7 +102,7 @@ def test_sharp_images_are_those_of_a_renderer_of_their_own(tmp_path):
         made = file["flux_e_per_s"][0]
     sensor = plan.sensor(plan.clips[0])
     scene = in_absolute_light(hr.load_scene("rotating-star"))[0]
-    own = flux_source(scene, sensor, 7, spec.quality, None, False, None)[0]
+    own = scene_renderer(scene, sensor, 7, spec.quality)
     pixel = np.flatnonzero(sensor.layout.aps_mask).astype(np.uint32)
     a, b = own.mean_flux(pixel, 7750, 8250)
     expected = 0.5 * (np.array(a, np.float32) + np.array(b, np.float32))

@@ -296,7 +296,7 @@ def test_what_cannot_be_built_is_refused_before_the_start(changes, message):
         ("scenes: {count: 1000000}\nseeds: [1, 2]", "at most"),
         ("scenes: {count: 1}\nseeds: [3, 3]", "each name once"),
         ("scenes: {count: 1}\nnoise: [{name: a, clean: true, without: [aps.read]}]", "no noise at all"),
-        ("scenes: {count: 1, materials: {matt: 0, plastic: 0, rough_plastic: 0, metal: 0}}", "at least one"),
+        ("scenes: {count: 1, materials: {diffuse: 0, plastic: 0, rough_plastic: 0, metal: 0}}", "at least one"),
         ("scenes: {count: 1}\nmotion: {}", "motions"),
     ],
 )

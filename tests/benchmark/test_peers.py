@@ -14,7 +14,7 @@ from hesim_render.benchmark.event_times import nearest_us, quiet_rates, timing
 from hesim_render.benchmark.peer_pictures import encoded, exposures_us, pictures
 from hesim_render.benchmark.peer_run import PeerError, read_events, run_peer, version_of
 from hesim_render.benchmark.peers import compare_peers, peers_table
-from hesim_render.capture.simulate import flux_source
+from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -255,7 +255,7 @@ def test_pictures_are_the_light_of_the_sensor(tmp_path):
     times = exposures_us(40_000, 1000, 1.0)
     made = np.stack(list(pictures(scene, sensor, times, 7, 0.5)))
     assert made.shape == (40, 16, 24)
-    flux = flux_source(in_absolute_light(scene)[0], sensor, 8, 0.25, None, False, None)[0]
+    flux = scene_renderer(in_absolute_light(scene)[0], sensor, 8, 0.25)
     pixel = sensor.layout.evs_pixel.ravel()
     for k in (0, 17, 39):
         a, b = flux.mean_flux(pixel, *times[k])

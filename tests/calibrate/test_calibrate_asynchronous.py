@@ -14,10 +14,10 @@ from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.asynchronous.defects import classify, plainly_bad
 from hesim_render.calibrate.asynchronous.first_event import first_event
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
+from hesim_render.calibration.spec import Defect
 from hesim_render.capture.lab import write_captures
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.recording.capture_set import read_captures
-from hesim_render.specs.calibration_spec import Defect
 
 TRUTH = Pixels()
 

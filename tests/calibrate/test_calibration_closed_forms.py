@@ -1,6 +1,6 @@
 """Lines of the calibration against closed forms of their own, without captures: each fails if its line is changed.
 
-Inputs are exact expectations, so that answers are exact as well; nothing here is random.
+Inputs are exact expectations, so that answers are exact as well, where no seed is named.
 """
 
 from dataclasses import replace
@@ -18,6 +18,7 @@ from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, s
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
 from hesim_render.calibrate.asynchronous.first_event import correlation
 from hesim_render.calibrate.estimate import Spread, estimated
+from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import counts, dispersion
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
@@ -392,6 +393,67 @@ def test_counts_of_a_trinomial_law_have_no_dispersion(between, monkeypatch):
     found = dispersion.dispersion_in_time(given, fit, 0.7)
     assert abs(found.total - 1) < 5 * 0.011 and abs(found.difference - 1) < 5 * 0.011
     assert 0.006 < found.total_error < 0.02 and 0.006 < found.difference_error < 0.02
+
+
+def test_the_error_of_the_mismatch_is_that_of_scores_along_the_fitted_thresholds():
+    """Where few trials tell more of a pixel's mean than of its threshold, a larger m looks like a lower threshold. The
+    error from ln L with both groups' middle thresholds fitted anew at m ± h; without their share it would be 1.3 times.
+    """
+    rng, m, trials = np.random.default_rng(7), 0.3, 40
+    group, pixel = np.repeat([0, 1, 1], 400), np.tile(np.arange(400), 3)
+    u = np.where(group == 0, 2.1, 2.6) * np.linspace(0.95, 1.05, 1200)
+    threshold = (1 + m * rng.standard_normal(400))[pixel] * np.where(group == 0, 1.04, 0.97)
+    mixture = dispersion._Mixture(u, rng.binomial(trials, ndtr(-u * threshold)) + 0.0, group, pixel, trials)
+    _, found, scale = mixture.maximum(0.1)
+    assert found == pytest.approx(m, abs=4 * 0.0155)
+    information, error = mixture.information(found, scale)
+    h = 0.03 * found
+    scales = [mixture.maximum(found + step, fixed=True)[2] for step in (-h, 0, h)]
+    logs = [mixture.log_likelihood(found + step, s) for step, s in zip((-h, 0, h), scales, strict=True)]
+    low, middle, high = (log.sum() - 0.5 * np.sum((np.log(s) / 0.3) ** 2) for log, s in zip(logs, scales, strict=True))
+    curvature = (2 * middle - low - high) / h**2
+    score = np.bincount(pixel, (logs[2] - logs[0]) / (2 * h))
+    assert information == pytest.approx(curvature, rel=5e-3)
+    assert error == pytest.approx(np.sqrt(score @ score) / curvature, rel=5e-3)
+
+
+@pytest.mark.parametrize("contrast_of", ["signal", "voltage"])
+@pytest.mark.parametrize("law", ["sqrt", "linear"])
+def test_the_width_of_s_curves_is_compared_with_the_noise_of_the_static_counts(contrast_of, law):
+    """σ_n² is the mean over both signs of s₀²/x₀² + s₁²/x₁² at the steps that reach θ₊ and −θ₋ (in volts: at one x)."""
+    natural_values = np.array([0.6, 9.0, 0.35, -0.4, 0.1, 0.002])
+    a, b, c, d = natural_values[:4]
+    signal, theta_v = 40.0, 2.7
+    given = replace(thresholds(mismatch=0.14), noise=(0.062, 0.0011), width=0.071)
+
+    def relative_variance(signal):
+        y = c * (signal if law == "linear" else np.sqrt(signal))
+        return 2 * (y * y + 2 * d * y + 1) / (a * signal + b) ** 2 / theta_v**2
+
+    levels, measured = [signal], np.sqrt(0.071**2 - (0.14 * 0.225) ** 2)
+    if contrast_of == "signal":
+        after = [((a * signal + b) * np.exp(step) - b) / a for step in (0.2, -0.25)]
+        levels, measured = [signal, signal, *after], 0.062
+    expected = 0.225 * np.sqrt(np.mean(relative_variance(np.array(levels))))
+    covariance = np.zeros((6, 6))
+    covariance[1, 1] = 0.09**2
+    error = np.sqrt((0.0011 / measured) ** 2 + 0.01**2 + 0.02**2)
+
+    def told(share):
+        """What is found where Θ is such that the static counts ask for a share of the measured noise."""
+        fit = SimpleNamespace(
+            values=natural_values, parameters=from_natural(natural_values), covariance=covariance, law=law,
+            identified=lambda name: True,
+        )  # fmt: skip
+        steps = SimpleNamespace(signal_dn=signal)
+        own = theta_v * expected / (share * measured)
+        return event_checks._width(
+            SimpleNamespace(thresholds=given, steps=steps, together=fit, theta_v=own), contrast_of
+        )
+
+    assert told(1.02) is None
+    for share in (0.86, 1.17):
+        assert told(share).p_value == pytest.approx(2 * ndtr(-abs(np.log(share)) / error), rel=1e-6)
 
 
 def test_noise_of_the_frames_makes_no_edge_of_an_even_scene():

@@ -6,14 +6,22 @@ import pytest
 import hesim_render as hr
 from hesim_render.capture import overheads
 from hesim_render.capture.overheads import noise_seconds, with_overheads
-from hesim_render.sources.render.change_driven.forecast import Estimate
+from hesim_render.mosaic.schedule import Block, BlockSample, Exposure
+from hesim_render.sources.demand import Demand, Estimate
 
 RAYS = Estimate(seconds=3.0, peak_bytes=7e8, rays=6e6)
-RUN = {"duration_us": 50_000, "windows": 130.0, "frames": 0, "audited": False, "rests": False}
+RUN = {"windows": 130.0, "frames": 0, "audited": False, "rests": False}
 
 
 def told(name, rays=RAYS, size=(64, 48), **changes):
-    found = with_overheads(rays, hr.load_sensor(name).crop(*size), **RUN | changes)
+    windows, frames, kind = (changes.pop(key, RUN[key]) for key in ("windows", "frames", "audited"))
+    one = Block(np.zeros(13), np.ones(13), np.ones(13, np.bool_))
+    blocks = BlockSample([one], 13 / windows) if windows else BlockSample([], 1.0)
+    nothing = np.empty(0, np.uint32)
+    exposures = [Exposure(k, 10_000 * k, 9000, 48, 0.0) for k in range(frames)]
+    demand = Demand(50_000, nothing, blocks, nothing, exposures)
+    sensor = hr.load_sensor(name).crop(*size)
+    found = with_overheads(rays, sensor, demand, audited=kind, rests=changes.get("rests", RUN["rests"]))
     assert (found.rays, found.peak_bytes) == (rays.rays, rays.peak_bytes)
     return found.seconds
 

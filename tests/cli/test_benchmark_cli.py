@@ -73,7 +73,7 @@ def test_a_long_build_has_to_be_wanted(spec, tmp_path, capsys, monkeypatch):
     from hesim_render.benchmark import build
     from hesim_render.benchmark.forecast import BuildEstimate
 
-    monkeypatch.setattr(build, "estimate_build", lambda plan, clips: BuildEstimate(1, 4000.0, 1e9))
+    monkeypatch.setattr(build, "estimate_build", lambda plan, clips, progress: BuildEstimate(1, 4000.0, 1e9))
     with pytest.raises(SystemExit) as stopped:
         from hesim_render import cli
 

@@ -1,5 +1,6 @@
 """The command line: exit codes, one clear line for every mistake, nothing left behind."""
 
+import html
 import json
 import os
 import re
@@ -407,6 +408,11 @@ def test_the_main_job_end_to_end(capsys, tmp_path):
     assert err == "" and "RAW frames: 1 of 64x48 px" in out
     # 16 rays a pixel are not enough for this chart, which a run says itself
     assert status == ExitStatus.NOT_MET and re.search(r"NOT MET: by their stated error .*; --samples \d+ would do", out)
+    # whoever looks at the recording later reads the same line, and looking at it is no failure
+    (line,) = re.findall("NOT MET.*", out)
+    status, out, _ = call(capsys, "view", tmp_path / "o", "--no-viewer")
+    assert status == ExitStatus.DONE and f"  {line}" in out
+    assert line in html.unescape((tmp_path / "o" / "recording.html").read_text(encoding="utf-8"))
     recording = hr.Recording.load(tmp_path / "o")
     frame = recording.frames[0]
     assert frame.raw.shape == (48, 64) and frame.raw.dtype == np.uint16

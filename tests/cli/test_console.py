@@ -5,13 +5,17 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_cli import call, fails
 
 import hesim_render as hr
+from benchmarks import SMALL
 from hesim_render.cli.exit_status import ExitStatus
+from hesim_render.core.errors import RangeError
+from hesim_render.core.progress import Pace, ProgressReport
 from hesim_render.core.shipped import data_folder, list_names, read_keys
 from hesim_render.specs.files import load_yaml
 
@@ -53,6 +57,43 @@ def test_a_dry_run_estimates_and_writes_nothing(options, moving, capsys, tmp_pat
     if options and not moving:  # every pixel once, in the only slice of a still scene
         assert told["estimate"]["rays"] == 16 * 12 * (4 if "--samples" in options else 64)
     assert "--duration is 0.0" in fails(capsys, *words, "--duration", "0", "--out", tmp_path / "o", "--dry-run")
+
+
+@pytest.mark.parametrize(("words", "estimates"), [
+    (STILL, "capture.simulate.forecast"), (STILL, "load_scene"),
+    (["benchmark", "build", "tiny.yaml"], "benchmark.build.estimate_build"),
+])  # fmt: skip
+@pytest.mark.parametrize("is_dry", [True, False])
+def test_a_long_dry_run_shows_progress_within_five_seconds(words, estimates, is_dry, capsys, tmp_path, monkeypatch):
+    """Also where there is no terminal. The time is that of a clock which stands still but in the estimate."""
+    reports, clock = [], SimpleNamespace(now=31.0)
+
+    class Watched(ProgressReport):
+        def __init__(self, view, pace=None):
+            super().__init__(view, Pace(lambda: clock.now))
+            reports.append(self)
+
+        def _refresh(self):  # nothing but this test moves it
+            pass
+
+    seen = {}
+
+    def estimate(*_, **__):
+        (progress,) = reports
+        progress(0, 3, "estimate")
+        for clock.now in (31.9, 35.5):
+            progress._step()
+            seen[clock.now] = capsys.readouterr().err
+        raise RangeError("estimate", 0, "seen")  # this is enough
+
+    given = {"scenes": {"given": [{"scene": "flat-field", "split": "test"}]}}
+    (tmp_path / "tiny.yaml").write_text(json.dumps(SMALL | given))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("hesim_render.core.progress.ProgressReport", Watched)
+    monkeypatch.setattr(f"hesim_render.{estimates}", estimate)
+    assert "seen" in fails(capsys, *words, "--out", tmp_path / "o", *(["--dry-run"] if is_dry else []))
+    title = SMALL["name"] if words[0] == "benchmark" else "colorchecker → reference-mono"
+    assert seen == {31.9: "", 35.5: f"{title}: 0 % of estimate, 4 s so far\n" if is_dry else ""}
 
 
 def test_the_rays_of_an_exact_run_are_near_their_estimate(capsys, tmp_path, monkeypatch):

@@ -11,8 +11,8 @@ from hesim_render.calibrate import calibrate_evs
 from hesim_render.cli import main
 from hesim_render.core.errors import SpecError
 from hesim_render.recording.recording import Recording
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.sensor.sensor import load_sensor
-from hesim_render.specs import read_sensor
 from hesim_render.specs.files import data_folder, list_names
 
 

@@ -13,16 +13,16 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.describe import event_curves, figures_of, photon_transfer, picture, s_curve, table_lines
 from hesim_render.describe.table import TABLE_LUX
+from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs import read_sensor
-from hesim_render.specs.event_noise import events_per_period
+from hesim_render.sensor.from_data_sheet import electrons_per_s_lux
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.files import list_names
-from hesim_render.specs.from_data_sheet import electrons_per_s_lux
 from hesim_render.spectral.spectrum import illuminant
 
 #: A pixel of 20 Hz, which is quick to simulate, written as a data sheet.
 SLOW = {
-    "evs.data_sheet.noise_bandwidth_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
+    "evs.data_sheet.noise_cutoff_hz": 20, "evs.data_sheet.background": [{"lux": 5, "rate_hz": 4}],
     "evs.data_sheet.speed": [{"lux": 5, "bandwidth_hz": 20}], "evs.data_sheet.refractory_us": 5000,
 }  # fmt: skip
 
@@ -134,7 +134,7 @@ def test_rare_background_with_its_leak(name, pixels):
     (stated,) = sheet.background
     curves = event_curves(sensor, [float(stated.lux)])
     assert curves.on_hz[0] + curves.off_hz[0] == pytest.approx(stated.rate_hz, rel=1e-3)
-    begin_s, end_s = (round(periods / sheet.noise_bandwidth_hz, 1) for periods in (1000, 3000))
+    begin_s, end_s = (round(periods / sheet.noise_cutoff_hz, 1) for periods in (1000, 3000))
     found = sum(simulated_rates(sensor, stated.lux, begin_s, end_s - begin_s))
     drawn = of_drawn_thresholds(sensor, stated.lux)
     assert found == pytest.approx(drawn, rel=0.05)  # 10,000 events or more
@@ -288,6 +288,25 @@ def test_mistakes_are_named(arguments, text):
         s_curve(hr.load_sensor("gen2"), 1.0, [-1.0])
 
 
+@pytest.mark.parametrize("name", SHEETS)
+def test_noise_and_latency_have_no_kink_where_the_dark_current_begins(name):
+    """Light and dark current together set the corner. The noise of a current I + I₀ in a bandwidth that is proportional
+    to it has the same σ in any light, and from the light on that has the noise's own bandwidth it falls.
+    """
+    dark_lux, evs, sensor = SHEETS[name].dark_lux, read_sensor(name).evs, hr.load_sensor(name)
+    dim = event_curves(sensor, np.geomspace(dark_lux / 10, 5 * dark_lux, 102), step=7.0)
+    (beta,) = evs.coefficients
+    share = evs.photoreceptor.min_cutoff_hz / evs.photoreceptor_cutoff_hz
+    np.testing.assert_allclose(dim.sigma, beta.beta4 / dark_lux * np.sqrt(share), rtol=2e-4)
+    # a step of the exponent by 1 has a second difference of 0.04
+    for values in (dim.sigma, dim.on_hz + dim.off_hz, dim.latency_us):
+        assert np.abs(np.diff(np.log(values), 2)).max() < 2e-3
+    assert np.all(np.diff(dim.latency_us) < 0)
+    # the rate rises with the bandwidth of the noise, and falls with its σ
+    rate_hz = event_curves(sensor, np.geomspace(dark_lux / 10, 1e4, 40)).on_hz
+    assert np.count_nonzero(np.diff(np.sign(np.diff(rate_hz)[np.abs(np.diff(rate_hz)) > 1e-9]))) == 1
+
+
 @pytest.mark.parametrize("name", ["imx636", "eiger", "reference-bayer"])
 def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeypatch):
     """And the point of the data sheet, which counts all events, lies on a curve that counts all events."""
@@ -309,10 +328,4 @@ def test_texts_on_the_axes_of_the_picture_do_not_overlap(name, tmp_path, monkeyp
         lines = {line.get_label(): line for line in rates.lines}
         curve, point = lines["all events"], lines["data sheet, all events"]
         (lux,), (rate,) = point.get_data()
-        # no curve goes below dark_lux, where the model turns round in a V: noise falls towards it
-        for axes in figure.axes:
-            for line in axes.lines if "illuminance" in axes.get_xlabel() else ():
-                assert line.get_label().startswith("θ") or np.min(line.get_xdata()) >= 0.08 - 1e-12
-        (noise,) = (axes.lines[0].get_ydata() for axes in figure.axes if axes.get_title(loc="left") == "Noise of ln x")
-        assert np.count_nonzero(np.diff(np.sign(np.diff(noise)))) == 1  # rises to its one maximum, then falls
         np.testing.assert_allclose(np.interp(lux, *curve.get_data()), rate, rtol=0.05)

@@ -154,14 +154,15 @@ def test_events_out_of_order_or_outside_are_not_written(name, tmp_path):
     shape = (200, 200)
     for events, told in (
         (made((5, 0, 0, 1), (4, 0, 0, 1)), "event 1, at 4 µs, comes after one at 5 µs"),
+        (made(*((t, 0, 0, 1) for t in (3, 5, 4, 6, 2))), "event 2, at 4 µs, comes after one at 5 µs"),  # the first one
         (made((-1, 0, 0, 1)), "event 0, at -1 µs, lies before 0"),
-        (made((0, 0, 0, 1), (1, 200, 3, 1)), r"event 1 \(x 200, y 3\) is outside of 200x200 px"),
+        (made((0, 0, 0, 1), (1, 200, 3, 1), (2, 201, 3, 1)), r"event 1 \(x 200, y 3\) is outside of 200x200 px"),
         (made((0, 3, 200, 1)), r"event 0 \(x 3, y 200\) is outside of 200x200 px"),
     ):
         with pytest.raises(SpecError, match=told):
             written(events, name, tmp_path, shape)
-    blocks = EventStream(lambda: [made((5, 0, 0, 1)), made(), made((4, 0, 0, 1))], shape)
-    with pytest.raises(SpecError, match="event 1, at 4 µs, comes after one at 5 µs"):
+    blocks = EventStream(lambda: [made((2, 0, 0, 1), (5, 0, 0, 1)), made(), made((4, 0, 0, 1), (3, 0, 0, 1))], shape)
+    with pytest.raises(SpecError, match="event 2, at 4 µs, comes after one at 5 µs"):
         list(blocks)
 
 

@@ -341,6 +341,29 @@ def indexes_by_the_loop(times):
     return np.array([*rows, now], dtype=[("id", "<u8"), ("ts", "<i8")])
 
 
+def test_packed_triggers_and_too_many_are_refused(tmp_path, monkeypatch):
+    """ECF is a codec of events: what a chunk of triggers behind its filter holds is not known."""
+    path = file_of(made((5, 3, 0, 1)), EDGES, "prophesee", tmp_path)
+    monkeypatch.setattr("hesim_render.exchange.prophesee_hdf5.MOST_TRIGGERS", EDGES.size)
+    np.testing.assert_array_equal(open_events(path).triggers(), EDGES)
+    monkeypatch.setattr("hesim_render.exchange.prophesee_hdf5.MOST_TRIGGERS", EDGES.size - 1)
+    with pytest.raises(SpecError, match=f"more than {EDGES.size - 1} edges"):
+        open_events(path).triggers()
+    monkeypatch.undo()
+    with h5py.File(path, "a") as file:
+        rows = file["EXT_TRIGGER/events"][:]
+        del file["EXT_TRIGGER/events"]
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_chunk((rows.size,))
+        layout.set_filter(ecf.FILTER, h5py.h5z.FLAG_OPTIONAL, ())
+        kind = h5py.h5t.py_create(rows.dtype, logical=True)
+        stored = h5py.h5d.create(file["EXT_TRIGGER"].id, b"events", kind, h5py.h5s.create_simple(rows.shape), layout)
+        # left out for this chunk, as an optional filter may be: HDF5 reads it, and would read a packed one as it stands
+        stored.write_direct_chunk((0,), rows.tobytes(), 1)
+    with pytest.raises(SpecError, match="packed with ECF"):
+        open_events(path).triggers()
+
+
 def test_other_packings_of_prophesees_layout_are_read(tmp_path):
     """Records with deflate, in another order, without size: by h5py alone."""
     events = many(500, 1 << 20)

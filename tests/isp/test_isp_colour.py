@@ -3,6 +3,7 @@
 import colour as colour_science
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError
@@ -69,3 +70,19 @@ def test_wrong_corners_of_a_chart_are_told_as_corners():
         with pytest.raises(RangeError, match="top right, bottom right and bottom left patch, in this order around the"):
             chart.patch_means(image, corners)
     assert chart.patch_means(image, [(10, 80), (10, 10), (50, 10), (50, 80)]).shape == (24, 3)  # seen in a mirror
+
+
+def test_patches_of_a_chart_in_perspective():
+    """A plane that is turned about two axes before a pinhole: its patches are projected one by one."""
+    turn = Rotation.from_euler("xyz", [0.5, -0.35, 0.2]).as_matrix()
+
+    def image(u, v):
+        """(row, col) of a place of the chart, whose corner patches are at 0 and 1."""
+        x, y, z = turn @ [0.6 * (u - 0.4), 0.45 * (v - 0.55), 0.0] + [0.05, -0.08, 1.1]
+        return 310 + 520 * y / z, 405 + 520 * x / z
+
+    corners = [image(*place) for place in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    expected = [image(u, v) for v in np.linspace(0, 1, 4) for u in np.linspace(0, 1, 6)]
+    np.testing.assert_allclose(chart.patch_centres(corners), expected, atol=1e-8)
+    # no parallelogram: the middle of the corners is elsewhere
+    assert np.hypot(*(np.mean(corners, axis=0) - image(0.5, 0.5))) > 5

@@ -5,7 +5,7 @@ import pytest
 
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs import read_sensor
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.files import list_names
 
 

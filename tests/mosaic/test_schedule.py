@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.mosaic.schedule import blocks_of_run, exposures, sample_of_blocks, tick_blocks
+from hesim_render.mosaic.schedule import blocks_of_run, exposures, instant_blocks, sample_of_blocks, tick_blocks
 
 #: 16 cells of 1 ms.
 STRETCH_US = 16_000
@@ -85,3 +85,16 @@ def test_a_frame_ends_with_its_last_row():
     np.testing.assert_array_equal(second.row_begin_us(np.array([0, 31])), [14_286, 14_286 + 232.5])
     still = spec.model_copy(update={"shutter": "global"})
     assert exposures(still, 32, 1300)[0].end_us == 1300
+
+
+@pytest.mark.parametrize(("begin_us", "end_us"), [(0, 5), (0, 16_000), (0, 16_001), (3, 47_999.5), (16_000, 33_300)])
+def test_windows_of_instants_end_at_every_instant_of_a_run(begin_us, end_us):
+    """Each instant after the begin, up to the end, is wanted once, however the run lies in blocks of 16 ms."""
+    every = np.arange(0, 64_001, 250)  # four of each cell
+
+    def instants(first, last):
+        return every[(every >= first) & (every <= last)]
+
+    found = [block.end_us[block.wanted] for block in instant_blocks(instants, 7, begin_us, end_us)]
+    expected = every[(every > begin_us) & (every <= end_us)]
+    np.testing.assert_array_equal(np.concatenate([np.empty(0), *found]), expected)

@@ -1,7 +1,7 @@
 """Imports point down only, nothing imports itself in a circle, and one package alone knows Mitsuba."""
 
 import ast
-import importlib
+import json
 import re
 import subprocess
 import sys
@@ -164,26 +164,6 @@ def test_values_on_the_device_have_named_types(name):
                 assert not (isinstance(annotation, ast.Name) and annotation.id == "Any"), f"{node.name}, {node.lineno}"
 
 
-def test_names_of_before_give_the_modules_of_today():
-    from hesim_render._moved import MOVED
-
-    for old, new in MOVED.items():
-        assert f"hesim_render.{new}" in MODULES or f"hesim_render.{new}" in PACKAGES, new
-        assert not (PACKAGE / Path(*old.split("."))).with_suffix(".py").exists()
-    for old in ("spectra", "renderer.flux", "video.inversion", "errors"):
-        assert importlib.import_module(f"hesim_render.{old}") is importlib.import_module(f"hesim_render.{MOVED[old]}")
-    from hesim_render.renderer.reference import WindowReference
-
-    import hesim_render as hr
-    from hesim_render import spectra
-    from hesim_render.recording import Recording
-    from hesim_render.sensor import Sensor, load_sensor
-
-    assert hr.renderer.__name__ == "hesim_render.sources.render"
-    assert spectra.__name__ == "hesim_render.spectral.spectrum" and spectra.__spec__.name == spectra.__name__
-    assert Recording.__module__ == "hesim_render.recording.recording" and Sensor and load_sensor and WindowReference
-
-
 def test_hooks_need_nothing_but_the_checkouts_own_environment():
     from ruamel.yaml import YAML
 
@@ -193,13 +173,62 @@ def test_hooks_need_nothing_but_the_checkouts_own_environment():
             assert hook["language"] == "system" and hook["entry"].startswith(".venv/bin/")
 
 
-def test_a_recording_does_not_know_its_previews():
-    """Pictures are drawn by those who know recordings, not the other way round."""
-    reached, waiting = set(), ["hesim_render.recording.recording", "hesim_render.recording.writer"]
+def test_the_content_of_a_recording_does_not_know_its_pictures():
+    """Pictures, pages and exports are functions over a recording; its content imports none of them."""
+    reached, waiting = set(), ["hesim_render.recording.recorded"]
     while waiting:
         name = waiting.pop()
         if name in MODULES and name not in reached:
             reached.add(name)
             waiting += modules_imported(name)
-    assert "hesim_render.recording.folder" in reached
-    assert not reached & {"hesim_render.recording.preview", "hesim_render.recording.showcase"}
+    assert "hesim_render.recording.stored_frames" in reached
+    drawn = {"preview", "showcase", "page", "plots", "movie", "exports", "save"}
+    assert not reached & {f"hesim_render.recording.{name}" for name in drawn}
+
+
+#: Modules that import by a name that is computed: the names of the package's face, and the backend that was chosen.
+BY_NAME = {"hesim_render/__init__.py", "hesim_render/core/backend.py"}
+
+
+def test_no_import_hides_behind_a_text():
+    for path in PACKAGE.rglob("*.py"):
+        if path.relative_to(ROOT).as_posix() not in BY_NAME:
+            text = path.read_text(encoding="utf-8")
+            assert "import_module" not in text and "__import__" not in text, path
+
+
+#: Runs the command line when it is imported.
+PROGRAM = "hesim_render.cli.__main__"
+#: Imports every module, and tells which module has asked for which while it was loaded.
+RUN = """
+import builtins, json, sys
+asked, plain = set(), builtins.__import__
+
+def noted(name, globals=None, locals=None, fromlist=(), level=0):
+    found = plain(name, globals, locals, fromlist, level)
+    if globals is not None and name.startswith("hesim_render"):
+        here = globals.get("__name__", "")
+        asked.update((here, other) for other in (name, *(f"{name}.{one}" for one in fromlist or ())))
+    return found
+
+builtins.__import__ = noted
+for name in json.loads(sys.argv[1]):
+    plain(name)
+print(json.dumps(sorted(asked)))
+"""
+
+
+def test_imports_point_down_when_they_run():
+    """What the text of a module says, seen while every module is loaded: hooks and helpers cannot hide an arrow."""
+    child = subprocess.run(
+        [sys.executable, "-c", RUN, json.dumps([name for name in EVERY if name != PROGRAM])],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    asked = [(here, other) for here, other in json.loads(child.stdout) if here in MODULES]
+    assert len(asked) > 1000
+    for here, other in asked:
+        if other in MODULES and package_of(here) and package_of(other):
+            assert LEVEL[package_of(other)] <= LEVEL[package_of(here)], f"{here} asks for {other}, which is above it"
+            assert other in modules_imported(here) | {here}, f"{here} asks for {other}, which its text does not say"

@@ -12,11 +12,11 @@ from hesim_render.core.shipped import list_names
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import reference_law
 from hesim_render.pixels.evs.model import EvsNoise
+from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.reference_law import Pixels, law
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.pixels.evs.start import start_of
-from hesim_render.specs.event_noise import events_per_period
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 SIDE = 64
 #: σ of ln x at 0 e⁻ is 0.07: thresholds of 2.6 and 3 standard deviations.

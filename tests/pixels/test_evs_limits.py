@@ -19,8 +19,8 @@ from hesim_render.pixels.evs.readout import EventReadout, scan_start_row
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.sources.window_by_window import WindowByWindow
-from hesim_render.specs.sensor import read_sensor
 
 K, T_REF_US, WINDOW_US = 0.2, 10_000, 1000  # of reference-mono: I = 2 DN per electron of a window
 CUTOFF_HZ = 300.0
@@ -127,8 +127,8 @@ def test_filter_does_not_depend_on_the_samples(spec):
 
 @pytest.mark.parametrize("signal_dn", (0.2, 10.0, 40.0, 100.0, 5000.0))
 def test_corner_follows_the_light(signal_dn):
-    """Small ripples at 30 Hz on constant light: the attenuation is that of f_c·I/signal_dn within its limits."""
-    corner = np.clip(CUTOFF_HZ * signal_dn / 100.0, 3.0, CUTOFF_HZ)
+    """Small ripples at 30 Hz on constant light: the corner rises from that of the dark to its largest at signal_dn."""
+    corner = min(3.0 + (CUTOFF_HZ - 3.0) * signal_dn / 100.0, CUTOFF_HZ)
     rate = 2 * np.pi * corner * 1e-6 / np.sqrt(np.sqrt(2) - 1)
     period_us, omega = 32_000, 2 * np.pi / 32_000
     times = np.arange(0, 12 * period_us, 500)
@@ -144,9 +144,9 @@ def test_corner_follows_the_light(signal_dn):
 def test_large_change_of_light_against_the_differential_equation(rise_us, bound):
     """From 0.5 to 300 DN and back: z' = a(u)(u − z), y' = a(u)(z − y), a following u at every instant.
 
-    The corner is at both of its limits, and in between. A jump falls between two nodes, 104 µs apart; the corner held
-    at its value at a node would be wrong by 0.3. Single precision is 1e-5; where ln x changes by 5.3 between two nodes,
-    the integral of the corner is a quadrature of three points.
+    The corner follows the light, is at its limit, and is near that of the dark. A jump falls between two nodes, 104 µs
+    apart; the corner held at its value at a node would be wrong by 0.3. Single precision is 1e-5; where ln x changes by
+    5.3 between two nodes, the integral of the corner is a quadrature of three points.
     """
     corners_us = np.array([0, 2040, 2040 + rise_us, 12_000, 12_000 + rise_us, 60_000])
     level = np.log1p([0.5, 0.5, 300.0, 300.0, 0.5, 0.5])
@@ -155,7 +155,7 @@ def test_large_change_of_light_against_the_differential_equation(rise_us, bound)
 
     def slope(t, state):
         u = np.interp(t, corners_us, level)
-        rate = np.clip(np.expm1(u) / 100.0, 0.01, 1.0) * RATE
+        rate = np.minimum(0.01 + 0.99 * np.expm1(u) / 100.0, 1.0) * RATE
         return [rate * (u - state[0]), rate * (state[0] - state[1])]
 
     exact, state = [level[:1]], [level[0]] * 2

@@ -12,7 +12,7 @@ from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.processes import BandNoise
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 TICK_US = 1000
 K, T_REF_US = 0.2, 10_000  # signal reference of reference-mono

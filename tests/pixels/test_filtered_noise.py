@@ -11,12 +11,14 @@ from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, _step
 from hesim_render.pixels.evs.stage import EvsStage
 
-#: Signals in DN of pixels whose corner is the least, a twentieth, a third and all of the noise's own bandwidth.
+#: Signals in DN: the dark, two at which the corner is below the noise's own bandwidth, and the largest corner.
 SIGNALS = (0.0, 5.0, 33.0, 400.0)
+#: Corner over the noise's bandwidth there, at most 1: 2 Hz in the dark and 398/400 Hz more for each DN, over 100 Hz.
+SHARES = np.array([0.02, 0.06975, 0.34835, 1.0])
 FILTERED = {
     "evs.photoreceptor_cutoff_hz": 100.0,
     "evs.photoreceptor": {
-        "cutoff_hz": 400.0, "signal_dn": 400.0, "min_cutoff_hz": 1.0, "filters_noise": True,
+        "cutoff_hz": 400.0, "signal_dn": 400.0, "min_cutoff_hz": 2.0, "filters_noise": True,
     },
 }  # fmt: skip
 
@@ -60,8 +62,7 @@ def test_variance_and_correlation_are_those_of_each_pixels_own_corner():
     photoreceptor = Photoreceptor(noise)
     photoreceptor.start(log, 0)
     band = BandNoise(noise, 7, photoreceptor)
-    corner = np.clip(400 * signal / 400, 1, 100)[:: width // len(SIGNALS)]
-    poles = 2 * np.pi * corner / np.sqrt(np.sqrt(2) - 1)
+    poles = 2 * np.pi * 100 * SHARES / np.sqrt(np.sqrt(2) - 1)
     values = [np.array(band.start(0))]
     period_us = 1e6 / 1600
     lags, every = (1, 4, 16, 64), 0.5
@@ -87,7 +88,7 @@ def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth():
     noise, plain = sensor(4, 1).evs, hr.load_sensor("davis346").crop(4, 1).evs
     counted = jit().Float(electrons(noise, SIGNALS).astype(np.float32))
     ratio = np.array(noise.log_level(counted)[1]) / np.array(plain.log_level(counted)[1])
-    np.testing.assert_allclose(ratio, [0.01, 0.05, 0.33, 1.0], rtol=1e-4)
+    np.testing.assert_allclose(ratio, SHARES, rtol=1e-4)
     # renders are asked for the noise that is there
     position = np.zeros(4, np.int64)
     some = electrons(noise, SIGNALS)
@@ -95,7 +96,7 @@ def test_the_variance_falls_with_the_corner_below_the_noises_bandwidth():
     theta = 0.05 * 0.2
     x = some * float(noise.table.slope[0]) + float(noise.table.base[0])
     floor = theta * x / float(noise.table.slope[0])
-    np.testing.assert_allclose(filtered, np.maximum(nominal * np.sqrt([0.01, 0.05, 0.33, 1.0]), floor), rtol=1e-4)
+    np.testing.assert_allclose(filtered, np.maximum(nominal * np.sqrt(SHARES), floor), rtol=1e-4)
     assert noise.without("bandwidth").noise_share(some, position) == 1.0
 
 

@@ -12,9 +12,11 @@ from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.nominal import NominalSteps
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
-SIDE, THETA = 48, 0.2
+#: Not square, so that rows are not taken for columns.
+ROWS, COLS, THETA = 36, 64, 0.2
+SIZE = ROWS * COLS
 #: x = I + 1 with I = 2 DN per electron of a window; s² = β4², so that the noise of ln x at x = 101 is β4/101.
 NOISY = {"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 5.0, "beta5": 0.0}
 #: Terms that make noise; bandwidth stays.
@@ -29,7 +31,7 @@ def model(asynchronous=False, coefficients=NOISY, **overrides):
         changes = {**{k: v for k, v in ASYNCHRONOUS.items() if v is not None or k == "evs.tick_us"}, **changes}
     spec = read_sensor(
         "reference-mono",
-        {"geometry.rows": SIDE, "geometry.cols": SIDE, "evs.coefficients": [coefficients],
+        {"geometry.rows": ROWS, "geometry.cols": COLS, "evs.coefficients": [coefficients],
          "evs.contrast_threshold_on": THETA, "evs.contrast_threshold_off": 1.15 * THETA, **changes},
     )  # fmt: skip
     layout = Layout.full(spec)
@@ -38,7 +40,7 @@ def model(asynchronous=False, coefficients=NOISY, **overrides):
 
 def light(t_us, swing=0.6, hz=20.0):
     """ln x of every pixel: a sinusoid with a phase of its own."""
-    phase = np.random.default_rng(5).uniform(0, 2 * np.pi, SIDE * SIDE)
+    phase = np.random.default_rng(5).uniform(0, 2 * np.pi, SIZE)
     return np.log(101.0) + swing * np.sin(2 * np.pi * hz * t_us * 1e-6 + phase)
 
 
@@ -90,7 +92,7 @@ def test_with_fixed_ticks_the_change_of_the_light_itself_decides():
     """From the levels that are put in: p·Δ ln x > θ, of the nominal threshold and of the pixel's own."""
     noise = model(evs__threshold_mismatch_std=0.1, evs__contrast_threshold_off=0.25)
     events, found = run(noise, TICKS, lambda t: light(t, hz=60.0))
-    place = events["y"].astype(int) * SIDE + events["x"]
+    place = events["y"].astype(int) * COLS + events["x"]
     levels = np.array([light(t, hz=60.0) for t in [0, *TICKS]])
     tick = events["t_us"] // 1000
     change = levels[tick, place] - levels[tick - 1, place]
@@ -106,7 +108,7 @@ def test_with_fixed_ticks_the_change_of_the_light_itself_decides():
 
 
 def test_leak_and_hot_pixels_are_told_apart_from_noise():
-    still = np.full(SIDE * SIDE, np.log(101.0))
+    still = np.full(SIZE, np.log(101.0))
     quiet = {**NOISY, "beta4": 0.0}
     hot = {"evs.defects": {"hot_share": 0.02, "hot_rate_hz": 200.0}}
     for asynchronous in (False, True):
@@ -118,15 +120,15 @@ def test_leak_and_hot_pixels_are_told_apart_from_noise():
         assert events.size > 300 and (found.label == Label.HOT).all()
         noise = model(asynchronous, **hot)
         events, found = run(noise, TICKS, lambda t: still)
-        of_hot = np.isin(events["y"].astype(int) * SIDE + events["x"], noise.defects.place)
+        of_hot = np.isin(events["y"].astype(int) * COLS + events["x"], noise.defects.place)
         assert (found.label[~of_hot] == Label.NOISE).all() and (found.label[of_hot] == Label.HOT).mean() > 0.5
 
 
 def test_with_a_dead_time_leak_and_hot_events_keep_their_origin():
     noise = model(True, {**NOISY, "beta4": 0.0}, evs__leak_rate_hz=3.0, evs__refractory_period_us=500,
                   **{"evs.defects": {"hot_share": 0.02, "hot_rate_hz": 200.0}})  # fmt: skip
-    events, found = run(noise, TICKS, lambda t: np.full(SIDE * SIDE, np.log(101.0)))
-    of_hot = np.isin(events["y"].astype(int) * SIDE + events["x"], noise.defects.place)
+    events, found = run(noise, TICKS, lambda t: np.full(SIZE, np.log(101.0)))
+    of_hot = np.isin(events["y"].astype(int) * COLS + events["x"], noise.defects.place)
     assert (found.label[~of_hot] == Label.LEAK).all() and (~of_hot).sum() > 300
     assert (found.label[of_hot] == Label.HOT).mean() > 0.9
 
@@ -166,7 +168,7 @@ def test_asynchronous_signal_has_the_rate_of_the_run_without_noise(noise_dn, spr
 def test_noise_of_still_light_is_not_signal():
     """From the first moment on, as pixels begin in the state that they have in this light."""
     noise = model(True, evs__threshold_mismatch_std=0.05)
-    events, found = run(noise, 1_000 * np.arange(1, 181), lambda t: np.full(SIDE * SIDE, np.log(101.0)))
+    events, found = run(noise, 1_000 * np.arange(1, 181), lambda t: np.full(SIZE, np.log(101.0)))
     assert events.size > 300 and (found.label == Label.NOISE).mean() > 0.998
     assert found.clean.size == 0
 
@@ -188,9 +190,9 @@ def test_events_lost_in_the_dead_time_are_noise_free_crossings_within_it():
     crossings, _ = run(noise.without("refractory"), times, labels=False)
     assert (found.label == Label.SIGNAL).mean() > 0.5
     expected = []
-    place = events["y"].astype(int) * SIDE + events["x"]
+    place = events["y"].astype(int) * COLS + events["x"]
     for event in crossings.tolist():
-        fired = events["t_us"][place == event[2] * SIDE + event[1]]
+        fired = events["t_us"][place == event[2] * COLS + event[1]]
         if np.any((fired < event[0]) & (event[0] <= fired + 3_000)):
             expected.append(event)
         if len(expected) == 300:
@@ -235,9 +237,9 @@ def test_with_a_dead_time_signal_has_the_rate_of_the_run_without_noise_but_with_
 def wandering(t_us, seed=6, every_us=500):
     """ln x of every pixel at samples: a walk with jumps of many thresholds, between two walls."""
     rng = np.random.default_rng(seed)
-    level = np.zeros((t_us // every_us + 1, SIDE * SIDE))
+    level = np.zeros((t_us // every_us + 1, SIZE))
     for k in range(1, len(level)):
-        jump = rng.normal(0, 0.12, SIDE * SIDE) + rng.normal(0, 1.0, SIDE * SIDE) * (rng.random(SIDE * SIDE) < 0.05)
+        jump = rng.normal(0, 0.12, SIZE) + rng.normal(0, 1.0, SIZE) * (rng.random(SIZE) < 0.05)
         level[k] = level[k - 1] + jump
         level[k] = np.where(np.abs(level[k]) > 1.5, level[k - 1] - jump, level[k])
     return np.log(101.0) + level
@@ -266,9 +268,9 @@ def test_a_step_is_signal_if_the_level_goes_on_to_the_nominal_threshold_before_t
     times = 500 * np.arange(1, 121)
     levels = wandering(int(times[-1]))
     events, found = run(noise, times, lambda t: levels[t // 500])
-    place = events["y"].astype(int) * SIDE + events["x"]
+    place = events["y"].astype(int) * COLS + events["x"]
     right = wrong = mismatch = 0
-    for pixel in range(0, SIDE * SIDE, 4):
+    for pixel in range(0, SIZE, 4):
         own = {1: noise.threshold_on_map.ravel()[pixel], -1: noise.threshold_off_map.ravel()[pixel]}
         expected = steps_worked_out(levels[1:, pixel], own, {1: THETA, -1: 0.25})
         here = place == pixel
@@ -295,7 +297,7 @@ def test_labels_neither_drift_nor_need_more_memory_as_time_goes_on(dead_us):
     for _ in range(3):
         blocks, count = [], 0
         for k in range(70):
-            on = (k // 5) % 2 * 1.1 + generator.normal(0, 0.05, SIDE * SIDE)
+            on = (k // 5) % 2 * 1.1 + generator.normal(0, 0.05, SIZE)
             t_us = (stage.t_us or 0) + 1_000
             count += stage.step(jit().Float(((101.0 * np.exp(on) - 1) / 2).astype(np.float32)), t_us).size
             blocks.append(labeller.taken())
@@ -327,7 +329,7 @@ def test_labels_where_nothing_happens_between_two_samples():
     noise = model(True, {**NOISY, "beta4": 0.0}, evs__threshold_mismatch_std=0.1)
 
     def rise(t_us):
-        return np.full(SIDE * SIDE, np.log(101.0) + 0.195 * (t_us > 500) + max(0, t_us - 20_000) * 1e-6)
+        return np.full(SIZE, np.log(101.0) + 0.195 * (t_us > 500) + max(0, t_us - 20_000) * 1e-6)
 
     for samples, label, highest in ((40, Label.MISMATCH, 0.195), (80, Label.SIGNAL, 0.215)):
         events, found = run(noise, 500 * np.arange(1, samples + 1), rise)

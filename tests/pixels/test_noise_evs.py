@@ -8,7 +8,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs.model import EVS_TERMS, LEAST_THRESHOLD_REL, EvsNoise
-from hesim_render.specs.sensor import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 COEFFICIENTS = {"beta1": 0.8, "beta2": 3.0, "beta3": 0.1, "beta4": 0.05, "beta5": -0.3}
 

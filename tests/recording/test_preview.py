@@ -1,5 +1,7 @@
 """Pictures: neutral stays neutral, colours come out right, no event gets lost, event pixels do not leak in."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import recordings
@@ -147,6 +149,19 @@ def test_contact_sheet_of_any_size(name, width, height, tmp_path):
         assert 900 < sheet.width < 1800 and sheet.mode == "RGB"
         assert np.asarray(sheet).std() > 15
     assert not showcase.moves(recording)
+
+
+@pytest.mark.parametrize(("start_us", "first_us"), [(91_000, 87_500), (200, 0), (246_000, 240_000)])
+def test_events_of_a_moving_scene_are_those_around_the_middle_of_the_frame(start_us, first_us, monkeypatch):
+    """10 ms about the middle of an exposure of 3 ms, and as many where the run begins or ends beside it."""
+    recording, asked = recordings.make("eiger", duration_us=250_000), []
+    frame = replace(recording.frames[1], exposure_start_us=start_us, exposure_us=3_000)
+    monkeypatch.setattr(showcase, "_middle", lambda _: frame)
+    monkeypatch.setattr(showcase, "moves", lambda _: True)
+    slices = type(recording).event_slice
+    monkeypatch.setattr(type(recording), "event_slice", lambda self, *span: asked.append(span) or slices(self, *span))
+    panels = showcase.middle_views(recording)
+    assert asked == [(first_us, first_us + 10_001)] and panels[1].caption.endswith("in 10 ms: ON orange, OFF blue")
 
 
 def test_moving_scene_gets_an_animation(tmp_path):

@@ -103,8 +103,8 @@ def calibration(folder):
 def use_calibration(folder):
     from hesim_render.calibrate import write_report
     from hesim_render.calibrate.summary import summary_lines
+    from hesim_render.calibration.file import as_written, read_calibration
     from hesim_render.isp.frame_noise import FrameNoise
-    from hesim_render.specs.calibration import as_written, read_calibration
 
     data = read_calibration(folder / "c.yaml")
     with as_written(folder / "c.yaml"):

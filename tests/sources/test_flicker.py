@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mitsuba_specfilm import reference_flux
 from rendering import make_scene, mono
 
 import hesim_render as hr
@@ -10,12 +11,12 @@ from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.flicker import FlickerFlux, flickering
+from hesim_render.sources.flicker import FlickerFlux
 from hesim_render.sources.light_parts import light_parts
 from hesim_render.sources.protocol import Sample
 from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.renderer import flickering
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
-from hesim_render.sources.render.specfilm import reference_flux
 from hesim_render.sources.scene import Scene
 from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral.waveform import Mains, Pwm

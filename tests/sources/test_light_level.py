@@ -3,6 +3,7 @@
 import colour
 import numpy as np
 import pytest
+from mitsuba_specfilm import reference_flux
 from rendering import make_scene, mono
 from scipy import integrate
 
@@ -11,7 +12,6 @@ from hesim_render.core.errors import SpecError
 from hesim_render.sources.render import light_level
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.light_level import WISH, in_absolute_light
-from hesim_render.sources.render.specfilm import reference_flux
 from hesim_render.sources.scene import Scene
 
 #: Past the lamps, at the plane's point.

@@ -10,9 +10,11 @@ from pydantic import BaseModel
 
 from hesim_render.core.errors import HesimWarning, RangeError, SpecError
 from hesim_render.mosaic.layout import Layout
-from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene, read_sensor
+from hesim_render.sensor.reading import read_sensor
+from hesim_render.specs import SceneSpec, SensorSpec, files, read_scene
+from hesim_render.specs.event_pixels import EvsSpec
 from hesim_render.specs.files import Strict, content_hash, data_folder, list_names, parse_override
-from hesim_render.specs.sensor import ApsSpec, EvsSpec
+from hesim_render.specs.frame_pixels import ApsSpec
 
 SENSOR = (data_folder("sensors") / "eiger.yaml").read_text()
 SCENE = """schema_version: 1

@@ -1,6 +1,6 @@
 """Scenes whose changes are easily missed: things that are small, thin, fast, or there for a moment only.
 
-The camera sees 0.8 m of the plane z = 0, 2 m away; all is matt but for the glint.
+The camera sees 0.8 m of the plane z = 0, 2 m away; all is diffuse but for the glint.
 """
 
 from __future__ import annotations

@@ -7,16 +7,16 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from mitsuba_reference import WindowReference
 from random_scenes import DURATION_US, RandomScene
 from scipy import stats
 
 import hesim_render as hr
-from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.audit.compare import Counted, compare_crossings, compare_ticks
 from hesim_render.sources.render.audit.units import NotedFlux
 from hesim_render.sources.render.change_driven.error_target import Noise
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.reference import WindowReference
+from hesim_render.sources.render.renderer import flickering
 
 QUALITY = 0.5
 #: Share of values off by more than three wanted errors that a run should have at most.
@@ -101,7 +101,7 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
     the reference is exact enough (`exact` of `all`): mean deviation, number off, and mean square over the errors.
     """
     _Seen.made.clear()
-    with mock.patch("hesim_render.capture.simulate.NotedFlux", _Seen):
+    with mock.patch("hesim_render.capture.scene_run.NotedFlux", _Seen):
         run = hr.simulate(
             random.scene, random.sensor, duration_s=DURATION_US * 1e-6, seed=random.seed, max_minutes=None
         )
@@ -142,7 +142,7 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
 def count_events(sensor, chosen, own, reference, stated, reference_error) -> Counted:
     """Events of some pixels by their own flux and by the reference, both [window, pixel].
 
-    What is sure depends on both standard errors, because a matt scene can be more exact than its reference.
+    What is sure depends on both standard errors, because a diffuse scene can be more exact than its reference.
     """
     noise = sensor.evs
     levels = [noise.log_signal(values, chosen) for values in (own, reference, own + np.hypot(stated, reference_error))]

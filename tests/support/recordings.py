@@ -10,7 +10,7 @@ from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.frame import Frame
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.lens import Lens, response
-from hesim_render.specs import read_sensor
+from hesim_render.sensor.reading import read_sensor
 
 
 def sensor_like(name, width=128, height=96):

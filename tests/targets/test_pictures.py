@@ -225,15 +225,15 @@ def test_lamps_of_a_grid_blink_on_a_board_in_steady_light():
     target = {"type": "led-grid", "rows": 1, "cols": 1, "pitch_m": 0.04, "diameter_m": 0.039, "luminance_cd_m2": 100,
               "margin_m": 0.02, "waveform": {"type": "pwm", "frequency_hz": 100, "duty": 0.25}}  # fmt: skip
     scene = make_scene(target=target, light={"type": "uniform", "illuminance_lux": 10}, camera=CAMERA)
-    from hesim_render.sources.flicker import flickering
     from hesim_render.sources.render.exact import RenderedFlux
+    from hesim_render.sources.render.renderer import flickering
 
     source = flickering(scene, lambda part, _: RenderedFlux(part, mono(32, 32), 16, 1))
     response = luminance_response(source.sensor)
     pixel = np.array([16 * 32 + 16, 2], np.uint32)  # a lamp, and the board
     for begin, end, power in ((0, 2000, 4.0), (3000, 9000, 0.0), (0, 10000, 1.0)):
         flux = np.mean([np.array(half) for half in source.mean_flux(pixel, begin, end)], axis=0)
-        # the lamp is also a matt surface of 5 % in the light of the room
+        # the lamp is also a diffuse surface of 5 % in the light of the room
         expected = np.array([100 * power + 0.05 * 10 / np.pi, 0.05 * 10 / np.pi]) * response
         np.testing.assert_allclose(flux, expected, rtol=6e-3)
     both = hr.simulate(scene, mono(8, 8), duration_s=0.01, clean=True).manifest

@@ -16,9 +16,9 @@ from hesim_render.calibrate.aps.fitted import ApsCalibration, Position
 from hesim_render.calibrate.aps.variance import TERMS, VarianceFit, variance_map
 from hesim_render.calibrate.estimate import estimated
 from hesim_render.calibrate.moments import Moments
+from hesim_render.calibration.rates import TelegraphPerFrame
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2
 from hesim_render.recording.capture_set import CaptureSet
-from hesim_render.specs.calibration_rates import PER_INTERVAL, per_second
 
 _FIGURE_PX = 320
 #: Number of points of pooled variances drawn per position, approximately.
@@ -119,17 +119,15 @@ def maps(captures: CaptureSet, result: ApsCalibration, lit: Moments, dark_moment
     for position, fit in result.fits.items():
         covariance[position] = fit.covariance
     telegraph, frame_rate_hz = result.telegraph, captures.frame_rate_hz
-    found = telegraph.amplitude_dn, telegraph.high_share, telegraph.correlation
-    of_telegraph: dict[str, NDArray] = dict(zip(PER_INTERVAL["aps"], found, strict=True))
-    if frame_rate_hz is not None:
-        of_telegraph = per_second("aps", of_telegraph, 1.0 / frame_rate_hz)
+    counted = TelegraphPerFrame(telegraph.amplitude_dn, telegraph.high_share, telegraph.correlation)
+    known = counted if frame_rate_hz is None else counted.per_second(1.0 / frame_rate_hz)
     arrays: dict[str, NDArray] = {
         "n_row": dark.n_row,
         "n_blc": dark.n_blc,
         "n_dp": dark.n_dp,
         "bad_pixels": result.bad,
         "hot_pixels": dark.hot,
-        **of_telegraph,
+        **known.maps(),
         "signal_dn_per_s": composite.rate_dn_per_s,
         "signal_standard_error_dn_per_s": composite.standard_error_dn_per_s,
         "beta_covariance": covariance,

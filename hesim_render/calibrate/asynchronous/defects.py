@@ -13,8 +13,8 @@ from hesim_render.calibrate.asynchronous.fit import Fit
 from hesim_render.calibrate.asynchronous.likelihood import MISMATCH, THETA, Counts, chances, log_prior
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials
 from hesim_render.calibrate.flicker import dynamics, unsteady
-from hesim_render.specs.calibration_rates import rate_hz
-from hesim_render.specs.calibration_spec import Defect
+from hesim_render.calibration.rates import rate_hz
+from hesim_render.calibration.spec import Defect
 
 #: Probability that a good pixel's counts are called bad.
 _CHANCE = 1e-7

@@ -26,11 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from hesim_render.pixels.evs.formulas import POLE_HZ
+
 #: ln κ against the level h in standard deviations, highest power first, between two ends of h; 0.4 % off the counts.
 _LOG_KAPPA = (-3.1165e-05, 3.6215e-04, -4.6413e-04, -4.4709e-03, -0.027395, 0.34284, -0.92856, 0.61716)
 _LOWEST, _HIGHEST, _SLOPE = -1.5, 6.0, -2.112  # below, ln κ goes on along its slope there
-#: (a/2π)/f_c.
-_CROSSINGS = 1 / math.sqrt(math.sqrt(2.0) - 1.0)
 #: Fraction of a period of the cut-off in which the noise stays as at the reset and cannot pass a threshold.
 _REMEMBERED = 0.15
 #: Gauss–Hermite nodes and weights of the noise at the reset, in standard deviations.
@@ -48,7 +48,7 @@ def passage_rate(level: NDArray) -> NDArray[np.float64]:
     for factor in _LOG_KAPPA[1:]:
         log_kappa = log_kappa * inside + factor
     log_kappa += _SLOPE * np.minimum(h - _LOWEST, 0.0)
-    return _CROSSINGS * np.exp(np.minimum(log_kappa - 0.5 * h * h, 50.0))
+    return POLE_HZ * np.exp(np.minimum(log_kappa - 0.5 * h * h, 50.0))
 
 
 def correlation(cutoff_hz: float, elapsed_s: float) -> float:
@@ -59,7 +59,7 @@ def correlation(cutoff_hz: float, elapsed_s: float) -> float:
     cutoff_hz : cut-off frequency, Hz.
     elapsed_s : time difference, s.
     """
-    h = math.tau * _CROSSINGS * cutoff_hz * elapsed_s
+    h = math.tau * POLE_HZ * cutoff_hz * elapsed_s
     return (1.0 + h) * math.exp(-h)
 
 

@@ -24,7 +24,7 @@ from hesim_render.calibrate.asynchronous.likelihood import (
 )  # fmt: skip
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.specs.calibration_spec import Defect
+from hesim_render.calibration.spec import Defect
 
 _MODEL = (
     "first event after a reset: S = ln((1 + r I1)/(1 + r I0)), sigma^2 = (beta3^2 I^p + beta4^2)/(1 + r I)^2, "

@@ -21,8 +21,8 @@ from hesim_render.calibrate.evs.medians import (
 from hesim_render.calibrate.evs.steps import Steps
 from hesim_render.calibrate.evs.thresholds import Thresholds, totals_of
 from hesim_render.calibrate.flicker import dynamics, unsteady
+from hesim_render.calibration.spec import Defect
 from hesim_render.pixels.evs.formulas import own_events
-from hesim_render.specs.calibration_spec import Defect
 
 #: Probability that a good pixel's count is called bad, number of spreads allowed, and least allowance.
 _CHANCE, _SPREADS, _LEAST_REACH = 1e-7, 6.0, 0.06

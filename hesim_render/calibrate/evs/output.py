@@ -16,10 +16,10 @@ from hesim_render.calibrate.evs.fitted import EventFit
 from hesim_render.calibrate.evs.model import both_probabilities
 from hesim_render.calibrate.evs.steps import GROUPS
 from hesim_render.calibrate.evs.thresholds import curve
+from hesim_render.calibration.rates import EventDefectsPerTrial, rate_hz
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.units import US_PER_S
 from hesim_render.recording.capture_set import CaptureSet
-from hesim_render.specs.calibration_rates import PER_INTERVAL, per_second, rate_hz
-from hesim_render.specs.calibration_spec import Defect
 
 _FIGURE_PX = 320
 #: Most bins of a histogram of counts.
@@ -161,11 +161,9 @@ def _gauge(result: EvsCalibration) -> dict[str, Any]:
 def maps(captures: CaptureSet, result: EvsCalibration) -> dict[str, NDArray]:
     """Map files of the section, and small arrays for the report (their names start with ``figure_``)."""
     defects, static, interval_s = result.defects, result.static, captures.interval_s
-    found = defects.kind, defects.on, defects.off, defects.firing_share, defects.correlation
-    of_defects: dict[str, NDArray] = dict(zip(PER_INTERVAL["evs"], found, strict=True))
-    if interval_s is not None:
-        of_defects = per_second("evs", of_defects, interval_s)
-    arrays = {"bad_pixels": result.bad, **of_defects}
+    counted = EventDefectsPerTrial(defects.kind, defects.on, defects.off, defects.firing_share, defects.correlation)
+    known = counted if interval_s is None else counted.per_second(interval_s)
+    arrays = {"bad_pixels": result.bad, **known.maps()}
     if result.thresholds is not None:
         arrays["threshold_on_relative"] = result.thresholds.pixel_on
         arrays["threshold_off_relative"] = result.thresholds.pixel_off

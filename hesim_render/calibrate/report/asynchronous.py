@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
-from hesim_render.core.html import row_of, table, tick_text
+from hesim_render.core.html import filled, tick_text
 
 #: Mean number of events for which no event is counted with a probability of 5 %: −ln 0.05.
 _UPPER_OF_NONE = 3.0
@@ -18,19 +17,16 @@ _UPPER_OF_NONE = 3.0
 
 def asynchronous_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     """HTML of the section: S-curves, noise rates, maps of thresholds, parameters."""
-    parts = [
-        "<h2>Events (EVS, asynchronous)</h2>",
-        findings(section),
-        row_of(*(_s_curves(maps, polarity) for polarity in (1, -1)), _noise_rate(maps)),
-        "<p>Points: counted. Lines: the fit. In the S-curves the lower branch is of events right after the step (the "
-        "first time bin), the upper one of all bins. Triangles: no event was counted; their upper "
-        "edge is the 95 % limit.</p>",
-        row_of(_pixels(maps), *(_map(maps, name, sign) for name, sign in (("on", "θ₊"), ("off", "θ₋")))),
-        "<h2>Parameters (EVS)</h2>",
-        table(("parameter", "value", "95 % interval", "unit, or why not"), _rows(section)),
-        f"<p>{escape(section['model'])}. Gauge of β: {escape(section['gauge'])}.</p>",
-    ]
-    return "\n".join(parts)
+    return filled(
+        "calibrate/report/asynchronous.html",
+        findings=findings(section),
+        curves=[*(_s_curves(maps, polarity) for polarity in (1, -1)), _noise_rate(maps)],
+        maps=[_pixels(maps), *(_map(maps, name, sign) for name, sign in (("on", "θ₊"), ("off", "θ₋")))],
+        head=HEAD,
+        parameters=_rows(section),
+        model=section["model"],
+        gauge=section["gauge"],
+    )
 
 
 def _s_curves(maps: dict[str, NDArray], polarity: int) -> str:

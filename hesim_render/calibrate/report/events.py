@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
-from hesim_render.core.html import row_of, table, tick_text
+from hesim_render.core.html import filled, tick_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,23 +27,23 @@ def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     section : ``evs`` of a ``calibration.yaml``.
     maps : its arrays, see `read_maps`; the arrays called ``figure_…`` are drawn.
     """
-    parts = [
-        "<h2>Events (EVS)</h2>",
-        findings(section),
-        row_of(
+    return filled(
+        "calibrate/report/events.html",
+        findings=findings(section),
+        rates=(
             picture("Event probability per trial, mean of ON and OFF", maps["figure_probability"], "", 340),
             _rates(maps),
             _position_rates(maps),
         ),
-        "<p>Triangles: no event was counted; their upper edge is the 95 % limit.</p>",
-        row_of(*(_on_off(name, maps) for name in ("lit", "dark"))),
-        row_of(_steps(maps), _starts(section, maps)),
-        "<h2>Parameters (EVS)</h2>",
-        table(("parameter", "value", "95 % interval", "unit, or why not"), _evs_rows(section)),
-        f"<p>{escape(section['model'])}. Gauge of β: {escape(section['gauge'])}.</p>",
-        _position_table(section),
-    ]
-    return "\n".join(parts)
+        counts=[_on_off(name, maps) for name in ("lit", "dark")],
+        steps=(_steps(maps), _starts(section, maps)),
+        head=HEAD,
+        parameters=_evs_rows(section),
+        model=section["model"],
+        gauge=section["gauge"],
+        position_head=("position", "A", "B", "C", "D", *(f"β{k}" for k in range(6)), "χ²/dof", "p"),
+        positions=_position_rows(section),
+    )
 
 
 def _rate_panel(title: str, signal: NDArray) -> tuple[Figure, Axes]:
@@ -201,7 +200,7 @@ def _evs_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _position_table(section: dict[str, Any]) -> str:
+def _position_rows(section: dict[str, Any]) -> list[tuple[str, ...]]:
     def text(item: dict[str, Any]) -> str:
         return (
             "not identifiable"
@@ -215,4 +214,4 @@ def _position_table(section: dict[str, Any]) -> str:
         goodness = section["goodness"]
         fit = f"{goodness['positions_chi2_per_dof'][k]:.3f}", p_text(goodness["positions_p_value"][k])
         rows.append((str(tuple(item["tile_position"])), *(text(item[n]) for n in "ABCD"), *beta, *fit))
-    return table(("position", "A", "B", "C", "D", *(f"β{k}" for k in range(6)), "χ²/dof", "p"), rows)
+    return rows

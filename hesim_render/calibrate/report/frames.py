@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import findings, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, picture, points, svg
-from hesim_render.core.html import number, row_of, table
+from hesim_render.core.html import filled, number
 from hesim_render.pixels.aps.formulas import polynomial
 
 
@@ -26,25 +25,22 @@ def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     band = np.repeat(n_row[:, None], max(8, len(n_row) // 3), axis=1)
     step = max(1, len(n_row) // 320)
     exposure = float(maps["figure_variance_exposure_us"]) / 1000
-    parts = [
-        "<h2>Frames (APS)</h2>",
-        findings(section),
-        row_of(
+    return filled(
+        "calibrate/report/frames.html",
+        findings=findings(section),
+        maps=(
             picture("Row bias", band[::step, ::step], "DN", 390),
             _profile(n_row),
             picture(f"Temporal variance per pixel, lit, {exposure:g} ms", maps["figure_variance_map"], "DN²", 330),
         ),
-        row_of(*(_histogram(name, maps[f"figure_noise_{name}"]) for name in ("dark", "lit"))),
-        "<h2>Variance against brightness, per tile position</h2>"
-        "<p>Points: pooled sample variances less the ADC's 1/12 DN², one colour an exposure. Lines: the fitted "
-        "polynomial. Below each: the residual in per cent.</p>",
-        _variance_panels(section, maps["figure_variance_points"]),
-        "<h2>Parameters (APS)</h2>",
-        _transfer_table(section),
-        _beta_table(section),
-        "".join(f"<p>Note: {escape(note)}</p>" for note in section["notes"]),
-    ]
-    return "\n".join(parts)
+        histograms=[_histogram(name, maps[f"figure_noise_{name}"]) for name in ("dark", "lit")],
+        variances=_variance_panels(section, maps["figure_variance_points"]),
+        head=HEAD,
+        parameters=_transfer_rows(section),
+        beta_head=("position", *(f"β{k} ({t})" for k, t in enumerate(section["terms"])), "χ²/dof", "p"),
+        beta=_beta_rows(section),
+        notes=section["notes"],
+    )
 
 
 def _profile(n_row: NDArray) -> str:
@@ -66,7 +62,7 @@ def _histogram(name: str, values: NDArray) -> str:
     return svg(figure)
 
 
-def _variance_panels(section: dict[str, Any], pooled: NDArray) -> str:
+def _variance_panels(section: dict[str, Any], pooled: NDArray) -> list[str]:
     figures = []
     for i, row in enumerate(section["beta"]):
         for j, cell in enumerate(row):
@@ -74,7 +70,7 @@ def _variance_panels(section: dict[str, Any], pooled: NDArray) -> str:
             if len(here) and any(b is not None for b in cell):
                 beta = np.array([0.0 if b is None else b for b in cell])
                 figures.append(_variance_panel(f"({i}, {j})", beta, here))
-    return row_of(*figures)
+    return figures
 
 
 def _variance_panel(title: str, beta: NDArray, here: NDArray) -> str:
@@ -98,7 +94,7 @@ def _variance_panel(title: str, beta: NDArray, here: NDArray) -> str:
     return svg(figure)
 
 
-def _transfer_table(section: dict[str, Any]) -> str:
+def _transfer_rows(section: dict[str, Any]) -> list[tuple[str, str, str, str]]:
     names = {
         "K": "K, system gain (EMVA 1288)", "read_noise_e": "read noise", "dark_current_e_per_s": "dark current",
         "full_well_e": "saturation capacity", "dsnu_e": "DSNU (without rows)", "prnu_percent": "PRNU",
@@ -115,10 +111,10 @@ def _transfer_table(section: dict[str, Any]) -> str:
     ]
     if section.get("telegraph_pixels") is not None:
         rows.append(("pixels with telegraph noise", str(section["telegraph_pixels"]), "", "two levels"))
-    return table(("parameter", "value", "95 % interval", "unit, or why not"), rows)
+    return rows
 
 
-def _beta_table(section: dict[str, Any]) -> str:
+def _beta_rows(section: dict[str, Any]) -> list[tuple[str, ...]]:
     rows = []
     for i, row in enumerate(section["beta"]):
         for j, cell in enumerate(row):
@@ -132,4 +128,4 @@ def _beta_table(section: dict[str, Any]) -> str:
                     for b, e in zip(cell, errors, strict=True)
                 ]
                 rows.append((f"({i}, {j})", *texts, *fit))
-    return table(("position", *(f"β{k} ({t})" for k, t in enumerate(section["terms"])), "χ²/dof", "p"), rows)
+    return rows

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
-from typing import Any
+
+from markupsafe import Markup
 
 from hesim_render.calibrate.report.asynchronous import asynchronous_section
 from hesim_render.calibrate.report.events import evs_section
 from hesim_render.calibrate.report.frames import aps_section
 from hesim_render.calibrate.report.parts import plain_text
 from hesim_render.calibrate.result import check_report, read_calibration, read_maps, report_beginning
+from hesim_render.calibration.file import as_written
+from hesim_render.calibration.spec import SECTIONS
 from hesim_render.core.drawing import report_style
-from hesim_render.core.html import PAGE_STYLE, table
+from hesim_render.core.html import filled
 from hesim_render.core.output import alone_in, replacing
-from hesim_render.specs.calibration import as_written
-from hesim_render.specs.calibration_spec import SECTIONS
 
 
 def write_report(calibration: str | Path, report: str | Path, overwrite: bool = False) -> Path:
@@ -37,24 +37,18 @@ def write_report(calibration: str | Path, report: str | Path, overwrite: bool = 
         data = read_calibration(calibration)
         maps = {section: read_maps(calibration, section, data) for section in SECTIONS if section in data}
     with as_written(calibration), report_style():
-        parts = [_introduction(data)]
+        sections = []
         if "aps" in data:
-            parts.append(aps_section(data["aps"], maps["aps"]))
+            sections.append(aps_section(data["aps"], maps["aps"]))
         if "evs" in data:
             draw = asynchronous_section if data["evs"].get("reference") == "last_event" else evs_section
-            parts.append(draw(data["evs"], maps["evs"]))
-    body = "\n".join(parts)
-    page = (
-        f'{report_beginning(calibration)}"><title>Noise calibration</title>'
-        f"<style>{PAGE_STYLE}</style></head><body>{body}</body></html>\n"
-    )
+            sections.append(draw(data["evs"], maps["evs"]))
+        capture = data["capture"]
+        page = filled(
+            "calibrate/report/page.html", beginning=Markup(report_beginning(calibration)), sections=sections,
+            sensor=capture.get("sensor"),
+            capture=[(key, plain_text(value)) for key, value in capture.items() if value not in (None, "")],
+        )  # fmt: skip
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return Path(report)
-
-
-def _introduction(data: dict[str, Any]) -> str:
-    capture = data["capture"]
-    rows = [(key, plain_text(value)) for key, value in capture.items() if value not in (None, "")]
-    of = f" of {escape(capture['sensor'])}" if "sensor" in capture else ""
-    return f"<h1>Noise calibration{of}</h1>{table(('capture', ''), rows)}"

@@ -1,23 +1,21 @@
-"""Common parts of the sections of the calibration report: rows of figures, lines of tables, findings."""
+"""Common parts of the sections of the calibration report: lines of tables, findings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from html import escape
 from typing import Any
 
 from hesim_render.core.html import number
 
+#: Headings of the tables of parameters.
+HEAD = ("parameter", "value", "95 % interval", "unit, or why not")
 
-def findings(section: Mapping[str, Any]) -> str:
-    """The findings of a section, one line each; empty for a calibration without checks."""
+
+def findings(section: Mapping[str, Any]) -> list[tuple[str, str, str]] | None:
+    """The findings of a section: check, chance and text of each; None for a calibration without checks."""
     if "findings" not in section:
-        return ""
-    found = section["findings"]
-    if not found:
-        return "<p>Checks of the captures: nothing was found that is not as the noise model supposes.</p>"
-    lines = "".join(f"<li><b>{escape(f['check'])}</b>{_chance(f['p_value'])}: {escape(f['text'])}</li>" for f in found)
-    return f'<div class="findings">Look at this first; figures below may be off:<ul>{lines}</ul></div>'
+        return None
+    return [(found["check"], _chance(found["p_value"]), found["text"]) for found in section["findings"]]
 
 
 def _chance(p_value: float | None) -> str:

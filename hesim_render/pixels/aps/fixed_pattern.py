@@ -13,7 +13,7 @@ from hesim_render.core.plain import PlainState
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.measured import frame_maps
-from hesim_render.specs.sensor import ApsSpec
+from hesim_render.specs.frame_pixels import ApsSpec
 
 Map = float | NDArray[np.float32]
 

@@ -24,7 +24,7 @@ from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, Pixel
 from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
 from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
 from hesim_render.pixels.terms import switched_off
-from hesim_render.specs.sensor import ApsSpec, InterferenceSpec
+from hesim_render.specs.frame_pixels import ApsSpec, InterferenceSpec
 
 APS_TERMS = (
     "shot", "dark_current", "read", "prnu", "dsnu", "row", "row_noise", "residual", "crosstalk", "telegraph", "column",

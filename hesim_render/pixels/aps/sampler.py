@@ -20,7 +20,7 @@ from hesim_render.pixels.aps.formulas import PixelProperties
 from hesim_render.pixels.aps.poisson import poisson
 from hesim_render.pixels.arrays import take, to_device
 from hesim_render.pixels.normal import normal_pair
-from hesim_render.specs.sensor import InterferenceSpec
+from hesim_render.specs.frame_pixels import InterferenceSpec
 
 if TYPE_CHECKING:
     from hesim_render.pixels.aps.model import ApsNoise

@@ -18,9 +18,9 @@ from hesim_render.core.rng import Stream, device_uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps import formulas
-from hesim_render.pixels.measured import telegraph_maps
+from hesim_render.pixels.measured import telegraph_rates
 from hesim_render.pixels.poisson_points import Telegraph
-from hesim_render.specs.sensor import ApsSpec
+from hesim_render.specs.frame_pixels import ApsSpec
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +82,10 @@ def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> Telegra
 
     They are taken from a calibration where it has measured them, and drawn from the device seed otherwise.
     """
-    frame_us, measured = US_PER_S / spec.frame_rate_hz, telegraph_maps(layout)
+    frame_us, measured = US_PER_S / spec.frame_rate_hz, telegraph_rates(layout)
     if measured is not None:
-        amplitude, share, change_hz = (values.ravel().astype(np.float64) for values in measured.values())
+        every = measured.amplitude_dn, measured.high_share, measured.change_hz
+        amplitude, share, change_hz = (values.ravel().astype(np.float64) for values in every)
         place = np.flatnonzero(amplitude > 0)
         found = amplitude[place], share[place], change_hz[place]
     elif spec.telegraph is not None:

@@ -12,16 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hesim_render.calibration.rates import EventDefectRates
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.rng import Stream, device_normal, device_uniform
 from hesim_render.core.units import US_PER_S
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.events import Origin
-from hesim_render.pixels.measured import event_defects
+from hesim_render.pixels.measured import event_defect_rates
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
-from hesim_render.specs.calibration_spec import Defect
 from hesim_render.specs.defects import EventDefectSpec
-from hesim_render.specs.sensor import EvsSpec
+from hesim_render.specs.event_pixels import EvsSpec
 
 #: Events of a defect per comparison above which more change nothing: the chance of no event is e⁻³⁰.
 _MOST_PER_TICK = 30.0
@@ -72,7 +73,7 @@ def defects_of(spec: EvsSpec, layout: Layout, device_seed: int) -> PixelDefects:
     device_seed : which device of this kind.
     """
     key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
-    measured = event_defects(layout)
+    measured = event_defect_rates(layout)
     if measured is not None:
         return _measured(measured, key)
     return _drawn(spec.defects or EventDefectSpec(), key, device_seed)
@@ -103,10 +104,10 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
     )
 
 
-def _measured(maps: dict[str, NDArray], key: NDArray[np.uint32]) -> PixelDefects:
-    stuck = np.flatnonzero(maps["defect"].ravel() == Defect.STUCK)
-    names = ("on_hz", "off_hz", "firing_share", "change_hz")
-    values = np.stack([maps[f"defect_{name}"].ravel() for name in names]).astype(np.float64)
+def _measured(rates: EventDefectRates, key: NDArray[np.uint32]) -> PixelDefects:
+    stuck = np.flatnonzero(rates.kind.ravel() == Defect.STUCK)
+    every = rates.on_hz, rates.off_hz, rates.firing_share, rates.change_hz
+    values = np.stack([values.ravel() for values in every]).astype(np.float64)
     place = np.flatnonzero((values[:2] > 0).any(axis=0))
     return PixelDefects(stuck, place, key[place], *values[:, place])
 

@@ -31,6 +31,10 @@ from hesim_render.core.namespace import Namespace
 
 ShotLaw = Literal["linear", "sqrt"]
 
+#: Two equal poles that are −3 dB together at f: the rate of each over f, a = 2π f/√(√2 − 1), and its frequency over f.
+POLE = math.tau / math.sqrt(math.sqrt(2.0) - 1.0)
+POLE_HZ = 1 / math.sqrt(math.sqrt(2.0) - 1.0)
+
 
 @dataclass(frozen=True)
 class Coefficients:
@@ -137,28 +141,34 @@ def noise_equivalent(
     return xp.maximum(noise, least_change * voltage(k, signal)) / k.slope
 
 
+def corner_line(part: Values, least_hz: float, largest_hz: float) -> Values:
+    """Corner frequency at a part of the signal at which it is `largest_hz`; limits as for `corner_hz`."""
+    return least_hz + (largest_hz - least_hz) * part
+
+
 def corner_hz(
     k: Coefficients, log: Values, reference_level: Values, least_hz: float, largest_hz: float, xp: Namespace
 ) -> Values:
-    """Corner frequency of a photoreceptor that follows the light: proportional to the signal, between two limits.
+    """Corner frequency of a photoreceptor that follows the light: a straight line from the dark to a largest value.
 
-    White noise before the photoreceptor has a variance behind it that is proportional to the corner. With all
-    frequencies over the largest bandwidth of the noise, and 1 as the largest, this is the part of the variance that
-    is left.
+    The corner is proportional to the photocurrent, of which the dark current is a part. White noise before the
+    photoreceptor has a variance behind it that is proportional to the corner.
 
     Parameters
     ----------
     k : coefficients.
     log : ln x.
     reference_level : β1 times the signal at which the corner is `largest_hz`.
-    least_hz, largest_hz : limits, Hz.
+    least_hz : corner in the dark, Hz.
+    largest_hz : corner that the bias current sets, Hz.
     xp : functions of the arrays' library.
 
     Returns
     -------
     Corner frequency, Hz.
     """
-    return xp.clip(largest_hz * ((xp.exp(log) - k.base) / reference_level), least_hz, largest_hz)
+    line = corner_line((xp.exp(log) - k.base) / reference_level, least_hz, largest_hz)
+    return xp.clip(line, least_hz, largest_hz)  # the lower limit is for rounding: no light is below 0
 
 
 def exceedance(margin: ArrayLike, sigma: ArrayLike) -> NDArray[np.float64]:

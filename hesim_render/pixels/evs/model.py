@@ -24,13 +24,13 @@ from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.defects import PixelDefects, defects_of
 from hesim_render.pixels.evs.formulas import Coefficients
+from hesim_render.pixels.evs.noise_rates import LEAST_THRESHOLD_REL
 from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
 from hesim_render.pixels.terms import switched_off
-from hesim_render.specs.event_noise import LEAST_THRESHOLD_REL
+from hesim_render.specs.event_pixels import EvsCoefficients, EvsSpec
 from hesim_render.specs.leak import LeakSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
-from hesim_render.specs.sensor import EvsCoefficients, EvsSpec
 
 #: Kinds of defects, each a term.
 _DEFECTS = ("stuck", "hot", "flickering")
@@ -184,8 +184,9 @@ class EvsNoise(PlainState):
         """Parameters of the event pixels on the device, for the event stage."""
         thresholds = self.threshold_on_map, self.threshold_off_map
         return EventPixels(
-            self.layout, self.table, self.spec.shot_law, thresholds, self._reference_level, self._noise_level
-        )
+            self.layout, self.table, self.spec.shot_law, thresholds, self._reference_level,
+            self.photoreceptor if self.filters_noise else None, self.spec.photoreceptor_cutoff_hz,
+        )  # fmt: skip
 
     @property
     def _reference_level(self) -> NDArray[np.float64] | None:
@@ -198,15 +199,6 @@ class EvsNoise(PlainState):
         """True where the photoreceptor filters the noise as well as the signal."""
         return self.photoreceptor is not None and self.photoreceptor.filters_noise
 
-    @property
-    def _noise_level(self) -> tuple[NDArray[np.float64], float] | None:
-        """x above its baseline [position] at which the corner is the noise's own bandwidth; least corner over it."""
-        spec, level, bandwidth_hz = self.photoreceptor, self._reference_level, self.spec.photoreceptor_cutoff_hz
-        if not self.filters_noise or spec is None or level is None or bandwidth_hz is None:
-            return None
-        assert spec.min_cutoff_hz is not None
-        return level * (bandwidth_hz / spec.cutoff_hz), min(spec.min_cutoff_hz / bandwidth_hz, 1.0)
-
     def noise_share(self, electrons: NDArray, position: NDArray[np.integer] | int) -> NDArray | float:
         """Part of the variance of ln x that the photoreceptor leaves, 1 where it does not filter the noise.
 
@@ -215,13 +207,26 @@ class EvsNoise(PlainState):
         electrons : [..., n], noise-free electrons of the window.
         position : [n], event positions, counted in reading order of the tile.
         """
-        if self._noise_level is None:
+        if not self.filters_noise:
             return 1.0
+        bandwidth_hz = self.spec.photoreceptor_cutoff_hz
+        assert bandwidth_hz is not None
+        return np.minimum(self.corner_hz(electrons, position) / bandwidth_hz, 1.0)
+
+    def corner_hz(self, electrons: NDArray, position: NDArray[np.integer] | int) -> NDArray:
+        """Corner of a photoreceptor that follows the light, Hz.
+
+        Parameters
+        ----------
+        electrons, position : as for `noise_share`.
+        """
+        spec, level = self.photoreceptor, self._reference_level
+        assert spec is not None and spec.min_cutoff_hz is not None and level is not None
         kind = np.result_type(electrons, np.float32)
         k = self.table.each(lambda values: values.astype(kind)[position])
         log = np.log(formulas.voltage(k, np.maximum(electrons, kind.type(0))))
-        level, least = self._noise_level
-        return formulas.corner_hz(k, log, level.astype(kind)[position], least, 1.0, NUMPY)
+        limits_hz = spec.min_cutoff_hz, spec.cutoff_hz
+        return formulas.corner_hz(k, log, level.astype(kind)[position], *limits_hz, NUMPY)
 
     # ---- the model ----------------------------------------------------------------------------------
 

@@ -30,8 +30,8 @@ class EventPixels:
     thresholds : θ₊ and θ₋ in ln units, maps or numbers.
     reference_level : [position], β1 times the signal at which the photoreceptor's corner is largest; None where no
         corner follows the light.
-    noise_level : [position], β1 times the signal above which the photoreceptor leaves the noise as it is, and least
-        part of its variance that it leaves; None where it does not filter the noise.
+    noise_filter : the photoreceptor, where it filters the noise as well; otherwise None.
+    bandwidth_hz : of the noise that no photoreceptor has filtered.
 
     Attributes
     ----------
@@ -46,7 +46,8 @@ class EventPixels:
         law: ShotLaw,
         thresholds: tuple[Map, Map],
         reference_level: NDArray[np.float64] | None,
-        noise_level: tuple[NDArray[np.float64], float] | None,
+        noise_filter: PhotoreceptorSpec | None,
+        bandwidth_hz: float | None,
     ) -> None:
         self._law = law
         self.key: UInt32 = jit().UInt32(layout.full_index.ravel()[layout.evs_pixel.ravel()])
@@ -54,29 +55,28 @@ class EventPixels:
         of_position = _by_position(layout)
         self._coefficients = table.each(of_position)
         self._reference_level: Float = None if reference_level is None else of_position(reference_level)
-        self._noise_level = None if noise_level is None else (of_position(noise_level[0]), noise_level[1])
+        self._noise_filter, self._bandwidth_hz = noise_filter, bandwidth_hz
 
     def log_level(self, electrons: Float) -> tuple[Float, Float]:
         """`EvsNoise.log_level`."""
         xp = device_namespace()
         log, variance = formulas.log_level(self._coefficients, electrons, self._law, xp)
-        if self._noise_level is not None:
-            variance *= formulas.corner_hz(self._coefficients, log, *self._noise_level, 1.0, xp)
+        if self._noise_filter is not None:
+            variance *= xp.minimum(self.corner_hz(log, self._noise_filter) / self._bandwidth_hz, 1.0)
         return log, variance
 
     def corner_hz(self, log: Float, spec: PhotoreceptorSpec) -> Float:
-        """Corner of each pixel's photoreceptor at ln x: f_c·I/signal_dn between the file's two limits."""
+        """Corner of each pixel's photoreceptor at ln x, Hz."""
         assert spec.min_cutoff_hz is not None
         limits = spec.min_cutoff_hz, spec.cutoff_hz
         return formulas.corner_hz(self._coefficients, log, self._reference_level, *limits, device_namespace())
 
-    def limits_of_corner(self, spec: PhotoreceptorSpec) -> tuple[Float, Float]:
-        """ln x up to which a photoreceptor's corner is its least, and from which on it is its largest."""
+    @property
+    def log_of_largest_corner(self) -> Float:
+        """ln x from which on a photoreceptor's corner is its largest."""
         import drjit as dr
 
-        assert spec.min_cutoff_hz is not None
-        base, level = self._coefficients.base, self._reference_level
-        return dr.log(dr.fma(level, spec.min_cutoff_hz / spec.cutoff_hz, base)), dr.log(level + base)
+        return dr.log(self._reference_level + self._coefficients.base)
 
 
 def _by_position(layout: Layout) -> Callable[[NDArray[np.float64]], Float]:

@@ -21,6 +21,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.units import US_PER_S
+from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
 
 #: Nodes per period of the highest corner frequency. Between nodes, y is taken as a straight line.
@@ -35,7 +36,7 @@ _State = tuple[Float, Float]
 
 def _rate(corner_hz: Float) -> Float:
     """a in 1/µs of both poles of a corner frequency."""
-    return corner_hz * (math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / US_PER_S)
+    return corner_hz * (POLE / US_PER_S)
 
 
 class Photoreceptor:
@@ -135,31 +136,29 @@ class Photoreceptor:
     def _followed(self, change: Float, elapsed_us: float) -> _State:
         """State at the end of a line, with the corner of the light at each instant of it.
 
-        The line has up to three parts: one in which the corner is held at one of its limits, one in which it follows
-        the light, and again one at a limit.
+        The line has up to two parts: one in which the corner follows the light, and before or after it one in which
+        the corner is the largest.
         """
         import drjit as dr
 
-        types, spec = jit(), self._spec
-        assert spec.min_cutoff_hz is not None
+        types = jit()
         begin, elapsed = self._input, dr.opaque(types.Float, elapsed_us)
-        dark, bright = self._noise.on_device.limits_of_corner(spec)
-        least, largest = (dr.opaque(types.Float, _rate(hz)) for hz in (spec.min_cutoff_hz, spec.cutoff_hz))
+        largest = dr.opaque(types.Float, _rate(self._spec.cutoff_hz))
         line = dr.select(change == 0, types.Float(1e-30), change)
-        reached = [dr.clip((limit - begin) / line, 0.0, 1.0) for limit in (dark, bright)]
-        first, last = dr.minimum(*reached), dr.maximum(*reached)
+        reached = dr.clip((self._noise.on_device.log_of_largest_corner - begin) / line, 0.0, 1.0)
+        first, last = dr.select(change < 0, reached, 0.0), dr.select(change < 0, 1.0, reached)
 
-        def at_limit(state: _State, light: Float, part: Float) -> _State:
-            h = dr.select(light < bright, least, largest) * (part * elapsed)
+        def at_limit(state: _State, part: Float) -> _State:
+            h = largest * (part * elapsed)
             return _advance(state, part * change, h, lag := _lag(h), h * lag)
 
         part = last - first
-        state = at_limit(self._state, begin, first)
+        state = at_limit(self._state, first)
         state = self._follow_inside(state, dr.fma(first, change, begin), part * change, part * elapsed)
-        return at_limit(state, begin + change, 1.0 - last)
+        return at_limit(state, 1.0 - last)
 
     def _follow_inside(self, state: _State, begin: Float, change: Float, elapsed_us: Float) -> _State:
-        """State at the end of a line on which the corner is between its limits.
+        """State at the end of a line on which the corner is below its largest value.
 
         The integrals are quadratures of Gauss and Legendre. In y they are good to 1e-6 for changes of ln x up to 1
         between two nodes, and to 1e-4 for changes of 4.

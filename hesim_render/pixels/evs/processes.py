@@ -16,6 +16,7 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Float64, UInt32
 from hesim_render.core.rng import Stream, philox, stream_key
 from hesim_render.core.units import US_PER_S
+from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.normal import normal_pair
@@ -52,7 +53,7 @@ class BandNoise:
         assert cutoff_hz is not None
         self._key, self._seed = noise.on_device.key, seed
         self._period_us = US_PER_S / (NODES_PER_CUTOFF_PERIOD * cutoff_hz)
-        h = math.tau / math.sqrt(math.sqrt(2.0) - 1.0) / NODES_PER_CUTOFF_PERIOD  # a·period
+        h = POLE / NODES_PER_CUTOFF_PERIOD  # a·period
         self._transition = math.exp(-h) * np.array([[1.0 + h, h], [-h, 1.0 - h]])
         self._amplitude = math.sqrt(3.0 / (2.0 + (1.0 + h) * math.exp(-h)))
         # in the stationary state u and u'/a are independent, each of variance 1

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-#: Rate of both poles, in units of their common −3 dB frequency.
-POLE = math.tau / math.sqrt(math.sqrt(2.0) - 1.0)
+from hesim_render.pixels.evs.formulas import POLE
+
 #: Grid of levels, in standard deviations.
 _STEP = 0.1
 _GRID = _STEP * np.arange(-56, 57)

@@ -6,9 +6,7 @@ Nothing outside this package imports mitsuba.
 from hesim_render.sources.render.camera import View, place_camera
 from hesim_render.sources.render.cube import read_spectral_exr, render_cube, write_spectral_exr
 from hesim_render.sources.render.exact import RenderedFlux
-from hesim_render.sources.render.reference import reference_windows
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.specfilm import reference_flux
 
 __all__ = [
     "RenderedFlux",
@@ -16,8 +14,6 @@ __all__ = [
     "View",
     "place_camera",
     "read_spectral_exr",
-    "reference_flux",
-    "reference_windows",
     "render_cube",
     "write_spectral_exr",
 ]

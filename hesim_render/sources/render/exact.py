@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -11,9 +12,12 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.journal import Journal
+from hesim_render.core.progress import Progress
 from hesim_render.mosaic.layout import Layout
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.demand import Demand, Estimate
 from hesim_render.sources.render.glare import VeilingGlare
+from hesim_render.sources.render.renderer import reported
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.timeline import Timeline
 from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
@@ -23,6 +27,10 @@ from hesim_render.spectral.spectrum import Spectrum
 
 #: Largest motion of an object within a slice, pixels.
 MAX_MOTION_PX = 0.5
+#: Exposures whose slices are counted for the estimate; pixels that are rendered to find the speed, at most.
+_EXPOSURES, _PIXELS = 16, 16384
+#: Memory of the program with its kernels, and per pixel of the mosaic, bytes.
+_BASE_BYTES, _PIXEL_BYTES = 0.6e9, 110
 
 
 def used_responses(sensor: Sensor) -> dict[str, Spectrum]:
@@ -91,6 +99,7 @@ class RenderedFlux(WindowByWindow):
     max_motion_px : largest motion of an object within a slice, pixels.
     progress : called with the number of rays traced so far, after each block.
     block_rays : largest number of rays that are traced at a time.
+    because : why the scene needs this mode, where nobody asked for it.
 
     Attributes
     ----------
@@ -116,10 +125,11 @@ class RenderedFlux(WindowByWindow):
         max_motion_px: float = MAX_MOTION_PX,
         progress: Callable[[int], None] | None = None,
         block_rays: int = BLOCK_RAYS,
+        because: str | None = None,
     ) -> None:
         if not max_motion_px > 0:
             raise RangeError("max_motion_px", max_motion_px, "a distance above 0")
-        self.scene, self.samples, self.seed = scene, samples, seed
+        self.scene, self.samples, self.seed, self._because = scene, samples, seed, because
         self._tracer = PixelTracer(scene, sensor, samples, seed, used_responses(sensor), progress, block_rays)
         self.view = self._tracer.view
         self.sensor = self.view.sensor
@@ -135,7 +145,68 @@ class RenderedFlux(WindowByWindow):
             filters = np.unique(self.sensor.layout.filter_index).tolist()
             self._glare = VeilingGlare(self._tracer, self._wavelengths, filters, seed)
 
-    def go_on(self, journal: Journal, part: int) -> None:
+    # ---- as a `SceneRenderer` ---------------------------------------------------------------------
+
+    #: All pixels get the same number of rays, whatever error that has; nothing is rendered again.
+    quality: None = None
+    auditable: None = None
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """See `Renderer.settings`."""
+        because = {} if self._because is None else {"exact_because": self._because}
+        return {**because, "mode": "exact", "samples": self.samples}
+
+    @property
+    def work(self) -> dict[str, float]:
+        """Nothing: the work follows from the number of rays."""
+        return {}
+
+    def estimate(self, demand: Demand, progress: Progress | None = None) -> Estimate:
+        """Rays by count, their speed from a few of them; see `Renderer.estimate`."""
+        events, exposures = demand.event_pixel.size, demand.exposures
+        if self.is_static:
+            values = float(demand.pixels.size)
+        else:
+            values = events * demand.blocks.windows
+            if exposures:
+                some = [exposures[k] for k in np.unique(np.linspace(0, len(exposures) - 1, _EXPOSURES).astype(int))]
+                # a rolling shutter exposes a row in only some of the slices of its frame
+                slices = [
+                    1 + len(self.slice_edges_us(e.start_us, e.end_us)) * e.exposure_us / (e.end_us - e.start_us)
+                    for e in some
+                ]
+                values += demand.frame_pixel.size * len(exposures) * float(np.mean(slices))
+        rays = values * self.samples
+        return Estimate(
+            seconds=rays / self._rays_per_second(demand.pixels),
+            peak_bytes=_BASE_BYTES + _PIXEL_BYTES * (demand.frame_pixel.size + events),
+            rays=rays,
+        )
+
+    def _rays_per_second(self, every: NDArray[np.uint32]) -> float:
+        """Speed of a small picture; a first one compiles the kernels, which the run needs as well."""
+        import drjit as dr
+
+        count = min(every.size, max(1, _PIXELS // max(1, self.samples // 16)))
+        if count == 0:
+            return float("inf")
+        pixel = every[np.linspace(0, every.size - 1, count).astype(int)]
+        begin, end = np.zeros(count), np.full(count, 1.0)
+        seconds = 1.0
+        for _ in range(2):
+            start = time.perf_counter()
+            dr.eval(*self.mean_flux(pixel, begin, end))
+            dr.sync_thread()
+            seconds = time.perf_counter() - start
+        return count * self.samples / max(seconds, 1e-6)
+
+    def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
+        """See `Renderer.report`."""
+        if self.is_static:
+            self._tracer.progress = reported(progress, float(demand.pixels.size * self.samples))
+
+    def go_on(self, journal: Journal, part: int = 0) -> None:
         """See `Tracer.go_on`."""
         self._tracer.go_on(journal, part)
 

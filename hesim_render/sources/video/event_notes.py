@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hesim_render.specs.sensor import EvsSpec
+from hesim_render.specs.event_pixels import EvsSpec
 
 
 def event_notes(spec: EvsSpec, period_us: float, is_held: bool) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,10 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Halves
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.demand import Demand
+from hesim_render.sources.renderer import Renderer, Untraced
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock
 from hesim_render.sources.video.colours import to_linear_srgb
+from hesim_render.sources.video.estimate import VideoEstimate, estimate_of_counts
 from hesim_render.sources.video.event_notes import event_notes
 from hesim_render.sources.video.file import FileVideo
 from hesim_render.sources.video.folder import FolderVideo
@@ -54,7 +58,7 @@ def open_video(source: Source, options: VideoOptions) -> Reader:
     return FileVideo(path, options.fps)
 
 
-class VideoFlux(WindowByWindow):
+class VideoFlux(WindowByWindow, Untraced):
     """Φ = V(x) · Σ_c M[filter, c] · (linear R, G, B averaged over the pixel's footprint); implements `FluxSource`.
 
     M comes from `hesim_render.sources.video.inversion`; V is 1 unless `lens_shading` is set. Negative rates, of
@@ -253,6 +257,11 @@ class VideoFlux(WindowByWindow):
         self._maps[number] = flux
         return flux
 
+    def estimate(self, demand: Demand, progress: Progress | None = None) -> VideoEstimate:
+        """See `Renderer.estimate`: from counts, and from the measured time to read the first pictures."""
+        pictures = min(self.clock.count, int(np.searchsorted(self.clock.middle_us, demand.duration_us)) + 1)
+        return estimate_of_counts(self.sensor, demand.duration_us, pictures, self.seconds_per_picture(pictures))
+
     def seconds_per_picture(self, count: int) -> float:
         """Measured time to read and decode a picture, s; 0 where only one is needed, which has been read already.
 
@@ -277,9 +286,14 @@ class VideoFlux(WindowByWindow):
 
     def describe(self) -> dict[str, Any]:
         """The manifest's entry for the video: input and hash, colours, scale, times, interpolation."""
-        return {**self._reader.describe(), **self.settings()}
+        return {**self._reader.describe(), **self.processing()}
 
-    def settings(self) -> dict[str, Any]:
+    @property
+    def settings(self) -> dict[str, object]:
+        """See `Renderer.settings`; without the hash of the input, which is known at the end."""
+        return {"video": self.processing()}
+
+    def processing(self) -> dict[str, Any]:
         """The part of `describe` that does not wait for the hash of the input."""
         options = self.options
         return {
@@ -333,3 +347,7 @@ def _device(share: NDArray[np.float64]) -> Float:
     if share.ndim == 0:
         return dr.opaque(types.Float, float(np.float32(share)))
     return types.Float(np.ascontiguousarray(share, dtype=np.float32))
+
+
+if TYPE_CHECKING:  # a type checker compares the two
+    _RENDERER: type[Renderer] = VideoFlux

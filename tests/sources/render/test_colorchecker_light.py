@@ -9,12 +9,12 @@ import functools
 import colour
 import numpy as np
 import pytest
+from mitsuba_reference import WindowReference
 from rendering import make_scene
 from scipy import stats
 
 import hesim_render as hr
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.reference import WindowReference
 
 COLS, ROWS = 72, 48
 ILLUMINANTS = ("A", "D65", "FL11", "LED-B3")

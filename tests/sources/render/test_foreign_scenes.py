@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mitsuba_specfilm import reference_flux
 from rendering import make_scene, mitsuba_scene, mono
 
 import hesim_render as hr
@@ -24,7 +25,6 @@ from hesim_render.sources.render.scene.builder import build
 from hesim_render.sources.render.scene.mitsuba_scene import _plugin_dict
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.specfilm import reference_flux
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
 from hesim_render.sources.scene import Scene
 from hesim_render.specs.motion import TrackSpec

@@ -6,9 +6,9 @@ from rendering import make_scene, mono
 
 from hesim_render.core.backend import jit
 from hesim_render.mosaic.schedule import Block
-from hesim_render.sources.flicker import flickering
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.light_times import LightTimes
+from hesim_render.sources.render.renderer import flickering
 from hesim_render.spectral.waveform import Mains, Pwm, TableWaveform
 
 WAVEFORMS = {

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mitsuba_specfilm import camera_at
 from rendering import D65_1000_LUX, FURNACE, flux_image, make_scene, mono
 
 import hesim_render as hr
@@ -11,7 +12,6 @@ from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.framing import posed_view
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
-from hesim_render.sources.render.specfilm import camera_at
 from hesim_render.sources.scene import Scene
 
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from hidden_scenes import crossing, glint, vibration
+from mitsuba_reference import WindowReference, reference_windows
 from rendering import d65_irradiance, electrons_per_s, make_scene, mono
 from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
-from hesim_render.sources.render.reference import WindowReference, reference_windows
 
 #: m of the plane z = 0 that the camera of `plate` sees across its 8 columns.
 WIDE_M = 0.8

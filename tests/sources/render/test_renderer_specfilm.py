@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from mitsuba_specfilm import reference_flux
 from rendering import flux_image, make_scene
 from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.sources.render import RenderedFlux, reference_flux
+from hesim_render.sources.render import RenderedFlux
 from hesim_render.sources.scene import Scene
 
 LIT_ROOM = {

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 import rendering
+from mitsuba_reference import WindowReference
+from mitsuba_specfilm import reference_flux
 from scipy import stats
 
 import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
-from hesim_render.sources.render import reference_flux
 from hesim_render.sources.render.camera import place_camera
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.primary_rays import RayFactory
-from hesim_render.sources.render.reference import WindowReference
 
 WALL = {"name": "wall", "shape": "rectangle", "size_m": [40, 40, 0], "reflectance": 1.0}
 LENS = {"lens__magnification": "focus", "lens__depth_of_field": True}

@@ -98,7 +98,7 @@ class NotedFlux:
     ) -> None:
         self.source, self._event_pixel = source, event_pixel
         self._before, self._core, self._after = before, core, after
-        self.is_static, self.sensor = source.is_static, getattr(source, "sensor", None)
+        self.is_static = source.is_static
         self._rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, 1]))
         self._of_events = -(-_UNITS // max(1, -(-samples // core)))
         self._of_frames = -(-_UNITS // max(1, frames))

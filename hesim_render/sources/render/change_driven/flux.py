@@ -20,13 +20,16 @@ from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Halves
 from hesim_render.core.errors import RangeError
 from hesim_render.core.journal import Journal
+from hesim_render.core.progress import Progress
 from hesim_render.mosaic.schedule import Block, blocks_of_run
 from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.protocol import Sample
+from hesim_render.sources.demand import Demand, Estimate
+from hesim_render.sources.protocol import AuditableFlux, Sample
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
 from hesim_render.sources.render.change_driven.event_blocks import Blocks
+from hesim_render.sources.render.change_driven.forecast import forecast
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
@@ -34,6 +37,7 @@ from hesim_render.sources.render.change_driven.sample_instants import MotionCloc
 from hesim_render.sources.render.change_driven.tuning import TUNING, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.exact import require_finite, used_responses
+from hesim_render.sources.render.renderer import reported
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
 
@@ -99,16 +103,38 @@ class ChangeDrivenFlux:
         #: References of the audit; a small run asks for the same pairs again and again.
         self._known: dict[tuple[Role, float], KnownPairs] = {}
 
+    # ---- as a `SceneRenderer` ---------------------------------------------------------------------
+
     @property
-    def progress(self) -> Callable[[int], None] | None:
-        """Called with the number of rays traced so far, after each block."""
-        return self._tracer.progress
+    def settings(self) -> dict[str, object]:
+        """See `Renderer.settings`."""
+        return {"mode": "change-driven", "quality": self.quality}
 
-    @progress.setter
-    def progress(self, progress: Callable[[int], None] | None) -> None:
-        self._tracer.progress = progress
+    #: Each pixel gets as many rays as its error takes.
+    samples: None = None
 
-    def go_on(self, journal: Journal, part: int) -> None:
+    @property
+    def auditable(self) -> AuditableFlux:
+        """See `Renderer.auditable`."""
+        return self
+
+    @property
+    def work(self) -> dict[str, float]:
+        """See `Renderer.work`."""
+        return {"quality": self.quality, "renders": 1, **vars(self.counts)}
+
+    def estimate(self, demand: Demand, progress: Progress | None = None) -> Estimate:
+        """See `Renderer.estimate`."""
+        if progress is not None:
+            progress(0, 1, "estimate")
+        return forecast(self, demand)
+
+    def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
+        """See `Renderer.report`."""
+        if self.is_static and expected is not None and expected.rays > 0:
+            self._tracer.progress = reported(progress, expected.rays)
+
+    def go_on(self, journal: Journal, part: int = 0) -> None:
         """See `Tracer.go_on`."""
         self._tracer.go_on(journal, part)
 

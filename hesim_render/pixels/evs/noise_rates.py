@@ -5,9 +5,9 @@ The noise of ln x is Gaussian, white noise through two equal poles that are −3
 that instant. How often the noise then crosses a threshold has no closed form. Level crossings [rice1945] are the rate
 of a pixel that always compares with the mean; it is ten to fifty times lower at thresholds of four σ, because the level
 of comparison itself wanders with the noise. The table has the rates of pixels in their stationary state
-(``benchmarks/event_noise.py``), as events per period 1/f, of the lower threshold and the difference of both over σ, of
-the dead time and of the rate of leak events. Between entries log(rate) is a cubic spline of the square of the lower
-threshold, of the root of the difference, and of the logs of dead time and leak.
+(``noise_rates.npz``, made by ``benchmarks/event_noise.py``), as events per period 1/f, of the lower threshold and the
+difference of both over σ, of the dead time and of the rate of leak events. Between entries log(rate) is a cubic spline
+of the square of the lower threshold, of the root of the difference, and of the logs of dead time and leak.
 
 An event of the leak resets a pixel with a dead time to the level of that instant, which is random. For a while after it
 noise events are more frequent. A pixel without a dead time moves its level of comparison by exactly a threshold with
@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,15 +27,9 @@ from scipy import optimize
 from scipy.interpolate import RegularGridInterpolator, make_interp_spline
 
 from hesim_render.core.errors import RangeError
-from hesim_render.specs.event_noise_table import (
-    DEAD_PERIODS,
-    DIFFERENCE,
-    LEAK_PERIODS,
-    LOG_EVENTS,
-    LOG_EVENTS_NO_DEAD_TIME,
-    LOWER,
-)
 
+#: The file of `RateTable`.
+TABLE = Path(__file__).with_name("noise_rates.npz")
 #: A pixel's threshold never falls below this part of the nominal one, as in v2e (0.01 of 0.2 ln units).
 LEAST_THRESHOLD_REL = 0.05
 
@@ -45,16 +41,43 @@ _DEVIATES = np.linspace(-4.0, 4.0, 33)
 _WEIGHTS = np.exp(-0.5 * _DEVIATES**2) / np.sum(np.exp(-0.5 * _DEVIATES**2))
 
 
+class RateTable(NamedTuple):
+    """Simulated rates of noise events.
+
+    Parameters
+    ----------
+    lower, difference : lower threshold, and difference of both, over σ.
+    dead_periods, leak_periods : dead time, in periods, and leak events of a period.
+    log_events_no_dead_time : [lower, difference], 1000 ln of the ON and OFF events of a period without a dead time.
+    log_events : the same with one, [lower, difference, dead time, leak].
+    """
+
+    lower: NDArray[np.float64]
+    difference: NDArray[np.float64]
+    dead_periods: NDArray[np.float64]
+    leak_periods: NDArray[np.float64]
+    log_events_no_dead_time: NDArray[np.int16]
+    log_events: NDArray[np.int16]
+
+
+@lru_cache(maxsize=1)
+def rate_table() -> RateTable:
+    """The table of this package."""
+    with np.load(TABLE) as arrays:
+        return RateTable(*(arrays[name] for name in RateTable._fields))
+
+
 @lru_cache(maxsize=64)
-def _table(dead_periods: float, leak_periods: float) -> RegularGridInterpolator:
+def _interpolator(dead_periods: float, leak_periods: float) -> RegularGridInterpolator:
     """log(rate) of the square of the lower threshold and of the root of the difference."""
-    values = np.asarray(LOG_EVENTS_NO_DEAD_TIME) / 1000
+    table = rate_table()
+    values = table.log_events_no_dead_time / 1000
     if dead_periods > 0:
-        values = np.reshape(LOG_EVENTS, (*values.shape, len(DEAD_PERIODS), len(LEAK_PERIODS))) / 1000
-        for nodes, value in ((DEAD_PERIODS, dead_periods), (LEAK_PERIODS, leak_periods)):
+        values = table.log_events / 1000
+        for nodes, value in ((table.dead_periods, dead_periods), (table.leak_periods, leak_periods)):
             at = math.log(min(max(value, nodes[0]), nodes[-1]))
             values = make_interp_spline(np.log(nodes), values, axis=2)(at)
-    return RegularGridInterpolator((np.square(LOWER), np.sqrt(DIFFERENCE)), values, "cubic")
+    return RegularGridInterpolator((np.square(table.lower), np.sqrt(table.difference)), values, "cubic")
 
 
 def events_per_period(
@@ -74,9 +97,11 @@ def events_per_period(
     """
     on, off = np.broadcast_arrays(np.asarray(on_sigma, np.float64), np.asarray(off_sigma, np.float64))
     lower, difference = np.minimum(on, off), np.abs(on - off)
-    where = np.clip(lower, LOWER[0], LOWER[-1]) ** 2, np.sqrt(np.minimum(difference, DIFFERENCE[-1]))
-    log = _table(float(dead_periods), float(leak_periods))(np.stack(where, axis=-1)).reshape(on.shape)
-    return np.exp(log - 0.5 * np.maximum(lower**2 - LOWER[-1] ** 2, 0.0))
+    table = rate_table()
+    least, most = table.lower[[0, -1]]
+    where = np.clip(lower, least, most) ** 2, np.sqrt(np.minimum(difference, table.difference[-1]))
+    log = _interpolator(float(dead_periods), float(leak_periods))(np.stack(where, axis=-1)).reshape(on.shape)
+    return np.exp(log - 0.5 * np.maximum(lower**2 - most**2, 0.0))
 
 
 def noise_rates_hz(
@@ -123,7 +148,8 @@ def _beyond(mean: NDArray[np.float64], dead_periods: float) -> NDArray[np.float6
     """
     if dead_periods <= 0:
         return np.zeros_like(mean)
-    at = np.log(np.clip(dead_periods, DEAD_PERIODS[0], DEAD_PERIODS[-1]))
+    first, *_, last = rate_table().dead_periods
+    at = np.log(np.clip(dead_periods, first, last))
     fixed, growing = (np.interp(at, np.log(_BEYOND[0]), values) for values in _BEYOND[1:])
     return fixed + growing * mean
 
@@ -159,7 +185,7 @@ def noise_sigma(
         found = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s, leak_hz))
         return math.log(max(found, 1e-300) / rate_hz)
 
-    lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / LOWER[0])
+    lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / rate_table().lower[0])
     if excess(highest) < 0:
         most = sum(noise_rates_hz(thresholds, mismatch, math.exp(highest), bandwidth_hz, dead_s, leak_hz))
         raise RangeError(

@@ -7,16 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hesim_render.core.errors import SpecError
-from hesim_render.specs.calibration import NoiseFile
-from hesim_render.specs.calibration_rates import rate_hz
-from hesim_render.specs.calibration_spec import (
+from hesim_render.calibration.measured import interval_s
+from hesim_render.calibration.rates import rate_hz
+from hesim_render.calibration.spec import (
     AsynchronousSection,
     CalibrationSpec,
     Estimate,
     EventSection,
     FrameSection,
 )
+from hesim_render.core.errors import SpecError
+from hesim_render.specs.noise_file import NoiseFile
 
 
 def with_intervals(own: Mapping[str, Mapping[str, Any]], noise: NoiseFile, data: CalibrationSpec) -> NoiseFile:
@@ -42,8 +43,8 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile, data: Calibratio
     """Replace a sensor file's own noise by the calibrated one, in place; the file is valid.
 
     Frames take K, the black level and the variance polynomial (0 where a term is not identified), and what
-    is known of read noise, dark current, DSNU, PRNU and full well; their fixed maps are kept by
-    `NoiseFile`. Events take the coefficients of each position, thresholds, mismatch, leak and signal reference.
+    is known of read noise, dark current, DSNU, PRNU and full well; their fixed maps are those of
+    `MeasuredMaps`. Events take the coefficients of each position, thresholds, mismatch, leak and signal reference.
 
     Raises
     ------
@@ -152,7 +153,7 @@ def _leak_rate_hz(evs: EventSection, noise: NoiseFile) -> float:
     if evs.leak_rate_hz is not None:
         return max(0.0, evs.leak_rate_hz.value or 0.0)
     chance = max(0.0, evs.leak_per_trial.value or 0.0)
-    return float(rate_hz(chance, noise.interval_s("evs", evs))) if chance > 0 else 0.0
+    return float(rate_hz(chance, interval_s(noise, "evs", evs))) if chance > 0 else 0.0
 
 
 def _asynchronous_values(sensor: Mapping[str, Any], evs: AsynchronousSection, file: Path) -> dict[str, Any]:

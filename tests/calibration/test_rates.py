@@ -8,13 +8,14 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
+from hesim_render.calibration.measured import measured_maps
+from hesim_render.calibration.rates import EventDefectsPerTrial, TelegraphPerFrame, change_hz, rate_hz
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.capture_set import read_captures
-from hesim_render.specs.calibration_rates import change_hz, per_second, rate_hz
-from hesim_render.specs.calibration_spec import Defect
 
 SIZE, TICK_US, LEAK = 32, 1700, 3e-4
 HOT, FLICKERING = (3, 5), (20, 7)
@@ -116,7 +117,7 @@ def test_captures_without_a_tick_count_as_made_at_that_of_the_sensor_file(captur
         # a recording's sensor is read from such a dump
         dump["noise"]["folder"] = str(captured)
         again = type(sensor.spec).model_validate(dump)
-        assert again.noise.measured.intervals_s["evs"] == pytest.approx(1e-3)
+        assert measured_maps(again.noise).intervals_s["evs"] == pytest.approx(1e-3)
     told = hr.load_sensor(captured / "untold-s.yaml", {"noise.tick_us": TICK_US})
     known = hr.load_sensor(captured / "s.yaml")
     assert told.spec.evs.leak_rate_hz == pytest.approx(known.spec.evs.leak_rate_hz, rel=1e-6)
@@ -128,7 +129,7 @@ def test_without_any_tick_the_key_is_named(captured):
     spec = hr.load_sensor(captured / "untold-s.yaml").spec
     noise = spec.noise.model_copy(update={"tick_us": None})
     with pytest.raises(SpecError, match=r"untold\.yaml: evs\.tick_us: is not stated"):
-        noise.keep_maps(noise.read())
+        measured_maps(noise)
 
 
 def test_a_tick_comes_from_the_named_sensor_or_from_the_captures(tmp_path):
@@ -150,11 +151,18 @@ def test_rates_from_chances_and_correlations():
     assert change_hz(0.3, 0.02) == pytest.approx(-np.log(0.3) / 0.02)
     assert change_hz(0.0, 0.5) == pytest.approx(-np.log(1e-9) / 0.5) and 0 < change_hz(1.0, 0.5) < 1e-8
     single = [np.array(values, np.float32) for values in ([0.3, 0.2, 0], [0.1, 0, 0], [0.4, 1, 1], [0.8, 0.9, 0])]
-    names = ("on_per_trial", "off_per_trial", "firing_share", "correlation")
-    maps = {f"defect_{name}": values for name, values in zip(names, single, strict=True)}
-    found = per_second("evs", maps | {"defect": np.array([3, 2, 0], np.uint8)}, 0.004)
-    assert found["defect"].dtype == np.uint8
+    counted = EventDefectsPerTrial(np.array([3, 2, 0], np.uint8), *single)
+    assert EventDefectsPerTrial.of(counted.maps()).maps().keys() == {
+        "defect", "defect_on_per_trial", "defect_off_per_trial", "defect_firing_share", "defect_correlation"
+    }  # fmt: skip
+    found = counted.per_second(0.004).maps()
+    assert found["defect"].dtype == np.uint8 and found["defect_on_hz"].dtype == np.float32
     np.testing.assert_allclose(found["defect_on_hz"], -np.log1p([-0.3, -0.2, 0]) / 0.004, rtol=1e-6)
     np.testing.assert_allclose(found["defect_off_hz"], -np.log1p([-0.1, 0, 0]) / 0.004, rtol=1e-6)
     np.testing.assert_allclose(found["defect_firing_share"], [0.4, 1, 1], rtol=1e-6)
     np.testing.assert_allclose(found["defect_change_hz"], [-np.log(0.8) / 0.004, 0, 0], rtol=1e-6)
+    frames = [np.array(values, np.float32) for values in ([7.5, 0], [0.3, 0.2], [0.6, 0.9])]
+    found = TelegraphPerFrame(*frames).per_second(0.04).maps()
+    assert list(found) == ["telegraph_amplitude_dn", "telegraph_high_share", "telegraph_change_hz"]
+    np.testing.assert_allclose(found["telegraph_change_hz"], [-np.log(0.6) / 0.04, 0], rtol=1e-6)
+    np.testing.assert_array_equal([found[name] for name in list(found)[:2]], frames[:2])

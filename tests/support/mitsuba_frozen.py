@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mitsuba_specfilm import camera_at, perspective_dict
 from numpy.typing import NDArray
 
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
@@ -17,7 +18,6 @@ from hesim_render.sources.render.scene.deformation import Deformation
 from hesim_render.sources.render.scene.mitsuba_version import box_corners, spectrum_dict
 from hesim_render.sources.render.scene.parents import camera_trajectory, trajectories
 from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.sources.render.specfilm import camera_at, perspective_dict
 from hesim_render.sources.scene import Scene
 from hesim_render.spectral.waveform import Waveform
 

@@ -66,8 +66,8 @@ evs:                           # pixels that give events
     threshold_off_percent: 25
     threshold_mismatch_percent: 2.5              # its spread over pixels
     background: [{lux: 5, rate_hz: 5}]           # all events of a pixel in steady light, mean over pixels
-    dark_lux: 0.1              # light that gives as much current as the dark; about the least usable light
-    noise_bandwidth_hz: 60     # in bright light; in dim light the speed of the pixel limits it
+    dark_lux: 0.1              # light that gives as much current as the dark
+    noise_cutoff_hz: 60        # in bright light; in dim light the speed of the pixel limits it
     leak_hz: 0.1               # ON events of the leak, a part of the background
     speed:                     # latency or bandwidth_hz, at one or two illuminances
       - {lux: 1000, latency_us: 200}

@@ -14,10 +14,10 @@ from scipy.special import ndtr
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
+from hesim_render.calibration.file import file_digest
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.specs.calibration import file_digest
 
 ROOT = Path(__file__).parents[2]
 SIZE = 32

@@ -4,11 +4,11 @@ One DN of the signal reference is one lux of the data sheet's light on the senso
 lux of a pixel, k = 1/F and t_ref = 1 s. With L that signal and L₀ the illuminance that equals the dark current::
 
     x = L + L₀,   s² = B (L + L₀)                 shot noise of light and dark current: σ² = B/(L + L₀)
-    f = f_max·L/L_max, from f_max·L₀/L_max to f_max    corner of the photoreceptor
+    f = f_max·min((L + L₀)/(L_max + L₀), 1)       corner of the photoreceptor: follows light and dark current
     σ² = B/(L + L₀) · min(f/f_n, 1)                where f limits the bandwidth f_n of the noise as well
     1 − (1 + y) exp(−y) = θ/ln(1 + c),  y = a·t    two poles a, latency t after a step of contrast c
 
-σ follows from the background activity by `hesim_render.specs.event_noise`.
+σ follows from the background activity by `hesim_render.pixels.evs.noise_rates`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.comments import CommentedMap
 from scipy import special
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.units import M_PER_UM, US_PER_S, photons_per_joule
+from hesim_render.pixels.evs.formulas import POLE, corner_line
+from hesim_render.pixels.evs.noise_rates import noise_sigma
 from hesim_render.specs.data_sheet import DataSheetSpec, V2eSpec
-from hesim_render.specs.event_noise import noise_sigma
+from hesim_render.specs.event_pixels import SHEETS
+from hesim_render.specs.files import as_read
+from hesim_render.specs.problems import line_of
+from hesim_render.specs.sensor import SensorSpec, SheetSensorSpec
 from hesim_render.spectral.spectrum import (
     INTEGRATION_STEP_NM,
     Spectrum,
@@ -37,25 +42,10 @@ from hesim_render.spectral.spectrum import (
     scale_to_lux,
 )
 
-if TYPE_CHECKING:
-    from hesim_render.specs.sensor import SensorSpec
-
-#: Keys of `evs` that follow from a data sheet, with values that only stand for them while the file is checked.
-DERIVED: dict[str, Any] = {
-    "contrast_threshold_on": 0.2, "contrast_threshold_off": 0.2, "threshold_mismatch_std": 0.0,
-    "signal_reference": {"k_dn_per_e": 1.0, "t_ref_us": 1e6, "filter": "own"},
-    "coefficients": [{"beta1": 1.0, "beta2": 1.0, "beta3": 0.0, "beta4": 0.0}],
-    "shot_law": "sqrt", "leak_rate_hz": 0.0, "photoreceptor_cutoff_hz": 1.0, "photoreceptor": None,
-    "refractory_period_us": None,
-}  # fmt: skip
-#: The two sections that a file may have, of which one is enough.
-SECTIONS = ("data_sheet", "v2e")
-#: Both poles together are −3 dB at f: a = 2π f/√(√2 − 1).
-_POLE = math.tau / math.sqrt(math.sqrt(2.0) - 1.0)
 #: L₀ of a pixel of which nothing else tells it, lx.
 _LEAST_DARK_LUX = 1e-3
-#: v2e's time constant at a grey level g of 255 is that at white times 275/(g + 20).
-_V2E_DARK_SHARE = 20 / 275
+#: v2e's time constant at a grey level g of 255 is that at white times 275/(g + 20): 20 levels are its dark current.
+_V2E_DARK_SHARE = 20 / 255
 #: Noise events of v2e at white over those in the dark.
 _V2E_WHITE_SHARE = 0.25
 #: Bandwidth of the noise where v2e has no cut-off, Hz: v2e's own default.
@@ -109,12 +99,12 @@ class Figures:
                 corners.append((level.lux * (1 + step), corner_of_latency_hz(level.latency_us, on, change)))
         return cls(
             (on, off), spread / ((on + off) / 2), [(b.lux, b.rate_hz - sheet.leak_hz) for b in sheet.background],
-            sheet.dark_lux, sheet.noise_bandwidth_hz, bool(sheet.speed), sheet.leak_hz, corners, sheet.refractory_us,
+            sheet.dark_lux, sheet.noise_cutoff_hz, bool(sheet.speed), sheet.leak_hz, corners, sheet.refractory_us,
         )  # fmt: skip
 
     @classmethod
     def of_v2e(cls, options: V2eSpec) -> Figures:
-        """Figures of v2e's options. Its cut-off and its logarithm follow the light down to 20/275 of white."""
+        """Figures of v2e's options. Its cut-off and its logarithm follow the light and 20 of its grey levels."""
         thresholds = options.pos_thres, options.neg_thres
         rate, white = options.shot_noise_rate_hz, options.white_lux
         return cls(
@@ -141,12 +131,12 @@ def corner_of_latency_hz(latency_us: float, theta: float, step: float) -> float:
     RangeError
         If the step is not above the threshold.
     """
-    return _settling(theta, step) * US_PER_S / (latency_us * _POLE)
+    return _settling(theta, step) * US_PER_S / (latency_us * POLE)
 
 
 def latency_us(corner_hz: float, theta: float, step: float) -> float:
     """Time from a step of ln x to the event, µs; inverse of `corner_of_latency_hz`."""
-    return _settling(theta, step) * US_PER_S / (corner_hz * _POLE)
+    return _settling(theta, step) * US_PER_S / (corner_hz * POLE)
 
 
 def _settling(theta: float, step: float) -> float:
@@ -173,42 +163,8 @@ def electrons_per_s_lux(spec: SensorSpec, filter_name: str, light: Spectrum) -> 
     return area_m2 * integrate_product(scale_to_lux(light, 1.0), per_joule)
 
 
-def placeholders(data: CommentedMap, changes: Mapping[str, Any], file: Path) -> bool:
-    """Add values to a file with a data sheet that stand for those that follow from it.
-
-    Returns
-    -------
-    True if the file has a data sheet.
-
-    Raises
-    ------
-    SpecError
-        If the file itself has one of these values.
-    """
-    evs = data.get("evs")
-    named = any(key.startswith(tuple(f"evs.{section}" for section in SECTIONS)) for key in changes)
-    if not isinstance(evs, CommentedMap) or not (named or any(section in evs for section in SECTIONS)):
-        return False
-    twice = [key for key in DERIVED if key in evs]
-    problems = [
-        SpecError("follows from data_sheet or v2e: leave one of them out", file=file, line=evs.lc.key(key)[0] + 1,
-                  key=f"evs.{key}") for key in twice
-    ]  # fmt: skip
-    if problems:
-        raise SpecError.together(problems)
-    evs.update({key: _as_read(value) for key, value in DERIVED.items() if value is not None})
-    return True
-
-
-def _as_read(value: Any) -> Any:
-    """A copy as if it had been read from a file, so that changes by `--set` reach into it."""
-    if isinstance(value, dict):
-        return CommentedMap({key: _as_read(inner) for key, inner in value.items()})
-    return CommentedSeq([_as_read(inner) for inner in value]) if isinstance(value, list) else value
-
-
-def derive(data: CommentedMap, spec: SensorSpec, file: Path) -> None:
-    """Replace the values of `placeholders` by those that follow from the data sheet.
+def derive(data: CommentedMap, spec: SheetSensorSpec, file: Path) -> None:
+    """Add the values that follow from a data sheet to the content of a file.
 
     Parameters
     ----------
@@ -221,22 +177,17 @@ def derive(data: CommentedMap, spec: SensorSpec, file: Path) -> None:
     SpecError
         If no parameters of the model have these figures.
     """
-    assert spec.evs is not None
-    section = SECTIONS[0] if spec.evs.data_sheet is not None else SECTIONS[1]
-    line = data["evs"].lc.key(section)[0] + 1 if section in data["evs"].lc.data else None
+    section = next(name for name in SHEETS if getattr(spec.evs, name) is not None)
     try:
         values = _values(spec)
     except (RangeError, SpecError) as error:
+        line = line_of(data, ("evs", section))
         raise SpecError(str(error), file=file, line=line, key=f"evs.{section}") from None
-    evs = data["evs"]
-    for key in DERIVED:
-        evs.pop(key, None)
-    evs.update({key: _as_read(value) for key, value in values.items() if value is not None})
+    data["evs"].update({key: as_read(value) for key, value in values.items() if value is not None})
 
 
-def _values(spec: SensorSpec) -> dict[str, Any]:
+def _values(spec: SheetSensorSpec) -> dict[str, Any]:
     evs = spec.evs
-    assert evs is not None
     if evs.data_sheet is not None:
         figures, light = Figures.of_data_sheet(evs.data_sheet), evs.data_sheet.light.load()
     else:
@@ -247,12 +198,8 @@ def _values(spec: SensorSpec) -> dict[str, Any]:
     photoreceptor = _photoreceptor(figures)
     bandwidth_hz = figures.bandwidth_hz or photoreceptor["cutoff_hz"]
     if photoreceptor and bandwidth_hz > photoreceptor["cutoff_hz"]:
-        raise SpecError(f"noise_bandwidth_hz {bandwidth_hz:g} is above the pixel's {photoreceptor['cutoff_hz']:.4g} Hz")
+        raise SpecError(f"noise_cutoff_hz {bandwidth_hz:g} is above the pixel's {photoreceptor['cutoff_hz']:.4g} Hz")
     dark_lux, beta3, beta4 = _noise(figures, bandwidth_hz, photoreceptor)
-    if photoreceptor:
-        darkest = photoreceptor["cutoff_hz"] * dark_lux / photoreceptor["signal_dn"]
-        photoreceptor["min_cutoff_hz"] = min(max(darkest, 1e-3), photoreceptor["cutoff_hz"])
-        photoreceptor["filters_noise"] = figures.filters_noise
     beta = {"beta1": 1.0, "beta2": dark_lux, "beta3": beta3, "beta4": beta4}
     if figures.shot_law == "linear":
         beta["beta5"] = 1.0
@@ -278,9 +225,8 @@ def _noise(figures: Figures, bandwidth_hz: float, photoreceptor: Mapping[str, fl
     def variance(lux: float, rate_hz: float) -> float:
         share = 1.0
         if figures.filters_noise:
-            assert figures.dark_lux is not None
-            corner_hz = photoreceptor["cutoff_hz"] * max(lux, figures.dark_lux) / photoreceptor["signal_dn"]
-            share = min(corner_hz / bandwidth_hz, 1.0)
+            limits = photoreceptor["min_cutoff_hz"], photoreceptor["cutoff_hz"]
+            share = min(corner_line(min(lux / photoreceptor["signal_dn"], 1.0), *limits) / bandwidth_hz, 1.0)
         sigma = noise_sigma(
             rate_hz, figures.thresholds, figures.mismatch, share * bandwidth_hz, dead_s, figures.leak_hz
         )
@@ -311,15 +257,20 @@ def _noise(figures: Figures, bandwidth_hz: float, photoreceptor: Mapping[str, fl
 
 
 def _photoreceptor(figures: Figures) -> dict[str, Any]:
-    """Corner proportional to the light through the darker of two levels, up to that of the brighter one; empty where
-    nothing limits the speed.
+    """Corner proportional to light and dark current through the darker of two levels, up to that of the brighter one;
+    empty where nothing limits the speed.
     """
     if not figures.corners:
         return {}
+    assert figures.dark_lux is not None
+    dark = figures.dark_lux
     (lux, corner), (brighter_lux, highest) = min(figures.corners), max(figures.corners)
-    if highest < corner or highest / corner > brighter_lux / lux * (1 + 1e-9):
+    if highest < corner or highest / corner > (brighter_lux + dark) / (lux + dark) * (1 + 1e-9):
         raise SpecError(
             f"speed: corners of {corner:.4g} Hz at {lux:g} lx and {highest:.4g} Hz at {brighter_lux:g} lx: in between "
-            "the corner can rise at most as fast as the light, and not fall"
+            f"the corner can rise at most as fast as the light with the dark current of {dark:g} lx, and not fall"
         )
-    return {"cutoff_hz": highest, "signal_dn": lux * highest / corner}
+    return {
+        "cutoff_hz": highest, "signal_dn": (lux + dark) * highest / corner - dark,
+        "min_cutoff_hz": max(corner * dark / (lux + dark), 1e-3), "filters_noise": figures.filters_noise,
+    }  # fmt: skip

@@ -7,16 +7,22 @@ import pytest
 from scipy import constants, optimize
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs import read_sensor
-from hesim_render.specs.event_noise import events_per_period, noise_rates_hz, noise_sigma
+from hesim_render.pixels.evs.noise_rates import events_per_period, noise_rates_hz, noise_sigma
+from hesim_render.sensor.from_data_sheet import corner_of_latency_hz, electrons_per_s_lux, latency_us
+from hesim_render.sensor.reading import read_sensor
 from hesim_render.specs.files import data_folder, list_names
-from hesim_render.specs.from_data_sheet import corner_of_latency_hz, electrons_per_s_lux, latency_us
 from hesim_render.spectral.spectrum import illuminant, photopic
 
 IMX636 = (data_folder("sensors") / "imx636.yaml").read_text()
 SHEET = "evs.data_sheet."
 #: The same without what is said about single keys, some of which tests leave out.
 BARE = IMX636[: IMX636.index("sources:")]
+
+
+def corner_at(photoreceptor, lux):
+    """Corner of a photoreceptor whose signal is in lux: a line from the dark to its largest value."""
+    dark, largest = photoreceptor.min_cutoff_hz, photoreceptor.cutoff_hz
+    return min(dark + (largest - dark) * lux / photoreceptor.signal_dn, largest)
 
 
 def reset_pixel_rates(on, off, dead_periods, seed, pixels=400, periods=700, first=100, nodes=16, leak_periods=0.0):
@@ -165,21 +171,27 @@ def test_the_coefficients_have_the_figures_of_the_sheet():
     # shot noise of light and dark current: σ² of 5 lx over that of 20 lx is (20 + L0)/(5 + L0)
     variance = {lux: (beta.beta3**2 * lux + beta.beta4**2) / (lux + 0.08) ** 2 for lux in (5.0, 20.0)}
     assert variance[5.0] / variance[20.0] == pytest.approx(20.08 / 5.08)
-    # at 5 lx the corner leaves 59 of the 60 Hz of the noise
-    corner_hz = evs.photoreceptor.cutoff_hz * 5 / evs.photoreceptor.signal_dn
-    share = corner_hz / 60
-    assert 0.9 < share < 1
-    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6, 0.1)
-    assert variance[5.0] * share == pytest.approx(noise**2, rel=1e-4)
     assert evs.photoreceptor.filters_noise and evs.photoreceptor_cutoff_hz == 60
-    assert evs.photoreceptor.min_cutoff_hz == pytest.approx(corner_hz * 0.08 / 5)
+    assert evs.photoreceptor.min_cutoff_hz == pytest.approx(corner_at(evs.photoreceptor, 5) * 0.08 / 5.08)
+
+
+def test_noise_that_the_corner_limits_has_the_rate_of_the_sheet():
+    """At 5 lx the corner leaves 60 of 90 Hz, and of the variance the same part."""
+    evs = read_sensor("imx636", {SHEET + "noise_cutoff_hz": 90}).evs
+    (beta,) = evs.coefficients
+    variance = (beta.beta3**2 * 5 + beta.beta4**2) / 5.08**2
+    corner_hz = corner_at(evs.photoreceptor, 5)
+    share = corner_hz / 90
+    assert 0.6 < share < 0.7
+    noise = noise_sigma(10.0 - 0.1, (math.log(1.25),) * 2, evs.threshold_mismatch_std, corner_hz, 500e-6, 0.1)
+    assert variance * share == pytest.approx(noise**2, rel=1e-4)
 
 
 def two_rates(tmp_path, first, second):
     file = tmp_path / "mine.yaml"
     file.write_text(BARE)
     changes = {
-        SHEET + "speed": [], SHEET + "dark_lux": None, SHEET + "noise_bandwidth_hz": 150,
+        SHEET + "speed": [], SHEET + "dark_lux": None, SHEET + "noise_cutoff_hz": 150,
         SHEET + "background": [{"lux": lux, "rate_hz": rate_hz} for lux, rate_hz in (first, second)],
     }  # fmt: skip
     return read_sensor(file, changes)
@@ -199,6 +211,8 @@ def test_v2e_options_keep_their_meaning():
     assert (evs.contrast_threshold_on, evs.contrast_threshold_off, evs.leak_rate_hz) == (0.2, 0.2, 0.1)
     assert evs.threshold_mismatch_std == pytest.approx(0.05 / 0.2)
     assert evs.refractory_period_us is None and evs.photoreceptor.cutoff_hz == 30
+    for grey in (0, 77, 255):  # v2e's own law
+        assert corner_at(evs.photoreceptor, 100 * grey / 255) == pytest.approx(30 * (grey + 20) / 275)
     (beta,) = evs.coefficients
     for lux, rate_hz in ((0.0, 5.0), (100.0, 1.25)):  # white has a quarter of the noise of the dark
         sigma = (beta.beta3 * lux + beta.beta4) / (lux + beta.beta2)
@@ -231,7 +245,7 @@ def test_changes_reach_the_sheet_and_have_the_last_word():
         ("lux: 1000, latency_us: 100}", "lux: 1000, latency_us: 5000}", "evs.data_sheet", "not fall"),
         ("latency_us: 100}", "latency_us: 100, bandwidth_hz: 3}", SHEET + "speed.0", "not both"),
         ("speed_step_percent: 100", "speed_step_percent: 20", "evs.data_sheet", "more than the threshold of 25 %"),
-        ("noise_bandwidth_hz: 60", "noise_bandwidth_hz: 5000", "evs.data_sheet", "above the pixel's"),
+        ("noise_cutoff_hz: 60", "noise_cutoff_hz: 5000", "evs.data_sheet", "above the pixel's"),
         ("  window_us: 1\n", "  window_us: 1\n  leak_rate_hz: 1\n", "evs.leak_rate_hz", "follows from data_sheet"),
         ("reference: last_event", "reference: previous_sample\n  tick_us: 100", "evs", "asynchronous pixels"),
         ("light: LED-B2", "light: {peak_nm: 900, fwhm_nm: 1}", "evs.data_sheet", "lux"),
@@ -260,7 +274,7 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
         return
     sheet, (beta,) = evs.data_sheet, evs.coefficients
     for level in sheet.background:
-        corner_hz = evs.photoreceptor.cutoff_hz * min(level.lux / evs.photoreceptor.signal_dn, 1)
+        corner_hz = corner_at(evs.photoreceptor, level.lux)
         share = min(corner_hz / evs.photoreceptor_cutoff_hz, 1)
         sigma = math.sqrt((beta.beta3**2 * level.lux + beta.beta4**2) * share) / (level.lux + beta.beta2)
         on, off = noise_rates_hz(
@@ -272,7 +286,7 @@ def test_every_sheet_that_ships_gives_its_own_rates(name):
     for speed in sheet.speed:
         if speed.latency_us is not None:
             bright = speed.lux * (1 + sheet.speed_step_percent / 100)
-            corner_hz = evs.photoreceptor.cutoff_hz * min(bright / evs.photoreceptor.signal_dn, 1)
+            corner_hz = corner_at(evs.photoreceptor, bright)
             pole = 2 * np.pi * corner_hz / np.sqrt(np.sqrt(2) - 1) * 1e-6
             change = math.log((bright + beta.beta2) / (speed.lux + beta.beta2))
             found = optimize.brentq(

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from math import ceil, log2
 
 import numpy as np
+from mitsuba_frozen import FrozenPixels, Work
+from mitsuba_specfilm import require_plain_lens
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.light_parts import light_parts
-from hesim_render.sources.render.frozen import FrozenPixels, Work
 from hesim_render.sources.render.scene.mitsuba_version import using_variant
-from hesim_render.sources.render.specfilm import require_plain_lens
 from hesim_render.sources.scene import Scene
 
 VARIANT = "scalar_spectral"

@@ -1,0 +1,1 @@
+"""``calibration.yaml`` and its maps: `calibrate` writes them, sensors read them."""

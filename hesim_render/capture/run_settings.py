@@ -1,0 +1,129 @@
+"""How a scene is simulated: the settings of a run, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypedDict
+
+from hesim_render.core.errors import ConflictError, RangeError
+from hesim_render.core.units import US_PER_S
+from hesim_render.recording.truth_kinds import truth_kinds
+
+
+class RunOptions(TypedDict, total=False):
+    """The fields of `RunSettings`, as keywords of `simulate`."""
+
+    duration_s: float
+    seed: int
+    clean: bool
+    without: Sequence[str]
+    quality: float | None
+    samples: int | None
+    exact: bool
+    max_minutes: float | None
+    truth: str | Sequence[str]
+    truth_every_us: int | None
+    audit: bool
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of a run.
+
+    Parameters
+    ----------
+    duration_s : simulated time from 0, s.
+    seed : seed of the temporal noise and of the render's samples. The fixed maps of the device come from the
+        device seed of the sensor file.
+    clean : switch every noise term off.
+    without : names of noise terms and of effects of the lens to switch off, such as ``aps.read`` or
+        ``lens.distortion``.
+    quality : wanted error of the render, as a fraction of the sensor's own noise; default 0.5. Each pixel gets as
+        many rays as this error needs, and only pixels that change are rendered again. An audit measures what this
+        misses.
+    samples : rays per pixel and slice, even. Selects the exact mode, in place of `quality`.
+    exact : render every pixel of every slice with the same number of rays; default 64 for a static scene, 16
+        for a moving one.
+    max_minutes : refuse a run whose estimated time is longer, min; None sets no limit.
+    truth : kinds of geometric truth to write into the recording (`TRUTH_KINDS`, or ``all``): ``depth``, ``flow``, …
+        Without `out`, `Recording.truth` computes them when they are asked for.
+    truth_every_us : interval between the times at which event pixels are described, µs; default: the middle of each
+        frame, or every 10 ms where there are none.
+    audit : measure the error of the render with random numbers of its own. Without it the run is shorter, all else is
+        the same to the bit, and ``settings.render`` has no audit.
+
+    Raises
+    ------
+    RangeError
+        If duration, seed or kind of truth is out of range.
+    ConflictError
+        If `quality` comes with `exact` or `samples`.
+    """
+
+    duration_s: float = 0.1
+    seed: int = 7
+    clean: bool = False
+    without: Sequence[str] = ()
+    quality: float | None = None
+    samples: int | None = None
+    exact: bool = False
+    max_minutes: float | None = None
+    truth: str | Sequence[str] = ()
+    truth_every_us: int | None = None
+    audit: bool = True
+
+    def __post_init__(self) -> None:
+        duration_us = whole_us(self.duration_s)
+        require_seed(self.seed)
+        if self.quality is not None and (self.exact or self.samples is not None):
+            other = "samples" if self.samples is not None else "exact"
+            raise ConflictError(
+                "quality",
+                self.quality,
+                f"give --quality or --{other} (quality, {other}), not both: --quality asks for an error and gives each "
+                f"pixel the rays that takes, --{other} belongs to the exact mode, which gives all pixels the same "
+                "number",
+            )
+        truth_kinds(self.truth)
+        if self.truth_every_us is not None and not 1 <= self.truth_every_us <= duration_us:
+            raise RangeError("truth_every_us", self.truth_every_us, f"1 to {duration_us} µs, the length of the run")
+
+    @property
+    def duration_us(self) -> int:
+        """Length of the run, µs."""
+        return whole_us(self.duration_s)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of geometric truth that are written."""
+        return tuple(truth_kinds(self.truth))
+
+    def as_dict(self) -> dict[str, object]:
+        """For the manifest, but what the renderer says of itself."""
+        found: dict[str, object] = {"clean": self.clean, "without": list(self.without)}
+        if self.kinds:
+            found["truth"] = {"kinds": list(self.kinds), "every_us": self.truth_every_us}
+        return found
+
+
+def whole_us(duration_s: float) -> int:
+    """A duration in whole µs.
+
+    Raises
+    ------
+    RangeError
+        If it is not finite, or shorter than half of one.
+    """
+    if not 0 < duration_s < float("inf"):
+        raise RangeError("duration_s", duration_s, "a time above 0, in seconds")
+    duration_us = round(duration_s * US_PER_S)
+    if duration_us < 1:
+        raise RangeError("duration_s", duration_s, "at least one microsecond")
+    return duration_us
+
+
+def require_seed(seed: int) -> None:
+    """Refuse a seed that the generator does not take."""
+    if not 0 <= seed < 2**64:
+        raise RangeError("seed", seed, "0 to 2^64 - 1")

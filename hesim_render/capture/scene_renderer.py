@@ -1,0 +1,71 @@
+"""The renderer that a run asks for, or that its scene needs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hesim_render.sensor.sensor import Sensor
+from hesim_render.sources.render.camera import View
+from hesim_render.sources.render.change_driven.flux import QUALITY, ChangeDrivenFlux
+from hesim_render.sources.render.exact import RenderedFlux
+from hesim_render.sources.render.renderer import SceneRenderer, flickering
+from hesim_render.sources.render.transport.needs_exact import NeedsExactMode
+from hesim_render.sources.scene import Scene
+
+#: Default rays per pixel in the exact mode. A static scene is rendered once for the whole run,
+#: a moving one once per slice.
+STATIC_SAMPLES = 64
+MOVING_SAMPLES = 16
+
+
+def scene_renderer(
+    scene: Scene,
+    sensor: Sensor,
+    seed: int,
+    quality: float | None = None,
+    samples: int | None = None,
+    exact: bool = False,
+) -> SceneRenderer:
+    """The renderer of a scene: change-driven, unless the exact mode is asked for or the scene needs it.
+
+    Parameters
+    ----------
+    scene : with lights in absolute units (`in_absolute_light`).
+    sensor, seed, quality, samples, exact : as for `simulate`.
+
+    Raises
+    ------
+    NeedsExactMode
+        If a quality is asked for, and the scene can only be rendered in the exact mode.
+    """
+    window_us = sensor.spec.evs.window_us if sensor.spec.evs is not None else 1.0
+    because: str | None = None
+    if not exact and samples is None:
+        wanted = QUALITY if quality is None else quality
+        try:
+            return flickering(
+                scene, lambda part, light: ChangeDrivenFlux(part, sensor, wanted, seed=seed, light=light), window_us
+            )
+        except NeedsExactMode as error:
+            if quality is not None:
+                raise
+            because = str(error)
+    rays = samples if samples is not None else MOVING_SAMPLES if scene.spec.moves else STATIC_SAMPLES
+    return flickering(
+        scene, lambda part, _: RenderedFlux(part, sensor, samples=rays, seed=seed, because=because), window_us
+    )
+
+
+def camera_used(view: View) -> dict[str, object]:
+    """Pose at rest and field of view of the camera in use, as plain values, whether scene or sensor set them."""
+    left, right, top, bottom = view.region_mm
+    ends = (view.direction(x, (top + bottom) / 2) for x in (left, right))
+    across = np.diff([np.arctan(x / -z) for x, _, z in ends])[0]
+    pose = view.camera_to_world
+    return {
+        "origin_m": pose[:3, 3].tolist(),
+        "forward": (-pose[:3, 2]).tolist(),
+        "up": pose[:3, 1].tolist(),
+        "horizontal_fov_deg": float(np.degrees(across)),
+        "near_m": float(view.near_m),
+    }
