@@ -27,6 +27,8 @@ _HOT, _HOT_CHANCE = 10.0, 1e-3
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
 _RATIO_SHIFT, _LEAK_SHIFT = 1.0, 3.0
+#: Relative error of the leak in the light of a moving target.
+UNSURE_LEAK = 0.1
 #: Range in which the ratio of the thresholds is taken to be where nothing tells it.
 _RATIO = (0.5, 2.0)
 #: Pairs of ON intervals that the local variation needs.
@@ -143,7 +145,7 @@ def balance_with_target(
     """The same with a moving target, which tells each pixel's own ratio of the thresholds.
 
     There the levels are balanced as well: a pixel's ON events, less its leak, over its OFF events are its θ₋/θ₊. The
-    leak of the target's light is not known. It is taken as `leak_hz`, with half of its effect as an error of its own.
+    leak of the target's light is not known. It is taken as `leak_hz`, and a tenth of its effect is an error of its own.
 
     Parameters
     ----------
@@ -165,7 +167,7 @@ def balance_with_target(
     sums = np.concatenate([each.sum(axis=1, keepdims=True), each.sum(axis=1, keepdims=True) - each], axis=1)
     leak = sums / np.append(pixels.sum(), pixels.sum() - pixels)
     share = abs(leak_hz) * moving.seconds * float(np.mean(1 / off[seen]))
-    unknown = 0.5 * share * np.array([group_rates(one)[1, 0] for one in tallies])
+    unknown = UNSURE_LEAK * share * np.array([group_rates(one)[1, 0] for one in tallies])
     return _with_ratio(leak, unknown, lux, ratio)
 
 

@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.calibrate.recordings.still import jackknife
+from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
 from hesim_render.calibrate.recordings.tally import GROUPS, Tally
 
 #: Simulated pixels, cycles before their counts begin, and most cycles that are simulated.
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
-#: Relative error of the leak in the target's light.
-_UNSURE_LEAK = 0.1
 #: Cycles, and ON and OFF events a cycle, that are needed.
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 
@@ -60,7 +58,7 @@ def thresholds(tally: Tally, contrast: float, cycles_hz: float | None, leak_hz: 
     count = count[:, seen]
     leaked = leak_hz * tally.seconds  # in thresholds of ON events
     share = np.array([[-0.5], [0.5 * count[1].mean() / max(count[0].mean() - leaked, 1.0)]])
-    unsure = _UNSURE_LEAK * np.abs(share[:, 0] * leaked) / count.mean(axis=1)
+    unsure = UNSURE_LEAK * np.abs(share[:, 0] * leaked) / count.mean(axis=1)
     count = (count + share * leaked) / max(cycles, 1e-300)
     if cycles < _LEAST_CYCLES or count.mean(axis=1).min() < _LEAST_EVENTS:
         return unknown(
