@@ -15,8 +15,8 @@ from hesim_render.calibration.spec import CalibrationSpec, MapsFile
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.core.guard import inside, reading, reason
 from hesim_render.core.npz import read_arrays
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.specs.problems import spec_error
-from hesim_render.specs.yamlfile import read_yaml
 
 
 def read_calibration(file: str | Path) -> dict[str, Any]:

@@ -68,12 +68,6 @@ _INFO = """<dv version="2.0">
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events as an AEDAT4 file with one stream.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write; it must be able to seek.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError

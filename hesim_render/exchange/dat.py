@@ -31,20 +31,13 @@ _VERSION = "2"
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events as a DAT file.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError
         If the sensor has more than 16384 rows or columns, or an event lies at 2³² µs (71 minutes) or later.
     """
+    stream.require_side(LARGEST_SIDE, "DAT", target)
     rows, cols = stream.shape
-    if max(rows, cols) > LARGEST_SIDE:
-        raise SpecError(f"DAT addresses at most {LARGEST_SIDE} rows and columns, not {cols}x{rows} px", file=target)
     lines = ("Data file containing CD events.", f"Version {_VERSION}", f"Height {rows}", f"Width {cols}")
     file.write("".join(f"% {line}\n" for line in lines).encode("ascii") + bytes((_EVENTS, _ENTRY.itemsize)))
     stream.encode_into(file, "DAT", lambda events, _: _encoded(events), _LATEST_US)
@@ -98,10 +91,7 @@ def _shape(keys: dict[str, str], path: Path) -> tuple[int, int] | None:
     width, height = keys.get("Width", ""), keys.get("Height", "")
     if not (width or height):
         return None
-    if not all(side.isdecimal() and len(side) < 6 and 0 < int(side) <= LARGEST_SIDE for side in (width, height)):
-        shown = printable(f"{width}x{height}")
-        raise SpecError(f"has the size {shown}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
-    return int(height), int(width)
+    return raw_file.stated_size(width, height, LARGEST_SIDE, path)
 
 
 def read(path: Path, begin: int) -> Iterator[NDArray]:

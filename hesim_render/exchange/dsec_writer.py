@@ -115,12 +115,6 @@ class EventFileWriter:
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events in the layout of DSEC; if the stream does not state its interval, it is read twice.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write; HDF5 opens it again by its name.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError

@@ -26,14 +26,7 @@ _LINES = 1 << 18
 
 
 def write_text(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
-    """Write events as text.
-
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write.
-    target : name of the file, for errors; the form has no limits that could cause one.
-    """
+    """Write events as text."""
     rows, cols = stream.shape
     file.write(f"{cols} {rows}\n".encode("ascii"))
     for block in stream:
@@ -60,14 +53,7 @@ def _lines(events: NDArray) -> NDArray[np.uint8]:
 
 
 def write_arrays(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
-    """Write events as an ``.npz`` file; the stream is read five times, so that no array is in memory.
-
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write.
-    target : name of the file, for errors; the form has no limits that could cause one.
-    """
+    """Write events as an ``.npz`` file; the stream is read five times, so that no array is in memory."""
     count, (rows, cols) = stream.count(), stream.shape
     with NpzWriter(file) as archive:
         for name, dtype in _COLUMNS.items():

@@ -34,12 +34,6 @@ _KNOWN = np.isin(np.arange(16), (_OFF, _ON, _TIME_HIGH, _TRIGGER, 0xE, 0xF))  # 
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events as an EVT2 RAW file.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError

@@ -49,12 +49,6 @@ _KNOWN = np.isin(
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events as an EVT3 RAW file.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError

@@ -31,7 +31,14 @@ from hesim_render.exchange.stream import EventStream
 
 @dataclass(frozen=True)
 class EventFormat:
-    """Suffix of a format's files; the function that writes one, of a stream, an open file, and its name for errors."""
+    """A format of events.
+
+    Parameters
+    ----------
+    suffix : end of the names of its files.
+    write : writes a stream into an open file; the third argument is its name, for errors. HDF5 opens it again by its
+        name. Raises `SpecError` if the events do not fit into the format.
+    """
 
     suffix: str
     write: Callable[[EventStream, IO[bytes], str | Path], None]

@@ -7,9 +7,7 @@ and reads a packet as one array. The container is that of the package mcap.
 
 from __future__ import annotations
 
-import io
 import struct
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -18,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.core.extras import how_to_install
-from hesim_render.core.guard import reading
+from hesim_render.exchange.mcap_records import records, require_mcap
 from hesim_render.exchange.stream import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -28,8 +25,6 @@ EVENT_TOPIC, FRAME_TOPIC, FRAME_ID = "/camera/events", "/camera/image_raw", "cam
 #: Longest time and most events of one packet.
 _PACKET_US, _PACKET_EVENTS = 10_000, 1 << 16
 _LATEST_US = (1 << 31) * 1_000_000
-#: Most bytes that a compressed part of a file may unpack to. Writers make parts of 1 to 16 MB.
-_MOST_CHUNK_BYTES = 1 << 28
 _LONGEST_TOPIC = 1000
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 #: What follows x and y of an event: its time and polarity, and x and y of the next one.
@@ -81,7 +76,7 @@ def write(
         If the package mcap is not installed, or an event lies at 2³¹ s or later.
     """
     event_type, definition, packets = packed or (EVENT_TYPE, _TYPES[EVENT_TYPE], _event_arrays)
-    _require(target)
+    require_mcap(target)
     from mcap.writer import Writer
 
     writer = Writer(file)
@@ -275,7 +270,7 @@ def messages(path: Path, topic: str | None, kind: str) -> Iterator[tuple[str, by
 
     fitting: set[int] = set()
     topics: dict[int, str] = {}
-    for record in _records(path):
+    for record in records(path):
         if isinstance(record, Schema):
             if record.name.endswith(kind):
                 fitting.add(record.id)
@@ -300,7 +295,7 @@ def first_type(path: Path) -> str | None:
 
     ends: dict[int, str] = {}
     channels: dict[int, str] = {}
-    for record in _records(path):
+    for record in records(path):
         if isinstance(record, Schema) and record.name.endswith((_EVENT_TYPES, PACKET_TYPES)):
             ends[record.id] = "/" + record.name.rpartition("/")[2]
         elif isinstance(record, Channel) and record.schema_id in ends:
@@ -308,66 +303,3 @@ def first_type(path: Path) -> str | None:
         elif isinstance(record, Message) and record.channel_id in channels:
             return channels[record.channel_id]
     return None
-
-
-def _records(path: Path) -> Iterator[Any]:
-    """Schemas, channels and messages of a file, from its parts as well."""
-    _require(path)
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-    from mcap.opcode import Opcode
-    from mcap.records import Channel, Chunk, Message, Schema
-    from mcap.stream_reader import StreamReader
-
-    with reading(path, "as an MCAP file"), path.open("rb") as file:
-        reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_MOST_CHUNK_BYTES)
-        try:
-            for record in reader.records:
-                if not isinstance(record, Chunk):
-                    yield record
-                    continue
-                stream, size = ReadDataStream(io.BytesIO(_content(record, path))), record.uncompressed_size
-                while stream.count < size:
-                    opcode, length = stream.read1(), stream.read8()
-                    if opcode == Opcode.MESSAGE:
-                        yield Message.read(stream, length)
-                    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                        yield (Schema if opcode == Opcode.SCHEMA else Channel).read(stream)
-                    else:
-                        stream.read(length)
-        except McapError as error:
-            raise SpecError(f"is a damaged MCAP file ({str(error) or type(error).__name__})", file=path) from None
-
-
-def _content(chunk: Any, path: Path) -> bytes:
-    """The content of a part, of the size that it says; a larger one is refused before it is unpacked."""
-    most = chunk.uncompressed_size
-    if most > _MOST_CHUNK_BYTES:
-        raise SpecError(f"has a part of {most} bytes; expected at most {_MOST_CHUNK_BYTES}", file=path)
-    if chunk.compression == "zstd":
-        import zstandard
-
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(most + 1)
-    elif chunk.compression == "lz4":
-        import lz4.frame
-
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most + 1)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise SpecError(f"has parts packed by {chunk.compression[:40]!r}; expected zstd or lz4", file=path)
-    if len(data) != most:
-        problem = (
-            f"has a part that unpacks to {len(data)} bytes{' or more' if len(data) > most else ''}; it says {most}"
-        )
-        raise SpecError(problem, file=path)
-    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
-        raise SpecError("has a part whose checksum is wrong; the file is damaged", file=path)
-    return data
-
-
-def _require(path: str | Path) -> None:
-    try:
-        import mcap.writer  # noqa: F401
-    except ImportError:
-        raise SpecError(f"MCAP files need the package mcap: {how_to_install('ros')}", file=path) from None

@@ -11,7 +11,6 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.errors import SpecError
 from hesim_render.exchange.stream import EventStream
 
 _LARGEST_SIDE = 1 << 8
@@ -21,20 +20,12 @@ _TIME_BITS = 23
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events as an N-MNIST file.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError
         If the sensor has more than 256 rows or columns, or an event lies at 2²³ µs (8.4 s) or later.
     """
-    rows, cols = stream.shape
-    if max(rows, cols) > _LARGEST_SIDE:
-        raise SpecError(f"N-MNIST addresses at most 256 rows and columns, not {cols}x{rows} px", file=target)
+    stream.require_side(_LARGEST_SIDE, "N-MNIST", target)
     stream.encode_into(file, "N-MNIST", _encoded, (1 << _TIME_BITS) - 1)
 
 

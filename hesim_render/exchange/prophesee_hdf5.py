@@ -34,12 +34,6 @@ _INDEX = np.dtype([("id", "<u8"), ("ts", "<i8")])
 def write(stream: EventStream, file: IO[bytes], target: str | Path) -> None:
     """Write events and triggers.
 
-    Parameters
-    ----------
-    stream : the events.
-    file : where to write; HDF5 opens it again by its name.
-    target : name of the file, for errors.
-
     Raises
     ------
     SpecError

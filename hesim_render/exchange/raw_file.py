@@ -54,7 +54,8 @@ def write(
     SpecError
         If events or triggers do not fit the format.
     """
-    write_header(file, name, stream.shape, target)
+    stream.require_side(LARGEST_SIDE, name, target)
+    write_header(file, name, stream.shape)
     before = None
     for entries, is_trigger in merged(stream, stream.triggers(), stream.source, channels):
         last_us = int(entries["t_us"][-1])
@@ -64,34 +65,14 @@ def write(
         before = entries[-1]
 
 
-def write_header(file: IO[bytes], name: str, shape: tuple[int, int], target: str | Path) -> None:
-    """Write the header of a format, ``EVT2`` or ``EVT3``.
-
-    Parameters
-    ----------
-    file : the file.
-    name : the format.
-    shape : rows and columns of the sensor, px.
-    target : name of the file, for the error.
-
-    Raises
-    ------
-    SpecError
-        If the sensor has more rows or columns than the format can address.
-    """
+def write_header(file: IO[bytes], name: str, shape: tuple[int, int]) -> None:
+    """Write the header of a format, ``EVT2`` or ``EVT3``, for a sensor of so many rows and columns."""
     rows, cols = shape
-    if max(shape) > LARGEST_SIDE:
-        raise SpecError(f"{name} addresses at most {LARGEST_SIDE} rows and columns, not {cols}x{rows} px", file=target)
     version = next(number for number, known in _VERSIONS.items() if known == name)
-    lines = [
-        "camera_integrator_name hesim_render",
-        f"evt {version}",
-        f"format {name};height={rows};width={cols}",
-        f"geometry {cols}x{rows}",
-        "integrator_name hesim_render",
-        "plugin_name hal_plugin_prophesee",
-        "end",
-    ]
+    lines = (
+        "camera_integrator_name hesim_render", f"evt {version}", f"format {name};height={rows};width={cols}",
+        f"geometry {cols}x{rows}", "integrator_name hesim_render", "plugin_name hal_plugin_prophesee", "end",
+    )  # fmt: skip
     file.write("".join(f"% {line}\n" for line in lines).encode("ascii"))
 
 
@@ -142,9 +123,20 @@ def _shape(keys: dict[str, str], details: list[str], path: Path) -> tuple[int, i
     width, height = size.groups() if size else (found.get("width", ""), found.get("height", ""))
     if not (width or height):
         return None
-    if not (width.isdecimal() and height.isdecimal() and 0 < int(width) <= LARGEST_SIDE >= int(height) > 0):
+    return stated_size(width, height, LARGEST_SIDE, path)
+
+
+def stated_size(width: str, height: str, largest: int, path: Path) -> tuple[int, int]:
+    """Rows and columns that a header states in digits.
+
+    Raises
+    ------
+    SpecError
+        If one of them is no number from 1 to `largest`.
+    """
+    if not all(side.isdecimal() and len(side) < 6 and 0 < int(side) <= largest for side in (width, height)):
         shown = printable(f"{width}x{height}")
-        raise SpecError(f"has the size {shown}; expected 1x1 to {LARGEST_SIDE}x{LARGEST_SIDE} px", file=path)
+        raise SpecError(f"has the size {shown}; expected 1x1 to {largest}x{largest} px", file=path)
     return int(height), int(width)
 
 

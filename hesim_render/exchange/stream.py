@@ -90,6 +90,23 @@ class EventStream:
             yield events
             last_us, done = int(times[-1]), done + events.size
 
+    def require_side(self, largest: int, name: str, target: str | Path) -> None:
+        """Refuse a sensor with more rows or columns than a format can address.
+
+        Parameters
+        ----------
+        largest : most of each.
+        name, target : the format, and the name of the file, for the error.
+
+        Raises
+        ------
+        SpecError
+            If it has more.
+        """
+        rows, cols = self.shape
+        if max(rows, cols) > largest:
+            raise SpecError(f"{name} addresses at most {largest} rows and columns, not {cols}x{rows} px", file=target)
+
     def encode_into(
         self,
         file: IO[bytes],

@@ -21,8 +21,8 @@ from ruamel.yaml.error import YAMLError
 from hesim_render.core.errors import SpecError, did_you_mean
 from hesim_render.core.guard import printable
 from hesim_render.core.shipped import data_folder, list_names
+from hesim_render.core.yaml_file import read_yaml
 from hesim_render.specs.problems import line_of, spec_error
-from hesim_render.specs.yamlfile import read_yaml
 
 #: Control characters but tabulators and ends of lines, and halves of characters.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")

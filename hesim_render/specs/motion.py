@@ -13,7 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vectors
-from hesim_render.specs.poses import PoseFile, read_poses
+from hesim_render.trajectories.pose_files import PoseFile, read_poses
 
 #: Keys of a track that say how its `file` is read, and the texts that they may be; without any, whole numbers.
 _OF_FILE = {"axes": ("scene", "opencv"), "quaternion": ("hamilton", "kalibr"), "begin_us": (), "every_us": ()}

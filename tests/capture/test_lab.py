@@ -38,6 +38,12 @@ def session(tmp_path_factory):
     return folder / "captures", sensor, calibration
 
 
+@pytest.fixture
+def few_trials(monkeypatch):
+    """Three trials of each step of contrast in place of 50, where no statistics are made of them."""
+    monkeypatch.setattr("hesim_render.capture.lab._LEAST_TRIALS", 3)
+
+
 def arrays(file):
     with np.load(file) as data:
         return {name: data[name] for name in data.files}
@@ -87,6 +93,7 @@ def test_the_light_suits_the_frames():
     assert brightest == pytest.approx(0.9 * (1023 - 64) / 0.16, rel=1e-9)  # 6000 e⁻ of full well are a little more
 
 
+@pytest.mark.usefixtures("few_trials")
 def test_frames_without_noise_are_the_flux_times_exposure(tmp_path):
     sensor = hr.load_sensor("eiger").crop(32, 32)
     off = [f"aps.{term}" for term in APS_TERMS]
@@ -130,24 +137,30 @@ def test_the_capture_set_has_the_format_that_calibration_reads(session):
     np.testing.assert_allclose(steps["contrast"][[0, 10, 20]], [-0.303, 0, 0.303], atol=1e-12)
 
 
+@pytest.mark.usefixtures("few_trials")
 def test_a_shipped_sensor_is_named_not_copied(tmp_path):
     folder = write_captures(hr.load_sensor("gen2").crop(32, 32), tmp_path / "c", frames=8, ticks=5)
     assert read_captures(folder).spec.sensor == "gen2" and not (folder / "sensor.yaml").exists()
 
 
+@pytest.mark.usefixtures("few_trials")
 def test_the_same_seed_gives_the_same_bytes_and_no_frame_repeats(tmp_path):
     sensor = hr.load_sensor("eiger").crop(16, 16)
     digests = []
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
-        folder = write_captures(sensor, tmp_path / name, frames=8, ticks=20, seed=seed)
+        folder = write_captures(
+            sensor, tmp_path / name, frames=8, ticks=20, seed=seed, dark_exposures_us=(1000, 9000),
+            lit_exposures_us=(2000, 7000, 11_000),
+        )  # fmt: skip
         digests.append({p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.iterdir()})
     assert digests[0] == digests[1]
     assert digests[0]["aps_dark.npz"] != digests[2]["aps_dark.npz"]
     folder = tmp_path / "a"
     frames = np.concatenate([arrays(folder / f"aps_{k}.npz")["frames"].reshape(-1, 256) for k in ("dark", "lit")])
-    assert len(np.unique(frames, axis=0)) == len(frames) == 13 * 8
+    assert len(np.unique(frames, axis=0)) == len(frames) == 5 * 8
 
 
+@pytest.mark.usefixtures("few_trials")
 def test_only_what_can_be_calibrated_is_captured(tmp_path):
     folder = write_captures(hr.load_sensor("reference-bayer").crop(16, 16), tmp_path / "none", frames=8, ticks=5)
     assert not list(folder.glob("evs_*")) and (folder / "aps_lit.npz").is_file()
@@ -179,6 +192,7 @@ def test_bad_numbers_write_nothing(options, text, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("few_trials")
 def test_a_session_that_breaks_off_leaves_nothing(tmp_path):
     def stop(done, total, what):
         assert 0 < done <= total

@@ -14,7 +14,7 @@ from test_round_trips import lists_of_events
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.exchange import EventStream, mcap_file, open_events
+from hesim_render.exchange import EventStream, mcap_file, mcap_records, open_events
 from hesim_render.recording import movie
 from hesim_render.recording.imports import import_recording
 
@@ -226,7 +226,7 @@ def test_a_part_that_unpacks_to_more_than_it_says_or_than_can_be_held_is_refused
     tmp_path, monkeypatch, compression, says
 ):
     """64 MB of zeros in some ten kB, where 16 MB can be held."""
-    monkeypatch.setattr(mcap_file, "_MOST_CHUNK_BYTES", 16 << 20)
+    monkeypatch.setattr(mcap_records, "_MOST_CHUNK_BYTES", 16 << 20)
     import lz4.frame
     import zstandard
     from mcap.data_stream import RecordBuilder

@@ -51,6 +51,12 @@ def test_wheel_and_source_archive_are_whole_and_pass_twine(tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     shipped = {path.relative_to(ROOT) for folder in FOLDERS.values() for path in (ROOT / folder).glob("*.yaml")}
     assert {name for name in names if name.endswith(".yaml")} == {f"hesim_render/shipped/{path}" for path in shipped}
+    data = {
+        path.relative_to(ROOT).as_posix()
+        for kind in ("html", "css", "npz")
+        for path in (ROOT / "hesim_render").rglob(f"*.{kind}")
+    }
+    assert len(data) > 10 and data <= names
     assert "hesim_render/py.typed" in names and not [name for name in names if name.startswith("tests/")]
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     code = (

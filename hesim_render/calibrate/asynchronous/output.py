@@ -24,6 +24,7 @@ from hesim_render.calibrate.asynchronous.likelihood import (
 )  # fmt: skip
 from hesim_render.calibrate.asynchronous.trials import Trials
 from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibration.rates import EventDefectRates
 from hesim_render.calibration.spec import Defect
 
 _MODEL = (
@@ -118,10 +119,9 @@ def _noise(fit: Fit, signal_dn: float) -> dict[str, Any]:
 def maps(result: AsynchronousCalibration) -> dict[str, NDArray]:
     """Map files of the section, and small arrays for the report (their names start with ``figure_``)."""
     shape, defects = result.steps.shape, result.defects
+    rates = EventDefectRates(defects.kind, defects.on_hz, defects.off_hz, defects.firing_share, defects.change_hz)
     arrays: dict[str, NDArray] = {
-        "bad_pixels": defects.bad, "defect": defects.kind, "defect_on_hz": defects.on_hz,
-        "defect_off_hz": defects.off_hz, "defect_firing_share": defects.firing_share,
-        "defect_change_hz": defects.change_hz,
+        "bad_pixels": defects.bad, **rates.maps(),
         "threshold_on_relative": result.relative[0], "threshold_off_relative": result.relative[1],
         "threshold_on_noise": result.noise[0], "threshold_off_noise": result.noise[1],
     }  # fmt: skip

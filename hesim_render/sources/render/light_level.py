@@ -23,7 +23,8 @@ from hesim_render.sources.render.scene.builder import BuiltScene, build
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.render.transport.paths import power_heuristic
 from hesim_render.sources.scene import Scene
-from hesim_render.specs.scene import MitsubaSpec, SceneSpec
+from hesim_render.specs.mitsuba_scene import MitsubaSpec
+from hesim_render.specs.scene import SceneSpec
 from hesim_render.spectral.spectrum import LUMINOUS_EFFICACY_LM_PER_W, RENDERABLE_NM, Spectrum, constant, photopic
 
 #: Relative standard error that is aimed at, and the largest one that is accepted.

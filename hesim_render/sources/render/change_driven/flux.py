@@ -260,19 +260,7 @@ class ChangeDrivenFlux:
         quality: float,
         events: bool,
     ) -> NDArray[np.float64]:
-        """Mean Φ of each listed pixel in its own window, and its error, with a stream of random numbers of its own.
-
-        Parameters
-        ----------
-        pixel : [n], mosaic indices.
-        begin_us, end_us : [n], the windows, µs.
-        quality : wanted error over the sensor's noise.
-        events : True for the noise of events, False for that of exposures.
-
-        Returns
-        -------
-        [2, n], e⁻/s: the flux, and half the difference of its halves.
-        """
+        """See `AuditableFlux.reference_flux`: a stream of random numbers of its own."""
         if self._is_dark or pixel.size == 0:
             return np.zeros((2, pixel.size))
         renderer, index = self._renderer, self._index[pixel]

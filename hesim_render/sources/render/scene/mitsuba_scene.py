@@ -23,7 +23,8 @@ from hesim_render.sources.render.scene.plugins import (
     set_depth,
     used_plugins,
 )
-from hesim_render.specs.scene import MitsubaSpec, SceneSpec
+from hesim_render.specs.mitsuba_scene import MitsubaSpec
+from hesim_render.specs.scene import SceneSpec
 
 #: Path length for a scene without an integrator of its own.
 _DEFAULT_DEPTH = 8

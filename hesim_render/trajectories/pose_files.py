@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import read_text, reading
 from hesim_render.core.units import US_PER_S
-from hesim_render.specs.yamlfile import parse_yaml
+from hesim_render.core.yaml_file import parse_yaml
 
 #: Columns of a CSV file of this package; those of TUM files are the same, with the time in seconds.
 CSV_COLUMNS = ("t_us", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")

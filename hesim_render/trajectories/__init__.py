@@ -1,0 +1,1 @@
+"""Trajectories in files of other programs."""
