@@ -71,6 +71,7 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile, data: Calibratio
             found = _asynchronous_values(sensor, data.evs, noise.path)
         else:
             found = _evs_values(sensor, data.evs, noise)
+        sensor["evs"].pop("leak", None)  # leak_rate_hz is the calibrated one
         changed |= {f"evs.{key}": value for key, value in (found | _signal_reference(data)).items()}
     # each value that was measured says so; what the file said of its source does not hold any more
     for key, value in changed.items():

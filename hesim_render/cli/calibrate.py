@@ -1,4 +1,4 @@
-"""Captures and calibrations: ``calibrate lab``, ``aps``, ``evs`` and ``twin``."""
+"""Captures and calibrations: ``calibrate lab``, ``aps``, ``evs``, ``recording`` and ``twin``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hesim_render.cli.calibrate_recording import recording
 from hesim_render.cli.console import Console, DryRun, Json, Quiet
 from hesim_render.cli.options import (
     SENSOR_HELP,
@@ -155,4 +156,5 @@ def _show(console: Console, part: str, out: Path, report: Path | None, sensor_fi
     console.result("\n".join([*lines, *where]), facts)
 
 
+app.command()(recording)
 app.command()(twin)

@@ -45,6 +45,8 @@ class Stream(IntEnum):
     TELEGRAPH_SHARE = 51
     TELEGRAPH_AMPLITUDE = 52
     EVENT_START = 53
+    LEAK_SPREAD = 54
+    LEAK_TAIL = 55
     IMU = 60
     RENDER_GLARE = 61
     RENDER_EDGE = 62

@@ -68,10 +68,18 @@ class _Pixel:
         share = np.broadcast_to(self.noise.noise_share(electrons, self.position), log.shape)
         return log, variance * share, share
 
+    def leak_hz(self, lux: float) -> float:
+        """Leak events of a pixel, Hz, mean over pixels."""
+        drift = self.noise.leak_drift
+        if drift is None:
+            return self.noise.leak_rate_hz
+        electrons = lux * self.flux * self.spec.window_us * S_PER_US
+        return drift.mean_rate_hz(electrons * float(self.noise.dn_per_electron[self.position]))
+
     def rates(self, lux: float) -> tuple[float, float]:
         """ON and OFF events per second in steady light, leak included."""
         _, variance, share = (float(value) for value in self.level(lux))
-        leak_hz = self.noise.leak_rate_hz
+        leak_hz = self.leak_hz(lux)
         if self.spec.reference == "previous_sample":
             assert self.spec.tick_us is not None
             tick_s = self.spec.tick_us * S_PER_US

@@ -87,11 +87,12 @@ def _events(sensor: Sensor) -> list[Row]:
         (None, None, None) if sheet is None else
         (sheet.threshold_on_percent, sheet.threshold_off_percent, sheet.threshold_mismatch_percent)
     )  # fmt: skip
+    leak = ("leak in the dark", evs.leak.rate_hz) if evs.leak else ("leak", evs.leak_rate_hz)
     rows = [
         Row("event columns", grid[1], "px"), Row("event rows", grid[0], "px"),
         Row("threshold ON", contrast[0], "%", stated[0]), Row("threshold OFF", contrast[1], "%", stated[1]),
         Row("threshold mismatch", spread * (100 + sum(contrast) / 2), "%", stated[2]),
-        Row("leak", evs.leak_rate_hz, "Hz", None if sheet is None else sheet.leak_hz),
+        Row(leak[0], leak[1], "Hz", None if sheet is None else sheet.leak_hz),
     ]  # fmt: skip
     if evs.tick_us is not None:
         rows.append(Row("tick", evs.tick_us, "µs"))

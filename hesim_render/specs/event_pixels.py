@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from hesim_render.specs.data_sheet import DataSheetSpec, V2eSpec
 from hesim_render.specs.defects import EventDefectSpec
 from hesim_render.specs.files import Strict
+from hesim_render.specs.leak import LeakSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 
 #: Smallest threshold if a change gives one event per threshold that it contains.
@@ -46,6 +47,7 @@ class SheetEvsSpec(Strict):
     noise_mode: Literal["per_instant", "independent"] = "per_instant"
     data_sheet: DataSheetSpec | None = Field(None, description="figures that the values above follow from")
     v2e: V2eSpec | None = Field(None, description="options of v2e that they follow from")
+    leak: LeakSpec | None = Field(None, description="in place of leak_rate_hz: which process the leak is")
     defects: EventDefectSpec | None = Field(None, description="stuck, hot and flickering pixels; default none")
     readout_max_events_per_s: float | None = Field(
         None, ge=1e-3, le=1e12, description="events beyond are lost; default no limit"
@@ -58,6 +60,11 @@ class SheetEvsSpec(Strict):
     def _check_sheet(self) -> SheetEvsSpec:
         if self.data_sheet is not None and self.v2e is not None:
             raise ValueError("data_sheet and v2e say the same in two ways: leave one of them out")
+        if self.leak is not None and self.leak.process == "drift" and self.reference != "last_event":
+            raise ValueError(
+                "leak.process 'drift' moves the reference of asynchronous pixels, reference 'last_event'; a fixed tick "
+                "has process 'poisson'"
+            )
         if (self.data_sheet or self.v2e) is not None and self.reference != "last_event":
             raise ValueError("data_sheet and v2e describe asynchronous pixels: they need reference 'last_event'")
         return self
@@ -103,6 +110,8 @@ class EvsSpec(SheetEvsSpec):
                 raise ValueError("photoreceptor.filters_noise belongs to reference 'last_event'")
             if (self.photoreceptor_cutoff_hz or 0.0) > self.photoreceptor.cutoff_hz:
                 raise ValueError("photoreceptor_cutoff_hz is above photoreceptor.cutoff_hz, which filters the noise")
+        if self.leak is not None and self.leak_rate_hz > 0:
+            raise ValueError("leak and leak_rate_hz (or leak_hz of a data sheet) say the same: leave one of them out")
         if self.readout_buffer_events is not None and self.readout_max_events_per_s is None:
             raise ValueError("readout_buffer_events needs readout_max_events_per_s")
         follows_light = self.photoreceptor is not None and self.photoreceptor.follows_light

@@ -15,11 +15,12 @@ from hesim_render.pixels.arrays import take
 from hesim_render.pixels.evs.defects import DefectEvents
 from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin, no_events
 from hesim_render.pixels.evs.formulas import leak_probability
+from hesim_render.pixels.evs.leak_drift import LeakDrift
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.photoreceptor import Photoreceptor
 from hesim_render.pixels.evs.processes import BandNoise, LeakProcess
 from hesim_render.pixels.evs.refractory import LONG_AGO_US, Refractory
-from hesim_render.pixels.evs.start import start_of
+from hesim_render.pixels.evs.start import start_chances, start_of
 from hesim_render.pixels.normal import normal_pair
 
 #: Periods of the noise in still light before the first sample, in which noise and level of comparison become those of
@@ -102,12 +103,12 @@ class LastEvent:
 
     STATE: tuple[str, ...] = (
         *("_t_us", "_log", "_spread", "level", "reference"),
-        *("_band_noise", "_photoreceptor", "_refractory", "_leak"),
+        *("_band_noise", "_photoreceptor", "_refractory", "_leak", "_drift"),
     )
 
     def __init__(self, noise: EvsNoise, seed: int, defects: DefectEvents | None, is_reset: bool) -> None:
         self._noise, self._seed, self._defects, self._is_reset = noise, seed, defects, is_reset
-        self._cols = noise.layout.evs_shape[1]
+        self._cols, self._pixels = noise.layout.evs_shape[1], math.prod(noise.layout.evs_shape)
         self._t_us = 0
         self._log: Float = None  # ln x of the last sample
         self._spread: Float = None  # s/x of the last sample
@@ -119,8 +120,17 @@ class LastEvent:
             self._band_noise = BandNoise(noise, seed, self._photoreceptor if noise.filters_noise else None)
         self._refractory: Refractory | None = None
         if noise.refractory_period_us is not None:
-            self._refractory = Refractory(noise.refractory_period_us, math.prod(noise.layout.evs_shape))
+            self._refractory = Refractory(noise.refractory_period_us, self._pixels)
         self._leak = LeakProcess(noise, seed) if noise.leak_rate_hz > 0 else None
+        self._drift = LeakDrift(noise) if noise.leak_drift is not None else None
+
+    def of_pixel(self, level: Float) -> Float:
+        """A level of this stage, which the drift of the leak has raised, as ln x."""
+        return level if self._drift is None or level is None else level - self._drift.way
+
+    def compare_with(self, reference: Float) -> None:
+        """Let the pixels compare with other levels, ln x."""
+        self.reference = reference if self._drift is None else reference + self._drift.way
 
     def step(self, electrons: Float, t_us: int) -> NDArray[np.void]:
         import drjit as dr
@@ -129,11 +139,11 @@ class LastEvent:
         spread = dr.sqrt(variance)
         dr.eval(log, spread)
         if self._log is None:
-            self._start(log, spread, t_us)
+            self._start(electrons, log, spread, t_us)
             return no_events()
-        return self._go_on(log, spread, t_us)
+        return self._go_on(electrons, log, spread, t_us)
 
-    def _start(self, log: Float, spread: Float, t_us: int) -> None:
+    def _start(self, electrons: Float, log: Float, spread: Float, t_us: int) -> None:
         """Begin in still light: where noise makes events, as pixels are after a long time in it, or all at a reset."""
         import drjit as dr
 
@@ -145,19 +155,26 @@ class LastEvent:
         if self._leak:
             self._leak.start(self._t_us)
         self._log, self._spread = log, spread
+        events_hz, chance = np.zeros(self._pixels), None
         if self._band_noise and settles:
-            count = dr.width(self.level)
+            count = self._pixels
             share = self._band_noise.share(count)
             spreads = np.broadcast_to(spread.numpy(), count)
             begin = start_of(self._noise, self._seed, spreads, share, self._band_noise.angle)
             self.reference = dr.fma(spread, jit().Float(begin.reference), log)
             if self._refractory:
                 self._refractory.begin(np.where(begin.dead_us > 0, self._t_us + begin.dead_us, LONG_AGO_US))
+            events_hz, chance = begin.events_hz, begin.chance
+        if self._drift:
+            if chance is None:
+                chance = start_chances(self._noise, self._seed)[2]
+            self._drift.start(electrons, self._is_reset, events_hz, chance)
+            self.level = self.level + self._drift.way
         dr.eval(self.level, self.reference)
         if self._t_us < t_us:
-            self._go_on(log, spread, t_us)
+            self._go_on(electrons, log, spread, t_us)
 
-    def _go_on(self, log: Float, spread: Float, t_us: int) -> NDArray[np.void]:
+    def _go_on(self, electrons: Float, log: Float, spread: Float, t_us: int) -> NDArray[np.void]:
         """Events up to the sample at `t_us`."""
         import drjit as dr
 
@@ -173,6 +190,9 @@ class LastEvent:
                 level = low_pass.to(level, end_us)
             if self._band_noise:
                 level = dr.fma(dr.fma(spread - self._spread, part, self._spread), self._band_noise.at(end_us), level)
+            if self._drift:
+                elapsed_us = end_us - self._t_us
+                level = level + self._drift.at(electrons, elapsed_us / (t_us - self._t_us), elapsed_us)
             parts.append(self._crossings(level, begin_us, end_us))
             begin_us = end_us
         if self._leak and not self._refractory:
@@ -181,8 +201,13 @@ class LastEvent:
         if self._defects and not self._refractory:
             own_us, pixel, polarity = self._defects.between(self._t_us, t_us)
             parts.append(_events(self._stamp(own_us), pixel, polarity * Origin.DEFECT, self._cols))
-        self._t_us, self._log, self._spread = t_us, log, spread
         events = np.concatenate(parts)
+        if self._drift:
+            events = events[np.argsort(events["t_us"], kind="stable")]
+            lower = jit().Float(self._drift.pass_by(events, self._cols, electrons, self._t_us, t_us))
+            self.level, self.reference = self.level - lower, self.reference - lower
+            dr.eval(self.level, self.reference)
+        self._t_us, self._log, self._spread = t_us, log, spread
         if self._defects:
             events = self._defects.alive(events, self._cols)
         # stable: the events of a pixel in one microsecond keep their order

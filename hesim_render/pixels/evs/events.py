@@ -20,6 +20,7 @@ class Origin(IntEnum):
     COMPARATOR = 1
     LEAK = 2
     DEFECT = 3
+    DRIFT = 4  # of the comparator, but at least half of it from the drift of the leak
 
 
 def no_events() -> NDArray:

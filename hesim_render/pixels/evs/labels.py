@@ -8,7 +8,8 @@ With fixed ticks, an event is `signal` if the nominal pixel gives the same event
 only the one with its own threshold does. Asynchronous pixels give their events a little earlier or later than without
 noise. There, an event is paired with the step that the noise-free pixel makes sooner or later, unless the real one goes
 back before (`partners`, `balance`). It is `signal` if the nominal threshold gives that step as well (`nominal`), else
-`mismatch`. What has no partner is `leak` or `hot` if that process gave it, else `noise`.
+`mismatch`. What has no partner is `leak` or `hot` if that process gave it (of a
+leak that drifts: at least half of the step), else `noise`.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class Labeller:
         before = self._events
         number = np.where(counted, before + np.cumsum(counted) - 1, -1)
         self._events += int(np.count_nonzero(counted))
-        found = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT]).astype(np.uint8)
+        found = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK]).astype(np.uint8)
         step = StepLabels(no_events(), np.empty(0, np.int64), np.empty(0, np.uint8))
         if self._partners is not None:
             step = self._partners.take(stage, electrons, events, origin, number)

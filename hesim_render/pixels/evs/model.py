@@ -29,6 +29,7 @@ from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
 from hesim_render.pixels.terms import switched_off
 from hesim_render.specs.event_pixels import EvsCoefficients, EvsSpec
+from hesim_render.specs.leak import LeakSpec
 from hesim_render.specs.photoreceptor import PhotoreceptorSpec
 
 #: Kinds of defects, each a term.
@@ -69,7 +70,7 @@ class EvsNoise(PlainState):
         """The same model with terms of `EVS_TERMS` switched off.
 
         ``shot`` is β3, ``dark_current`` is β4 (its shot noise), ``mismatch`` the spread of thresholds,
-        ``leak`` the leak events, ``bandwidth`` the photoreceptor's low-pass, ``refractory`` the dead time after
+        ``leak`` the leak, ``bandwidth`` the photoreceptor's low-pass, ``refractory`` the dead time after
         an event, ``readout_limit`` the loss of events in the read-out, ``crosstalk`` the light from neighbouring
         pixels, ``stuck``, ``hot`` and ``flickering`` the defects of pixels.
 
@@ -86,7 +87,16 @@ class EvsNoise(PlainState):
 
     @property
     def leak_rate_hz(self) -> float:
-        return 0.0 if "leak" in self.off else self.spec.leak_rate_hz
+        """Rate of leak events that come as a Poisson process."""
+        if "leak" in self.off or self.leak_drift is not None:
+            return 0.0
+        return self.spec.leak_rate_hz if self.spec.leak is None else self.spec.leak.rate_hz
+
+    @property
+    def leak_drift(self) -> LeakSpec | None:
+        """The leak where it is a drift of the reference, else None."""
+        leak = self.spec.leak
+        return leak if leak is not None and leak.process == "drift" and "leak" not in self.off else None
 
     @cached_property
     def defects(self) -> PixelDefects:
@@ -131,7 +141,7 @@ class EvsNoise(PlainState):
     # ---- per-position coefficients and per-pixel thresholds -----------------------------------------
 
     @property
-    def _dn_per_electron(self) -> NDArray[np.float64]:
+    def dn_per_electron(self) -> NDArray[np.float64]:
         """DN of the signal reference for one electron of the window, per event position."""
         reference = self.spec.signal_reference
         return reference.k_dn_per_e * reference.t_ref_us / self.spec.window_us * np.asarray(self.signal_scale)
@@ -147,7 +157,7 @@ class EvsNoise(PlainState):
             np.array([0.0 if gone.get(name) else getattr(entry, name) for entry in entries], dtype=np.float64)
             for name in EvsCoefficients.model_fields
         )
-        return Coefficients.of(beta, self._dn_per_electron, spec.shot_law, NUMPY)
+        return Coefficients.of(beta, self.dn_per_electron, spec.shot_law, NUMPY)
 
     def _threshold_map(self, nominal: float, polarity: str, stream: Stream) -> Map:
         spread = self.spec.threshold_mismatch_std
@@ -182,7 +192,7 @@ class EvsNoise(PlainState):
     def _reference_level(self) -> NDArray[np.float64] | None:
         """x above its baseline at the photoreceptor's reference signal, β1·signal_dn [position]; None without one."""
         reference = None if self.photoreceptor is None else self.photoreceptor.signal_dn
-        return None if reference is None else self.table.slope / self._dn_per_electron * reference
+        return None if reference is None else self.table.slope / self.dn_per_electron * reference
 
     @property
     def filters_noise(self) -> bool:

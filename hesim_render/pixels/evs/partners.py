@@ -86,8 +86,8 @@ class Partners:
         is_first = self._own.t_us is None
         own = self._own.step(electrons, stage.t_us)
         steps = as_steps(own, self._steps + np.arange(own.size), self._cols)
-        compared = events[origin == Origin.COMPARATOR]
-        effects = as_steps(compared, number[origin == Origin.COMPARATOR], self._cols)
+        of_comparator = (origin == Origin.COMPARATOR) | (origin == Origin.DRIFT)
+        effects = as_steps(events[of_comparator], number[of_comparator], self._cols)
         cause, effect, lost = self._of_events.take(steps, effects)
         asleep = own[np.sort(lost) - self._steps]
         self._steps += own.size

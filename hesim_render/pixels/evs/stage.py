@@ -64,7 +64,8 @@ class EvsStage:
     change of several thresholds gives several events, each at its own crossing, rounded up to whole µs. The
     noise is stationary and band-limited at the photoreceptor's cut-off (`BandNoise`), on time nodes of
     the sensor's own; its time-averaged variance is s²/x² at the current signal; `noise_mode` has no
-    meaning. Leak events come as a Poisson process and do not change the reference. The result does not depend on how
+    meaning. Leak events come as a Poisson process and do not change the reference, or the leak is a drift of the
+    reference (`LeakDrift`). The result does not depend on how
     often `step` is called.
 
     Where the sensor has a photoreceptor, ln x (without its noise) first passes its low-pass, with ln x
@@ -110,18 +111,18 @@ class EvsStage:
     def reference(self) -> Float:
         """Level with which each asynchronous pixel compares, ln x; None before the first sample."""
         assert isinstance(self._mode, LastEvent)
-        return self._mode.reference
+        return self._mode.of_pixel(self._mode.reference)
 
     @property
     def level(self) -> Float:
         """Level of each asynchronous pixel at the last sample, ln x, with its noise."""
         assert isinstance(self._mode, LastEvent)
-        return self._mode.level
+        return self._mode.of_pixel(self._mode.level)
 
     def compare_with(self, reference: Float) -> None:
         """Let the asynchronous pixels compare with other levels, ln x, from now on."""
         assert isinstance(self._mode, LastEvent)
-        self._mode.reference = reference
+        self._mode.compare_with(reference)
 
     @property
     def t_us(self) -> int | None:

@@ -38,10 +38,14 @@ class Start(NamedTuple):
     ----------
     reference : [pixel], level of comparison less ln x, in standard deviations of the noise.
     dead_us : [pixel], time until each is ready, µs; 0 for most.
+    events_hz : [pixel], noise events, Hz.
+    chance : [pixel], a uniform random number that neither of both depends on.
     """
 
     reference: NDArray[np.float32]
     dead_us: NDArray[np.float64]
+    events_hz: NDArray[np.float64]
+    chance: NDArray[np.float64]
 
 
 class _Laws:
@@ -51,7 +55,7 @@ class _Laws:
         self._dead, self._leak, self._angle = dead, leak, angle
         size = _NODES.size
         self.quantiles = np.full((size * size, _QUANTILES.size), np.nan, np.float32)
-        self.dead_share = np.zeros(size * size)
+        self.dead_share, self.events = np.zeros(size * size), np.zeros(size * size)
 
     def know(self, nodes: NDArray[np.intp]) -> None:
         """Work out the laws of nodes, numbered ON first."""
@@ -64,7 +68,7 @@ class _Laws:
         wanted = special.ndtr(_QUANTILES)
         for node, one in zip(new, below, strict=True):
             self.quantiles[node] = np.interp(wanted, one, found.edges)
-        self.dead_share[new] = found.dead_share
+        self.dead_share[new], self.events[new] = found.dead_share, found.events
 
 
 _laws = lru_cache(maxsize=64)(_Laws)
@@ -83,10 +87,7 @@ def start_of(
     share : [pixel], bandwidth of each pixel's noise over the largest.
     angle : rate of the poles at the largest bandwidth times the time between nodes of the noise.
     """
-    layout = noise.layout
-    key = layout.full_index.ravel()[layout.evs_pixel.ravel()]
-    none = np.zeros(key.size, np.uint32)
-    chance, of_dead = uniform(words(seed, Stream.EVENT_START, key, none, none)[:2])
+    chance, of_dead, free = start_chances(noise, seed)
     sigma = np.maximum(spread.astype(np.float64), 1e-12)
     thresholds = noise.threshold_on_map, noise.threshold_off_map
     where = [_place(np.ravel(theta) / sigma, _NODES) for theta in thresholds]
@@ -97,7 +98,7 @@ def start_of(
     )
     low = np.minimum(z.astype(np.intp), _QUANTILES.size - 2)
     part = (z - low).astype(np.float32)
-    reference, dead_share = np.zeros(key.size, np.float32), np.zeros(key.size)
+    reference, dead_share, events_hz = np.zeros(chance.size, np.float32), np.zeros(chance.size), np.zeros(chance.size)
     bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
     assert bandwidth_hz is not None
     dead_s = (period_us or 0) / US_PER_S
@@ -115,9 +116,17 @@ def start_of(
             value, following = (laws.quantiles[node, low[here] + k] for k in (0, 1))
             reference[here] += all_weight * (value + part[here] * (following - value))
             dead_share[here] += all_weight * laws.dead_share[node]
+            events_hz[here] += all_weight * laws.events[node] * own_hz
     asleep = of_dead < dead_share
     dead_us = np.where(asleep, (period_us or 0) * of_dead / np.where(asleep, dead_share, 1.0), 0.0)
-    return Start(reference, dead_us)
+    return Start(reference, dead_us, events_hz, free)
+
+
+def start_chances(noise: EvsNoise, seed: int) -> NDArray[np.float64]:
+    """Three uniform random numbers of each pixel, [3, pixel]."""
+    key = noise.layout.full_index.ravel()[noise.layout.evs_pixel.ravel()]
+    none = np.zeros(key.size, np.uint32)
+    return uniform(words(seed, Stream.EVENT_START, key, none, none)[:3])
 
 
 def _place(value: NDArray[np.float64], nodes: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:

@@ -1,0 +1,144 @@
+"""Calibration of event pixels from ordinary recordings, and its file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ruamel.yaml import YAML
+
+from hesim_render.calibrate.recordings import still, target
+from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
+from hesim_render.calibrate.recordings.tally import Tally, tally
+from hesim_render.calibrate.result import plain
+from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.core.output import free_place, replacing
+from hesim_render.exchange import open_events
+
+#: Thresholds follow from the leak, and the leak from the thresholds.
+_ROUNDS = 3
+
+
+def calibrate_recordings(
+    files: Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    lux: Sequence[float] | None = None,
+    target_file: str | Path | None = None,
+    target_contrast: float | None = None,
+    target_hz: float | None = None,
+    shape: tuple[int, int] | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> dict[str, Any]:
+    """Figures of event pixels from recordings of still scenes and, where given, of a moving target.
+
+    Parameters
+    ----------
+    files : recordings of still scenes, one for each light, of any format that `open_events` reads.
+    out : YAML file to write; None writes none.
+    lux : illuminance on the sensor of each, lx; None where it is not known.
+    target_file : recording of a target of two grey levels that moves through the whole picture.
+    target_contrast : light of its bright parts over that of its dark ones.
+    target_hz : bright–dark cycles that a pixel sees per second; None: read from the recording.
+    shape : rows and columns of the sensor, px, where a file does not state them.
+    overwrite : replace `out`.
+    progress : called with what is being done, and the part that is done.
+
+    Returns
+    -------
+    ``recordings`` (one entry a file), common figures, and ``findings``: signs that a recording is not what is needed. A
+    figure has ``value``, ``standard_error``, ``interval_95`` and ``unit``, or ``value: None`` and the ``reason``.
+
+    Raises
+    ------
+    RangeError
+        If the numbers of files and illuminances differ, or a number is out of its range.
+    SpecError
+        If a file cannot be read, has no events, is of another sensor than the first, or is limited by the read-out.
+    """
+    names = [str(file) for file in files]
+    if not names:
+        raise RangeError("files", names, "a recording of a still scene at least")
+    if lux is not None and len(lux) != len(names):
+        raise RangeError("lux", list(lux), f"one illuminance for each of the {len(names)} recordings")
+    if lux is not None and not all(np.isfinite(level) and level >= 0 for level in lux):
+        raise RangeError("lux", list(lux), "illuminances of 0 or more")
+    if (target_file is None) != (target_contrast is None):
+        raise RangeError(
+            "target_contrast", target_contrast, "the contrast of the target where one is given, and only there"
+        )
+    if target_contrast is not None and not (np.isfinite(target_contrast) and 1 < target_contrast < 1e4):
+        raise RangeError("target_contrast", target_contrast, "bright over dark, from 1 to 10000")
+    if target_hz is not None and (target_file is None or not target_hz > 0):
+        raise RangeError("target_hz", target_hz, "cycles per second of a moving target, above 0")
+    path = None if out is None else free_place(out, overwrite, (".yaml", ".yml"))
+    told = progress or (lambda what, part: None)
+    tallies: list[Tally] = []
+    every = [*names, *([str(target_file)] if target_file is not None else [])]
+    for k, name in enumerate(every):
+        told(f"read {Path(name).name}", k / (len(every) + 1))
+        stream = open_events(name, shape=shape, keep_stated=True)
+        if tallies and stream.shape != tallies[0].shape:
+            (rows, cols), (first_rows, first_cols) = stream.shape, tallies[0].shape
+            raise SpecError(f"is of {cols}x{rows} px; expected {first_cols}x{first_rows}, as {names[0]}", file=name)
+        tallies.append(tally(stream))
+    told("fit", len(every) / (len(every) + 1))
+    moving = tallies.pop() if target_file is not None else None
+    found = figures(
+        tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz
+    )
+    if path is not None:
+        yaml = YAML()
+        yaml.width, yaml.default_flow_style = 120, None
+        with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8") as file:
+            yaml.dump(plain(found), file)
+    return found
+
+
+def figures(
+    tallies: Sequence[Tally],
+    moving: Tally | None,
+    lux: Sequence[float] | None,
+    contrast: float | None,
+    cycles_hz: float | None,
+) -> dict[str, Any]:
+    """The result of `calibrate_recordings` for tallies of still scenes and of a moving target, if there is one."""
+    every = [*tallies, *([moving] if moving is not None else [])]
+    limit, limited = readout_limit(every)
+    for one in limited:
+        raise SpecError(
+            f"is saturated: the read-out, of {limit['value']:.4g} events/s, limits it for more than a tenth of its "
+            "time; expected a recording of all events: less light, a smaller part of the sensor, or less contrast",
+            file=one.source,
+        )
+    of_target = target.unknown("it takes a recording of a moving target (--target)")
+    found = still.balance(tallies, lux)
+    if moving is not None and contrast is not None:
+        leak_hz = 0.0
+        for _ in range(_ROUNDS):
+            of_target = target.thresholds(moving, contrast, cycles_hz, leak_hz)
+            if of_target.ratio["value"] is None:
+                break
+            found = still.balance_with_target(tallies, lux, moving, of_target.ratio, leak_hz)
+            leak_hz = float(np.mean([leak["value"] for leak in found.leaks]))
+    entries, findings = [], []
+    for k, (one, leak) in enumerate(zip(tallies, found.leaks, strict=True)):
+        rates = still.group_rates(one)
+        entries.append({
+            "file": Path(one.source).name, "lux": None if lux is None else lux[k], "seconds": one.seconds,
+            "events": int(one.counts.sum()), "on_rate_hz": still.rate(rates, 0), "off_rate_hz": still.rate(rates, 1),
+            "on_rate_spread": still.rate_spread(one, 0), "off_rate_spread": still.rate_spread(one, 1),
+            "on_local_variation": still.regularity(one), "leak_rate_hz": leak,
+        })  # fmt: skip
+        if problem := still.not_still(one):
+            findings.append({"file": Path(one.source).name, "text": problem})
+    return {
+        "sensor": {"rows": tallies[0].shape[0], "cols": tallies[0].shape[1]},
+        "recordings": entries, "threshold_ratio": found.ratio, **of_target.entries, "leak_dark_hz": found.dark,
+        "leak_growth_hz_per_lux": found.growth,
+        "hot_share": still.hot_share(tallies), "silent_share": still.silent_share(tallies),
+        "dead_time_us": dead_time(every), "readout_limit_events_per_s": limit, "findings": findings,
+    }  # fmt: skip

@@ -1,0 +1,81 @@
+"""Event pixels written in NumPy alone: still light, a target that moves by, pixels that fire at random.
+
+Nothing of the package's simulator is used: a comparator with two thresholds of its own in each pixel, noise through two
+equal poles, a drift of the reference, light whose logarithm rises and falls in straight lines.
+"""
+
+import numpy as np
+
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+
+
+def _events(found, cols):
+    t_us, pixel, polarity = (np.concatenate(values) for values in zip(*found, strict=True))
+    order = np.argsort(t_us, kind="stable")
+    events = np.empty(t_us.size, EVENT_DTYPE)
+    events["t_us"], events["polarity"] = t_us[order], polarity[order]
+    events["y"], events["x"] = np.divmod(pixel[order], cols)
+    return events
+
+
+def still_events(rng, theta_on, theta_off, sigma, drift, *, cutoff_hz, seconds, shape):
+    """Events of pixels with own thresholds [pixel], noise of ln x, and drift [pixel] in ln units a second.
+
+    The pixels have run for a while before the first µs that counts.
+    """
+    pole = 2 * np.pi * cutoff_hz / np.sqrt(np.sqrt(2) - 1)
+    dt = 1 / (16 * cutoff_hz)
+    h = pole * dt
+    move = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])
+    fresh = np.linalg.cholesky(np.eye(2) - move @ move.T)
+    size = theta_on.size
+    state = rng.standard_normal((2, size))
+    level = sigma * state[0]
+    reference = level - theta_on * rng.random(size)
+    found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
+    warm = round(30 / cutoff_hz / dt)
+    for k in range(-warm, round(seconds / dt)):
+        state = move @ state + fresh @ rng.standard_normal(state.shape)
+        before, level = level, sigma * state[0]
+        reference -= drift * dt
+        on, off = level - reference >= theta_on, level - reference <= -theta_off
+        some = np.flatnonzero(on | off)
+        goal = np.where(on[some], reference[some] + theta_on[some], reference[some] - theta_off[some])
+        way = level[some] - before[some]
+        part = np.clip((goal - before[some]) / np.where(way == 0, np.inf, way), 0, 1)
+        reference[some] = goal
+        if k >= 0:
+            found.append((np.ceil((k + part) * dt * 1e6).astype(int) + 1, some, np.where(on[some], 1, -1)))
+    return _events(found, shape[1])
+
+
+def target_events(rng, theta_on, theta_off, rise, *, hz, cycles, shape, sigma=0.0, drift=0.0):
+    """Events of pixels that see the light rise and fall by `rise` (ln) `hz` times a second, each with its own phase."""
+    steps, size = 1000, theta_on.size
+    phase = rng.integers(0, steps, size) / steps  # so that the turns are among the steps
+    reference = rng.random(size) * rise
+    found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
+    for k in range(-2 * steps, cycles * steps):
+        at = (k / steps + phase) % 1
+        level = rise * (1 - np.abs(2 * at - 1)) + sigma * rng.standard_normal(size)
+        reference -= drift / steps / hz
+        for sign, theta in ((1, theta_on), (-1, theta_off)):
+            count = np.maximum(np.floor(sign * (level - reference) / theta), 0).astype(int)
+            reference += sign * count * theta
+            some = np.flatnonzero(count)
+            if k >= 0 and some.size:
+                pixel = np.repeat(some, count[some])
+                found.append((np.full(pixel.size, round((k + 1) / steps / hz * 1e6)), pixel, np.full(pixel.size, sign)))
+    return _events(found, shape[1])
+
+
+def random_events(rng, rate_hz, dead_us, *, seconds, shape):
+    """Events of pixels [pixel] that fire at random after a dead time of any real number of µs."""
+    found = [(np.empty(0, int), np.empty(0, int), np.empty(0, int))]
+    t_us, pixel = rng.exponential(1e6 / rate_hz), np.arange(rate_hz.size)
+    while pixel.size:
+        keep = t_us < seconds * 1e6
+        t_us, pixel = t_us[keep], pixel[keep]
+        found.append((np.ceil(t_us).astype(int), pixel, rng.choice([-1, 1], pixel.size)))
+        t_us = t_us + dead_us + rng.exponential(1e6 / rate_hz[pixel])
+    return _events(found, shape[1])
