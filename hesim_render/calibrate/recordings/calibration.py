@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from hesim_render.calibrate.recordings import still, target
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
-from hesim_render.calibrate.recordings.tally import Tally, tally
+from hesim_render.calibrate.recordings.tally import EventTally, tally
 from hesim_render.calibrate.result import plain
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import free_place, replacing
@@ -76,7 +76,7 @@ def calibrate_recordings(
         raise RangeError("target_hz", target_hz, "cycles per second of a moving target, above 0")
     path = None if out is None else free_place(out, overwrite, (".yaml", ".yml"))
     told = progress or (lambda what, part: None)
-    tallies: list[Tally] = []
+    tallies: list[EventTally] = []
     every = [*names, *([str(target_file)] if target_file is not None else [])]
     for k, name in enumerate(every):
         told(f"read {Path(name).name}", k / (len(every) + 1))
@@ -99,8 +99,8 @@ def calibrate_recordings(
 
 
 def figures(
-    tallies: Sequence[Tally],
-    moving: Tally | None,
+    tallies: Sequence[EventTally],
+    moving: EventTally | None,
     lux: Sequence[float] | None,
     contrast: float | None,
     cycles_hz: float | None,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from hesim_render.calibrate.estimate import not_identifiable
-from hesim_render.calibrate.recordings.tally import LONG_US, WINDOW_US, Tally
+from hesim_render.calibrate.recordings.tally import LONG_US, WINDOW_US, EventTally
 from hesim_render.core.units import US_PER_S
 
 #: Intervals within a factor of two of the dead time that are needed to see it.
@@ -23,7 +23,7 @@ _LEAST_WINDOWS, _SATURATED = 20, 0.1
 _SAME = 0.01
 
 
-def dead_time(tallies: Sequence[Tally]) -> dict[str, Any]:
+def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
     """Dead time in µs: where the density of the intervals of a pixel steps up.
 
     The likelihood of a step from one density to another, over the whole µs; its place has a flat prior, both densities
@@ -80,7 +80,7 @@ def _step(counts: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.fl
     return d, chance / chance.sum()
 
 
-def readout_limit(tallies: Sequence[Tally]) -> tuple[dict[str, Any], list[Tally]]:
+def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[EventTally]]:
     """Events a second that the read-out takes, and the recordings that it limits for more than a tenth of the time.
 
     A read-out at its limit passes equally many events in every window. Where the fullest windows are not equally full,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
-from hesim_render.calibrate.recordings.tally import GROUPS, SLICES, Tally
+from hesim_render.calibrate.recordings.tally import GROUPS, SLICES, EventTally
 
 #: Events of a pixel, as the median, with which a silent pixel is not silent by chance.
 _EVENTS_TO_BE_SILENT = 30
@@ -35,7 +35,7 @@ _RATIO = (0.5, 2.0)
 _LEAST_PAIRS = 200
 
 
-def group_rates(tally: Tally) -> NDArray[np.float64]:
+def group_rates(tally: EventTally) -> NDArray[np.float64]:
     """Events per pixel and second [polarity, k]: of all pixels, and without each group of pixels."""
     events = tally.slices.sum(axis=1).astype(np.float64)
     pixels = np.bincount(tally.group.astype(np.int64), minlength=GROUPS)
@@ -56,7 +56,7 @@ def rate(rates: NDArray[np.float64], polarity: int) -> dict[str, Any]:
     return estimated(rates[polarity, 0], float(jackknife(rates[polarity])), "Hz", GROUPS)
 
 
-def rate_spread(tally: Tally, polarity: int) -> dict[str, Any]:
+def rate_spread(tally: EventTally, polarity: int) -> dict[str, Any]:
     """Standard deviation of the rates over pixels, relative: the covariance of both halves of the time, in which the
     counting of events has no part. The error is that of a jackknife over groups of pixels.
     """
@@ -79,7 +79,7 @@ def rate_spread(tally: Tally, polarity: int) -> dict[str, Any]:
     return estimated(np.sqrt(whole), error / (2 * np.sqrt(whole)), "relative std", GROUPS)
 
 
-def regularity(tally: Tally) -> dict[str, Any]:
+def regularity(tally: EventTally) -> dict[str, Any]:
     """Local variation of a pixel's ON intervals [shinomoto2003]: 1 for a Poisson process, 0 for equal intervals."""
     pairs = int(tally.pairs.sum())
     if pairs < _LEAST_PAIRS:
@@ -90,7 +90,7 @@ def regularity(tally: Tally) -> dict[str, Any]:
     return estimated(whole, error, "", GROUPS)
 
 
-class Balance(NamedTuple):
+class LeakBalance(NamedTuple):
     """Figures of the balance of levels, as entries of the result.
 
     Parameters
@@ -106,7 +106,7 @@ class Balance(NamedTuple):
     growth: dict[str, Any]
 
 
-def balance(tallies: Sequence[Tally], lux: Sequence[float] | None) -> Balance:
+def balance(tallies: Sequence[EventTally], lux: Sequence[float] | None) -> LeakBalance:
     """Ratio of the thresholds and leak from the balance of the levels, without a moving target.
 
     All errors are those of a jackknife over groups of pixels, through all steps: pixels differ, and the same pixels are
@@ -136,12 +136,16 @@ def balance(tallies: Sequence[Tally], lux: Sequence[float] | None) -> Balance:
         )
     leaks = [_leak_alone(one, reason["reason"]) for one in rates]
     few = np.array([leak["value"] is not None for leak in leaks])
-    return Balance(reason, leaks, *_line(rates[:, 0] - rates[:, 1], (_RATIO[1] - 1) * rates[:, 1, 0], few, lux))
+    return LeakBalance(reason, leaks, *_line(rates[:, 0] - rates[:, 1], (_RATIO[1] - 1) * rates[:, 1, 0], few, lux))
 
 
 def balance_with_target(
-    tallies: Sequence[Tally], lux: Sequence[float] | None, moving: Tally, ratio: dict[str, Any], leak_hz: float
-) -> Balance:
+    tallies: Sequence[EventTally],
+    lux: Sequence[float] | None,
+    moving: EventTally,
+    ratio: dict[str, Any],
+    leak_hz: float,
+) -> LeakBalance:
     """The same with a moving target, which tells each pixel's own ratio of the thresholds.
 
     There the levels are balanced as well: a pixel's ON events, less its leak, over its OFF events are its θ₋/θ₊. The
@@ -173,10 +177,10 @@ def balance_with_target(
 
 def _with_ratio(
     leak: NDArray[np.float64], unknown: NDArray[np.float64], lux: Sequence[float] | None, ratio: dict[str, Any]
-) -> Balance:
+) -> LeakBalance:
     errors = np.hypot(jackknife(leak), unknown)
     leaks = [estimated(one[0], float(error), "Hz", GROUPS) for one, error in zip(leak, errors, strict=True)]
-    return Balance(ratio, leaks, *_line(leak, unknown, np.ones(len(leak), np.bool_), lux))
+    return LeakBalance(ratio, leaks, *_line(leak, unknown, np.ones(len(leak), np.bool_), lux))
 
 
 def _leak_alone(rates: NDArray[np.float64], why: str) -> dict[str, Any]:
@@ -240,7 +244,7 @@ def share(count: int, of: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def hot_share(tallies: Sequence[Tally]) -> dict[str, Any]:
+def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
     """Part of the pixels with many more ON events than the others, in each recording."""
     if len(tallies) < 2:
         return not_identifiable("it takes two recordings: in one, a pixel that sees a change looks like a hot one")
@@ -252,7 +256,7 @@ def hot_share(tallies: Sequence[Tally]) -> dict[str, Any]:
     return share(int(np.count_nonzero(hot)), hot.size)
 
 
-def silent_share(tallies: Sequence[Tally]) -> dict[str, Any]:
+def silent_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
     """Part of the pixels without an event in any recording."""
     total = np.sum([one.per_pixel().sum(axis=0) for one in tallies], axis=0)
     median = float(np.median(total))
@@ -264,7 +268,7 @@ def silent_share(tallies: Sequence[Tally]) -> dict[str, Any]:
     return share(int(np.count_nonzero(total == 0)), total.size)
 
 
-def not_still(tally: Tally) -> str | None:
+def not_still(tally: EventTally) -> str | None:
     """A line that says that a recording is not one of a still scene; None where its rate is steady enough.
 
     The last quarter of the slices against the first, and the largest against the mean.

@@ -25,7 +25,7 @@ _LEAST_US = 10 * SLICES
 
 
 @dataclass(eq=False)
-class Tally:
+class EventTally:
     """Sums over the events of a recording.
 
     Parameters
@@ -165,7 +165,7 @@ class Tally:
         return cast(NDArray[np.int64], self.counts.sum(axis=1))
 
 
-def tally(stream: EventStream) -> Tally:
+def tally(stream: EventStream) -> EventTally:
     """The tally of a recording, which is read twice, block by block.
 
     Raises
@@ -177,7 +177,7 @@ def tally(stream: EventStream) -> Tally:
     if end_us - begin_us < _LEAST_US:
         told = "has no events" if end_us == begin_us == 0 else f"lasts {end_us - begin_us} µs"
         raise SpecError(f"{told}; expected a recording of at least {_LEAST_US} µs", file=stream.source)
-    found = Tally(str(stream.source), stream.shape, begin_us, end_us)
+    found = EventTally(str(stream.source), stream.shape, begin_us, end_us)
     for block in stream:
         found.add(block)
     found.finish()

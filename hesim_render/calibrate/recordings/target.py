@@ -17,7 +17,7 @@ from scipy import special
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
 from hesim_render.calibrate.recordings.still import UNSURE_LEAK, jackknife
-from hesim_render.calibrate.recordings.tally import GROUPS, Tally
+from hesim_render.calibrate.recordings.tally import GROUPS, EventTally
 
 #: Simulated pixels, cycles before their counts begin, and most cycles that are simulated.
 _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
@@ -25,7 +25,7 @@ _PIXELS, _WARM, _MOST_CYCLES = 8192, 4, 60
 _LEAST_CYCLES, _LEAST_EVENTS = 3, 1.5
 
 
-class Thresholds(NamedTuple):
+class TargetThresholds(NamedTuple):
     """Figures of a moving target.
 
     Parameters
@@ -38,7 +38,7 @@ class Thresholds(NamedTuple):
     ratio: dict[str, Any]
 
 
-def thresholds(tally: Tally, contrast: float, cycles_hz: float | None, leak_hz: float = 0.0) -> Thresholds:
+def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak_hz: float = 0.0) -> TargetThresholds:
     """θ₊, θ₋ and their relative mismatch over pixels, each with its interval, a jackknife over groups of pixels.
 
     Parameters
@@ -86,13 +86,13 @@ def thresholds(tally: Tally, contrast: float, cycles_hz: float | None, leak_hz: 
         }  # fmt: skip
     ratio = every[1] / every[0]
     error = float(np.hypot(jackknife(ratio), unsure.sum() * ratio[0]))
-    return Thresholds(entries, estimated(ratio[0], error, "", GROUPS))
+    return TargetThresholds(entries, estimated(ratio[0], error, "", GROUPS))
 
 
-def unknown(reason: str) -> Thresholds:
+def unknown(reason: str) -> TargetThresholds:
     """Figures of a target that tells none, with the reason."""
     entry = not_identifiable(reason)
-    return Thresholds(dict.fromkeys(("theta_on", "theta_off", "threshold_mismatch"), entry), entry)
+    return TargetThresholds(dict.fromkeys(("theta_on", "theta_off", "threshold_mismatch"), entry), entry)
 
 
 def _moments(count: NDArray[np.float64]) -> NDArray[np.float64]:
