@@ -49,7 +49,7 @@ def recording(
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Noise, leak and thresholds of event pixels from ordinary recordings.
+    """Noise and thresholds of event pixels from recordings.
 
     Still scenes at two lights or more and, for the thresholds, a moving target of known contrast.
     """

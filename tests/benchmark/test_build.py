@@ -317,7 +317,8 @@ def test_a_worker_of_another_version_is_refused():
     assert "9.9.9" in attempt(order, plan.clips[0].as_dict())["error"]
 
 
-def test_a_scheduler_that_is_not_there_is_refused(tmp_path):
+def test_a_scheduler_that_is_not_there_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("hesim_render.benchmark.cluster._PATIENCE_S", 1.5)
     with pytest.raises(RangeError, match="--scheduler"):
         build_benchmark(small(), tmp_path / "b", scheduler="tcp://127.0.0.1:9", estimate=False)
 

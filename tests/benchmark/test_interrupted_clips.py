@@ -34,7 +34,10 @@ class KilledError(Exception):
 
 
 def build(plan, root, most=None):
-    """Build the only clip; killed at the block of rays number `most`. Returns the number of blocks traced."""
+    """Build the only clip; killed at the block of rays number `most`. Returns the number of blocks traced.
+
+    Pilots are not counted: those whose single rays are compared are not kept.
+    """
     blocks = []
 
     def counted(name):
@@ -50,7 +53,7 @@ def build(plan, root, most=None):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clips, "_KEPT_AFTER_S", 0.0)
-        for name in ("_trace_block", "_pilot_block"):
+        for name in ("_trace_block", "_edge_block"):
             patch.setattr(PairTracer, name, counted(name))
         if most is None:
             build_clip(plan, plan.clips[0], root)
@@ -75,7 +78,7 @@ def test_a_clip_whose_build_was_killed_has_the_bytes_of_a_whole_one(name, tmp_pa
     for most in kills:
         assert build(plan, root, most) == most
         assert not clip_folder(root, plan.clips[0]).exists() and journal.stat().st_size > 0
-    # no block is traced twice
+    # no block that is kept is traced twice
     assert build(plan, root) == blocks - sum(kills)
     assert bytes_of(root, plan) == bytes_of(tmp_path / "whole", plan)
     assert not journal.exists()

@@ -57,7 +57,8 @@ def test_clips_that_miss_their_quality_are_told_with_the_status_of_a_run(spec, t
     assert (status, json.loads(text)["status"], json.loads(text)["not_met"]) == (3, 3, [name])
 
 
-def test_mistakes_are_one_line(spec, tmp_path, capsys):
+def test_mistakes_are_one_line(spec, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("hesim_render.benchmark.cluster._PATIENCE_S", 1.5)
     out = tmp_path / "b"
     assert "no such file" in fails(capsys, "benchmark", "build", tmp_path / "none.yaml", "--out", out)
     assert "motions" in fails(capsys, "benchmark", "build", spec, "--out", out, "--set", "motion.speed=3")

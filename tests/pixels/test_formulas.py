@@ -51,7 +51,7 @@ def same(library, found, expected, atol=0.0):
 def test_value_of_the_physical_form(library, shot):
     """A Poisson count of mean m has mean and variance m: K m + 0 and K² m, and K² σ_r² beside it."""
     response, dark, gain, read, t = np.linspace(0.9, 1.1, 6), np.linspace(0, 500, 6), 0.25, 6.0, 0.02
-    pixels = aps.Pixels(library.take(response), library.take(dark), 64.0, None)
+    pixels = aps.PixelProperties(library.take(response), library.take(dark), 64.0, None)
     value = aps.physical_value(library.take(ELECTRONS), t, pixels, gain, read, shot)
     light = response * ELECTRONS
     same(library, value.mean_dn, gain * (light + dark * t))
@@ -64,7 +64,9 @@ def test_value_of_the_physical_form(library, shot):
 def test_value_of_the_polynomial_form(library):
     """Mean I + t N_DP and variance β0 + β1 I + β2 t + β3 I² + β4 I t + β5 t², with I up to full scale in the gain."""
     gain, t, full_scale = 0.25, 0.02, 1023.0
-    pixels = aps.Pixels(1.1, library.take(np.full(6, 200.0)), 64.0, tuple(library.take(np.full(6, b)) for b in BETA))
+    pixels = aps.PixelProperties(
+        1.1, library.take(np.full(6, 200.0)), 64.0, tuple(library.take(np.full(6, b)) for b in BETA)
+    )
     value = aps.calibrated_value(library.take(ELECTRONS), t, pixels, gain, full_scale, library.xp())
     signal = gain * 1.1 * ELECTRONS
     b0, b1, b2, b3, b4, b5 = BETA
@@ -73,7 +75,7 @@ def test_value_of_the_polynomial_form(library):
     same(library, value.variance_dn2, variance)
     np.testing.assert_allclose(aps.polynomial([BETA] * 5, signal[:5], t), variance[:5], rtol=1e-12)
     # without a gain the light has no noise; a remainder below 0 is none
-    nothing = aps.Pixels(1.0, 0.0, 0.0, tuple(library.take(np.full(6, b)) for b in (-1.0, 0, 0, 0, 0, 0)))
+    nothing = aps.PixelProperties(1.0, 0.0, 0.0, tuple(library.take(np.full(6, b)) for b in (-1.0, 0, 0, 0, 0, 0)))
     value = aps.calibrated_value(library.take(ELECTRONS), t, nothing, gain, full_scale, library.xp())
     same(library, value.mean_dn, gain * ELECTRONS)
     same(library, value.variance_dn2, 0 * ELECTRONS)
@@ -169,7 +171,7 @@ from hesim_render.pixels.evs import formulas as evs
 folder, out, beta, event_beta, electrons = sys.argv[1], sys.argv[2], *map(json.loads, sys.argv[3:])
 calibrate_aps(folder, out)
 calibrate_evs(folder, out)
-pixels = aps.Pixels(1.0, 0.0, 0.0, tuple(beta))
+pixels = aps.PixelProperties(1.0, 0.0, 0.0, tuple(beta))
 value = aps.calibrated_value(np.array(electrons), 0.02, pixels, 0.25, 1023.0, NUMPY)
 k = evs.Coefficients.of(tuple(event_beta), 1.0, "linear", NUMPY)
 found = [value.variance_dn2, *evs.log_level(k, np.array(electrons), "linear", NUMPY)]

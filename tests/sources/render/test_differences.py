@@ -55,19 +55,25 @@ def test_rays_follow_the_scatter_of_a_pixel_and_of_those_around():
 
 
 def test_what_a_pilot_does_not_show_has_rays_too():
-    """4 % of all light, 0.04·2500 = 100 e⁻/s, beside a scatter of 240; and never less than 64 rays."""
-    rays, scatter = rays_of(pilot_of(1, open_flux=2500, lit_scatter=240.0))
+    """Half of all light over the root of 144 rays, 2400/24 = 100 e⁻/s, beside a scatter of 240; and never less than 64
+    rays. A pixel without neighbours has but 32 rays of its own.
+    """
+    rays, scatter = rays_of(pilot_of(1, open_flux=2400, lit_scatter=240.0))
     assert scatter[CENTRE] == pytest.approx(260, rel=1e-5)
     assert rays[CENTRE] == pytest.approx((0.95 * 260 / WANTED) ** 2, rel=1e-4)
     assert rays_of(pilot_of(1))[0][CENTRE] == 64
+    alone = Sites.alone(np.arange(121, dtype=np.uint32))
+    units, lit = np.full(121, UNIT, np.float32), np.ones(121, bool)
+    _, scatter = difference_of(pilot_of(1, open_flux=2400, lit_scatter=240.0), 0, lit, alone, units, QUALITY, TUNING)
+    assert scatter[CENTRE] == pytest.approx(np.hypot(240, 1200 / 32**0.5), rel=1e-5)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_change_beside_a_pixel_may_reach_into_it(sign):
     """A 32nd of a pixel may have changed as the neighbour did: (0.95/ε)²·contrast²/32; two away, by its light alone."""
-    moved = sign * 2000.0
+    moved = sign * 1500.0
     rays, _ = rays_of(pilot_of(1, lit=one_site(moved, sign * 150.0)))
-    assert rays[CENTRE + 1] == pytest.approx((0.95 * 1850 / WANTED) ** 2 / 32, rel=1e-4)
+    assert rays[CENTRE + 1] == pytest.approx((0.95 * 1350 / WANTED) ** 2 / 32, rel=1e-4)
     assert rays[CENTRE + 12] == rays[CENTRE + 1] > rays[CENTRE + 2]
     far, _ = rays_of(pilot_of(1, lit=one_site(sign * 16_000.0)))
     assert far[CENTRE + 2] == pytest.approx(0.25 * 16_000 / UNIT) and far[CENTRE + 3] == 64
@@ -91,17 +97,17 @@ def test_a_difference_takes_a_quarter_of_the_rays_or_is_not_made():
 
 
 def test_windows_within_a_block_share_their_rays_and_pay_for_those_in_its_first():
-    """Scatters of 130 and 200 want 64 and 128 rays; both windows take 128, and 128 more in the first window."""
+    """Scatters of 93 and 143 want 64 and 128 rays; both windows take 128, and 128 more in the first window."""
     scatter = np.zeros((4, 1))
-    scatter[1:3, 0] = 130, 200
+    scatter[1:3, 0] = 93, 143
     pilot = pilot_of(4, lit_scatter=scatter, hidden_scatter=5e4)
     found = chosen(pilot, 1024)
     assert found.rays[:, CENTRE].tolist() == [64, 128, 128, 64] and found.lit.all()
-    np.testing.assert_allclose(found.error[1:3, CENTRE], 0.95 * np.array([130, 200]) / np.sqrt(128), rtol=1e-5)
+    np.testing.assert_allclose(found.error[1:3, CENTRE], 0.95 * np.array([93, 143]) / np.sqrt(128), rtol=1e-5)
     # one window alone would take 128 rays and 128 in the first, which is as much as 256 of its own
     once = np.ones((4, 121), bool)
     once[1] = False
-    assert chosen(pilot_of(4, lit_scatter=200.0, hidden_scatter=5e4), 512, once).rays[:, CENTRE].tolist() == [
+    assert chosen(pilot_of(4, lit_scatter=143.0, hidden_scatter=5e4), 512, once).rays[:, CENTRE].tolist() == [
         128,
         0,
         128,

@@ -44,7 +44,7 @@ def test_flux_against_the_reference(part, tmp_path):
     assert_right([check_exposure(random_scene(seed, tmp_path, 12, 8), 12) for seed in FAST[part::2]])
 
 
-@pytest.mark.parametrize("part", [0, 1])
+@pytest.mark.parametrize("part", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_quick_runs_are_as_right_as_they_say(part, tmp_path):
     assert not judge([judged_run(small_scene(seed, tmp_path)) for seed in QUICK[part::2]])
 

@@ -104,17 +104,15 @@ class Anchor:
         renderer.counts.rays += renderer.tracer.rays_done - before
         renderer.counts.pairs += int(np.count_nonzero(todo))
 
-    def rays_of(self, what: Plan, todo: NDArray[np.bool_]) -> tuple[int, int]:
-        """Number of rays that the differences `todo` of a plan take, and of those that their pixels take in the anchor.
-
-        Rays in the anchor to compare with are counted as if each were used once.
-        """
+    def rays_of(self, what: Plan, todo: NDArray[np.bool_]) -> tuple[int, int, int]:
+        """Rays of the differences `todo` of a plan, of those in the anchor to compare with, and of the flux there."""
         rays = np.where(todo, what.differences.rays, 0).astype(np.int64)
         is_at_end = np.zeros(todo.shape[0], np.bool_)
         is_at_end[[0, -1]] = True
         own = int(rays.sum() + rays[~is_at_end].max(axis=0, initial=0).sum())
         compared = (rays[is_at_end] > 0).any(axis=0)
-        return own, int(self._own_plan().rays[0][compared].sum(dtype=np.int64)) + int(rays[is_at_end].sum())
+        flux = int(self._own_plan().rays[0][compared].sum(dtype=np.int64))
+        return own, int(rays[is_at_end].sum()), flux
 
     def _own_plan(self) -> Plan:
         """How the pixels are rendered in the anchor."""

@@ -79,9 +79,10 @@ def difference_of(
     # Few rays change, and a pixel's own pilot may have met none of them: half of the scatter is that of pixels around.
     square = (np.where(lit, change.lit_scatter[window], change.hidden_scatter[window]) * _SMALLER) ** 2
     scatter = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
-    # What these rays can not have seen: a small part of them that changed by all the light there is.
+    # What these rays can not have seen: a small part of the light that changed, the larger the fewer rays looked.
+    looked = tuning.lone_pilot_rays if sites.shape is None else 9 * tuning.pilot_rays
     open_flux = pilot.unshadowed[window][here]
-    scatter = np.hypot(scatter, np.float32(tuning.unseen_change) * open_flux)
+    scatter = np.hypot(scatter, np.float32(tuning.unseen_change / looked**0.5) * open_flux)
     wanted_error = np.float32(tuning.difference_part * quality) * units[here]
     rays = (np.float32(tuning.difference_factor) * scatter / wanted_error) ** 2
     # An edge that has moved in a neighbour may reach into this pixel between the pilot rays.

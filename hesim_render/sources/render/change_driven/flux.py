@@ -198,9 +198,9 @@ class ChangeDrivenFlux:
         role: Role,
         until: int | None = None,
         is_anchor: bool = False,
-    ) -> tuple[float, float]:
-        """Rays per listed pixel for a block of windows without its first one, or for a single window; and for its
-        anchor.
+    ) -> NDArray[np.float64]:
+        """Rays per listed pixel for a block of windows without its first one, or for a single window; in its anchor, to
+        compare with; those of the flux there; and those of pilots in the block.
 
         Parameters
         ----------
@@ -211,38 +211,36 @@ class ChangeDrivenFlux:
         is_anchor : True for an anchor, which is compared with nothing.
         """
         if self._is_dark or pixel.size == 0:
-            return 0.0, 0.0
-        renderer, windows, rays, anchor_rays = self._renderer, Windows(begin_us, end_us), 0, 0
+            return np.zeros(4)
+        renderer, windows, rays = self._renderer, Windows(begin_us, end_us), np.zeros(4)
         counts, done = replace(renderer.counts), self._tracer.rays_done
         later = max(1, windows.size - 1)
         for band in renderer.bands(pixel, role):
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
+            # of the sites, some are neighbours beyond the patch
+            share, before = band.place.size / band.sites.size, renderer.counts.pilot_rays
             is_compared = role == "events" and not is_anchor
             anchor = Anchor(renderer, band, anchor_us(begin_us, end_us)) if is_compared else None
+            rays[1] += share * (renderer.counts.pilot_rays - before)
             before = renderer.counts.pilot_rays
-            pilot, _ = renderer.pilot(
-                *(band, windows, numbers, windows.span_us),
-                *(() if anchor is None else (anchor.pilot, renderer.look_stride)),
-            )
-            # of the sites, some are neighbours beyond the patch
-            share = band.place.size / band.sites.size
-            rays += int(share * later / windows.size * (renderer.counts.pilot_rays - before))
+            against = () if anchor is None else (anchor.pilot, renderer.look_stride)
+            pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, *against)
+            rays[3] += share * (renderer.counts.pilot_rays - before)
             what = renderer.plan(pilot, band, is_knot=role == "events").until(
                 windows.size - 1 if until is None else until
             )
             todo = what.rendered.copy()
             todo[:-later] = False
             if anchor is not None:
-                own, at_anchor = anchor.rays_of(what, todo)
-                rays, anchor_rays = rays + own, anchor_rays + at_anchor
+                rays[:3] += anchor.rays_of(what, todo)
             todo &= what.differences.rays == 0
             window, place = np.nonzero(todo)
             aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
             before = self._tracer.rays_done
             each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims)
-            rays += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
+            rays[0] += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
         renderer.counts, self._tracer.rays_done = counts, done
-        return rays / pixel.size, anchor_rays / pixel.size
+        return rays / pixel.size
 
     def rays_per_second(self) -> float:
         """Measured speed of the tracer on this machine, over pixels from the whole region, rays/s."""

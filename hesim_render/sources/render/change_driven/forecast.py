@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 
 #: Number of patches, side of a patch, px, and number of blocks over the run, in which rays are counted.
-_PATCHES, _SIDE, _BLOCKS = 6, 12, 3
+_PATCHES, _SIDE, _BLOCKS = 12, 12, 3
 #: Memory of the program with its kernels, per event pixel and window of a block, and per event pixel and frame pixel
 #: of the stages, bytes.
 _BASE_BYTES, _WINDOW_BYTES, _EVENT_BYTES, _FRAME_BYTES = 0.6e9, 14, 110, 60
@@ -47,19 +47,22 @@ def forecast(source: ChangeDrivenFlux, demand: Demand) -> Estimate:
             source.foretell(patch, block.begin_us, block.end_us, "events", end)
             for block, end in zip(chosen, ends, strict=True)
         ]
-        each, anchors = np.mean(counts, axis=0)
+        each, compared, anchors, pilots = np.mean(counts, axis=0)
         # all pixels are rendered in the first anchor, and in later ones those that are compared with it
         begin_us, end_us = anchor_us(every[0].begin_us, every[0].end_us)
-        first, _ = source.foretell(patch, np.array([begin_us]), np.array([end_us]), "events", is_anchor=True)
+        first = source.foretell(patch, np.array([begin_us]), np.array([end_us]), "events", is_anchor=True)[[0, 3]].sum()
+        # the first window of the first block belongs to no block before it
+        begin = source.foretell(patch, every[-1].begin_us[:1], every[-1].end_us[:1], "events")[0]
         share = np.mean([np.ptp(block.end_us) / period_us(block.end_us) for block in chosen])
         more_anchors = max(0.0, float(np.ceil(demand.blocks.count * share)) - 1)
-        rays += float(first + anchors * more_anchors + each * demand.blocks.count) * event_pixel.size
+        rest = anchors * more_anchors + compared * (1 + more_anchors) + (each + pilots) * demand.blocks.count
+        rays += float(first + begin + rest) * event_pixel.size
     # frames; of a static scene each pixel once, those of events included
     pixel = demand.pixels if is_static else np.unique(demand.frame_pixel if exposures else demand.frame_pixel[:0])
     if pixel.size:
         patch = _patches(pixel, source, rng)
         begin, end = (0.0, 1000.0) if not exposures else (float(exposures[0].start_us), float(exposures[0].t_us))
-        each_frame, _ = source.foretell(patch, np.array([begin]), np.array([end]), "any")
+        each_frame = source.foretell(patch, np.array([begin]), np.array([end]), "any").sum()
         rays += each_frame * pixel.size * (1 if is_static else len(exposures))
     held = _WINDOW_BYTES * windows * event_pixel.size
     return Estimate(

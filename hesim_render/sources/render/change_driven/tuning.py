@@ -101,8 +101,9 @@ class Tuning:
     difference_factor : factor, F. From the star alone, windows 4 to 60 ms apart: the standard error of a difference of
         n rays is this times their scatter over √n, because few rays change, and strata gain little. Without (0.5):
         differences are off by twice what they should.
-    unseen_change : part of all light, F. From the star alone: scatter of differences that the pilot of a neighbourhood
-        does not show. Without (0): pixels at the rim of a penumbra are off.
+    unseen_change : rays, F. From the star alone: scatter of differences that the pilot does not show, as a part of all
+        light, times the root of the number of its rays in a neighbourhood. Without (0): pixels at the rim of a penumbra
+        are off, above all those without neighbours.
     audit_pilot_rays : rays, C. Pilot rays of the audit. Without (as few as `pilot_rays`): the plan of the reference is
         as poor as that of the values it judges.
     least_audit_rays : rays, C. Least number of rays of a reference value. Without: as above.
@@ -149,9 +150,9 @@ class Tuning:
     flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0
-    difference_part: float = 0.7
+    difference_part: float = 0.5
     difference_factor: float = 0.95
-    unseen_change: float = 0.04
+    unseen_change: float = 0.5
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
     audit_ray_weight: float = 0.4
