@@ -36,6 +36,7 @@ def test_opencv_finds_every_corner_where_it_is(board):
     assert np.sqrt(np.mean(off**2)) < 0.08 and np.abs(off.mean(axis=0)).max() < 0.03
 
 
+@pytest.mark.slow  # its corners are checked by the test before
 def test_opencv_calibrates_the_camera_from_checkerboards():
     focal, middle, count = calibrated(CHECKERBOARD, 12, 0, 384, 288, 64, 6, NO_DISTORTION)
     assert count == 12

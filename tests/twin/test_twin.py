@@ -106,6 +106,7 @@ def test_a_series_too_short_for_two_halves_is_refused(tmp_path):
     assert not (tmp_path / "out").exists() and [p.name for p in tmp_path.iterdir()] == ["short"]
 
 
+@pytest.mark.slow
 def test_the_limit_is_exceeded_as_often_as_it_says():
     """One of a thousand right checks fails, whatever its number of values: of 20,000, 20 ± 4.5."""
     rng = np.random.default_rng(2)

@@ -39,14 +39,18 @@ def test_scenes_are_functions_of_their_seed(tmp_path):
     assert first == again != other
 
 
-@pytest.mark.parametrize("part", [0, 1])  # two test processes share them
+#: Every fourth scene, and with `-m slow` the others as well.
+PARTS = [0, *(pytest.param(part, marks=pytest.mark.slow) for part in (1, 2, 3))]
+
+
+@pytest.mark.parametrize("part", PARTS)
 def test_flux_against_the_reference(part, tmp_path):
-    assert_right([check_exposure(random_scene(seed, tmp_path, 12, 8), 12) for seed in FAST[part::2]])
+    assert_right([check_exposure(random_scene(seed, tmp_path, 12, 8), 12) for seed in FAST[part::4]])
 
 
-@pytest.mark.parametrize("part", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("part", PARTS)
 def test_quick_runs_are_as_right_as_they_say(part, tmp_path):
-    assert not judge([judged_run(small_scene(seed, tmp_path)) for seed in QUICK[part::2]])
+    assert not judge([judged_run(small_scene(seed, tmp_path)) for seed in QUICK[part::4]])
 
 
 @pytest.mark.slow

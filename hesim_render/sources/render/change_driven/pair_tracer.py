@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import fields
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
-from hesim_render.core.device_types import Float, Ray, UInt32, UInt64
-from hesim_render.core.method_cache import method_cache
-from hesim_render.core.rng import Stream, stream_key
+from hesim_render.core.device_types import Float, UInt64
+from hesim_render.core.rng import Stream
 from hesim_render.core.tables import spread_out, table
-from hesim_render.sensor import lens as optics
-from hesim_render.sensor.sensor import Sensor
-from hesim_render.sources.render.change_driven.aim import Aim, LaneAims, PairAims, in_blocks
-from hesim_render.sources.render.change_driven.edges import EdgeFit, LaneEdges, PairEdges, joined_rays
+from hesim_render.sources.render.change_driven.aim import PairAims, in_blocks
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges, joined_rays
+from hesim_render.sources.render.change_driven.packet_tracer import PACKET, PacketTracer
 from hesim_render.sources.render.change_driven.pair_flux import (
     PairFlux,
     PilotFlux,
@@ -27,113 +25,10 @@ from hesim_render.sources.render.change_driven.pair_flux import (
     told_of,
 )
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
-from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
-from hesim_render.sources.render.scene.mitsuba_version import mitsuba, path_depths
-from hesim_render.sources.render.tracer import BLOCK_RAYS, Tracer
-from hesim_render.sources.render.transport.matt import MattIntegrator
-from hesim_render.sources.render.transport.moving_scene import MovingScene
-from hesim_render.sources.render.transport.paths import PathIntegrator
-from hesim_render.sources.render.transport.swept_boxes import Moment
-from hesim_render.sources.scene import Scene
-from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.spectral.waveform import Waveform
-
-#: Least and largest number of rays of a pair; one kernel serves all numbers at once.
-LEAST_SAMPLES, MOST_SAMPLES = 8, 4096
-_PACKET = LEAST_SAMPLES
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Rays before they are traced, one per lane.
-
-    Parameters
-    ----------
-    ray : in world space.
-    now : its time.
-    filter : of its pixel.
-    place : of its start, px from the centre of its pixel.
-    weight : None for 1.
-    model : flux of the model of an edge, e⁻/s on the optical axis; None for 0.
-    """
-
-    ray: Ray
-    now: Moment
-    filter: UInt32
-    place: tuple[Float, Float]
-    weight: Float | None
-    model: Float | None
-
-
-@dataclass(frozen=True)
-class _Traced:
-    """Results of rays, one per lane.
-
-    Parameters
-    ----------
-    fluxes : the integrator's three fluxes, weighted, e⁻/s on the optical axis, and 1 where the ray met the box of a
-        moving object, else 0.
-    place : of its start, px from the centre of its pixel.
-    """
-
-    fluxes: tuple[Float, Float, Float, UInt32]
-    place: tuple[Float, Float]
-
-
-class PairTracer(Tracer):
-    """Traces paths from mosaic pixels into a `MovingScene`.
-
-    Random numbers are a pure function of (seed, stream, pixel on the full sensor, half, sample), the same in every
-    window, so a pixel whose paths no object crosses is exactly constant. Pixels are identified by their number on the
-    full sensor, so a crop has the values of the full sensor to the bit.
-
-    Parameters
-    ----------
-    scene, sensor, responses, progress, block_rays : see `Tracer`.
-    seed : seed of the run.
-    light : waveform of all lights of the scene, None if they are steady. The flux in a window is then the mean over
-        instants whose density is the waveform.
-
-    Raises
-    ------
-    SpecError
-        If the scene cannot be loaded, does not cover a response, or needs the exact mode.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        sensor: Sensor,
-        seed: int,
-        responses: dict[str, Spectrum],
-        progress: Callable[[int], None] | None = None,
-        block_rays: int = BLOCK_RAYS,
-        light: Waveform | None = None,
-    ) -> None:
-        import drjit as dr
-
-        super().__init__(scene, sensor, responses, progress, block_rays)
-        types, self._seed, self._light = jit(), seed, light
-        self.rays.require_one_path()
-        self.parts = MovingScene(self.built)
-        self._integrator: MattIntegrator | PathIntegrator
-        if self.built.paints is not None:
-            self._integrator = MattIntegrator(self.parts, self.built.paints, scene.spec.lights, self.sensor.responses)
-        else:
-            depth, roulette = path_depths(self.built.integrator)
-            self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
-        self._aim = Aim(self.parts, self.rays)
-        self._boxes = method_cache(self.parts.box_rows_in, maxsize=8)
-        layout = self.sensor.layout
-        tile = np.array(layout.filter_index[: layout.tile_shape[0], : layout.tile_shape[1]], np.uint32)
-        self._filter_tile = types.UInt32(tile.ravel())
-        self._tile_rows, self._tile_cols = (dr.opaque(types.UInt32, count) for count in layout.tile_shape)
-        dr.make_opaque(self._filter_tile)
-
-    @property
-    def is_matt(self) -> bool:
-        """True if all visible light is direct light on matt surfaces."""
-        return isinstance(self._integrator, MattIntegrator)
+class PairTracer(PacketTracer):
+    """Flux and pilots of pairs; see `PacketTracer`."""
 
     def trace(
         self,
@@ -171,15 +66,15 @@ class PairTracer(Tracer):
         Flux of the pairs, [n].
         """
         out = PairFlux.empty(pixel.size)
-        packets = (samples // _PACKET).astype(np.int64)
+        packets = (samples // PACKET).astype(np.int64)
         moments = self._moments(windows, span_us)
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
-        for part, aimed in in_blocks(packets, self._block_rays // _PACKET, aims, edges):
+        for part, aimed in in_blocks(packets, self._block_rays // PACKET, aims, edges):
             lanes = pixel[part], window[part].astype(np.uint32), times[part]
             inputs = "flux", *lanes, lit[part], packets[part], stream, *told_of(windows, span_us, aimed)
             trace = partial(self._trace_block, lanes, lit[part], packets[part], moments, key, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
-            self._report(int(packets[part].sum()) * _PACKET)
+            self._report(int(packets[part].sum()) * PACKET)
         if edges is not None:
             there = np.flatnonzero(edges.is_there)
             model = edges.part(there).mean
@@ -329,12 +224,12 @@ class PairTracer(Tracer):
 
         def decision_rays(some: NDArray[np.int64], repeat: int, about: PairEdges | None) -> list[Float]:
             """Place and flux of the rays of some pairs."""
-            packets = np.full(some.size, samples // _PACKET)
+            packets = np.full(some.size, samples // PACKET)
             chosen = [values[some] for values in lanes[:2]] + [np.full(some.size, repeat, np.uint32)]
             width = footprint if about is None else dr.opaque(jit().Float, 1.0)
-            found = self._packets_of(chosen, packets, packets * _PACKET, moments, key, width, about, is_weighted=False)
+            found = self._packets_of(chosen, packets, packets * PACKET, moments, key, width, about, is_weighted=False)
             types = jit()
-            packet = dr.arange(types.UInt32, len(found.fluxes[0])) // _PACKET
+            packet = dr.arange(types.UInt32, len(found.fluxes[0])) // PACKET
             takes_lit = spread_out(types.UInt32, np.repeat(lit[some].astype(np.uint32), packets), packet)
             values = [*found.place, dr.select(takes_lit != 0, found.fluxes[0], found.fluxes[1])]
             dr.eval(values)
@@ -351,27 +246,6 @@ class PairTracer(Tracer):
             fit.replace(lines, closer)
         out.replace(part, fit)
 
-    def _key(self, stream: Stream) -> UInt64:
-        import drjit as dr
-
-        mitsuba()  # the variant may have been changed by other code
-        return dr.opaque(jit().UInt64, stream_key(self._seed, stream))
-
-    def axis_factor(self, pixel: NDArray[np.uint32]) -> NDArray[np.float32]:
-        """Factor from the flux on the optical axis to that of each pixel."""
-        row, col = np.divmod(pixel.astype(np.int64), self.sensor.spec.geometry.cols)
-        return optics.relative_illumination_at(self.sensor.spec, self.sensor.lens, row, col) * np.float32(
-            self.radiance_scale
-        )
-
-    def _moments(self, windows: Windows, span_us: tuple[float, float] | None) -> Moments:
-        """Windows on the device, with the boxes that contain each object during each window, or during all of
-        `span_us`.
-        """
-        tracks = [group.trajectory for group in self.parts.groups] + ([self.camera] if self.camera else [])
-        # where nothing moves, any instant will do
-        return Moments.of(windows, span_us, tracks, self._boxes, self._light if tracks else None)
-
     def _trace_block(
         self,
         lanes: Sequence[NDArray[np.uint32]],
@@ -387,12 +261,12 @@ class PairTracer(Tracer):
         import drjit as dr
 
         types = jit()
-        rays = packets * _PACKET
+        rays = packets * PACKET
         footprint = dr.opaque(types.Float, 1.0)
         if_lit, if_hidden, _, met = self._packets_of(lanes, packets, rays // 2, moments, key, footprint, aims).fluxes
-        packet = dr.arange(types.UInt32, len(met)) // _PACKET
+        packet = dr.arange(types.UInt32, len(met)) // PACKET
         takes_lit = spread_out(types.UInt32, np.repeat(lit.astype(np.uint32), packets), packet)
-        out.put(part, dr.select(takes_lit != 0, if_lit, if_hidden), met, packets, _PACKET)
+        out.put(part, dr.select(takes_lit != 0, if_lit, if_hidden), met, packets, PACKET)
 
     def _pilot_block(
         self,
@@ -407,117 +281,10 @@ class PairTracer(Tracer):
         before: tuple[PilotRays, NDArray[np.integer]] | None,
     ) -> tuple[Float, Float]:
         """Statistics of some pairs, each with the same number of rays; their fluxes by both estimators."""
-        packets = np.full(lanes[0].size, samples // _PACKET)
+        packets = np.full(lanes[0].size, samples // PACKET)
         # all rays belong to the first half
-        found = self._packets_of(lanes, packets, packets * _PACKET, moments, key, footprint, aims).fluxes
+        found = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
         compared = None if before is None else before[0].at(before[1])
         out.put(part, *found, samples, samples if aims is None else samples // 2, compared)
         return found[0], found[1]
-
-    def _packets_of(
-        self,
-        lanes: Sequence[NDArray[np.uint32]],
-        packets: NDArray[np.int64],
-        half_rays: NDArray[np.int64],
-        moments: Moments,
-        key: UInt64,
-        footprint: Float,
-        aims: PairAims | PairEdges | None,
-        is_weighted: bool = True,
-    ) -> _Traced:
-        """Trace pairs in packets of `_PACKET` rays.
-
-        The final render and the pilot pass share the kernel of the integrator, which takes seconds to compile.
-
-        Parameters
-        ----------
-        lanes : pixel, window and repetition of each pair.
-        packets, half_rays : number of packets of each pair, and of rays in its first half.
-        moments, key, footprint, aims : see `trace` and `pilot`.
-        is_weighted : take the model from the fluxes of pairs with an edge, and apply the weights of rays.
-
-        Returns
-        -------
-        Of each ray.
-        """
-        import drjit as dr
-
-        types = jit()
-        used = int(packets.sum())
-        pair = np.repeat(np.arange(packets.size, dtype=np.uint32), packets)
-        starts = np.cumsum(packets) - packets
-        within = (np.arange(used) - np.repeat(starts, packets)).astype(np.uint32)
-
-        ray_index = dr.arange(types.UInt32, used * _PACKET)
-        packet = ray_index // _PACKET
-        sample = spread_out(types.UInt32, within, packet) * _PACKET + ray_index - packet * _PACKET
-        tables = *lanes, half_rays.astype(np.uint32)
-        pixel, window, repeat, per_half = (spread_out(types.UInt32, values[pair], packet) for values in tables)
-        half = dr.select(sample >= per_half, types.UInt32(1), types.UInt32(0))
-        within_half, aimed = sample - half * per_half, None
-        if aims is not None:
-            # rays of either kind have random numbers of their own, and are stratified among themselves
-            per_half //= 2
-            is_aimed = within_half >= per_half
-            kind: type[LaneAims | LaneEdges] = LaneAims if isinstance(aims, PairAims) else LaneEdges
-            aimed = kind.of(aims, pair, packet, is_aimed)  # type: ignore[arg-type]
-            within_half = dr.select(is_aimed, within_half - per_half, within_half)
-            half += dr.select(is_aimed, types.UInt32(2), 0)
-        self._sampler.setup(key, pixel, half, within_half, per_half, MOST_SAMPLES // 2, repeat)
-        rays = self._rays_of(pixel, window, moments, footprint, aimed)
-        # A kernel of its own makes the rays, so that one kernel traces them however they were aimed. Rays that pass
-        # through memory cost no time that could be measured.
-        self._sampler.evaluate()
-        now = rays.now
-        dr.eval(
-            rays.ray.o,
-            rays.ray.d,
-            now.instant_us,
-            now.window,
-            now.bin,
-            rays.filter,
-            rays.weight,
-            rays.model,
-            rays.place,
-        )
-        *fluxes, met = self._integrator.flux(self._sampler, rays.ray, now, rays.filter)
-        bits = dr.select(met, types.UInt32(1), dr.zeros(types.UInt32, used * _PACKET))
-        dr.eval(fluxes, bits)
-        self._sampler.rest()
-        if rays.weight is not None and is_weighted:
-            model = 0 if rays.model is None else rays.model
-            fluxes = [(flux - model) * rays.weight for flux in fluxes]
-            dr.eval(fluxes)
-        return _Traced((fluxes[0], fluxes[1], fluxes[2], bits), rays.place)
-
-    def _rays_of(
-        self, pixel: UInt32, window: UInt32, moments: Moments, footprint: Float, aims: LaneAims | LaneEdges | None
-    ) -> _Rays:
-        """One ray per lane."""
-        import drjit as dr
-
-        mi, types = self.built.mi, jit()
-        row, col = self._row_and_col(pixel)
-        sampler = self._sampler
-        aperture, moment = sampler.next_3d()
-        widened = (aperture - 0.5) * footprint + 0.5
-        blur = self.rays.blur_numbers(sampler)
-        centre = types.Float(col), types.Float(row)
-        (x, y), weight, slot, model = self.rays.offset(widened, blur, centre), None, types.UInt32(0), None
-        if isinstance(aims, LaneAims):
-            slot, moment = self._aim.choose(aims, moment)
-        now = moments.at(window, moment)
-        pose = None if self.camera is None else self.camera.pose_at(now.local_us(len(self.parts.groups)))
-        if isinstance(aims, LaneEdges):
-            x, y, weight, model = aims.place((x, y), aperture)
-        elif aims is not None:
-            x, y, weight = self._aim.place(aims, slot, now, pose, centre, (x, y), aperture)
-        origin, direction, weight = self.rays.through_lens(centre, (x, y), sampler, weight=weight)
-        if pose is not None:
-            origin, direction = pose.to_world(origin), pose.turn_to_world(direction)
-        tile_row = row - row // self._tile_rows * self._tile_rows
-        tile_col = col - col // self._tile_cols * self._tile_cols
-        which = dr.gather(types.UInt32, self._filter_tile, tile_row * self._tile_cols + tile_col)
-        primary = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*direction))
-        return _Rays(primary, now, which, (x, y), weight, model)
