@@ -10,6 +10,7 @@ from test_change_driven import fluxes, noisy
 import hesim_render as hr
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.differences import difference_of, differences
+from hesim_render.sources.render.change_driven.event_blocks import intervals_of
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pilot import Change, Closer, Pilot
@@ -139,6 +140,24 @@ def test_anchors_lie_at_multiples_of_64_ms_or_of_four_blocks():
     assert anchor_us(begin, begin + 1) == (127_999, 128_000)
     ticks = np.arange(17) * 2000.0 + 130_000  # a block of 32 ms
     assert period_us(ticks) == 128_000 and anchor_us(ticks - 700, ticks) == (127_300, 128_000)
+
+
+def test_small_asynchronous_sensors_have_longer_blocks():
+    """By the size of the sensor, not of what is read out, so that a crop has the values of the whole."""
+    assert [intervals_of(rows * cols) for rows, cols in ((260, 346), (480, 640), (720, 1280))] == [64, 32, 16]
+    sensor = hr.load_sensor("davis346").crop(20, 12)
+    blocks = list(ChangeDrivenFlux(shadow_scene(), sensor, seed=1).sample_blocks(1, 0, 33_000))
+    assert max(block.wanted.size for block in blocks) == 65
+
+
+def test_sites_near_a_mark():
+    marked = np.zeros(121, bool)
+    marked[3 * 11 + 9] = True
+    row, col = np.indices((11, 11))
+    expected = (abs(row - 3) <= 2) & (abs(col - 9) <= 2)
+    np.testing.assert_array_equal(sites_of().near(marked, 2), expected.ravel())
+    alone = Sites.alone(np.arange(121, dtype=np.uint32))
+    np.testing.assert_array_equal(alone.near(marked, 2), marked)
 
 
 def shadow_scene():

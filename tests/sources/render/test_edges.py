@@ -49,6 +49,15 @@ def test_rays_that_differ_by_rounding_have_no_scatter():
     assert np.all(found.scatter < 1e-6 * 37_000) and not found.is_edge.any()
 
 
+def test_one_ray_on_a_side_is_a_line_to_look_closer_at_and_no_edge():
+    rng = np.random.default_rng(6)
+    x, y = rng.random((2, 30, 64)) - 0.5
+    rank = np.argsort(np.argsort(0.8 * x + 0.6 * y, axis=1), axis=1)
+    for high, is_edge in ((63, False), (62, True)):
+        found = fitted(x, y, np.where(rank >= high, 900.0, 350.0))
+        assert found.is_line.all() and np.all(found.is_edge == is_edge)
+
+
 def test_the_line_is_the_one_with_the_largest_distance_from_all_rays():
     """In all directions. A search in steps misses the widest gap now and then: at most 1 of 100 lines is not found, and
     3 of 100 have a gap that is smaller than the one about the true line.
@@ -174,15 +183,15 @@ def test_a_line_depends_on_its_pair_alone(edges):
 def test_a_run_takes_lines_where_there_are_some():
     """In the default mode: at most 0.7 times the rays, pilots included, and the same flux within the wanted error."""
     sensor, found, rays = hr.load_sensor("davis346").crop(30, 22), {}, {}
-    pixel = np.arange(30 * 22, dtype=np.uint32)
+    pixel, alone = np.arange(30 * 22, dtype=np.uint32), replace(TUNING, difference_gain=1e9)  # which save on their own
     for least in (256, 1 << 14):
-        source = ChangeDrivenFlux(plates(), sensor, seed=3, tuning=replace(TUNING, edge_least_rays=least))
+        source = ChangeDrivenFlux(plates(), sensor, seed=3, tuning=replace(alone, edge_least_rays=least))
         blocks = source.sample_blocks(1, 0, 4000)
         samples = list(source.flux_of_blocks(pixel, blocks))
         found[least] = np.array([0.5 * (np.array(s.half_a, np.float64) + np.array(s.half_b)) for s in samples])
         rays[least] = source.rays_traced
     unit = source.noise_unit(pixel, found[256], True)
-    assert rays[256] < 0.75 * rays[1 << 14]
+    assert rays[256] < 0.7 * rays[1 << 14]
     assert np.sqrt(np.mean(((found[256] - found[1 << 14]) / unit) ** 2)) < 0.5
 
 

@@ -98,6 +98,7 @@ class PairTracer(PacketTracer):
         span_us: tuple[float, float] | None = None,
         aims: PairAims | None = None,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
+        kept: NDArray[np.float32] | None = None,
     ) -> PilotFlux:
         """Statistics of a few rays of every listed pair, with random numbers of their own.
 
@@ -111,6 +112,8 @@ class PairTracer(PacketTracer):
         aims : small objects at which half of the rays of each pair are aimed; each pair has one or more.
         before : rays of other windows, and [n] the place among them of the same rays as those of each pair: the
             statistics then include the differences.
+        kept : [2, n · samples], where the fluxes of single rays are put, by both estimators, e⁻/s on the optical axis.
+            They are large, so the journal keeps nothing of such a pass.
 
         Returns
         -------
@@ -129,8 +132,10 @@ class PairTracer(PacketTracer):
             compared = None if before is None else (before[0], before[1][part])
             others = () if compared is None else (compared[0].spans_us, compared[1])
             inputs = "pilot", *lanes, samples, footprint_px, stream, *told_of(windows, span_us, aimed), *others
-            trace = partial(self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared)
-            remembered(self._journal, self._run_part + inputs, out, part, trace)
+            trace = partial(
+                self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared, kept
+            )
+            remembered(self._journal if kept is None else None, self._run_part + inputs, out, part, trace)
             self._report((part.stop - first) * samples)
         scale = self.axis_factor(pixel)
         for each in fields(out):
@@ -145,33 +150,14 @@ class PairTracer(PacketTracer):
         windows: Windows,
         samples: int,
         footprint_px: float,
-        stream: Stream = Stream.RENDER_PILOT,
         span_us: tuple[float, float] | None = None,
         before: tuple[PilotRays, NDArray[np.integer]] | None = None,
     ) -> tuple[PilotFlux, PilotRays]:
         """As `pilot`, and the fluxes of the single rays, to compare the same rays in other windows with."""
-        import drjit as dr
-
-        count, out = pixel.size, PilotFlux.empty(pixel.size)
-        moments, key = self._moments(windows, span_us), self._key(stream)
-        footprint, room = dr.opaque(jit().Float, footprint_px), max(1, self._block_rays // samples)
-        kept = np.empty((2, count * samples), np.float32)
-        used = np.unique(window)
-        spans_us = tuple(windows.begin_us[used].tolist() + windows.end_us[used].tolist())
-        for first in range(0, count, room):
-            part = slice(first, min(count, first + room))
-            lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
-            compared = None if before is None else (before[0], before[1][part])
-            rays = self._pilot_block(lanes, moments, key, samples, footprint, None, out, part, compared)
-            for values, ray in zip(kept, rays, strict=True):
-                values[part.start * samples : part.stop * samples] = np.array(ray)
-            self._report((part.stop - first) * samples)
-        scale = self.axis_factor(pixel)
-        for each in fields(out):
-            if each.name != "met":
-                getattr(out, each.name)[:] *= scale
+        kept, used = np.empty((2, pixel.size * samples), np.float32), np.unique(window)
+        out = self.pilot(pixel, window, windows, samples, footprint_px, span_us=span_us, before=before, kept=kept)
         lit, hidden = (table(jit().Float, values) for values in kept)
-        return out, PilotRays(lit, hidden, samples, spans_us)
+        return out, PilotRays(lit, hidden, samples, (*windows.begin_us[used].tolist(), *windows.end_us[used].tolist()))
 
     def edges(
         self,
@@ -279,12 +265,15 @@ class PairTracer(PacketTracer):
         out: PilotFlux,
         part: slice,
         before: tuple[PilotRays, NDArray[np.integer]] | None,
-    ) -> tuple[Float, Float]:
-        """Statistics of some pairs, each with the same number of rays; their fluxes by both estimators."""
+        kept: NDArray[np.float32] | None,
+    ) -> None:
+        """Statistics of some pairs, each with the same number of rays, and their single rays where they are kept."""
         packets = np.full(lanes[0].size, samples // PACKET)
         # all rays belong to the first half
         found = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
         compared = None if before is None else before[0].at(before[1])
         out.put(part, *found, samples, samples if aims is None else samples // 2, compared)
-        return found[0], found[1]
+        if kept is not None:
+            for values, flux in zip(kept, found[:2], strict=True):
+                values[part.start * samples : part.stop * samples] = np.array(flux)

@@ -143,6 +143,7 @@ def take_pilot(
     span_us : interval around all windows for which `near` is computed, µs; None: not computed.
     closer : for each window, the sites that get extra rays; see `Zoom`.
     anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
+    stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
 
     Returns
     -------
