@@ -1,6 +1,7 @@
 """Pairs as differences to other windows: how many rays they take, that they have no bias, and what the pilot skips."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +9,15 @@ from rendering import make_scene
 from test_change_driven import fluxes, noisy
 
 import hesim_render as hr
+from hesim_render.core.backend import jit
+from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.differences import difference_of, differences
 from hesim_render.sources.render.change_driven.event_blocks import intervals_of
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Sites
-from hesim_render.sources.render.change_driven.pilot import Change, Closer, Pilot
+from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
+from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Closer, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
 
@@ -219,3 +223,85 @@ def test_a_look_at_every_fourth_instant_finds_what_all_looks_find():
     (every, most), (some, fewer) = found
     assert np.ptp(every, axis=0).max() > 0.2 * every.max() and fewer < 0.7 * most
     assert np.mean(every != some) < 4e-3
+
+
+class MadeUp:
+    """A tracer whose pilot has the flux `light` [window, site], and as scatter the place it is compared with."""
+
+    camera = parts = rays = None
+
+    def __init__(self, light, near):
+        self.light, self.near, self.traced = light, near, []
+        self.rays, self.parts = SimpleNamespace(spreads=False), SimpleNamespace(groups=[])
+
+    def pilot(self, index, window, windows, rays, width_px, span_us=None, before=None):
+        self.traced += zip(window.tolist(), index.tolist(), strict=True)
+        found = PilotFlux.empty(index.size)
+        found.lit[:], found.hidden[:] = self.light[window, index], 0.5 * self.light[window, index]
+        found.lit_change[:], found.met[:] = 3000 + before[1], self.near[index]
+        return found
+
+    def pilot_rays(self, index, window, windows, rays, width_px, span_us=None, before=None):
+        zeros = jit().Float(np.zeros(rays * index.size, np.float32))
+        return self.pilot(index, window, windows, rays, width_px, before=before), PilotRays(
+            zeros, zeros, rays, (5.0, 6.0)
+        )
+
+
+def test_what_a_pilot_compares_and_between_which_looks_it_traces():
+    """Nine windows and looks at every fourth, 11×11 sites: one changes from window 6 on, one is far from all motion."""
+    sites, far = sites_of(), 10 * 11 + 10
+    light, near = np.full((9, 121), 250.0, np.float32), np.ones(121, bool)
+    light[6:, CENTRE], near[far] = 700.0, False
+    tracer, anchor = MadeUp(light, near), PilotFlux.empty(121)
+    anchor.lit[:], anchor.hidden[:] = 240.0, 90.0
+    zeros = jit().Float(np.zeros(16 * 121, np.float32))
+    anchored = Anchored(anchor, PilotRays(zeros, zeros, 16, (1.0, 2.0)))
+    numbers = np.repeat(np.arange(9)[:, None], 121, axis=1)
+    windows = Windows(np.arange(9.0), np.arange(9.0) + 1)
+    pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, 1.25, None, anchored=anchored, stride=4)
+    np.testing.assert_array_equal(pilot.lit, light)
+    row, col = np.indices((11, 11))
+    busy = np.flatnonzero(((abs(row - 5) <= 2) & (abs(col - 5) <= 2)).ravel())
+    looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]
+    assert sorted(tracer.traced) == sorted([*looks, *((window, site) for window in (5, 6, 7) for site in busy)])
+    # the ends are compared with the anchor, those between with the first window
+    scatter, site = pilot.change.lit_scatter, np.arange(121)
+    near_by = site != far
+    np.testing.assert_array_equal(scatter[0], 3000 + site)
+    np.testing.assert_array_equal(scatter[8, near_by], (3000 + site + 121)[near_by])
+    assert scatter[8, far] == scatter[0, far] and np.all(scatter[1:4] == 0) and np.all(scatter[1:8, far] == 0)
+    np.testing.assert_array_equal(scatter[4:8, near_by], np.tile((3000 + site)[near_by], (4, 1)))
+    np.testing.assert_array_equal(pilot.change.lit[[0, 8]], light[[0, 8]] - 240)
+    np.testing.assert_array_equal(pilot.change.hidden[8], 0.5 * light[8] - 90)
+    np.testing.assert_array_equal(pilot.change.lit[1:8], light[1:8] - 250)
+
+
+def test_windows_that_save_less_than_their_rays_in_the_first_one_are_rendered_by_themselves():
+    """One window wants 512 rays in place of 2048, five want 64 in place of 256: 512 in all save 1536 − 5·256 = 256."""
+    scatter, alone = np.zeros((8, 1)), np.full((8, 121), 256, np.int16)
+    scatter[3, 0], alone[3] = 285, 2048
+    units, every = np.full((8, 121), UNIT, np.float32), np.ones((8, 121), bool)
+    pilot = pilot_of(8, lit_scatter=scatter, hidden_scatter=5e4)
+    for rendered, expected in ((range(8), 0), ((0, 3, 4, 5, 7), 512)):
+        some = np.zeros_like(every)
+        some[list(rendered)] = True
+        found = differences(pilot, sites_of(), units, QUALITY, some, alone, TUNING).rays[:, CENTRE]
+        assert found[3] == expected and found[0] == 64
+
+
+def test_a_negative_mean_is_raised_to_zero_and_keeps_its_halves_apart():
+    flux = PairFlux(*(np.array(half, np.float32) for half in ([-3.0, 5, -7], [1.0, 2, 19])), np.zeros(3, bool))
+    not_negative(flux)
+    assert flux.half_a.tolist() == [-2, 5, -7] and flux.half_b.tolist() == [2, 2, 19]
+
+
+def test_the_expected_error_of_a_difference_holds_that_of_what_it_is_compared_with():
+    """With so many rays that the difference has none to speak of, a pixel of the wall has that of its anchor."""
+    many = replace(TUNING, difference_gain=0.0, difference_part=0.02)
+    source = ChangeDrivenFlux(shadow_scene(), noisy(20, 14), 0.5, 3, tuning=many)
+    pixels = source.sensor.layout.evs_pixel.ravel()
+    sample = list(source.flux_of_blocks(pixels, tick_blocks(source.sensor.spec.evs, 0, 5000)))[-1]
+    flux = 0.5 * (np.array(sample.half_a) + np.array(sample.half_b))
+    in_units = sample.error / source.noise_unit(pixels, flux[None], True)[0]
+    assert np.quantile(in_units, 0.3) > 0.2  # 0.34; that of the differences alone is 0.04
