@@ -8,10 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hesim_render.benchmark.colour_truth import COLOURS_FILE, frame_filters, write_colours
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import BenchmarkPlan, Clip
-from hesim_render.benchmark.sharp import SHARP_FILE, sharp_flux, windows, write_sharp
+from hesim_render.benchmark.sharp import (
+    COLOURS_FILE,
+    SHARP_FILE,
+    frame_filters,
+    sharp_flux,
+    windows,
+    write_colours,
+    write_sharp,
+)
 from hesim_render.benchmark.spans import (
     Span,
     discard_spans,

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import IO, Any
 
 from hesim_render.benchmark.plan import Clip
-from hesim_render.benchmark.spans import Span
-from hesim_render.benchmark.units import Unit, Waiting
+from hesim_render.benchmark.spans import Span, Unit, Waiting
 from hesim_render.core.child import child_environment, python_command, with_package
 from hesim_render.core.errors import BackendError, OutputError
 

@@ -141,7 +141,7 @@ class BenchmarkPlan:
             If a sensor, a scene or a combination is not valid, or a given scene stands in two splits.
         """
         from hesim_render.capture.noise_terms import noise_models
-        from hesim_render.recording.truth_kinds import truth_kinds
+        from hesim_render.recording.truth_file import truth_kinds
 
         truth_kinds(self.spec.truth)
         seen: set[tuple[int, int]] = set()

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.sources.render.audit.audit import MOST_OFF, TOLERANCE
 
 #: Number of values sampled per picture, and bins per decade of the histogram after its first bin.
 _VALUES, _BINS, _FIRST, _DECADES = 1 << 15, 50, 1e-5, 10
@@ -89,3 +91,34 @@ class ErrorMeter:
     def share_from(self, limit: float) -> float:
         """Share of the values with an error of `limit` or more; the limit is rounded up to the begin of a bin."""
         return float(self._counts[limit * (1 - 1e-9) <= _LOWER].sum() / self.values)
+
+
+def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float) -> dict[str, Any]:
+    """The entry ``audit`` of a run in the exact mode, as plain values.
+
+    Parameters
+    ----------
+    errors : error meters of frames and events.
+    samples : rays per pixel and slice.
+    wanted : largest error that is good enough, over the sensor's noise.
+
+    Returns
+    -------
+    The verdict, shares that are off, and where it is not met ``samples_needed``: the next power of two that suffices,
+    as the error of independent rays falls with the root of their number.
+    """
+    limit = TOLERANCE * wanted
+    found: dict[str, Any] = {
+        "compares_with": "the two halves of each value's own rays; nothing was rendered again",
+        "tolerance_noise": limit,
+        "off_wanted_at_most": MOST_OFF,
+    }
+    needed = float(samples)
+    for name, meter in errors.items():
+        if meter.values:
+            found[f"{name}_off"] = meter.share_from(limit)
+            needed = max(needed, samples * (meter.quantile(1 - MOST_OFF) / limit) ** 2)
+    failed = any(found.get(f"{name}_off", 0.0) > MOST_OFF for name in errors)
+    found["verdict"] = "not met" if failed else "met"
+    found["samples_needed"] = 1 << int(np.ceil(np.log2(max(needed, samples + 1)))) if failed else None
+    return found

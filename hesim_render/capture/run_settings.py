@@ -8,7 +8,7 @@ from typing import TypedDict
 
 from hesim_render.core.errors import ConflictError, RangeError
 from hesim_render.core.units import US_PER_S
-from hesim_render.recording.truth_kinds import truth_kinds
+from hesim_render.recording.truth_file import truth_kinds
 
 
 class RunOptions(TypedDict, total=False):

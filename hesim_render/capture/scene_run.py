@@ -6,14 +6,14 @@ import warnings
 from collections.abc import Callable
 from functools import cached_property
 
+from hesim_render.capture.error_meter import stated_verdict
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import Noise
 from hesim_render.capture.overheads import with_overheads
 from hesim_render.capture.run_settings import RunSettings
-from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core.errors import SpecError, TooLongError
 from hesim_render.core.progress import Progress
-from hesim_render.recording.truth_kinds import EVENTS
+from hesim_render.recording.truth_file import EVENTS
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.demand import Demand, Estimate

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hesim_render.cli.terminal import say
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import HesimError, RangeError
 from hesim_render.core.output import check_target
 from hesim_render.core.region import parse_roi
 
@@ -116,3 +116,29 @@ def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:
 def cropped(sensor: Sensor, roi: str | None) -> Sensor:
     """The sensor with the region of ``--roi``."""
     return sensor if roi is None else sensor.crop(*parse_roi(roi))
+
+
+def in_options(error: HesimError, program: Any, given: Sequence[str]) -> str:
+    """The message of an error, with the option of the command in place of the argument of a function.
+
+    Parameters
+    ----------
+    error : what was raised.
+    program : all commands.
+    given : the command line.
+
+    Returns
+    -------
+    ``--filter is 'rde'; …`` for ``filter_name is 'rde'; …``. An argument without an option of its name, or with one as
+    its begin or end, as ``duration_s``, keeps its name.
+    """
+    name, text = getattr(error, "name", None), str(error)
+    if not isinstance(name, str) or not text.startswith(f"{name} is "):
+        return text
+    command = program
+    for word in given:
+        command = getattr(command, "commands", {}).get(word, command)
+    options = {param.name.rstrip("_"): max(param.opts, key=len) for param in command.params if param.opts}
+    fitting = [option for own, option in options.items() if own == name]
+    fitting += [option for own, option in options.items() if name.startswith(f"{own}_") or name.endswith(f"_{own}")]
+    return next((f"{option}{text[len(name) :]}" for option in fitting if option.startswith("--")), text)

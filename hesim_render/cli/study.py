@@ -57,7 +57,7 @@ def study(
     Ends with status 3 where the audits find runs of a sweep that are worse than it asks for.
     """
     from hesim_render.specs.files import parse_override
-    from hesim_render.specs.kinds import StudyKind, study_kind
+    from hesim_render.specs.run import StudyKind, study_kind
     from hesim_render.specs.study import surfaces_of
 
     kind = study_kind(spec)
@@ -85,8 +85,8 @@ def _compare(console: Console, spec: str, out: Path, keys: dict[str, Any], overw
     from hesim_render.specs.study import read_study
 
     chosen = read_study(spec, keys)
-    from hesim_render.studies.headings import NOTE, level_text
     from hesim_render.studies.run import MARKER
+    from hesim_render.studies.table import NOTE, level_text
 
     check_target(out, MARKER, overwrite)
     import hesim_render as hr

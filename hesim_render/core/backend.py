@@ -28,10 +28,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hesim_render.core.child import child_environment, python_command
+from hesim_render.core.child import child_environment, interrupts_held, python_command
 from hesim_render.core.errors import BackendError
 from hesim_render.core.extras import how_to_install
-from hesim_render.core.interrupts import interrupts_held
 
 OLDEST_LLVM = 17
 BACKEND_VARIABLE = "HESIM_RENDER_BACKEND"  # "llvm" or "cuda" forces one

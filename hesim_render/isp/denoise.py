@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from hesim_render.isp import collaborate, kriging
-from hesim_render.isp.blocks import block_of, bordered, join, split
 from hesim_render.isp.collaborate import SampleBlocks
 from hesim_render.isp.frame_noise import FrameNoise
-from hesim_render.isp.stabilise import Stabiliser
+from hesim_render.isp.stabilise import Stabiliser, block_of, bordered, join, split
 
 #: The block means correct only longer wavelengths than this: standard deviation of a Gaussian, blocks.
 _LONG_BLOCKS = 2.0

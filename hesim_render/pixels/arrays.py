@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import DeviceArray, Float, UInt32
+from hesim_render.core.errors import RangeError
 
 
 def to_device(value: float | NDArray) -> Float:
@@ -62,3 +64,17 @@ def _on_device(value: Any) -> Any:
             return kind(entries)
         return tuple(_on_device(entry) for entry in value)
     return value
+
+
+def switched_off(already: frozenset[str], terms: Iterable[str], known: tuple[str, ...]) -> frozenset[str]:
+    """`already` and `terms` together.
+
+    Raises
+    ------
+    RangeError
+        If a name is not among `known`; the message lists them.
+    """
+    for term in terms:
+        if term not in known:
+            raise RangeError("noise term", term, f"one of {', '.join(known)}")
+    return already | frozenset(terms)

@@ -15,13 +15,13 @@ from pydantic import BaseModel, ValidationError
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, read_text, reading
 from hesim_render.mosaic import description as mosaic
+from hesim_render.recording.dng import noise_profile
 from hesim_render.recording.manifest_spec import RecordingSpec
-from hesim_render.recording.noise_profile import noise_profile
 from hesim_render.specs.files import content_hash, validate
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
+from hesim_render.specs.reflectance import TextureSpec, leaves_of
 from hesim_render.specs.sensor import SensorSpec
-from hesim_render.specs.surface import TextureSpec, leaves_of
 
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor

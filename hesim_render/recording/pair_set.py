@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import MOST_PIXELS, leads_out, printable, read_text, reading
 from hesim_render.core.units import S_PER_US
-from hesim_render.recording.raw_file import RAW_SUFFIXES, read_raw
+from hesim_render.recording.camera_raw import RAW_SUFFIXES, read_raw
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import load_yaml, validate
 

@@ -21,8 +21,7 @@ from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
 from hesim_render.recording.camera_files import write_kalibr_camchain, write_opencv_camera, write_yaml
-from hesim_render.recording.truth_file import POSE_STEP_US, images_at
-from hesim_render.recording.truth_kinds import IMAGES
+from hesim_render.recording.truth_file import IMAGES, POSE_STEP_US, images_at
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from hesim_render.sources.scene import Scene
+from hesim_render.specs.light import WaveformSpec
 from hesim_render.specs.target import lamps_of
-from hesim_render.specs.waveform import WaveformSpec
 from hesim_render.spectral.waveform import Waveform
 
 

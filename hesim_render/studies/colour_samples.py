@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.specs.study import SurfacesSpec
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colorimetry import responses_to, tristimulus
+from hesim_render.spectral.patches import read_patches
 from hesim_render.spectral.spectrum import REQUIRED_COVERAGE, Spectrum, constant, coverage
 
 
@@ -186,3 +189,25 @@ def held(reflectance: Spectrum, low_nm: float = 360.0, high_nm: float = 830.0) -
     if grid[-1] < high_nm:
         grid, values = np.append(grid, high_nm), np.append(values, values[-1])
     return Spectrum(grid, values)
+
+
+def reflectances_of(item: SurfacesSpec) -> dict[str, Spectrum]:
+    """Reflectances by name, of a shipped set or of a CSV file of patches.
+
+    Raises
+    ------
+    SpecError
+        If there is no such set or file, or the file is not valid.
+    """
+    assert item.reflectances is not None
+    if item.reflectances in REFLECTANCE_SETS:
+        return reflectance_set(item.reflectances)
+    if Path(item.reflectances).suffix == "":
+        return reflectance_set(item.reflectances)  # raises, with what there is
+    file = Path(item.beside(item.reflectances))
+    if not file.is_file():
+        raise SpecError("no such file", file=file)
+    patches = read_patches(file)
+    if not patches:
+        raise SpecError("has no patches", file=file)
+    return {name: held(each) for name, each in patches.items()}

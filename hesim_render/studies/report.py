@@ -14,11 +14,10 @@ from hesim_render.core.drawing import report_style
 from hesim_render.core.html import filled, inline_picture, number
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
+from hesim_render.studies.candidate import Seen
 from hesim_render.studies.cfa import StudyResult
-from hesim_render.studies.headings import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, level_text
 from hesim_render.studies.plots import PARETO, chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
-from hesim_render.studies.seen import Seen
-from hesim_render.studies.table import Cell, Table
+from hesim_render.studies.table import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, Cell, Table, level_text
 
 #: Columns that say which row it is; all but the first are left out if they say the same in every row.
 _NAMES = {"filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, ms"}

@@ -22,8 +22,7 @@ from hesim_render.benchmark.build import UnfinishedError
 from hesim_render.benchmark.clip import build_clip, clip_folder, render_span
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import BenchmarkPlan
-from hesim_render.benchmark.spans import journals_in, spans_folder, spans_of
-from hesim_render.benchmark.units import Unit, Waiting
+from hesim_render.benchmark.spans import Unit, Waiting, journals_in, spans_folder, spans_of
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.benchmark.worker import attempt
 from hesim_render.core.errors import OutputError, RangeError

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hesim_render.capture.error_meter import ErrorMeter
-from hesim_render.capture.stated_verdict import stated_verdict
+from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
 from hesim_render.core.backend import jit
 
 

@@ -194,7 +194,7 @@ def test_the_content_of_a_recording_does_not_know_its_pictures():
         if name in MODULES and name not in reached:
             reached.add(name)
             waiting += modules_imported(name)
-    assert "hesim_render.recording.stored_frames" in reached
+    assert "hesim_render.recording.frame" in reached
     drawn = {"preview", "showcase", "page", "plots", "movie", "exports", "save"}
     assert not reached & {f"hesim_render.recording.{name}" for name in drawn}
 

@@ -8,7 +8,7 @@ import recordings
 from PIL import Image
 
 from hesim_render.mosaic import description as mosaic
-from hesim_render.recording import event_view, preview, showcase
+from hesim_render.recording import colour_view, preview, showcase
 from hesim_render.recording.colour_view import colour_picture, thumbnail
 from hesim_render.recording.recording import Recording
 from hesim_render.spectral import colorimetry
@@ -128,8 +128,8 @@ def test_events_land_where_they_are_and_none_is_lost(size):
     events = recordings.events_of(sensor, 1000, count=2)
     events["x"], events["y"], events["polarity"] = [3, 60], [5, 40], [1, -1]
     background = np.zeros((*size, 3), np.uint8)
-    picture = event_view.events_picture(background, events, sensor.layout.evs_shape).astype(int)
-    blank = event_view.events_picture(background, events[:0], sensor.layout.evs_shape).astype(int)
+    picture = colour_view.events_picture(background, events, sensor.layout.evs_shape).astype(int)
+    blank = colour_view.events_picture(background, events[:0], sensor.layout.evs_shape).astype(int)
     changed = np.abs(picture - blank).sum(axis=2) > 0
     rows, cols = np.nonzero(changed)
     for k, warm in ((0, True), (1, False)):

@@ -20,8 +20,7 @@ from hesim_render.studies import (
     reflectance_set,
     vora_value,
 )
-from hesim_render.studies.colour_error import expanded
-from hesim_render.studies.colour_matrix import to_srgb
+from hesim_render.studies.colour_error import expanded, to_srgb
 from hesim_render.studies.subspace import GRID_NM, rank
 
 NIKON, SIGMA = "Nikon 5100 (NPL)", "Sigma SDMerill (NPL)"

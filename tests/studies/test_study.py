@@ -16,7 +16,7 @@ from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W
 from hesim_render.sources.crosstalk import mixed
 from hesim_render.specs.files import list_names
 from hesim_render.specs.filter_set import read_filter_set, read_palette
-from hesim_render.specs.kinds import StudyKind, study_kind
+from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.specs.study import read_study
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.studies import Table, channel_noise, with_filter_set

@@ -23,7 +23,7 @@ from hesim_render.pixels.aps.fixed_pattern import FixedPattern
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, PixelProperties, PixelValue
 from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
 from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
-from hesim_render.pixels.terms import switched_off
+from hesim_render.pixels.arrays import switched_off
 from hesim_render.specs.frame_pixels import ApsSpec, InterferenceSpec
 
 APS_TERMS = (

@@ -21,8 +21,7 @@ from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.measured import event_defect_rates
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
-from hesim_render.specs.defects import EventDefectSpec
-from hesim_render.specs.event_pixels import EvsSpec
+from hesim_render.specs.event_pixels import EventDefectSpec, EvsSpec
 
 #: Events of a defect per comparison above which more change nothing: the chance of no event is e⁻³⁰.
 _MOST_PER_TICK = 30.0

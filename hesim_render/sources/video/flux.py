@@ -16,11 +16,11 @@ from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.demand import Demand
 from hesim_render.sources.renderer import Renderer, Untraced
+from hesim_render.sources.still import WindowByWindow
 from hesim_render.sources.video.arrays import ArrayVideo
 from hesim_render.sources.video.clock import Clock
 from hesim_render.sources.video.colours import to_linear_srgb
-from hesim_render.sources.video.estimate import VideoEstimate, estimate_of_counts
-from hesim_render.sources.video.event_notes import event_notes
+from hesim_render.sources.video.estimate import VideoEstimate, estimate_of_counts, event_notes
 from hesim_render.sources.video.file import FileVideo
 from hesim_render.sources.video.folder import FolderVideo
 from hesim_render.sources.video.geometry import Resampler, mapping
@@ -29,7 +29,6 @@ from hesim_render.sources.video.linear import Lineariser
 from hesim_render.sources.video.motion import MotionVideo
 from hesim_render.sources.video.options import WHITE_LUX, VideoOptions
 from hesim_render.sources.video.picture import Reader
-from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral import spectrum as spectra
 
 Source = str | Path | NDArray

@@ -33,9 +33,9 @@ from hesim_render.sources.render.scene.surfaces import area_emitter, is_matt, pa
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
+from hesim_render.specs.reflectance import leaves_of
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.surface import leaves_of
 from hesim_render.specs.target import lamps_of
 from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
 from hesim_render.targets.build import placed_pieces

@@ -13,7 +13,7 @@ from hesim_render.core.guard import require_memory
 from hesim_render.core.npz import read_arrays
 from hesim_render.sources.render.scene.mitsuba_version import as_spec_error
 from hesim_render.sources.render.scene.sizes import require_fits
-from hesim_render.specs.deformation import DeformationSpec
+from hesim_render.specs.motion import DeformationSpec
 
 
 @dataclass(frozen=True, eq=False)

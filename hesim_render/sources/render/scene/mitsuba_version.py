@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core import backend
+from hesim_render.core.child import interrupts_held
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
-from hesim_render.core.interrupts import interrupts_held
 from hesim_render.sources.render.scene.files import SceneFiles
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals, ordered_normals
 from hesim_render.spectral.spectrum import Spectrum
