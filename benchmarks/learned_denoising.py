@@ -19,10 +19,10 @@ import argparse
 import time
 
 import numpy as np
+from learned_filter import LearnedFilter, area_under_curve, uniform_noise
 
 import hesim_render as hr
 from hesim_render.benchmark.event_filters import FILTERS
-from hesim_render.benchmark.learned_filter import LearnedFilter, area_under_curve, uniform_noise
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core import backend

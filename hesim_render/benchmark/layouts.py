@@ -58,10 +58,6 @@ class _Clip:
     def shape(self) -> tuple[int, int]:
         return self.development.layout.shape
 
-    def sharp_times(self) -> NDArray[np.float64]:
-        sharp = self.clip.sharp
-        return np.empty(0) if sharp is None else sharp.time_us
-
     def sequence(self) -> list[tuple[float, Callable[[], NDArray]]]:
         """Times and RAW of the frames of an interpolation set: the sharp images, or else the frames themselves."""
         sharp = self.clip.sharp

@@ -27,7 +27,6 @@ FILTER, MOST_EVENTS = 0x8ECF, 65535
 #: Coordinates have 11 bits.
 LARGEST_SIDE = 1 << 11
 _ALL_PACKED, _COLUMNS_PACKED = 2, 1
-_HEAD_BYTES = 12  # number of events, and the first time
 _LONG_STEP, _LONG_RUN = 15, 15
 
 

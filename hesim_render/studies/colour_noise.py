@@ -40,19 +40,6 @@ class ChannelNoise:
     quadratic: NDArray[np.float64]
     count: NDArray[np.float64]
 
-    @classmethod
-    def of_photons(cls, channels: int, read_noise_e: float = 0.0, count: ArrayLike = 1.0) -> ChannelNoise:
-        """Shot noise and read noise alone.
-
-        Parameters
-        ----------
-        channels : number of channels.
-        read_noise_e : of one pixel, e⁻.
-        count : pixels of each channel.
-        """
-        ones = np.ones(channels)
-        return cls(read_noise_e**2 * ones, ones, 0 * ones, np.broadcast_to(np.asarray(count, float), channels).copy())
-
     def variance_e2(self, signal_e: ArrayLike) -> NDArray[np.float64]:
         """Variance of the mean of a channel's pixels, e⁻², at signals [..., channel]."""
         s = np.asarray(signal_e, dtype=np.float64)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
 from hesim_render.specs.study import SurfacesSpec
@@ -31,29 +31,6 @@ class ColourSamples:
     camera: NDArray[np.float64]
     xyz: NDArray[np.float64]
     white_xyz: NDArray[np.float64]
-
-    @classmethod
-    def of_tables(
-        cls, curves: ArrayLike, light: ArrayLike, reflectances: ArrayLike, observer: ArrayLike
-    ) -> ColourSamples:
-        """Samples from tables on one even grid, as sums of products.
-
-        Parameters
-        ----------
-        curves : [wavelength, channel], responses per watt.
-        light : [wavelength], relative spectral power.
-        reflectances : [wavelength, surface].
-        observer : [wavelength, 3], colour-matching functions.
-
-        Returns
-        -------
-        The samples.
-        """
-        power = np.asarray(light, dtype=np.float64)[:, None]
-        seen, observed = power * np.asarray(curves), power * np.asarray(observer)
-        surfaces = np.asarray(reflectances, dtype=np.float64).T
-        white, white_xyz = seen.sum(axis=0), observed.sum(axis=0)
-        return cls(surfaces @ seen / white, surfaces @ observed / white_xyz[1], white_xyz / white_xyz[1])
 
 
 def colour_samples(

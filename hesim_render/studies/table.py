@@ -102,23 +102,6 @@ class Table:
             self._require(name)
         return Table(row for row in self if all(row[name] == wanted for name, wanted in cells.items()))
 
-    def sorted_by(self, column: str, descending: bool = False) -> Table:
-        """The rows in the order of a column; rows without a value come last.
-
-        Parameters
-        ----------
-        column : name.
-        descending : largest first.
-
-        Returns
-        -------
-        A new table.
-        """
-        self._require(column)
-        wanted: list[tuple[Any, dict[str, Cell]]] = [(row[column], row) for row in self if row[column] is not None]
-        known = [row for _, row in sorted(wanted, key=lambda pair: pair[0], reverse=descending)]
-        return Table([*known, *(row for row in self if row[column] is None)])
-
     def to_csv(self) -> str:
         """The table as CSV text (RFC 4180); numbers keep all digits, None is empty."""
         text = io.StringIO()
