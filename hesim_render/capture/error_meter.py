@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +92,7 @@ class ErrorMeter:
         return float(self._counts[limit * (1 - 1e-9) <= _LOWER].sum() / self.values)
 
 
-def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float) -> dict[str, Any]:
+def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float) -> dict[str, object]:
     """The entry ``audit`` of a run in the exact mode, as plain values.
 
     Parameters
@@ -108,17 +107,15 @@ def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float
     as the error of independent rays falls with the root of their number.
     """
     limit = TOLERANCE * wanted
-    found: dict[str, Any] = {
+    measured = {name: meter for name, meter in errors.items() if meter.values}
+    off = {f"{name}_off": meter.share_from(limit) for name, meter in measured.items()}
+    failed = any(share > MOST_OFF for share in off.values())
+    needed = max(samples + 1.0, *(samples * (meter.quantile(1 - MOST_OFF) / limit) ** 2 for meter in measured.values()))
+    return {
         "compares_with": "the two halves of each value's own rays; nothing was rendered again",
         "tolerance_noise": limit,
         "off_wanted_at_most": MOST_OFF,
+        **off,
+        "verdict": "not met" if failed else "met",
+        "samples_needed": 1 << int(np.ceil(np.log2(needed))) if failed else None,
     }
-    needed = float(samples)
-    for name, meter in errors.items():
-        if meter.values:
-            found[f"{name}_off"] = meter.share_from(limit)
-            needed = max(needed, samples * (meter.quantile(1 - MOST_OFF) / limit) ** 2)
-    failed = any(found.get(f"{name}_off", 0.0) > MOST_OFF for name in errors)
-    found["verdict"] = "not met" if failed else "met"
-    found["samples_needed"] = 1 << int(np.ceil(np.log2(max(needed, samples + 1)))) if failed else None
-    return found

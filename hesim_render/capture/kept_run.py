@@ -4,101 +4,18 @@ again for what has passed.
 
 from __future__ import annotations
 
-import json
-import struct
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.capture.loop import Capture
-from hesim_render.core.backend import jit
 from hesim_render.core.journal import Journal, key_of
+from hesim_render.core.plain_bytes import from_bytes, to_bytes
 from hesim_render.core.progress import Progress
+from hesim_render.pixels.arrays import SavedState
 from hesim_render.recording.frame import Frame
 from hesim_render.recording.writer import RecordingWriter
-
-#: Length of the JSON text that comes first; the data of the arrays follow it in order.
-_LENGTH = struct.Struct("<Q")
-
-
-def to_bytes(value: Any) -> bytes:
-    """Bytes of a value: None, truth values, numbers, text, types of Dr.Jit arrays, NumPy arrays and scalars, and tuples
-    and dictionaries of these.
-
-    Parameters
-    ----------
-    value : the value; keys of dictionaries are text.
-
-    Raises
-    ------
-    TypeError
-        If there is something else in it.
-    """
-    arrays: list[NDArray] = []
-    text = json.dumps(_outline(value, arrays)).encode()
-    return b"".join([_LENGTH.pack(len(text)), text, *(array.tobytes() for array in arrays)])
-
-
-def from_bytes(data: bytes) -> Any:
-    """The value that `to_bytes` was given; its arrays may be written to.
-
-    Parameters
-    ----------
-    data : from `to_bytes`.
-    """
-    (length,) = _LENGTH.unpack_from(data)
-    begin = _LENGTH.size + length
-    value, _ = _filled(json.loads(data[_LENGTH.size : begin]), data, begin)
-    return value
-
-
-def _outline(value: Any, arrays: list[NDArray]) -> Any:
-    """The value with an object of one key in place of each part that JSON does not tell apart."""
-    if isinstance(value, np.ndarray | np.generic):  # first, as a float64 of NumPy is a float of Python as well
-        if value.dtype.hasobject:
-            raise TypeError("no plain value: an array of objects")
-        arrays.append(np.asarray(value))
-        kind = np.lib.format.dtype_to_descr(value.dtype)
-        return {"array": [kind, list(value.shape), isinstance(value, np.generic)]}
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, type):
-        return {"type": value.__name__}
-    if isinstance(value, tuple):
-        return {"tuple": [_outline(entry, arrays) for entry in value]}
-    if isinstance(value, dict):
-        return {"dict": [[key, _outline(entry, arrays)] for key, entry in value.items()]}
-    raise TypeError(f"no plain value: {type(value).__name__}")
-
-
-def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
-    """The value of an outline, and the end of its data."""
-    import drjit as dr
-
-    if not isinstance(outline, dict):
-        return outline, begin
-    ((kind, given),) = outline.items()
-    if kind == "type":
-        found = getattr(jit(), given, None)
-        if not dr.is_array_v(found):  # the bytes may name anything
-            raise TypeError(f"no type of Dr.Jit arrays: {given!r}")
-        return found, begin
-    if kind == "array":
-        descr, shape, is_scalar = given
-        dtype = np.dtype(descr if isinstance(descr, str) else [tuple(field) for field in descr])
-        count = int(np.prod(shape, dtype=np.int64))
-        array = np.frombuffer(data, dtype, count, begin).reshape(shape).copy()
-        return (array[()] if is_scalar else array), begin + array.nbytes
-    entries = []
-    for entry in given if kind == "tuple" else [entry for _, entry in given]:
-        found, begin = _filled(entry, data, begin)
-        entries.append(found)
-    if kind == "tuple":
-        return tuple(entries), begin
-    return dict(zip([key for key, _ in given], entries, strict=True)), begin
-
 
 #: Events that are held before they are kept.
 _MOST_EVENTS = 1 << 20
@@ -131,7 +48,7 @@ class KeptRun:
         writer, progress : as for `Capture.record`.
         """
         state = None
-        while (part := self._read("part", self._parts)) is not None:
+        while part := self._read("part", self._parts):
             frames, chunks = range(self._frames, part["frames"]), range(self._chunks, part["chunks"])
             whole = [("frame", k) for k in frames] + [("events", k) for k in chunks]
             if any(self._journal.read(key_of(*name)) is None for name in whole):  # before any of it is written
@@ -159,15 +76,16 @@ class KeptRun:
         ----------
         item : a frame, or a block of events.
         """
-        if isinstance(item, Frame):
-            assert not np.any(item.electrons_stderr > 0)
-            frame = {"times": item.times, "raw": item.raw, "electrons": item.electrons_mean}
-            self._write("frame", self._frames, frame)
-            self._frames += 1
-        elif item.size:
-            self._blocks.append(item)
-            if sum(block.size for block in self._blocks) >= _MOST_EVENTS:
-                self._keep_events()
+        match item:
+            case Frame():
+                assert not np.any(item.electrons_stderr > 0)
+                frame = {"times": item.times, "raw": item.raw, "electrons": item.electrons_mean}
+                self._write("frame", self._frames, frame)
+                self._frames += 1
+            case events if events.size:
+                self._blocks.append(events)
+                if sum(block.size for block in self._blocks) >= _MOST_EVENTS:
+                    self._keep_events()
         if time.monotonic() >= self._end_s:
             self._keep_events()
             part = {"frames": self._frames, "chunks": self._chunks, "progress": self._capture.progress}
@@ -182,7 +100,7 @@ class KeptRun:
             self._blocks = []
             self._chunks += 1
 
-    def _frame(self, found: dict[str, Any]) -> Frame:
+    def _frame(self, found: SavedState) -> Frame:
         valid = self._capture.frame_mask
         return Frame(
             raw=found["raw"],
@@ -192,9 +110,10 @@ class KeptRun:
             **found["times"],
         )
 
-    def _read(self, *name: object) -> Any:
+    def _read(self, *name: object) -> SavedState:
+        """What was kept under a name; empty where there is nothing."""
         data = self._journal.read(key_of(*name))
-        return None if data is None else from_bytes(data)
+        return {} if data is None else from_bytes(data)
 
-    def _write(self, kind: str, number: int, value: dict[str, Any]) -> None:
+    def _write(self, kind: str, number: int, value: SavedState) -> None:
         self._journal.keep(key_of(kind, number), [np.frombuffer(to_bytes(value), np.uint8)])

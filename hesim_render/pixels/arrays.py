@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import DeviceArray, Float, UInt32
 from hesim_render.core.errors import RangeError
+
+#: State of an object between two calls, by name: plain values, NumPy arrays, and tuples and states of these.
+SavedState: TypeAlias = dict[str, Any]
 
 
 def to_device(value: float | NDArray) -> Float:
@@ -32,12 +35,12 @@ def take(value: DeviceArray, index: UInt32) -> DeviceArray:
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
-def saved(part: Any) -> dict[str, Any]:
+def saved(part: Any) -> SavedState:
     """State of an object between two calls, as plain values and NumPy arrays: the attributes named in its `STATE`."""
     return {name: _off_device(getattr(part, name)) for name in part.STATE}
 
 
-def restore(part: Any, state: dict[str, Any]) -> None:
+def restore(part: Any, state: SavedState) -> None:
     """Put the result of `saved` back into an object made from the same parameters."""
     for name in part.STATE:
         own = getattr(part, name)

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from hesim_render.core.drawing import COLOURS, new_figure, report_style, svg
 from hesim_render.core.guard import printable
 from hesim_render.core.html import filled, inline_picture, table, tick_text
 from hesim_render.core.output import replacing
 from hesim_render.core.units import US_PER_S
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.events import event_rate
 from hesim_render.recording.outline import parameters, scene_name
 from hesim_render.recording.quality import render_lines
@@ -170,7 +170,6 @@ def _short(node: Any) -> Any:
 
 
 def _as_yaml(node: Any) -> str:
-    stream, yaml = io.StringIO(), YAML(typ="safe", pure=True)
-    yaml.default_flow_style, yaml.allow_unicode, yaml.width = None, True, 110
-    yaml.dump(node, stream)
+    stream = io.StringIO()
+    write_yaml(node, stream, is_sorted=True)
     return "" if not node else stream.getvalue()

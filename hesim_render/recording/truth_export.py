@@ -20,7 +20,7 @@ from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
-from hesim_render.recording.camera_files import write_kalibr_camchain, write_opencv_camera, write_yaml
+from hesim_render.recording.camera_files import write_kalibr, write_kalibr_camchain, write_opencv_camera
 from hesim_render.recording.truth_file import IMAGES, POSE_STEP_US, images_at
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.raster import Grid
@@ -234,7 +234,7 @@ def _kalibr(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int 
         "gyroscope_noise_density": model.gyro_noise_density,
         "gyroscope_random_walk": model.gyro_random_walk,
     }
-    write_yaml(folder / "imu.yaml", unit)
+    write_kalibr(folder / "imu.yaml", unit)
     return {"cameras": {f"cam{number}": grid for number, grid in enumerate(grids)}}
 
 

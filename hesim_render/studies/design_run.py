@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress, shown
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.specs.design import DesignSpec, read_design
 from hesim_render.specs.files import validate
 from hesim_render.specs.filter_set import FilterSetSpec, read_palette
@@ -189,11 +189,8 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
 
 
 def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    writer = YAML()  # keeps the order
-    writer.default_flow_style = None
-    writer.width = 120
     with output_errors(path), path.open("w", encoding="utf-8") as file:
-        writer.dump(dict(content), file)
+        write_yaml(dict(content), file, width=120)
 
 
 def designed_set(problem: Problem, result: DesignResult) -> FilterSetSpec:

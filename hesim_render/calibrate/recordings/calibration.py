@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from hesim_render.calibrate.recordings import still, target
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
@@ -15,6 +14,7 @@ from hesim_render.calibrate.recordings.tally import EventTally, tally
 from hesim_render.calibrate.result import plain
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import free_place, replacing
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.exchange import open_events
 
 #: Thresholds follow from the leak, and the leak from the thresholds.
@@ -91,10 +91,8 @@ def calibrate_recordings(
         tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz
     )
     if path is not None:
-        yaml = YAML()
-        yaml.width, yaml.default_flow_style = 120, None
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8") as file:
-            yaml.dump(plain(found), file)
+            write_yaml(plain(found), file, width=120)
     return found
 
 
