@@ -1,4 +1,4 @@
-"""What `core.large_arrays` gains over NumPy's `unique` at the sizes of a full sensor; the results are compared.
+"""What `core.distinct` gains over NumPy's `unique` at the sizes of a full sensor; the results are compared.
 
     python benchmarks/distinct.py [--rows 2448] [--cols 3264]
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hesim_render.core.large_arrays import distinct_columns, distinct_pixels
+from hesim_render.core.distinct import distinct_columns, distinct_pixels
 
 
 def fastest(call: Callable[[], Any]) -> tuple[float, Any]:

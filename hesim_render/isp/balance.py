@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
-from hesim_render.core.large_arrays import in_bands
 
 #: Samples outside this part of the range are not used: below it there is noise, above it saturation.
 _DARKEST, _BRIGHTEST = 0.01, 0.95

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import in_bands
+from hesim_render.core.bands import in_bands
 from hesim_render.isp.kriging import ISOTROPIC
 
 #: Number of similar patches, and radius of the search, blocks.

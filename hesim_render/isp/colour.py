@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
-from hesim_render.core.large_arrays import in_bands
 from hesim_render.spectral.spectrum import colour_science
 
 

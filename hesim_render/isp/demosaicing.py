@@ -15,8 +15,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
-from hesim_render.core.large_arrays import in_bands
 from hesim_render.isp import kriging
 from hesim_render.isp.guide import predict_guide
 from hesim_render.isp.stabilise import BAND_BLOCKS, block_of, bordered, join, split

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.calibration.file import as_written, read_calibration, read_maps
 from hesim_render.calibration.measured import MeasuredMaps, measured_maps
+from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.large_arrays import in_bands
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, dark_variance_dn2, light_gain_dn

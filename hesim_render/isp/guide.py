@@ -14,7 +14,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import in_bands
+from hesim_render.core.bands import in_bands
 from hesim_render.isp import kriging
 from hesim_render.isp.kriging import Prior
 

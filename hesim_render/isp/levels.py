@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
-from hesim_render.core.large_arrays import in_bands
 
 
 def black_level(

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import poisson
 
+from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
-from hesim_render.core.large_arrays import in_bands
 
 _ENTRIES = 1 << 13
 #: Nodes of the quadrature over the noise; more nodes do not change the fourth digit.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import distinct_pixels
+from hesim_render.core.distinct import distinct_pixels
 from hesim_render.mosaic.schedule import BlockSample, Exposure
 
 

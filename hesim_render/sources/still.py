@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, Halves
-from hesim_render.core.large_arrays import distinct_pixels
+from hesim_render.core.distinct import distinct_pixels
 from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.protocol import FluxSource, Sample
 

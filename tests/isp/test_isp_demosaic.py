@@ -23,7 +23,7 @@ from isp_images import (
     srgb,
 )
 
-from hesim_render.core import large_arrays
+from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
 from hesim_render.isp import Camera, Pipeline, demosaic, guide, kriging, process, remosaic
 
@@ -178,7 +178,7 @@ def test_mirrored_picture_gives_the_mirrored_result():
 def test_result_does_not_depend_on_the_number_of_threads(monkeypatch):
     raw = mosaic_of(captured(images()["natural"]), QUAD) / np.float32(255)
     several = demosaic(raw, QUAD)
-    monkeypatch.setattr(large_arrays, "_WORKERS", 1)
+    monkeypatch.setattr(bands, "_WORKERS", 1)
     np.testing.assert_array_equal(demosaic(raw, QUAD), several)
 
 

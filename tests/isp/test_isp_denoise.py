@@ -6,7 +6,7 @@ from isp_images import BAYER, EIGER, MIPI, QUAD, images, mosaic_of
 from scipy.stats import chi2
 
 import hesim_render as hr
-from hesim_render.core import large_arrays
+from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
 from hesim_render.isp import FrameNoise
 from hesim_render.isp.denoise import denoise
@@ -198,7 +198,7 @@ def test_result_does_not_depend_on_the_number_of_threads(monkeypatch):
     noise = noise_of(EIGER)
     raw = noisy(signal, noise)
     several = denoise(raw, EIGER, noise, 959.0, [2.0, 1.0, 1.5])
-    monkeypatch.setattr(large_arrays, "_WORKERS", 1)
+    monkeypatch.setattr(bands, "_WORKERS", 1)
     np.testing.assert_array_equal(denoise(raw, EIGER, noise, 959.0, [2.0, 1.0, 1.5]), several)
 
 

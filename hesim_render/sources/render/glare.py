@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Bands, Float, Halves, UInt32
-from hesim_render.core.large_arrays import distinct_columns
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sensor.lens import relative_illumination_at
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler

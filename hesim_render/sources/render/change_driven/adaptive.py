@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import distinct_columns
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.aim import PairAims
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
 from hesim_render.sources.render.change_driven.edges import PairEdges

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import distinct_columns
+from hesim_render.core.distinct import distinct_columns
 
 #: Largest distance of a neighbour from its listed pixel, pixels.
 REACH = 3

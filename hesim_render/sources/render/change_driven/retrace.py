@@ -8,7 +8,7 @@ from dataclasses import astuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import distinct_columns
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.aim import Aims, PairAims
 from hesim_render.sources.render.change_driven.edge_rays import about_edges

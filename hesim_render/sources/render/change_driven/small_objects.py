@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from hesim_render.core.large_arrays import distinct_columns
+from hesim_render.core.distinct import distinct_columns
 from hesim_render.core.method_cache import method_cache
 from hesim_render.sources.render.camera import View
 from hesim_render.sources.render.change_driven.tuning import Tuning

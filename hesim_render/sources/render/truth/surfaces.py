@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.core.large_arrays import in_bands
+from hesim_render.core.bands import in_bands
 from hesim_render.sources.render.projection import Projection
 from hesim_render.sources.render.tracer import BLOCK_RAYS
 from hesim_render.sources.render.truth.chief_rays import ChiefRays, Hits, Placed

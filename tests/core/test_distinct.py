@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hesim_render.core.large_arrays import distinct_columns, distinct_pixels
+from hesim_render.core.distinct import distinct_columns, distinct_pixels
 
 
 def test_distinct_pixels_are_those_of_numpy():

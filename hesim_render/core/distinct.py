@@ -1,10 +1,7 @@
-"""Large arrays of a full sensor: bands of rows on all cores, and distinct values."""
+"""Distinct values of the large arrays of a full sensor, for which NumPy's `unique` takes seconds."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import numpy as np
@@ -48,27 +45,3 @@ def distinct_columns(values: NDArray[_Number]) -> tuple[NDArray[_Number], NDArra
     first = np.flatnonzero(differs)
     found, place = np.unique(values[:, first], axis=1, return_inverse=True)
     return found, np.repeat(place.ravel(), np.diff(first, append=values.shape[1]))
-
-
-_WORKERS = min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-
-
-def in_bands(rows: int, work: Callable[[slice], object], band_rows: int = 64) -> None:
-    """Call `work` with slices that together cover `rows`, several at a time.
-
-    `work` writes into arrays of the caller; no two calls get the same row.
-
-    Parameters
-    ----------
-    rows : number of rows.
-    work : called with a slice of rows, on several threads.
-    band_rows : rows of a slice.
-    """
-    slices = [slice(first, min(first + band_rows, rows)) for first in range(0, rows, band_rows)]
-    if len(slices) == 1 or _WORKERS == 1:
-        for part in slices:
-            work(part)
-        return
-    with ThreadPoolExecutor(_WORKERS) as pool:
-        for _ in pool.map(work, slices):
-            pass
