@@ -34,16 +34,16 @@ def spread(clips: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     ----------
     clips : contents of ``clip.json``.
     """
-    found = {}
+    result = {}
     for name in FIGURES:
         given = [clip["figures"].get(name) for clip in clips]
         values = np.array([value for value in given if value is not None], dtype=np.float64)
         if values.size:
-            found[name] = {
+            result[name] = {
                 "min": float(values.min()), "median": float(np.median(values)), "max": float(values.max()),
                 "decades": _decades(values), "zero": int(np.count_nonzero(values <= 0)),
             }  # fmt: skip
-    return found
+    return result
 
 
 def histograms(clips: list[dict[str, Any]]) -> bytes:

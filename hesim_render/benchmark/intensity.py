@@ -68,7 +68,7 @@ def sharp_over_blurred(
     lead[where[firsts]] = when[firsts] - begin
     mean = (lead + np.bincount(where, held, size)) / exposure_us
 
-    found = []
+    result = []
     for t in times_us:
         if t >= begin:
             part = (time > begin) & (time <= t)
@@ -76,8 +76,8 @@ def sharp_over_blurred(
         else:
             part = (time > t) & (time <= begin)
             change = -np.bincount(place[part], step[part], size)
-        found.append(np.clip(np.exp(np.clip(change, -most, most)) / mean, 1 / _MOST, _MOST))
-    return np.array(found).reshape(len(found), rows, cols)
+        result.append(np.clip(np.exp(np.clip(change, -most, most)) / mean, 1 / _MOST, _MOST))
+    return np.array(result).reshape(len(result), rows, cols)
 
 
 #: Time in which the sum falls to 1/e, µs; a choice of ours, not fitted to any data.
@@ -131,7 +131,7 @@ def intensity_scores(log_picture: NDArray, log_truth: NDArray) -> dict[str, floa
     slope = float(np.mean((a - a.mean()) * (b - b.mean())) / spread**2) if spread > 0 else 0.0
     fitted = slope * (a - a.mean()) + b.mean()
     correlated = spread > 0 and b.std() > 0
-    found: dict[str, float] = {
+    result: dict[str, float] = {
         "log_rmse": float(np.sqrt(np.mean((fitted - b) ** 2))),
         "correlation": float(np.corrcoef(a, b)[0, 1]) if correlated else float("nan"),
     }
@@ -139,5 +139,5 @@ def intensity_scores(log_picture: NDArray, log_truth: NDArray) -> dict[str, floa
     if min(log_truth.shape) >= 11 and high > low:
         pictures = np.zeros((2, *log_truth.shape))
         pictures[:, valid] = (np.stack([fitted, b]) - low) / (high - low)
-        found["ssim"] = ssim(pictures[0], pictures[1])
-    return found
+        result["ssim"] = ssim(pictures[0], pictures[1])
+    return result

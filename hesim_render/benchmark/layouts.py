@@ -49,10 +49,10 @@ class _Clip:
     def events(self, begin_us: float, end_us: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """x, y (px of the picture), t (µs) and polarity (0, 1) of the events after `begin_us`, up to `end_us`."""
         first, last = int(np.floor(begin_us)) + 1, int(np.floor(end_us)) + 1
-        found = self.clip.recording.event_slice(first, max(first, last))
+        result = self.clip.recording.event_slice(first, max(first, last))
         layout = self.development.layout
-        place = layout.evs_pixel.reshape(layout.evs_shape)[found["y"], found["x"]].astype(np.int64)
-        return place % layout.cols, place // layout.cols, found["t_us"], (found["polarity"] > 0).astype(np.uint8)
+        place = layout.evs_pixel.reshape(layout.evs_shape)[result["y"], result["x"]].astype(np.int64)
+        return place % layout.cols, place // layout.cols, result["t_us"], (result["polarity"] > 0).astype(np.uint8)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,14 +68,14 @@ class _Clip:
 
     def pairs(self) -> list[tuple[Frame, int]]:
         """Frames with the number of the sharp image in the middle of their exposure."""
-        sharp, found = self.clip.sharp, []
+        sharp, result = self.clip.sharp, []
         for frame in self.clip.recording.frames if sharp is not None and len(sharp.time_us) else ():
             middle = frame.exposure_start_us + frame.exposure_us / 2
             assert sharp is not None
             number = sharp.nearest(middle)
             if abs(sharp.time_us[number] - middle) <= frame.exposure_us / 4:
-                found.append((frame, number))
-        return found
+                result.append((frame, number))
+        return result
 
 
 def _save(picture: NDArray[np.uint8], path: Path) -> None:

@@ -225,9 +225,9 @@ def shared_parts(parts: Mapping[str, tuple[str, set[str]]]) -> list[tuple[str, s
     Part and the two splits, for each part of that kind.
     """
     owner: dict[str, str] = {}
-    found = []
+    result = []
     for split, names in parts.values():
         for name in sorted(names):
             if owner.setdefault(name, split) != split:
-                found.append((name, owner[name], split))
-    return sorted(set(found))
+                result.append((name, owner[name], split))
+    return sorted(set(result))

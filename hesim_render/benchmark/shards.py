@@ -234,10 +234,10 @@ def _write_split(
     split: str, given: Iterator[_Sample], put: Put, folder: Path, format: str, most_bytes: float
 ) -> list[dict[str, Any]]:
     """Write the shards of a split; returns their entries of the index."""
-    found: list[dict[str, Any]] = []
+    result: list[dict[str, Any]] = []
     sample = next(given, None)
     while sample is not None:
-        name = f"{split}-{len(found):06d}.{FORMATS[format]}"
+        name = f"{split}-{len(result):06d}.{FORMATS[format]}"
         path, count = folder / name, 0
         shard = _TarShard(path) if format == "webdataset" else _Hdf5Shard(path)
         try:
@@ -248,11 +248,11 @@ def _write_split(
         finally:
             shard.close()
         put(name, path)
-        found.append({
+        result.append({
             "name": name, "split": split, "samples": count, "bytes": path.stat().st_size, "sha256": file_hash(path),
         })  # fmt: skip
         path.unlink()
-    return found
+    return result
 
 
 def verify_shards(target: str | Path, progress: Progress | None = None) -> list[str]:

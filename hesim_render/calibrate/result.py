@@ -110,9 +110,9 @@ def _digest(maps: Mapping[str, NDArray]) -> str:
 def _remove_unnamed(path: Path, section: str) -> None:
     """Remove map files of a section that no calibration in the folder names, those of killed runs among them."""
     ours = re.compile(rf"{re.escape(path.stem)}_{section}_maps(-[0-9a-f]{{12}})?\.npz")
-    found = [other for other in path.parent.iterdir() if ours.fullmatch(other.name)]
-    texts = [read_text(other) for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if found else []
-    for other in found:
+    result = [other for other in path.parent.iterdir() if ours.fullmatch(other.name)]
+    texts = [read_text(other) for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if result else []
+    for other in result:
         if not any(other.name in text for text in texts):
             other.unlink(missing_ok=True)
 

@@ -22,7 +22,7 @@ from hesim_render.sources.scene import Scene
 from hesim_render.specs.files import content_hash
 
 
-class RunOptions(TypedDict, total=False):
+class RerunOptions(TypedDict, total=False):
     """Options of `simulate` that do not change the result."""
 
     overwrite: bool
@@ -36,7 +36,7 @@ def simulate_again(
     recording: Recording | str | Path,
     out: str | Path | None = None,
     scene: Scene | None = None,
-    **options: Unpack[RunOptions],
+    **options: Unpack[RerunOptions],
 ) -> Recording:
     """Simulate a recording again: same scene, sensor, region, times, seed, terms and quality.
 

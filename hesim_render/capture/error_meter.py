@@ -75,11 +75,11 @@ class ErrorMeter:
         """
         if not self.values:
             return None
-        found = {"rms": float(np.sqrt(self._square / self.values))}
-        found |= {name: self.quantile(part) for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
+        result = {"rms": float(np.sqrt(self._square / self.values))}
+        result |= {name: self.quantile(part) for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
         if wanted is not None:
-            found["share_above_wanted"] = self.share_from(wanted)
-        return found
+            result["share_above_wanted"] = self.share_from(wanted)
+        return result
 
     def quantile(self, part: float) -> float:
         """Error that a part of the values does not exceed, to 5 %."""
@@ -110,7 +110,8 @@ def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float
     measured = {name: meter for name, meter in errors.items() if meter.values}
     off = {f"{name}_off": meter.share_from(limit) for name, meter in measured.items()}
     failed = any(share > MOST_OFF for share in off.values())
-    needed = max(samples + 1.0, *(samples * (meter.quantile(1 - MOST_OFF) / limit) ** 2 for meter in measured.values()))
+    enough = [samples * (meter.quantile(1 - MOST_OFF) / limit) ** 2 for meter in measured.values()]
+    needed = max([samples + 1.0, *enough])
     return {
         "compares_with": "the two halves of each value's own rays; nothing was rendered again",
         "tolerance_noise": limit,

@@ -206,8 +206,8 @@ def _open(asked: _Run, overwrite: bool) -> None:
     if not state.is_file():
         return
     try:
-        found = json.loads(state.read_text(encoding="utf-8"))
-        identity, done = found["sha256"], [str(name) for name in found["done"]]
+        result = json.loads(state.read_text(encoding="utf-8"))
+        identity, done = result["sha256"], [str(name) for name in result["done"]]
     except (OSError, ValueError, KeyError, TypeError):
         identity, done = None, []
     if identity == asked.identity():

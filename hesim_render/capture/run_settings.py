@@ -101,10 +101,10 @@ class RunSettings:
 
     def as_dict(self) -> dict[str, object]:
         """For the manifest, but what the renderer says of itself."""
-        found: dict[str, object] = {"clean": self.clean, "without": list(self.without)}
+        result: dict[str, object] = {"clean": self.clean, "without": list(self.without)}
         if self.kinds:
-            found["truth"] = {"kinds": list(self.kinds), "every_us": self.truth_every_us}
-        return found
+            result["truth"] = {"kinds": list(self.kinds), "every_us": self.truth_every_us}
+        return result
 
 
 def whole_us(duration_s: float) -> int:

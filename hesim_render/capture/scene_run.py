@@ -110,19 +110,19 @@ class SceneRun:
     def verdict(self) -> dict[str, object]:
         """The entry ``render`` of the manifest: errors, work, and whether the render is good enough."""
         renderer, errors = self._renderer, self._capture.errors
-        found: dict[str, object] = {
+        result: dict[str, object] = {
             "error_noise": {name: meter.as_dict(renderer.quality) for name, meter in errors.items()}
         }
-        found |= renderer.work
+        result |= renderer.work
         if renderer.samples is not None:
-            found["audit"] = stated_verdict(errors, renderer.samples, QUALITY)
+            result["audit"] = stated_verdict(errors, renderer.samples, QUALITY)
         elif renderer.quality is not None and self._noted is not None and renderer.auditable is not None:
             if self._progress is not None:
                 self._progress(0, 1, "audit")
             evs = renderer.sensor.evs if renderer.sensor.spec.evs is not None else None
             pixels, seed = self._demand.event_pixel, self._settings.seed
-            found["audit"] = Audit(self._noted, renderer.auditable, renderer.quality, evs, pixels, seed).run()
-        return found
+            result["audit"] = Audit(self._noted, renderer.auditable, renderer.quality, evs, pixels, seed).run()
+        return result
 
     def write_truth(self, writer: RecordingWriter, scene: Scene, sensor: Sensor) -> None:
         """Write the kinds of geometric truth that were asked for.

@@ -201,19 +201,19 @@ def recording(
     shape, levels = None if size is None else parse_size(size), None if lux is None else _levels(lux)
     console = Console(json_, quiet)
     with console.progress("calibrate recording") as move:
-        found = calibrate_recordings(
+        result = calibrate_recordings(
             files, out, lux=levels, target_file=target, target_contrast=contrast, target_hz=target_hz, shape=shape,
             overwrite=overwrite, progress=lambda what, part: move(part, 1.0, what),
         )  # fmt: skip
     lines = []
-    for one in found["recordings"]:
+    for one in result["recordings"]:
         light = "" if one["lux"] is None else f", {one['lux']:g} lx"
         lines.append(f"{one['file']}{light}: {one['events']} events in {one['seconds']:.4g} s")
         lines += [f"  {_line(text, one[name])}" for name, text in _OF_ONE.items()]
-    lines += [_line(text, found[name]) for name, text in _OF_ALL.items()]
-    lines += [f"look at: {finding['file']}: {finding['text']}" for finding in found["findings"]]
+    lines += [_line(text, result[name]) for name, text in _OF_ALL.items()]
+    lines += [f"look at: {finding['file']}: {finding['text']}" for finding in result["findings"]]
     lines += [] if out is None else [f"in {out}"]
-    console.result("\n".join(lines), {"calibration": out, **found})
+    console.result("\n".join(lines), {"calibration": out, **result})
 
 
 def _levels(text: str) -> list[float]:
@@ -249,14 +249,14 @@ def twin(
 
     console = Console(json_, quiet)
     with console.progress("twin") as move:
-        found = make_twin(
+        result = make_twin(
             captures, out, seed=seed, overwrite=overwrite, progress=lambda what, fraction: move(fraction, 1.0, what)
         )
-    lines = [check_line(check) for check in found.checks]
-    passed = sum(check.passed for check in found.checks)
+    lines = [check_line(check) for check in result.checks]
+    passed = sum(check.passed for check in result.checks)
     text = "\n".join([*lines, f"{passed} of {len(lines)} pass", f"in {out}"])
-    facts = {"twin": found.folder, "passed": found.passed, "checks": {c.name: c.passed for c in found.checks}}
-    console.result(text, facts, ExitStatus.DONE if found.passed else ExitStatus.NOT_MET)
+    facts = {"twin": result.folder, "passed": result.passed, "checks": {c.name: c.passed for c in result.checks}}
+    console.result(text, facts, ExitStatus.DONE if result.passed else ExitStatus.NOT_MET)
 
 
 app.command()(recording)

@@ -131,12 +131,12 @@ def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwr
     chosen = read_design(spec, keys)
     check_target(out, MARKER, overwrite)
     with console.progress(chosen.name) as progress:
-        found = design(chosen, out=out, overwrite=overwrite, progress=progress)
-    costs = found.result.costs
+        result = design(chosen, out=out, overwrite=overwrite, progress=progress)
+    costs = result.result.costs
     console.text(
         f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs)
     )
-    for verdict in found.verdicts:
+    for verdict in result.verdicts:
         aware, free = (
             ", ".join(
                 f"{value:.3f} at {key.split('_')[-2]} lx" for key, value in verdict.items() if key.startswith(start)
@@ -151,7 +151,7 @@ def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwr
         )
     console.result(
         f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",
-        {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": found.verdicts},
+        {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": result.verdicts},
     )
 
 

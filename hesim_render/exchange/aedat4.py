@@ -214,9 +214,9 @@ def _events_stream(info: str, path: Path) -> tuple[tuple[int, int], int]:
     if "<!" in info:
         raise SpecError("declares a document type or entities in its XML, as no such file does", file=path)
     for node in ElementTree.fromstring(info).iterfind("./node/node"):
-        found = {attribute.get("key"): attribute.text or "" for attribute in node.iter("attr")}
-        if found.get("typeIdentifier") == "EVTS":
-            name, cols, rows = node.get("name", ""), found.get("sizeX", ""), found.get("sizeY", "")
+        result = {attribute.get("key"): attribute.text or "" for attribute in node.iter("attr")}
+        if result.get("typeIdentifier") == "EVTS":
+            name, cols, rows = node.get("name", ""), result.get("sizeX", ""), result.get("sizeY", "")
             if not all(re.fullmatch(r"\d{1,6}", value) for value in (name, cols, rows)):
                 entry = printable(f"{name!r} of {cols!r} x {rows!r}")
                 raise SpecError(f"has a stream of events without number and size ({entry[:80]})", file=path)
@@ -260,7 +260,7 @@ def _unpacked(content: bytes, compression: int, path: Path) -> bytes:
         import lz4.frame
 
         with lz4.frame.LZ4FrameDecompressor() as unpack:
-            found = unpack.decompress(content, max_length=_LARGEST_PACKET)
+            result = unpack.decompress(content, max_length=_LARGEST_PACKET)
             whole = unpack.eof
     elif compression in _ZSTD:
         import zstandard
@@ -270,12 +270,12 @@ def _unpacked(content: bytes, compression: int, path: Path) -> bytes:
         while size <= _LARGEST_PACKET and (part := unpacker.read(_PIECE)):
             parts.append(part)
             size += len(part)
-        found, whole = b"".join(parts), size <= _LARGEST_PACKET
+        result, whole = b"".join(parts), size <= _LARGEST_PACKET
     else:
         raise SpecError(f"has the compression {compression}; expected 0 to 4", file=path)
     if not whole:
         raise SpecError(f"a packet ends early, or is larger than {_LARGEST_PACKET >> 20} MiB", file=path)
-    return found
+    return result
 
 
 def _exactly(file: IO[bytes], size: int, path: Path) -> bytes:

@@ -135,13 +135,13 @@ def open_events(
     file = Path(path).expanduser()
     if format is not None and format not in READABLE:
         raise RangeError("format", format, f"one of {', '.join(READABLE)}")
-    found = _detect(file)
-    if format is not None and found != format:
-        actual = f"which is {found}" if found else "which has another begin"
+    result = _detect(file)
+    if format is not None and result != format:
+        actual = f"which is {result}" if result else "which has another begin"
         raise SpecError(f"was to be read as {format}, {actual}", file=file)
-    if found is None:
+    if result is None:
         raise SpecError(f"is of no known event format; expected one of {', '.join(READABLE)}", file=file)
-    stream = _OPENERS[found](file)
+    stream = _OPENERS[result](file)
     if shape is not None and not (keep_stated and stream.shape != (0, 0)):
         return replace(stream, shape=shape)
     if stream.shape == (0, 0):
@@ -170,10 +170,10 @@ def is_event_file(path: str | Path) -> bool:
 def _detect(file: Path) -> str | None:
     with reading(file), file.open("rb") as opened:
         begin = opened.read(16)
-    found = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
-    if found == "raw":
+    result = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
+    if result == "raw":
         return "dat" if dat.is_dat(file) else raw_file.read_header(file)[0].lower()
-    return "prophesee" if found == "dsec" and prophesee_hdf5.holds(file) else found
+    return "prophesee" if result == "dsec" and prophesee_hdf5.holds(file) else result
 
 
 def _open_raw(file: Path) -> EventStream:

@@ -118,9 +118,9 @@ def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
 
 
 def _shape(keys: dict[str, str], details: list[str], path: Path) -> tuple[int, int] | None:
-    found = dict(detail.partition("=")[::2] for detail in details)
+    result = dict(detail.partition("=")[::2] for detail in details)
     size = re.fullmatch(r"(\d{1,5})x(\d{1,5})", keys.get("geometry", ""))
-    width, height = size.groups() if size else (found.get("width", ""), found.get("height", ""))
+    width, height = size.groups() if size else (result.get("width", ""), result.get("height", ""))
     if not (width or height):
         return None
     return stated_size(width, height, LARGEST_SIDE, path)
@@ -168,9 +168,9 @@ def require_types(types: NDArray[np.uint8], known: NDArray[np.bool_], name: str,
     """
     unknown = ~known[types]
     if unknown.any():
-        found = int(types[unknown.argmax()])
+        result = int(types[unknown.argmax()])
         raise SpecError(
-            f"holds a word of type {found:#x}, which {name} does not have; the file is damaged or of another format",
+            f"holds a word of type {result:#x}, which {name} does not have; the file is damaged or of another format",
             file=path,
         )
 

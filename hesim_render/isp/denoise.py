@@ -51,13 +51,13 @@ def denoise(
 def _stabilisers(noise: FrameNoise, tile: NDArray, top_dn: float) -> dict[tuple[int, int], Stabiliser]:
     """The transform of each tile position; positions with equal noise share one."""
     made: dict[tuple[float, float, float], Stabiliser] = {}
-    found = {}
+    result = {}
     for row, col in np.argwhere(tile >= 0):
         law = noise.variance((int(row), int(col)))
         if law not in made:
             made[law] = Stabiliser(*law, top_dn)
-        found[int(row), int(col)] = made[law]
-    return found
+        result[int(row), int(col)] = made[law]
+    return result
 
 
 def _each(

@@ -76,18 +76,18 @@ def event_statistics(stream: EventStream) -> EventStatistics:
         problem = f"lasts {end_us - begin_us} µs; expected {_LEAST_PART_US * PARTS} µs at least"
         raise SpecError(problem, file=stream.source)
     rows, cols = stream.shape
-    found: list[tuple[NDArray, ...]] = []
+    result: list[tuple[NDArray, ...]] = []
     held, last_us = [no_events()], np.full(rows * cols, -1, np.int64)
     for events in (*stream, no_events()):
         held.append(events)
-        done = begin_us + (len(found) + 1) * part_us
-        while len(found) < PARTS and (events.size == 0 or events["t_us"][-1] >= done):
+        done = begin_us + (len(result) + 1) * part_us
+        while len(result) < PARTS and (events.size == 0 or events["t_us"][-1] >= done):
             every = np.concatenate(held)
             inside = np.searchsorted(every["t_us"], done)
-            found.append(_part(every[:inside], begin_us + len(found) * part_us, part_us, last_us, rows, cols))
+            result.append(_part(every[:inside], begin_us + len(result) * part_us, part_us, last_us, rows, cols))
             held = [every[inside:]]
             done += part_us
-    columns = [np.stack(values) for values in zip(*found, strict=True)]
+    columns = [np.stack(values) for values in zip(*result, strict=True)]
     if columns[0].sum() < _LEAST_EVENTS:
         raise SpecError(f"has {columns[0].sum()} events; expected {_LEAST_EVENTS} at least", file=stream.source)
     polarity, intervals, series, active, bursts, pixels = columns
@@ -186,7 +186,7 @@ def event_distances(first: EventStatistics, second: EventStatistics, seed: int =
     rng = np.random.default_rng(seed)
     draws = rng.integers(0, PARTS, (3, _DRAWS, PARTS))
     whole = np.arange(PARTS)
-    found = []
+    result = []
     for name, definition, figure, distance, is_number in _FIGURES:
         a, b = figure(first, whole), figure(second, whole)
         ours, again = ([figure(first, draw) for draw in part] for part in draws[:2])
@@ -195,7 +195,7 @@ def event_distances(first: EventStatistics, second: EventStatistics, seed: int =
         own = [distance(x, y) for x, y in zip(ours, again, strict=True)]
         low, high = np.percentile(spread, (2.5, 97.5))
         numbers = (float(a[0]), float(b[0])) if is_number else (None, None)
-        found.append(
+        result.append(
             EventDistance(
                 name,
                 definition,
@@ -205,7 +205,7 @@ def event_distances(first: EventStatistics, second: EventStatistics, seed: int =
                 *numbers,
             )
         )
-    return found
+    return result
 
 
 def _rate(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
@@ -234,8 +234,8 @@ def _over_time(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:
     series = series - series.mean()
     variance = np.mean(series**2)
     lags = [lag for lag in LAGS if lag < series.shape[1]]
-    found = [np.mean(series[:, lag:] * series[:, :-lag]) / max(variance, 1e-300) for lag in lags]
-    return np.array(found + [0.0] * (len(LAGS) - len(lags)))
+    result = [np.mean(series[:, lag:] * series[:, :-lag]) / max(variance, 1e-300) for lag in lags]
+    return np.array(result + [0.0] * (len(LAGS) - len(lags)))
 
 
 def _over_space(one: EventStatistics, draw: _Draw) -> NDArray[np.float64]:

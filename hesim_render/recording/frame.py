@@ -124,5 +124,5 @@ class StoredFrames(Sequence[Frame]):
 
 def read_maps(file: Path, names: tuple[str, ...], shape: tuple[int, int]) -> list[NDArray[np.float32]]:
     """float32 maps of one shape from an `.npz` file, in the order of `names`."""
-    found = read_arrays(file, names, only=names, shapes=dict.fromkeys(names, shape), kinds="f")
-    return [found[name].astype(np.float32, copy=False) for name in names]
+    result = read_arrays(file, names, only=names, shapes=dict.fromkeys(names, shape), kinds="f")
+    return [result[name].astype(np.float32, copy=False) for name in names]

@@ -81,9 +81,9 @@ class Kept:
                 dr.eval(kept)
             self._known[fresh] = True
         index = types.UInt32(pixel)
-        found = [(dr.gather(types.Float, a, index), dr.gather(types.Float, b, index)) for a, b in self._kept]
-        dr.eval(found)
-        return found
+        result = [(dr.gather(types.Float, a, index), dr.gather(types.Float, b, index)) for a, b in self._kept]
+        dr.eval(result)
+        return result
 
     def _reach(self, size: int) -> None:
         """Make room for mosaic indices below `size`."""

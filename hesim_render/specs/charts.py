@@ -82,10 +82,10 @@ class PatchChartTarget(SizedTarget, InFolder):
         """A dump (and so a hash) holds the numbers of the file, not its name."""
         data = handler(self)
         if self.patches is not None:
-            found = self.load().items()
+            result = self.load().items()
             data["patches"] = None
             data["spectra"] = {
-                name: {"wavelength_nm": s.wavelength_nm.tolist(), "value": s.values.tolist()} for name, s in found
+                name: {"wavelength_nm": s.wavelength_nm.tolist(), "value": s.values.tolist()} for name, s in result
             }
         return data
 

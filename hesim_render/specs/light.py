@@ -171,5 +171,5 @@ def mixed_light(lights: Iterable[LightSpec]) -> Spectrum | None:
     given = list(lights)
     if len(given) == 1 and given[0].type != "none":
         return given[0].illuminant.load()
-    found = [level for level in map(irradiance, given) if level is not None]
-    return summed(*found) if found else None
+    result = [level for level in map(irradiance, given) if level is not None]
+    return summed(*result) if result else None

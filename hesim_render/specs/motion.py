@@ -124,12 +124,14 @@ class TrackSpec(Strict):
     @field_validator("keyframes")
     @classmethod
     def _without_matrices(cls, frames: list[KeyframeSpec], info: ValidationInfo) -> list[KeyframeSpec]:
-        found: list[KeyframeSpec] = []
+        result: list[KeyframeSpec] = []
         turns = iter(rotation_vectors([frame.matrix for frame in frames if frame.matrix is not None]))
         for frame in frames:
             turn = None if frame.matrix is None else next(turns)
-            found.append(frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), found[-1] if found else None, turn))
-        return found
+            result.append(
+                frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), result[-1] if result else None, turn)
+            )
+        return result
 
     @model_validator(mode="after")
     def _check(self) -> TrackSpec:
@@ -163,8 +165,8 @@ class DeformationSpec(InFolder):
         """Names of all its files, relative to the folder of the scene file, in the order of time."""
         if not self.path.is_dir():
             return [self.file]
-        found = (path for path in self.path.iterdir() if path.suffix.lower() in (".ply", ".obj"))
-        return [str(Path(self.file) / path.name) for path in sorted(found)]
+        result = (path for path in self.path.iterdir() if path.suffix.lower() in (".ply", ".obj"))
+        return [str(Path(self.file) / path.name) for path in sorted(result)]
 
     @model_validator(mode="after")
     def _check(self) -> DeformationSpec:

@@ -136,6 +136,6 @@ def leaves_of(material: Mapping[str, Any], kind: type) -> Iterator[tuple[str, An
     """Dotted keys and values of a material that are of a kind, such as `SpectrumSpec`."""
     for key, value in material.items():
         if isinstance(value, Mapping):
-            yield from ((f"{key}.{inside}", found) for inside, found in leaves_of(value, kind))
+            yield from ((f"{key}.{inside}", result) for inside, result in leaves_of(value, kind))
         elif isinstance(value, kind):
             yield key, value

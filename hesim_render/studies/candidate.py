@@ -102,7 +102,7 @@ def candidates(spec: StudySpec) -> list[Candidate]:
             palettes[name] = read_palette(spec.beside(name))
         return palettes[name]
 
-    found, problems = [], []
+    result, problems = [], []
     for name in spec.sensors:
         base = load_sensor(spec.beside(name), spec.sensor_keys)
         sets: Sequence[Any] = spec.filter_sets or [None]
@@ -118,7 +118,7 @@ def candidates(spec: StudySpec) -> list[Candidate]:
                 for crosstalk in parts:
                     candidate = Candidate(sensor, base.name, label, crosstalk)
                     _check(candidate, spec)
-                    found.append(candidate)
+                    result.append(candidate)
             except HesimError as error:
                 if isinstance(error, SpecError) and error.file is not None:
                     raise
@@ -126,7 +126,7 @@ def candidates(spec: StudySpec) -> list[Candidate]:
                 problems.append(SpecError(str(error), key=key))
     if problems:
         raise SpecError.together(problems)
-    return found
+    return result
 
 
 def _check(candidate: Candidate, spec: StudySpec) -> None:

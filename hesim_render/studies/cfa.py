@@ -86,8 +86,8 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
 
 def _chart(item: SurfacesSpec) -> list[Spectrum]:
     """The reflectances that matrices are fitted to; of a cube, the ColorChecker."""
-    found = reflectance_set("colorchecker") if item.reflectances is None else reflectances_of(item)
-    return list(found.values())
+    result = reflectance_set("colorchecker") if item.reflectances is None else reflectances_of(item)
+    return list(result.values())
 
 
 def _cube(item: SurfacesSpec, spec: StudySpec) -> CubeFile | None:
@@ -138,8 +138,8 @@ def _rows(
             if aps is not None and "noise" in spec.figures:
                 row |= noise_figures(spec, seen, spectrum, chart, rate, lux, exposure_us)
             if aps is not None and "demosaic" in spec.figures:
-                found, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
-                row |= found
+                result, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
+                row |= result
                 if len(pictures) < MOST_PICTURES:
                     text = f"{candidate.set_name}, {seen.light_name}, {lux:g} lx, equal {equal}"
                     pictures.append((text, picture))

@@ -122,19 +122,19 @@ def fit_matrix(
     if expansion not in get_args(Expansion):
         raise RangeError("expansion", expansion, f"one of {', '.join(get_args(Expansion))}")
     terms = expanded(samples.camera, expansion)
-    found_rank = rank(samples.camera)
-    if found_rank < 3:
+    rank_of_channels = rank(samples.camera)
+    if rank_of_channels < 3:
         raise SpecError(
-            f"the channels see these surfaces in {found_rank} of the 3 dimensions that colour needs; add a filter, or "
+            f"the channels see these surfaces in {rank_of_channels} of the 3 dimensions that colour needs; add a filter, or "
             "other surfaces"
         )
     if len(terms) < terms.shape[1]:
         raise RangeError("surfaces", len(terms), f"at least {terms.shape[1]}, the number of terms of the matrix")
     start, *_ = np.linalg.lstsq(terms, samples.xyz, rcond=1e-9)
-    found: NDArray[np.float64] = np.asarray(start.T, dtype=np.float64)
+    result: NDArray[np.float64] = np.asarray(start.T, dtype=np.float64)
     if method != "least_squares_xyz":
-        found = _least_difference(terms, samples, found, method)
-    return ColourError(found, method, expansion, colour_differences(samples, found, expansion, _measure_of(method)))
+        result = _least_difference(terms, samples, result, method)
+    return ColourError(result, method, expansion, colour_differences(samples, result, expansion, _measure_of(method)))
 
 
 def colour_differences(
@@ -236,8 +236,8 @@ def _least_difference(
         around = loss(np.concatenate([values[None], values + steps, values - steps]))
         return float(around[0]), (around[1 : 1 + start.size] - around[1 + start.size :]) / (2 * steps[0, 0])
 
-    found = minimize(loss_and_slope, start.ravel(), jac=True, method="BFGS", options={"maxiter": 200, "gtol": 1e-4})
-    return found.x.reshape(start.shape) if found.fun < loss(start.ravel()) else start
+    result = minimize(loss_and_slope, start.ravel(), jac=True, method="BFGS", options={"maxiter": 200, "gtol": 1e-4})
+    return result.x.reshape(start.shape) if result.fun < loss(start.ravel()) else start
 
 
 def to_srgb(matrix: ArrayLike, white_xyz: ArrayLike) -> NDArray[np.float64]:

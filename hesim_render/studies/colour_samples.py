@@ -141,12 +141,12 @@ def reflectance_set(name: str) -> dict[str, Spectrum]:
     if name in ("rawtoaces", "rawtoaces-even", "rawtoaces-odd"):
         table = colour.characterisation.read_training_data_rawtoaces_v1()
         grid, values = np.asarray(table.wavelengths), np.asarray(table.values)
-        found = {
+        result = {
             str(label): held(Spectrum(grid, np.maximum(column, 0.0)))
             for label, column in zip(table.labels, values.T, strict=True)
         }
         first, step = {"rawtoaces": (0, 1), "rawtoaces-even": (0, 2), "rawtoaces-odd": (1, 2)}[name]
-        return dict(list(found.items())[first::step])
+        return dict(list(result.items())[first::step])
     if name == "cie-tcs":
         samples = colour.quality.datasets.SDS_TCS["CIE 1995"]
         return {

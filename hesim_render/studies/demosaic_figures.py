@@ -34,12 +34,12 @@ _FINE = 8
 def _sampled(value: Callable[[NDArray, NDArray], NDArray]) -> NDArray[np.float64]:
     """Mean over the area of each pixel of a function of the place from the centre, px."""
     fine = (np.arange(SIDE_PX * _FINE) + 0.5) / _FINE - SIDE_PX / 2
-    found = np.empty((SIDE_PX, SIDE_PX))
+    result = np.empty((SIDE_PX, SIDE_PX))
     for row in range(SIDE_PX):
         y = fine[row * _FINE : (row + 1) * _FINE, None]
         part = value(fine[None, :], y)
-        found[row] = part.reshape(_FINE, SIDE_PX, _FINE).mean(axis=(0, 2))
-    return found
+        result[row] = part.reshape(_FINE, SIDE_PX, _FINE).mean(axis=(0, 2))
+    return result
 
 
 def slanted_edge() -> NDArray[np.float64]:
@@ -164,9 +164,9 @@ def demosaic_figures(
         off = (picture - reflectance[..., None])[:, SIDE_PX : 2 * SIDE_PX][_ring()]
         errors.append(np.sqrt(np.mean(off**2)))
     if errors:
-        found = Measured.of(np.array(errors))
+        result = Measured.of(np.array(errors))
         figures |= {
-            "picture_error_simulated": found.value, "picture_error_low": found.low, "picture_error_high": found.high,
+            "picture_error_simulated": result.value, "picture_error_low": result.low, "picture_error_high": result.high,
         }  # fmt: skip
     return figures, picture.astype(np.float32)
 

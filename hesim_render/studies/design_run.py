@@ -93,10 +93,10 @@ def design(
             sensor |= {"description": palette.description, "sources": {}, "assumptions": palette.assumptions}
             _write_yaml(folder.path / "sensor.yaml", sensor)
             judged = _judgement(read, problem, folder.path)
-            found = run_study(judged, report)
-        verdicts = _verdicts(read, found.table)
+            outcome = run_study(judged, report)
+        verdicts = _verdicts(read, outcome.table)
         with output_errors(folder.target):
-            found.table.write(folder.path / "results.csv")
+            outcome.table.write(folder.path / "results.csv")
             content = {
                 "design": json.loads(read.model_dump_json()), "cost": result.cost, "costs": result.costs.tolist(),
                 "evaluations": result.evaluations, "shares": result.shares,
@@ -104,12 +104,12 @@ def design(
             }  # fmt: skip
             (folder.path / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
             summary = verdict_table(verdicts, result.costs, None if result.shares is None else filters.tile)
-            (folder.path / "report.html").write_text(report_page(judged, found, summary), encoding="utf-8")
+            (folder.path / "report.html").write_text(report_page(judged, outcome, summary), encoding="utf-8")
         folder.commit()
     except BaseException:
         folder.discard()
         raise
-    return Design(result, found.table, verdicts)
+    return Design(result, outcome.table, verdicts)
 
 
 def _judgement(spec: DesignSpec, problem: Problem, folder: Path) -> StudySpec:
@@ -149,7 +149,7 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
     """
     weights = spec.cost
     own = table.where(filter_set=DESIGNED)
-    found = []
+    result = []
     for name in dict.fromkeys(table["filter_set"]):
         if name == DESIGNED:
             continue
@@ -184,8 +184,8 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
                 verdict[figure], verdict[f"{figure}_against"] = (
                     float(np.nanmean(each[figure])) for each in (own, other)
                 )
-        found.append(verdict)
-    return found
+        result.append(verdict)
+    return result
 
 
 def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
@@ -205,10 +205,10 @@ def designed_set(problem: Problem, result: DesignResult) -> FilterSetSpec:
     }
     counts = counts_of(np.array([result.shares[name] for name in problem.frames]), int(free.sum()))
     wanted = {letters[name]: int(count) for name, count in zip(problem.frames, counts, strict=True)}
-    found = spread_tile(tile, free, wanted)
-    drawn = set(found.ravel().tolist())
+    outcome = spread_tile(tile, free, wanted)
+    drawn = set(outcome.ravel().tolist())
     return own.model_copy(update={
-        "name": f"{own.name}-designed", "tile": "\n".join("".join(row) for row in found),
+        "name": f"{own.name}-designed", "tile": "\n".join("".join(row) for row in outcome),
         "description": f"{own.description} Shares of the frame filters designed by gradients.",
         "pixels": {letter: pixel for letter, pixel in own.pixels.items() if letter in drawn},
     })  # fmt: skip

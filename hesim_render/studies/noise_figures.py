@@ -171,8 +171,8 @@ def noise_figures(
         return row if balanced is None else row | _cells("ysnr_noise_aware", measured_luminance(balanced, aware[1]))
     for end, matrix in (("_noise_aware", aware), ("", seen.colour.matrix)):
         rgb = to_srgb(matrix, seen.samples.white_xyz)
-        found = output_noise(rgb, white_e, noise)
-        row |= {f"noise_amplification{end}": found.amplification, f"ysnr{end}": found.ysnr}
+        result = output_noise(rgb, white_e, noise)
+        row |= {f"noise_amplification{end}": result.amplification, f"ysnr{end}": result.ysnr}
         if balanced is not None:
             for name, value in measured_figures(balanced, rgb, matrix, seen.samples).items():
                 row |= _cells(f"{name}{end}", value)
@@ -220,5 +220,5 @@ def _noisy(
     )  # fmt: skip
 
 
-def _cells(name: str, found: Measured) -> dict[str, Cell]:
-    return {f"{name}_simulated": found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+def _cells(name: str, result: Measured) -> dict[str, Cell]:
+    return {f"{name}_simulated": result.value, f"{name}_low": result.low, f"{name}_high": result.high}

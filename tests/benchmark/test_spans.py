@@ -138,7 +138,7 @@ def test_journals_of_others_are_read_and_never_written(tmp_path):
         with one.path.open("ab") as file:
             file.write(begun)
         with Journal(tmp_path / "two", run, others=[one.path, tmp_path / "none"]) as two:
-            assert two.found == 1 and two.recall(key, [found]) and np.array_equal(found, data)
+            assert two.count == 1 and two.recall(key, [found]) and np.array_equal(found, data)
             two.keep(b"l" * 16, [data])
         assert not two.path.exists()
         with Journal(tmp_path / "two", {"clip": 2}, others=[one.path]) as of_another_run:

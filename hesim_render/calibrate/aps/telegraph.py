@@ -45,7 +45,7 @@ class TelegraphMaps:
     correlation: NDArray[np.float32]
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def is_telegraph(self) -> NDArray[np.bool_]:
         return self.amplitude_dn > 0
 
 
@@ -71,10 +71,10 @@ def find_telegraph(
         values[divmod(number, stack.shape[1])] = frame.ravel()[place]
     for first in range(0, place.size, _TOGETHER):
         part = slice(first, first + _TOGETHER)
-        found = fit_two_levels(values[..., part], stack.exposures_us.astype(np.float64) * S_PER_US)
-        good = found.is_telegraph
+        result = fit_two_levels(values[..., part], stack.exposures_us.astype(np.float64) * S_PER_US)
+        good = result.is_telegraph
         for name in ("amplitude_dn", "high_share", "correlation"):
-            getattr(maps, name).ravel()[place[part][good]] = getattr(found, name)[good]
+            getattr(maps, name).ravel()[place[part][good]] = getattr(result, name)[good]
     return maps
 
 
@@ -223,9 +223,9 @@ def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.floa
             product = terms[i] if high is not None and i == j == 2 else terms[i] * terms[j]
             normal[:, i, j] = np.sum(product, axis=axes)
     normal += 1e-9 * np.eye(size) * y.shape[0] * y.shape[1]
-    found: NDArray = np.linalg.solve(normal, right[..., None])[..., 0].T
-    squares = np.sum(y * y, axis=axes) - np.sum(found * right.T, axis=0)
-    return found, np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2)).astype(np.float64)
+    result: NDArray = np.linalg.solve(normal, right[..., None])[..., 0].T
+    squares = np.sum(y * y, axis=axes) - np.sum(result * right.T, axis=0)
+    return result, np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2)).astype(np.float64)
 
 
 def _chain(

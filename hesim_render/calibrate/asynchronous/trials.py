@@ -100,22 +100,22 @@ def is_asynchronous(captures: CaptureSet) -> bool:
     SpecError
         If the captures do not suit the sensor.
     """
-    found = captures.has(S_CURVE) or captures.has(NOISE_RATE)
+    result = captures.has(S_CURVE) or captures.has(NOISE_RATE)
     evs = captures.sensor.evs if captures.sensor is not None else None
-    if evs is not None and evs.reference == "previous_sample" and found:
+    if evs is not None and evs.reference == "previous_sample" and result:
         raise SpecError(
             "its sensor compares at fixed ticks: capture evs_static.npz and evs_steps.npz, not trials after a reset",
             file=captures.folder / "capture.yaml",
             key="sensor",
         )
-    if evs is not None and evs.reference == "last_event" and not found and captures.has("evs_static"):
+    if evs is not None and evs.reference == "last_event" and not result and captures.has("evs_static"):
         raise SpecError(
             "its sensor has reference 'last_event', without comparisons at fixed ticks: capture trials after a reset, "
             f"{NOISE_RATE}.npz and {S_CURVE}.npz",
             file=captures.folder / "capture.yaml",
             key="sensor",
         )
-    return found or (evs is not None and evs.reference == "last_event")
+    return result or (evs is not None and evs.reference == "last_event")
 
 
 def read_trials(captures: CaptureSet) -> tuple[Trials, Trials]:
@@ -236,7 +236,7 @@ def _parts(
 
 
 def _list(values: NDArray, name: str, file: Path) -> NDArray[np.float64]:
-    found = values.astype(np.float64)
-    if found.ndim != 1 or found.size == 0 or not np.all(np.isfinite(found)):
+    result = values.astype(np.float64)
+    if result.ndim != 1 or result.size == 0 or not np.all(np.isfinite(result)):
         raise SpecError(f"{name} must be a list of finite numbers", file=file)
-    return found
+    return result

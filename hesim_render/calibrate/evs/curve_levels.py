@@ -34,11 +34,11 @@ class CurveLevels:
 def curve_levels(steps: Steps, thresholds: Thresholds) -> CurveLevels:
     """Fit floors and ceiling to the pooled S-curves."""
     start = np.array([*thresholds.values, 0.0, 0.0, 1.0])
-    found = _fit(steps, thresholds.step, np.ones(GROUPS, bool), start)
+    result = _fit(steps, thresholds.step, np.ones(GROUPS, bool), start)
     groups = np.flatnonzero(steps.pixels)
-    left_out = np.array([_fit(steps, thresholds.step, np.arange(GROUPS) != k, found) for k in groups])
+    left_out = np.array([_fit(steps, thresholds.step, np.arange(GROUPS) != k, result) for k in groups])
     error = np.sqrt((groups.size - 1) * left_out.var(axis=0))
-    return CurveLevels(*((float(found[k]), float(error[k])) for k in (4, 5, 6)))
+    return CurveLevels(*((float(result[k]), float(error[k])) for k in (4, 5, 6)))
 
 
 def _fit(steps: Steps, step: NDArray, groups: NDArray[np.bool_], start: NDArray) -> NDArray[np.float64]:

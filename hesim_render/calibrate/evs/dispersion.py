@@ -172,8 +172,8 @@ class _Mixture:
 
         bounds = [(np.log(_NO_MISMATCH), np.log(_LARGEST_MISMATCH)), *[(-1.0, 1.0)] * size]
         start = np.concatenate([[np.log(m)], np.zeros(size)])
-        found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
-        return -float(found.fun), float(np.exp(found.x[0])), np.exp(found.x[1:])
+        result = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+        return -float(result.fun), float(np.exp(result.x[0])), np.exp(result.x[1:])
 
     def information(self, m: float, scale: NDArray) -> tuple[float, float]:
         """Information of m with the groups' thresholds fitted, and the standard error of m."""

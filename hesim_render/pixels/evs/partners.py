@@ -113,8 +113,8 @@ class NominalSteps:
         if pixel.size == 0:
             return
         place = np.minimum(np.searchsorted(pixel, self._waiting.pixel), pixel.size - 1)
-        found = pixel[place] == self._waiting.pixel
-        self._waiting.goal[found] += by[place[found]]
+        result = pixel[place] == self._waiting.pixel
+        self._waiting.goal[result] += by[place[result]]
 
 
 #: Pairs and steps that may wait for each other before those without hope are looked for.

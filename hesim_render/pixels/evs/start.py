@@ -118,11 +118,11 @@ def _stationary(chances: NDArray[np.float64]) -> NDArray[np.float64]:
     for k in range(count - 1, 0, -1):
         rest[:, :k, k] /= rest[:, k, :k].sum(axis=1, keepdims=True)
         rest[:, :k, :k] += rest[:, :k, k, None] * rest[:, None, k, :k]
-    found = np.zeros(chances.shape[:2])
-    found[:, 0] = 1.0
+    result = np.zeros(chances.shape[:2])
+    result[:, 0] = 1.0
     for k in range(1, count):
-        found[:, k] = (found[:, :k] * rest[:, :k, k]).sum(axis=1)
-    return found / found.sum(axis=1, keepdims=True)
+        result[:, k] = (result[:, :k] * rest[:, :k, k]).sum(axis=1)
+    return result / result.sum(axis=1, keepdims=True)
 
 
 #: Thresholds over noise at which laws are known. Beyond, noise events are too rare, or so frequent that any law is left
@@ -166,12 +166,12 @@ class _Laws:
         if new.size == 0:
             return
         on, off = (_NODES[place] for place in np.divmod(new, _NODES.size))
-        found = law(Pixels(on, off, self._dead, self._leak, self._angle))
-        below = np.concatenate([np.zeros((new.size, 1)), np.cumsum(found.share, axis=1)], axis=1)
+        result = law(Pixels(on, off, self._dead, self._leak, self._angle))
+        below = np.concatenate([np.zeros((new.size, 1)), np.cumsum(result.share, axis=1)], axis=1)
         wanted = special.ndtr(_QUANTILES)
         for node, one in zip(new, below, strict=True):
-            self.quantiles[node] = np.interp(wanted, one, found.edges)
-        self.dead_share[new], self.events[new] = found.dead_share, found.events
+            self.quantiles[node] = np.interp(wanted, one, result.edges)
+        self.dead_share[new], self.events[new] = result.dead_share, result.events
 
 
 _laws = lru_cache(maxsize=64)(_Laws)
