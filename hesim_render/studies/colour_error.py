@@ -122,10 +122,10 @@ def fit_matrix(
     if expansion not in get_args(Expansion):
         raise RangeError("expansion", expansion, f"one of {', '.join(get_args(Expansion))}")
     terms = expanded(samples.camera, expansion)
-    rank_of_channels = rank(samples.camera)
-    if rank_of_channels < 3:
+    seen_rank = rank(samples.camera)
+    if seen_rank < 3:
         raise SpecError(
-            f"the channels see these surfaces in {rank_of_channels} of the 3 dimensions that colour needs; add a filter, or "
+            f"the channels see these surfaces in {seen_rank} of the 3 dimensions that colour needs; add a filter, or "
             "other surfaces"
         )
     if len(terms) < terms.shape[1]:

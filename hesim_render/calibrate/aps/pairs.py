@@ -188,7 +188,8 @@ def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
             )
         if dark.variance[k] - ADC_VARIANCE_DN2 < QUANTISED_VARIANCE_DN2:
             raise entry.error(
-                f"the dark variance is {dark.variance[k]:.3f} DN², below {QUANTISED_VARIANCE_DN2 + ADC_VARIANCE_DN2:.2f}: "
+                f"the dark variance is {dark.variance[k]:.3f} DN², below "
+                f"{QUANTISED_VARIANCE_DN2 + ADC_VARIANCE_DN2:.2f}: "
                 "rounding hides the noise; capture with more bits or a higher gain"
             )
     if long_dark.temporal.pixel <= 0:
