@@ -226,23 +226,16 @@ def export_benchmark(
     if layout not in LAYOUTS:
         raise RangeError("layout", layout, f"one of {', '.join(LAYOUTS)}{did_you_mean(layout, LAYOUTS)}")
     clips = list(Benchmark(root).clips())
-    output, count = OutputFolder(out, _MARKER, overwrite), 0
-    try:
-        with output_errors(output.target):
-            for done, clip in enumerate(clips):
-                if len(clip.recording.frames):
-                    count += LAYOUTS[layout](_Clip(clip), clip.split, output.path)
-                if progress is not None:
-                    progress(done + 1, len(clips), "clips")
-            if count == 0:
-                raise OutputError(
-                    f"{out}: no clip has what the layout {layout} holds (frames, and sharp images beside)"
-                )
-            (output.path / _MARKER).write_text(f"{layout}\n", encoding="utf-8")
-        output.commit()
-    except BaseException:
-        output.discard()
-        raise
+    count = 0
+    with OutputFolder(out, _MARKER, overwrite) as output, output_errors(output.target):
+        for done, clip in enumerate(clips):
+            if len(clip.recording.frames):
+                count += LAYOUTS[layout](_Clip(clip), clip.split, output.path)
+            if progress is not None:
+                progress(done + 1, len(clips), "clips")
+        if count == 0:
+            raise OutputError(f"{out}: no clip has what the layout {layout} holds (frames, and sharp images beside)")
+        (output.path / _MARKER).write_text(f"{layout}\n", encoding="utf-8")
     return count
 
 

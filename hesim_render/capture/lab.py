@@ -121,22 +121,17 @@ def write_captures(
     session.total += _FRAME_WORK * shots + comparisons
     if on_estimate is not None:
         on_estimate(_size_in_words(sensor, shots, comparisons, plans))
-    folder = OutputFolder(out, CAPTURE_NAME, overwrite)
-    try:
-        with output_errors(folder.target):
-            if bench.aps is not None:
-                session.write_frames(folder.path / "aps_dark.npz", dark_exposures_us, frames, 0.0)
-                session.write_frames(folder.path / "aps_lit.npz", lit_exposures_us, frames, 1.0)
-            if plans:
-                session.write_trials(folder.path, plans)
-            elif bench.evs is not None:
-                session.write_static(folder.path / "evs_static.npz", ticks, parts)
-                session.write_steps(folder.path / "evs_steps.npz", step_trials)
-            _describe(bench, folder.path, illuminant, seed)
-        return folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
+    with OutputFolder(out, CAPTURE_NAME, overwrite) as folder, output_errors(folder.target):
+        if bench.aps is not None:
+            session.write_frames(folder.path / "aps_dark.npz", dark_exposures_us, frames, 0.0)
+            session.write_frames(folder.path / "aps_lit.npz", lit_exposures_us, frames, 1.0)
+        if plans:
+            session.write_trials(folder.path, plans)
+        elif bench.evs is not None:
+            session.write_static(folder.path / "evs_static.npz", ticks, parts)
+            session.write_steps(folder.path / "evs_steps.npz", step_trials)
+        _describe(bench, folder.path, illuminant, seed)
+    return folder.target
 
 
 def _require(

@@ -70,16 +70,11 @@ def export_truth(
     if every_us is not None and not 1 <= every_us <= recording.duration_us:
         raise RangeError("every_us", every_us, f"1 to {recording.duration_us} µs, the length of the recording")
     truth = recording.truth
-    folder = OutputFolder(out, MARKER, overwrite)
-    try:
-        with output_errors(folder.target):
-            facts = write(recording, truth, folder.path, every_us)
-            text = json.dumps({"format": format_, **facts}, indent=2, ensure_ascii=False)
-            (folder.path / MARKER).write_text(text + "\n", encoding="utf-8")
-        return folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
+    with OutputFolder(out, MARKER, overwrite) as folder, output_errors(folder.target):
+        facts = write(recording, truth, folder.path, every_us)
+        text = json.dumps({"format": format_, **facts}, indent=2, ensure_ascii=False)
+        (folder.path / MARKER).write_text(text + "\n", encoding="utf-8")
+    return folder.target
 
 
 # ---- EXR -----------------------------------------------------------------------------------------------------------

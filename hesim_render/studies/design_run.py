@@ -80,8 +80,7 @@ def design(
         read: DesignSpec = validate(DesignSpec, dict(spec), None, {})
     else:
         read = spec if isinstance(spec, DesignSpec) else read_design(spec)
-    folder = OutputFolder(out, MARKER, overwrite)
-    try:
+    with OutputFolder(out, MARKER, overwrite) as folder:
         with shown(progress, read.name) as report:
             problem = Problem(read)
             result = optimise(problem, report)
@@ -105,10 +104,6 @@ def design(
             (folder.path / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
             summary = verdict_table(verdicts, result.costs, None if result.shares is None else filters.tile)
             (folder.path / "report.html").write_text(report_page(judged, outcome, summary), encoding="utf-8")
-        folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
     return Design(result, outcome.table, verdicts)
 
 

@@ -75,8 +75,7 @@ def make_twin(
     if min(len(pairs.spatial_lit.files), len(pairs.spatial_dark.files)) < 8:
         raise pairs.spatial_lit.error("a series of fewer than 8 frames has no two halves")
     fitted, held = pairs.half(0), pairs.half(1)
-    folder = OutputFolder(out, RESULT_NAME, overwrite)
-    try:
+    with OutputFolder(out, RESULT_NAME, overwrite) as folder:
         with output_errors(folder.target):
             calibration = folder.path / "calibration.yaml"
             result = calibrate_pairs(fitted, calibration, progress=progress)
@@ -95,9 +94,6 @@ def make_twin(
             (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
             (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
         return Twin(folder.commit(), checks)
-    except BaseException:
-        folder.discard()
-        raise
 
 
 def _json(checks: list[Check], seed: int) -> str:
