@@ -93,7 +93,7 @@ def make_twin(
             texts = [finding.text for finding in findings(result)]
             (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
             (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
-        return Twin(folder.commit(), checks)
+    return Twin(folder.target, checks)
 
 
 def _json(checks: list[Check], seed: int) -> str:

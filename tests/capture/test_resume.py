@@ -106,7 +106,7 @@ def test_entries_are_told_apart_by_all_that_they_depend_on(exact, tmp_path):
     assert len({values.tobytes() for values in expected}) == (4 if exact else 6)  # two windows in one slice of time
     for again in (False, True):
         with pytest.raises(KeyboardInterrupt), Journal(tmp_path / "out", {}) as journal:
-            assert (journal.found > 0) == again
+            assert (journal.count > 0) == again
             made = sources()
             for number, source in enumerate(made):
                 source.go_on(journal, number)
