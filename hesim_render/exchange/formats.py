@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.guard import reading
+from hesim_render.core.guard import printable, reading
 from hesim_render.exchange import (
     aedat4,
     dat,
@@ -84,9 +84,10 @@ class FrameFormat:
     write: Callable[[Path, NDArray[Any]], None]
 
 
+#: Formats of Prophesee's RAW files, which one header is common to.
+_RAW = {"evt2": evt2, "evt3": evt3}
 EVENT_FORMATS = {
-    "evt2": EventFormat(".raw", evt2.write),
-    "evt3": EventFormat(".raw", evt3.write),
+    **{name: EventFormat(".raw", kind.write) for name, kind in _RAW.items()},
     "dat": EventFormat(".dat", dat.write),
     "prophesee": EventFormat(".hdf5", prophesee_hdf5.write),
     "aedat4": EventFormat(".aedat4", aedat4.write),
@@ -104,7 +105,7 @@ FRAME_FORMATS = {
 }
 #: Formats that can be read, by the first bytes of their files.
 _BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz", mcap_file.BEGIN: "mcap"}
-READABLE = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
+READABLE = (*_RAW, "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
 
 
 def open_events(
@@ -171,14 +172,20 @@ def _detect(file: Path) -> str | None:
     with reading(file), file.open("rb") as opened:
         begin = opened.read(16)
     result = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
+    if result == "raw" and dat.is_dat(file):
+        return "dat"
     if result == "raw":
-        return "dat" if dat.is_dat(file) else raw_file.read_header(file)[0].lower()
+        name = raw_file.read_header(file)[0]
+        if name.lower() not in _RAW or not name.isupper():
+            expected = " or ".join(_RAW).upper()
+            raise SpecError(f"has the format {printable(name)!r}; expected {expected}", file=file)
+        return name.lower()
     return "prophesee" if result == "dsec" and prophesee_hdf5.holds(file) else result
 
 
 def _open_raw(file: Path) -> EventStream:
     name, shape, begin = raw_file.read_header(file)
-    kind = {"EVT2": evt2, "EVT3": evt3}[name]
+    kind = _RAW[name.lower()]
     return EventStream(
         lambda: kind.read(file, begin), shape or (0, 0), file, triggers=lambda: kind.read_triggers(file, begin)
     )
@@ -219,8 +226,7 @@ def _open_mcap(file: Path) -> EventStream:
 
 
 _OPENERS: dict[str, Callable[[Path], EventStream]] = {
-    "evt2": _open_raw,
-    "evt3": _open_raw,
+    **dict.fromkeys(_RAW, _open_raw),
     "dat": _open_dat,
     "prophesee": _open_prophesee,
     "aedat4": _open_aedat4,

@@ -100,20 +100,18 @@ def read_lines(path: Path) -> tuple[dict[str, str], int]:
 
 
 def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
-    """Format (``EVT2``, ``EVT3``), shape (rows, columns; None if the header has none), and first byte of the words.
+    """Format (``EVT2``, ``EVT3``, …), shape (rows, columns; None if the header has none), and first byte of the words.
 
     Raises
     ------
     SpecError
-        If the file has no such header, or states a format that cannot be read.
+        If the file has no such header.
     """
     keys, begin = read_lines(path)
     if not keys:
         raise SpecError("is not a Prophesee RAW file (no header of lines with %)", file=path)
     stated, *details = keys.get("format", "").split(";")
     name = stated or _VERSIONS.get(keys.get("evt", ""), keys.get("evt", ""))
-    if name not in ("EVT2", "EVT3"):
-        raise SpecError(f"has the format {printable(name)!r}; expected EVT2 or EVT3", file=path)
     return name, _shape(keys, details, path), begin
 
 

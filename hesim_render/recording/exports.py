@@ -85,6 +85,13 @@ def export(recording: Recorded, format: str, path: str | Path, overwrite: bool =
     return _write_frames(recording, format, path, overwrite)
 
 
+def every_format() -> tuple[str, ...]:
+    """Names of all formats: of events, of frames, of both, of geometric truth."""
+    from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
+
+    return (*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS, *TRUTH_FORMATS)
+
+
 def check_format(format: str, has_events: bool, has_frames: bool) -> None:
     """Refuse a format that does not exist, or of what a recording does not have.
 
@@ -93,9 +100,7 @@ def check_format(format: str, has_events: bool, has_frames: bool) -> None:
     RangeError
         With the formats that can be used.
     """
-    from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
-
-    known = (*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS, *TRUTH_FORMATS)
+    known = every_format()
     if format not in known:
         raise RangeError("format", format, f"one of {', '.join(known)}{did_you_mean(format, known)}")
     if format in (*EVENT_FORMATS, "mp4-events") and not has_events:
