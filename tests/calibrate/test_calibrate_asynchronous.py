@@ -134,7 +134,8 @@ def test_each_pixel_has_its_own_threshold_and_error(plain):
 def test_a_column_is_judged_from_25_events_and_25_trials_without_one(monkeypatch):
     """Expected or counted, of 2 pixels with 50 trials each; [kind of trial, bin] of contrast 0.2 and −0.2."""
     chance = np.array([[0.24, 0.26, 0.1], [0.2, 0.74, 0.02]])
-    events = np.array([[[9, 11, 2], [11, 40, 2]], [[12, 14, 5], [17, 37, 1]]])  # the first of the second kind: 28 in all
+    # the first column of the second kind has 28 where 20 were expected
+    events = np.array([[[9, 11, 2], [11, 40, 2]], [[12, 14, 5], [17, 37, 1]]])
     silent = 50 - events.sum(axis=2)
     counts = SimpleNamespace(
         log_likelihood=lambda values, grid, law: np.zeros((2, 3)), polarity=1, events=events.reshape(2, 6),
