@@ -1,6 +1,7 @@
 """Calibration of asynchronous event pixels, against trials written out in NumPy, closed forms and the event stage."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.stats import binom
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate.asynchronous import checks
 from hesim_render.calibrate.asynchronous.defects import classify, plainly_bad
 from hesim_render.calibrate.asynchronous.first_event import first_event
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
@@ -127,6 +129,24 @@ def test_each_pixel_has_its_own_threshold_and_error(plain):
         z = (found - truth) / error
         assert abs(z.mean()) < 0.3 and z.std() == pytest.approx(1.0, abs=0.12)
         assert np.median(error) < 0.05 * truth.mean()
+
+
+def test_a_column_is_judged_from_25_events_and_25_trials_without_one(monkeypatch):
+    """Expected or counted, of 2 pixels with 50 trials each; [kind of trial, bin] of contrast 0.2 and −0.2."""
+    chance = np.array([[0.24, 0.26, 0.1], [0.2, 0.74, 0.02]])
+    # the first column of the second kind has 28 where 20 were expected
+    events = np.array([[[9, 11, 2], [11, 40, 2]], [[12, 14, 5], [17, 37, 1]]])
+    silent = 50 - events.sum(axis=2)
+    counts = SimpleNamespace(
+        log_likelihood=lambda values, grid, law: np.zeros((2, 3)), polarity=1, events=events.reshape(2, 6),
+        silent=silent, sets=[SimpleNamespace(contrast=np.array([0.2, -0.2]))],
+    )  # fmt: skip
+    monkeypatch.setattr(checks, "chances", lambda *_: np.broadcast_to(chance[..., None], (2, 3, 3)))
+    monkeypatch.setattr(checks, "log_prior", lambda theta, mismatch, grid: np.zeros(3))
+    likelihood = SimpleNamespace(counts=[counts], grids=[np.arange(3.0)])
+    columns = checks._columns(SimpleNamespace(likelihood=likelihood, values=np.zeros(12), law="sqrt"))
+    assert columns.expected == pytest.approx([26, 20, 74]) and columns.silent == pytest.approx([74, 80, 26])
+    assert columns.residual == pytest.approx(np.array([[-2, 1, 3], [1, 7, 0]])) and columns.family.tolist() == [1, 0, 1]
 
 
 def test_report_shows_curves_rates_and_maps(plain):

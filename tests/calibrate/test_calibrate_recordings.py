@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from hesim_render.calibrate.recordings import calibrate_recordings, calibration, still
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
@@ -185,7 +186,8 @@ def test_hot_and_silent_pixels():
     assert still.hot_share(parts)["value"] == pytest.approx(count / PIXELS)
     assert still.silent_share(parts)["value"] == pytest.approx(5 / PIXELS)
     low, high = still.silent_share(parts)["interval_95"]
-    assert low < 5 / PIXELS < high < 0.03
+    # Clopper and Pearson: as few pixels, or as many, have a chance of 2.5 % at each end
+    assert stats.binom.sf(4, PIXELS, low) == pytest.approx(0.025) == stats.binom.cdf(5, PIXELS, high)
     assert "two recordings" in still.hot_share(parts[:1])["reason"]
 
 

@@ -15,6 +15,7 @@ import hesim_render as hr
 from hesim_render.calibrate.aps import checks as frame_checks
 from hesim_render.calibrate.aps import photon_transfer
 from hesim_render.calibrate.aps.composite import Composite, signal_at_event_pixels
+from hesim_render.calibrate.aps.dark import fit_dark
 from hesim_render.calibrate.aps.photon_transfer import _read_noise, linearity, system_gain
 from hesim_render.calibrate.aps.variance import Pooled, fit_variance, join, pool
 from hesim_render.calibrate.asynchronous.first_event import correlation
@@ -543,6 +544,28 @@ def test_noise_of_two_equal_poles_has_its_correlation():
     for elapsed_s in (0.0, 2e-4, 1.1e-3, 4e-3):
         expected = np.trapezoid(power * np.cos(2 * np.pi * f * elapsed_s), f) / np.trapezoid(power, f)
         assert correlation(cutoff_hz, elapsed_s) == pytest.approx(expected, abs=1e-4)
+
+
+def test_dark_lines_of_pixels_and_their_goodness_are_those_of_weighted_least_squares():
+    """Five exposures, of which one has its noise hidden by rounding and does not count; NumPy's own polynomial."""
+    rng = np.random.default_rng(21)
+    seconds, frames, shared = np.array([0.002, 0.01, 0.03, 0.05, 0.09]), 12, 0.03
+    spread = np.array([2.3, 0.09, 3.1, 4.7, 6.5])
+    mean = 40.0 + np.array([-1.0, 2.0, 4.5])[:, None] + 60.0 * seconds[:, None, None] + rng.normal(0, 0.8, (5, 3, 7))
+    moments = SimpleNamespace(
+        exposures_s=seconds, frames=frames, mean=mean, variance=spread[:, None, None] + np.zeros((5, 3, 7)),
+        lowest=np.full((5, 3, 7), 9), highest=np.full((5, 3, 7), 90),
+    )  # fmt: skip
+    used = np.ones((3, 7), bool)
+    used[1, 4] = False
+    found = fit_dark(moments, used, 255, shared)
+    told, weight = np.arange(5) != 1, frames / (spread + shared)
+    lines = np.polynomial.polynomial.polyfit(seconds[told], mean[told][:, used], 1, w=np.sqrt(weight[told]))
+    left = mean[told][:, used] - np.polynomial.polynomial.polyval(seconds[told], lines).T
+    chi2 = np.sum(weight[told] * np.mean(left**2, axis=1))
+    assert found.chi2_per_dof == pytest.approx(chi2 / 2, rel=1e-5)
+    np.testing.assert_allclose(found.n_dp[used], lines[1], rtol=1e-4)
+    np.testing.assert_allclose(found.n_fp[used], lines[0], rtol=1e-5)
 
 
 def test_dark_line_is_judged_by_the_noise_of_rows_and_pixels():

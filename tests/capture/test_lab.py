@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from scipy.stats import multivariate_normal
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
+from hesim_render.capture import lab_trials
 from hesim_render.capture.bench import Bench, set_up, step_target
 from hesim_render.capture.lab import DARK_EXPOSURES_US, LIT_EXPOSURES_US, _describe, _Session, write_captures
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.core.npz import NpzWriter
 from hesim_render.pixels.aps.model import APS_TERMS
+from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.capture_set import read_captures
 from hesim_render.spectral import spectrum as spectra
 
@@ -220,11 +223,58 @@ def test_npz_pieces_are_read_by_numpy(tmp_path):
     np.testing.assert_array_equal(found["whole"], values)
     np.testing.assert_array_equal(found["pieces"], values)
     assert found["number"] == 7 and found["pieces"].dtype == np.uint16
-    with pytest.raises(RangeError, match="values of x"), NpzWriter(tmp_path / "b.npz") as archive:
-        archive.add_pieces("x", (5, 3, 2), np.uint16, iter(values))
+    for rows in (5, 3):  # too few pieces, and too many
+        with pytest.raises(RangeError, match="values of x"), NpzWriter(tmp_path / "b.npz") as archive:
+            archive.add_pieces("x", (rows, 3, 2), np.uint16, iter(values))
 
 
 # ---- events --------------------------------------------------------------------------------------------
+
+
+def test_first_events_of_trials_fall_into_the_bins_that_end_with_their_instant(tmp_path, monkeypatch):
+    """Two trials of a step and three of steady light, on 2 rows of 3 pixels, in bins (0, 4] and (4, 10] µs."""
+    seeds, levels = [], []
+
+    class Given:
+        """A stage whose events are given: (µs after the step, x, y, polarity), in the order of time."""
+
+        def __init__(self, noise, seed, defects, is_reset):
+            seeds.append(seed)
+            early, late = (-4, 2, 1, 1), (9, 2, 1, 1)  # while it settles, and after: not calm
+            ends = [(4, 1, 0, 1), (10, 1, 0, -1)] if len(seeds) % 2 else [(10, 1, 0, 1)]  # the first one counts
+            own = [early, (5, 0, 1, -1), *ends, late]
+            self.events = np.array(sorted(own), EVENT_DTYPE)
+            self.last_us = self.step_us = None
+
+        def step(self, electrons, t_us):
+            levels.append(float(electrons.numpy()[0]))
+            if self.step_us is None:
+                self.step_us, self.last_us = t_us + 7, t_us
+            found = self.events.copy()
+            found["t_us"] += self.step_us
+            found = found[(found["t_us"] > self.last_us) & (found["t_us"] <= t_us)]
+            self.last_us = t_us
+            return found
+
+    monkeypatch.setattr(lab_trials, "EvsStage", Given)
+    noise = SimpleNamespace(
+        layout=SimpleNamespace(evs_shape=(2, 3)), defects=None, spec=SimpleNamespace(window_us=500)
+    )  # fmt: skip
+    plan = lab_trials.TrialPlan(np.array([2.0, 5.0]), np.array([0.3, 0.0]), 7, np.array([0, 4, 10]), np.array([2, 3]))
+    passed = []
+    bench = lab_trials.TrialBench(noise, np.full((2, 3), 1e-4), 2**64 - 1, passed.append)
+    bench.write(tmp_path / "t.npz", plan)
+    found = arrays(tmp_path / "t.npz")
+    assert found["n_calm"].tolist() == [[[2, 2, 2], [2, 2, 0]], [[3, 3, 3], [3, 3, 0]]]
+    none = [0, 0, 0]
+    # trials 1, 3 and 5 fire at 4 µs, 2 and 4 at 10 µs
+    assert found["n_on"].tolist() == [[[[0, 1, 0], none], [[0, 1, 0], none]], [[[0, 2, 0], none], [[0, 1, 0], none]]]
+    assert found["n_off"].tolist() == [[[none, none], [none, [2, 0, 0]]], [[none, none], [none, [3, 0, 0]]]]
+    assert len(set(seeds)) == 5 and all(0 <= seed < 2**64 for seed in seeds) and bench.t_us == 5 * 18
+    # light of 2 DN and, from 1 µs after the step, of 2 e^0.3 DN, at 1e-4 DN per e⁻/s, in the window of 500 µs
+    after = 10 * np.exp(0.3)
+    assert levels[:4] == pytest.approx([10, 10, after, after], rel=1e-6) and set(levels[8:]) == {25.0}
+    assert passed == pytest.approx([17e-6] * 5)
 
 
 @pytest.mark.slow

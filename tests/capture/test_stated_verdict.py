@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
+from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit
+from hesim_render.core.errors import TooLongError
+from hesim_render.sources.demand import Estimate
 
 
 def meter(scatter, outliers=0.0, count=20_000, seed=3):
@@ -16,6 +19,13 @@ def meter(scatter, outliers=0.0, count=20_000, seed=3):
         types.Float(level + error * noise), types.Float(level - error * noise), lambda e, _: np.full(e.size, noise)
     )
     return found
+
+
+def test_a_run_is_too_long_beyond_its_limit_in_minutes():
+    estimate = Estimate(seconds=150.0, peak_bytes=2e8, rays=3e6)
+    require_short(estimate, 2.5, "less")
+    with pytest.raises(TooLongError, match=r"more than 2.49 min has to be wanted: .*, or ask for less: fewer pixels"):
+        require_short(estimate, 2.49, "fewer pixels")
 
 
 @pytest.mark.parametrize(

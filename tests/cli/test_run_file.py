@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -132,8 +131,9 @@ def test_a_run_that_was_interrupted_after_its_recording_goes_on(tmp_path, capsys
         [sys.executable, "-c", program, "simulate", run, "--out", tmp_path / "o"], stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
-    while "developing" not in child.stdout.readline():
-        time.sleep(0.01)
+    while (line := child.stdout.readline()) and "developing" not in line:
+        pass
+    assert line, child.stderr.read()
     os.kill(child.pid, signal.SIGINT)
     assert child.wait(timeout=60) == 130
     assert json.loads((tmp_path / "o" / "run.json").read_text())["done"] == ["recording"]

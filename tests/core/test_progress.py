@@ -6,7 +6,7 @@ import pty
 import re
 import subprocess
 import sys
-import time
+import threading
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -74,25 +74,29 @@ def test_lengths_of_time_are_words():
 
 
 def test_lines_come_now_and_then_where_there_is_no_terminal(monkeypatch):
-    """Also while nothing reports: native code may take its time."""
-    monkeypatch.setattr(progress, "_FIRST_LINE_S", 0.3)
-    monkeypatch.setattr(progress, "_LEAST_LATE_S", 0.0)
-    monkeypatch.setattr(progress, "_REFRESH_S", 0.02)
-    stream = io.StringIO()
-    with progress_report("star → gen2", stream) as report:
-        report.expect(0.4)
-        report(25, 100, "simulated µs")
-        deadline = time.monotonic() + 30
-        while stream.getvalue().count("\n") < 3 and time.monotonic() < deadline:
-            time.sleep(0.05)
-    lines = stream.getvalue().splitlines()
-    assert all(line.startswith("star → gen2: ") for line in lines)
-    late = [line for line in lines if "takes longer than its estimate" in line]
-    assert len(late) == 1 and "25 % of simulated µs" in late[0]
-    assert re.fullmatch(r"star → gen2: 25 % of simulated µs, about \d+ s left, 1 s so far", lines[0])
-    again = stream.getvalue()
-    time.sleep(0.1)
-    assert stream.getvalue() == again  # nothing after it is closed
+    """Also while nothing reports: native code may take its time. The clock goes on once a line has been written."""
+    monkeypatch.setattr(progress, "_REFRESH_S", 0.01)
+    written, clock = threading.Semaphore(0), Clock()
+
+    class Stream(io.StringIO):
+        def flush(self):
+            written.release()
+
+    stream = Stream()
+    report = ProgressReport(progress._Lines("star → gen2", stream), Pace(clock))
+    report.expect(40)
+    report(25, 100, "simulated µs")
+    with report:
+        for at_s in (31, 70, 90, 200):
+            clock.now = 100 + at_s
+            assert written.acquire(timeout=60)
+    assert stream.getvalue().splitlines() == [
+        "star → gen2: 25 % of simulated µs, about 2 min left, 31 s so far",
+        "star → gen2: 25 % of simulated µs, about 4 min left, 70 s so far",
+        "star → gen2: takes longer than its estimate: 2 min so far, estimated were 40 s; "
+        "25 % of simulated µs, about 4 min left",
+        "star → gen2: 25 % of simulated µs, about 10 min left, 3 min so far",
+    ]
 
 
 def test_a_short_run_is_silent_where_there_is_no_terminal():
@@ -116,20 +120,27 @@ def test_a_stream_that_nobody_reads_is_no_reason_to_stop():
     assert tried == ["x: still here\n", "x: and here\n"]
 
 
+#: Each phase ends when it has been shown.
 _ON_A_TERMINAL = """
-import time
+import threading
 from hesim_render.core import progress
 from hesim_render.core.progress import progress_report
 from hesim_render.cli.terminal import say
 progress._LEAST_LATE_S = 0.0
+shown, late = threading.Event(), threading.Event()
+show, tell = progress._Bar.show, progress._Bar.say
+progress._Bar.show = lambda *given: (show(*given), shown.set())
+progress._Bar.say = lambda *given: (tell(*given), late.set())
 with progress_report("star") as report:
     report(1, 10, "rays")
-    time.sleep(0.7)
+    shown.wait()
     with report.paused():
         say("estimate: about 67 s")
     report.expect(0.2)
     report(5, 10, "rays")
-    time.sleep(1.3)
+    late.wait()
+    shown.clear()
+    shown.wait()
 say("the end")
 """
 

@@ -14,6 +14,7 @@ import hesim_render as hr
 from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
 from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events
+from hesim_render.exchange.dsec_writer import EventFileWriter
 from hesim_render.recording.exports import SUFFIXES, import_events
 
 READABLE = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz")
@@ -125,6 +126,14 @@ def test_files_cut_short_are_told(name, missing, told, tmp_path):
     path.write_bytes(path.read_bytes()[:-missing])
     with pytest.raises(SpecError, match=told):
         read_all(path)
+
+
+def test_events_in_blocks_that_go_back_are_refused_as_they_are_written(tmp_path):
+    writer = EventFileWriter(tmp_path / "events.h5", (3, 5), 20, 900)
+    writer.append(made((30, 4, 1, 1), (80, 2, 2, -1)))
+    with pytest.raises(ValueError, match="in order of time"):
+        writer.append(made((50, 1, 0, 1)))
+    writer.abandon()
 
 
 def test_no_file_and_no_such_format(tmp_path):

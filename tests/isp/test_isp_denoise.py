@@ -8,7 +8,7 @@ from scipy.stats import chi2
 import hesim_render as hr
 from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
-from hesim_render.isp import FrameNoise
+from hesim_render.isp import FrameNoise, rows
 from hesim_render.isp.denoise import denoise
 from hesim_render.isp.rows import row_offsets
 from hesim_render.isp.stabilise import Stabiliser
@@ -288,6 +288,18 @@ def test_an_offset_counts_up_to_four_deviations_of_what_is_likely():
         flat[15] += factor * limit
         found = row_offsets(flat, [[0]], noise, row_std)
         assert found[15] / (factor * limit) == pytest.approx(share, abs=0.01)
+
+
+def test_picture_in_a_row_counts_as_alike_over_eight_pixels():
+    """Samples of a position lie two pixels apart in a tile of three rows and two columns: four of them are one."""
+    tile, noise, size = np.array([[0, 1], [2, 2], [3, 4]]), noise_of(np.zeros((3, 2), int)), 60
+    flat = np.full((15, 2 * size), 50.0, np.float32)
+    flat[6, ::4] += 7
+    flat[6, 2::4] -= 7
+    (found,) = rows._compared(flat, tile, (0, 0), noise, 3.0)
+    sigma2 = (0.64 + 1 / 12 + 0.16 * 50) * 1.5
+    assert found.rows.tolist() == [3, 6, 9] and found.mean[1] == pytest.approx(0, abs=1e-6)
+    assert found.variance[1] == pytest.approx((sigma2 + 4 * (49 - sigma2)) / size, rel=1e-5)
 
 
 def test_scatter_of_what_is_left_is_what_the_noise_makes():

@@ -14,7 +14,7 @@ from hesim_render.pixels.evs import start
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.noise_rates import events_per_period
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.pixels.evs.start import Pixels, law, start_of
+from hesim_render.pixels.evs.start import Pixels, law, start_chances, start_of
 from hesim_render.sensor.reading import read_sensor
 
 SIDE = 64
@@ -128,6 +128,8 @@ def test_levels_of_comparison_are_drawn_from_the_law():
     below = np.append(0.0, np.cumsum(expected.share[0]))
     # Kolmogorov, 1e-6
     assert np.abs(np.interp(np.sort(found), expected.edges, below) - (np.arange(count) + 0.5) / count).max() < 0.04
+    # a larger number never gives a lower level
+    assert np.diff(found[np.argsort(start_chances(noise, 3)[0])]).min() >= 0
     # twice the noise halves both thresholds; half the bandwidth halves the dead time in periods
     other = start_of(noise, 3, np.full(count, 0.14, np.float32), np.full(count, 0.5), angle).reference
     half = law(Pixels(np.array([1.5]), np.array([1.75]), 400e-6 * 125, 1e-3 / 125, angle / 2))

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import h5py
@@ -19,6 +18,7 @@ import tifffile
 
 import hesim_render as hr
 from hesim_render.core.errors import OutputError, SpecError
+from hesim_render.mosaic.description import describe
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.preview_dng import binned
@@ -147,6 +147,22 @@ def test_preview_dng_is_the_binned_quad(tmp_path):
     assert smaller.noise_profile == pytest.approx(np.array(own.noise_profile) / 3, rel=1e-12)
     assert smaller.pitch_um == 2 * own.pitch_um
     assert binned(frame.raw, recordings.make("reference-bayer", frames=0).mosaic) is None
+
+
+def test_cells_of_a_tile_are_binned_wherever_their_event_pixels_are():
+    """A tile of 2 rows and 6 columns; the first pixel of one cell, and two of another, have no value."""
+    tile = {"tile": "e R G G B e\nR R G G e B", "evs_grid": {"rows_per_tile": 1, "cols_per_tile": 3}}
+    mosaic = describe(hr.load_sensor("mipi-hybridevs", tile | {"geometry.rows": 20, "geometry.cols": 60}))
+    mosaic = mosaic.model_copy(update={"noise_profile": (2e-4, 3e-6)})
+    raw = np.random.default_rng(2).integers(100, 900, (20, 60), np.uint16)
+    found, smaller = binned(raw, mosaic)
+    assert [[mosaic.channels.index(name) for name in row] for row in smaller.tile_filter] == [[0, 1, 2]]
+    one = raw.reshape(10, 2, 10, 6).astype(float)
+    red, blue = one[:, [0, 1, 1], :, [1, 0, 1]].mean(axis=0), one[:, [0, 1], :, [4, 5]].mean(axis=0)
+    expected = np.stack([red, one[..., 2:4].mean(axis=(1, 3)), blue], axis=-1)
+    np.testing.assert_array_equal(found, np.rint(expected).reshape(10, 30))
+    shares = (1 / 3 + 1 / 4 + 1 / 2) / 3
+    assert smaller.noise_profile == pytest.approx(np.array([2e-4, 3e-6]) * shares, rel=1e-12)
 
 
 @pytest.mark.parametrize("block", [1, 977, 70_000])
@@ -345,7 +361,6 @@ with RecordingWriter(sys.argv[1], sensor, seed=1, duration_us=10**6) as writer:
     child.wait(timeout=10)
     assert not (tmp_path / "r").exists()
     assert [p.name.endswith(".partial") for p in tmp_path.iterdir()] == [True]
-    time.sleep(0.1)
     recordings.make("eiger", tmp_path / "r")
     assert [p.name for p in tmp_path.iterdir()] == ["r"]
 

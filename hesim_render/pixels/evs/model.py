@@ -124,10 +124,11 @@ class EvsNoise(PlainState):
 
     @property
     def readout_buffer_events(self) -> int:
-        """Events that can wait for the read-out: from the file, else the number that it reads in a tick or in 1 ms."""
+        """Events that can wait for a limited read-out: from the file, else what it reads in a tick or in 1 ms."""
         spec = self.spec
-        if spec.readout_buffer_events is not None or spec.readout_max_events_per_s is None:
-            return spec.readout_buffer_events or 1
+        if spec.readout_buffer_events is not None:
+            return spec.readout_buffer_events
+        assert spec.readout_max_events_per_s is not None
         return max(1, round(spec.readout_max_events_per_s * (spec.tick_us or 1000) * S_PER_US))
 
     @property
