@@ -20,6 +20,7 @@ from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core import backend, progress
 from hesim_render.core.backend import BackendCandidate
 from hesim_render.core.errors import RangeError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.region import parse_roi
 from hesim_render.core.shipped import data_folder, list_names
 
@@ -199,7 +200,7 @@ def test_doctor_says_what_to_install_where_nothing_runs(capsys, monkeypatch):
     monkeypatch.setattr(backend, "candidates", lambda: [broken])
     status, out, err = call(capsys, "info")
     assert status == 2 and "does not work: no such file" in out
-    assert err.count("\n") == 1 and "libllvm19" in err and "pip install 'tadashi" in err
+    assert err.count("\n") == 1 and "libllvm19" in err and how_to_install("llvm") in err
 
 
 @pytest.mark.parametrize(
