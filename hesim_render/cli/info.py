@@ -63,7 +63,7 @@ def info(
     json_: Json = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Show what runs here, what ships, or a sensor.
+    """Show backends, shipped names, or a sensor.
 
     What this machine can run, the names that can be used, or the figures and curves of a sensor.
     """

@@ -181,7 +181,7 @@ def test_a_long_run_says_what_to_do_in_one_reading(capsys, tmp_path):
         "--quality", "0.4", "--roi", "64x64",
     )  # fmt: skip
     assert status == 2 and out.startswith("estimate: about ") and line.count("\n") == 1
-    assert "this run takes about " in line and "has to be wanted: add --yes (max_minutes=None), or ask for less" in line
+    assert "this run takes about " in line and "must be allowed: add --yes (max_minutes=None), or ask for less" in line
     assert "--duration, a smaller --roi, or a larger error, such as --quality 0.8" in line
     assert list(tmp_path.iterdir()) == []
 
