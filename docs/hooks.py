@@ -19,6 +19,8 @@ PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.
 CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(\[])")
 #: A symbol of one letter with an index.
 INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
+#: Characters of a cell from which a table does not fit on a telephone.
+LONG_CELL = 40
 #: Where docs/cli.md is to have what `--help-all` says of each command.
 COMMANDS = "<!-- commands -->"
 
@@ -91,6 +93,26 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     pieces[::2] = (INDEXED.sub(r"\1<sub>\2</sub>", piece) for piece in pieces[::2])
     markdown = "".join(pieces)
     return CITED.sub(linked, re.sub(r"(\]\([^)]*)\.ipynb\)", r"\1.md)", markdown))
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Name each cell of a table with long text by the head of its column: narrow screens show a row as a list."""
+
+    def named(table: re.Match) -> str:
+        heads = [plain_text(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", table.group(0), re.DOTALL)]
+        cells = re.findall(r"<td[^>]*>(.*?)</td>", table.group(0), re.DOTALL)
+        if len(heads) < 3 or not any(len(plain_text(cell)) > LONG_CELL for cell in cells):
+            return table.group(0)
+        count = iter(range(len(cells)))
+        label = lambda match: f'<td data-label="{heads[next(count) % len(heads)]}"{match.group(1)}>'  # noqa: E731
+        return re.sub(r"<td([^>]*)>", label, table.group(0)).replace("<table", "<table data-long", 1)
+
+    return re.sub(r"<table>.*?</table>", named, html, flags=re.DOTALL)
+
+
+def plain_text(html: str) -> str:
+    """The text of a piece of a page, for an attribute."""
+    return re.sub(r"<[^>]*>", "", html).strip().replace('"', "&quot;")
 
 
 @functools.cache
