@@ -96,17 +96,20 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Name each cell of a table with long text by the head of its column: narrow screens show a row as a list."""
+    """Fold the tests of equations; name cells of tables with long text by their heads, for narrow screens."""
 
     def named(table: re.Match) -> str:
         heads = [plain_text(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", table.group(0), re.DOTALL)]
         cells = re.findall(r"<td[^>]*>(.*?)</td>", table.group(0), re.DOTALL)
-        if len(heads) < 3 or not any(len(plain_text(cell)) > LONG_CELL for cell in cells):
+        has_keys = len(heads) == 2 and any("<code>" in cell for cell in cells[::2])
+        if not (len(heads) > 2 or has_keys) or not any(len(plain_text(cell)) > LONG_CELL for cell in cells):
             return table.group(0)
         count = iter(range(len(cells)))
         label = lambda match: f'<td data-label="{heads[next(count) % len(heads)]}"{match.group(1)}>'  # noqa: E731
         return re.sub(r"<td([^>]*)>", label, table.group(0)).replace("<table", "<table data-long", 1)
 
+    folded = r"<details class=tests><summary>Checked by tests</summary>\1</details>"
+    html = re.sub(r"<p><em>Checked by</em> (.*?)</p>", folded, html, flags=re.DOTALL)
     return re.sub(r"<table>.*?</table>", named, html, flags=re.DOTALL)
 
 
