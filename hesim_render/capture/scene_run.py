@@ -160,6 +160,6 @@ def require_short(expected: Estimate, most_minutes: float, cheaper: str) -> None
         raise TooLongError(
             "max_minutes",
             most_minutes,
-            f"this run takes {expected}, and one of more than {most_minutes:g} min has to be wanted: add --yes "
+            f"this run takes {expected}, and more than {most_minutes:g} min must be allowed: add --yes "
             f"(max_minutes=None), or ask for less: {cheaper}",
         )

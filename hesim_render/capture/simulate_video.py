@@ -165,8 +165,8 @@ def _duration_us(duration_s: float | None, flux: VideoFlux) -> int:
     if duration_s is None:
         if flux.cut_short:
             raise SpecError(
-                f"ends after {length_us * S_PER_US:.6g} s, but it once was longer ({flux.cut_short}): copy it anew, or "
-                "give a duration that is there",
+                f"ends after {length_us * S_PER_US:.6g} s, but it once was longer ({flux.cut_short}): copy it again, "
+                "or give a duration within that time",
                 file=flux.name,
             )
         duration_us = int(length_us + 1e-3)

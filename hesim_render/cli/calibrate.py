@@ -50,7 +50,8 @@ def lab(
     parts: Annotated[
         int,
         typer.Option(
-            help="parts of the dark ticks (of bright trials) counted too: tells flickering pixels", hidden=True
+            help="parts of dark ticks (bright trials) counted separately as well, to find flickering pixels",
+            hidden=True,
         ),
     ] = 0,
     seed: Annotated[int, typer.Option(help="of all temporal noise", hidden=True)] = 7,

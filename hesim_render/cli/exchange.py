@@ -91,9 +91,9 @@ def import_(
     out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
     format: Annotated[
         str | None,
-        typer.Option(help="of the file, such as evt3; default: what it says itself", autocompletion=_complete_import),
+        typer.Option(help="of the file, such as evt3; default: as the file states", autocompletion=_complete_import),
     ] = None,
-    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, where the file does not say it")] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if the file does not state it")] = None,
     sensor: Annotated[
         str | None,
         typer.Option(help=f"make a recording of this sensor: {SENSOR_HELP}", autocompletion=names_of("sensors")),

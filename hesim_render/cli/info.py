@@ -63,7 +63,7 @@ def info(
     json_: Json = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Show what runs here, what ships, or a sensor.
+    """Show backends, shipped names, or a sensor.
 
     What this machine can run, the names that can be used, or the figures and curves of a sensor.
     """
@@ -227,7 +227,7 @@ def new(
     ] = "hybrid",
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a sensor file to begin with.
+    """Write a sensor file to start from.
 
     A template in which comments explain every key, or a copy of a shipped one.
     """

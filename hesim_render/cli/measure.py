@@ -83,13 +83,13 @@ def _region(roi: str) -> tuple[int, int, int, int]:
 
 def compare(
     first: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file, such as that of a real camera")],
-    second: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file of a like scene")],
+    second: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file of a similar scene")],
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if files do not state it")] = None,
     json_: Json = False,
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Compare the events of two recordings of like scenes.
+    """Compare the events of two recordings of similar scenes.
 
     Rates, intervals, correlations, polarity, hot pixels and bursts, each as a distance with an interval.
     """

@@ -83,7 +83,7 @@ Truth = Annotated[
 ]
 #: Runs with a longer estimate need a confirmation.
 LONG_MINUTES = 30
-Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes", hidden=True)]
+Yes = Annotated[bool, typer.Option("--yes", help=f"also if it takes more than {LONG_MINUTES} minutes", hidden=True)]
 AllowOutside = Annotated[
     bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder", hidden=True)
 ]

@@ -33,12 +33,12 @@ def study(
             autocompletion=names_of("studies"),
         ),
     ],
-    out: Annotated[Path, typer.Option(help="folder of tables and report; a sweep that was ended goes on there")],
+    out: Annotated[Path, typer.Option(help="folder of tables and report; an interrupted sweep continues there")],
     surfaces: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME or FILE",
-            help="what a comparison looks at, in place of its own: a scene, a cube, patches; repeatable",
+            help="surfaces of a comparison, in place of its own: a scene, a cube, patches; repeatable",
         ),
     ] = None,
     set_: Annotated[

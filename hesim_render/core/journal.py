@@ -127,7 +127,7 @@ class Journal:
                 changed = [name for name in {**self._run, **before} if before.get(name) != self._run.get(name)]
                 if not overwrite and before:
                     raise OutputError(
-                        f"{target}: an interrupted run, which would go on there, had another {', '.join(changed)}; "
+                        f"{target}: the interrupted run at this place differs in {', '.join(changed)}; "
                         f"repeat that run, or begin anew (--overwrite, overwrite=True), or remove {self.path}"
                     )
                 self.path.unlink()

@@ -96,7 +96,7 @@ class TrackSpec(Strict):
     @model_validator(mode="before")
     @classmethod
     def _from_file(cls, data: Any, info: ValidationInfo) -> Any:
-        """Read the keyframes of ``file``; a dump then holds the numbers. What only rides on its parent needs none."""
+        """Read the keyframes of ``file``; a dump then holds the numbers. A track with a parent needs none."""
         if isinstance(data, dict) and data.get("parent") is not None and not ({"file", "keyframes"} & set(data)):
             return {**data, "keyframes": [{"t_us": 0}, {"t_us": 1}]}
         if not isinstance(data, dict) or not ({"file", *_OF_FILE} & set(data)):

@@ -81,7 +81,7 @@ def test_another_command_does_not_go_on(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         record("exact static", tmp_path / "out", stop_after=1, monkeypatch=monkeypatch, overwrite=True, samples=8192)
     (journal,) = tmp_path.iterdir()
-    with pytest.raises(OutputError, match=r"interrupted run.*another seed;"):
+    with pytest.raises(OutputError, match=r"interrupted run.*differs in seed;"):
         record("exact static", tmp_path / "out", monkeypatch=monkeypatch, seed=6, samples=8192)
     assert list(tmp_path.iterdir()) == [journal]
     record("exact static", tmp_path / "out", monkeypatch=monkeypatch, seed=6, samples=4, overwrite=True)

@@ -86,7 +86,7 @@ def test_another_run_is_refused_by_what_differs_or_begun_anew(tmp_path):
     path = interrupted(tmp_path / "out")
     before = path.read_bytes()
     other = {"seed": 4, "scene": {"name": "b", "sha256": "1"}}
-    with pytest.raises(OutputError, match=r"another seed, scene; .*--overwrite"):
+    with pytest.raises(OutputError, match=r"differs in seed, scene; .*--overwrite"):
         Journal(tmp_path / "out", other)
     assert path.read_bytes() == before
     with Journal(tmp_path / "out", other, overwrite=True) as journal:

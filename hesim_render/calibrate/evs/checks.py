@@ -135,8 +135,8 @@ def _width(result: EvsCalibration, contrast_of: str) -> Finding | None:
         return None
     return Finding(
         "S-curve width",
-        f"the width of the S-curve asks for noise of {measured:.3g} (ln), the static counts for {expected:.3g}: they "
-        "are not of one normal law. A … D hold for the static counts at best, and θ/σ does not. Look for noise with "
-        "longer tails than a normal law, events that come by themselves, or steps captured at another light or bias.",
+        f"the width of the S-curve belongs to a noise of {measured:.3g} (ln), the static counts for {expected:.3g}: "
+        "they are not of one normal law. A … D hold for the static counts at best, and θ/σ does not. Look for noise "
+        "with longer tails than a normal law, events without a change, or steps captured at another light or bias.",
         p_value,
     )

@@ -20,6 +20,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     Movable,
     as_spec_error,
     box_corners,
+    can_move,
     files_readable,
     make_mesh,
     settle_normals,
@@ -168,7 +169,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
             if prefix not in shapes:
                 known = ", ".join(sorted(shapes))
                 raise SpecError(f"motion: no shape {name!r} in the Mitsuba scene; there are {known}", file=spec.file)
-            if f"{prefix}.vertex_positions" not in parameters and f"{prefix}.to_world" not in parameters:
+            if not can_move(parameters, prefix):
                 kind = shapes[prefix].class_name()
                 raise SpecError(
                     f"motion: shape {name!r} is a {kind}, which cannot move; use a mesh (PLY, OBJ)", file=spec.file
