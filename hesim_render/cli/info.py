@@ -1,4 +1,7 @@
-"""What there is: the machine, names that can be used, and the figures of a sensor (``info``)."""
+"""What there is: the machine, names that can be used, and the figures of a sensor (``info``).
+
+Files to begin with: ``new``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Measuring on recordings: ``measure``."""
+"""Measuring on recordings: ``measure``.
+
+Two recordings of events of like scenes: ``compare``.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,24 @@ thresholds, the noise and the bandwidth that the pixel has in the light of the f
 few periods of their noise, whose events nobody sees (`hesim_render.pixels.evs.comparison.LastEvent`).
 
 The laws are known at nodes of thresholds over noise and of the bandwidth. Between nodes, quantiles are interpolated.
+
+Level with which asynchronous pixels compare after a long time in steady light: the law over pixels.
+
+In units of the noise's standard deviation, a pixel with thresholds a and b compares with a level r. Its noise goes up
+through r + a at the rate ν(a + r), down through r − b at the rate ν(b − r), each after a wait of its own. Then the
+level of comparison becomes that of the crossing or, with a dead time, the level at its end; a leak event of a pixel
+with a dead time does the same at any level. So r is a semi-Markov process: the share of the time at r is the share of
+the visits to r times the mean wait there. Pixels wait longest where both thresholds are far, and there they are found.
+
+- ν is the rate at which the simulated noise, which is linear between its nodes, crosses a level. For two nodes of the
+  standard deviation A and the correlation ρ it is 2 T(L/A, √((1 − ρ)/(1 + ρ))) with Owen's function T [owen1956]; with
+  ever more nodes it is that of a Gaussian process [rice1945].
+- At a crossing the noise is at the threshold, with a speed of Rayleigh's law. A dead time later it is at
+  e^−h ((1 + h) L + h v), with the variance 1 − e^−2h (1 + 2h + 2h²) of what came since.
+- The visits are the stationary law of a Markov chain on a grid, by elimination without differences [grassmann1985]:
+  its chances differ by many powers of ten.
+
+The law holds for rare crossings; where they are frequent, a few periods of the noise bring any law to the true one.
 """
 
 from __future__ import annotations
