@@ -209,6 +209,7 @@ def start_of(
     angle : rate of the poles at the largest bandwidth times the time between nodes of the noise.
     """
     chance, of_dead, free = start_chances(noise, seed)
+    # where each pixel lies between the nodes of the table: thresholds in noise units, octave of its bandwidth, quantile
     sigma = np.maximum(spread.astype(np.float64), 1e-12)
     thresholds = noise.threshold_on_map, noise.threshold_off_map
     where = [_place(np.ravel(theta) / sigma, _NODES) for theta in thresholds]
@@ -220,6 +221,7 @@ def start_of(
     low = np.minimum(z.astype(np.intp), _QUANTILES.size - 2)
     part = (z - low).astype(np.float32)
     reference, dead_share, events_hz = np.zeros(chance.size, np.float32), np.zeros(chance.size), np.zeros(chance.size)
+    # what resets a pixel besides its events, and for how long it is dead after one
     bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
     assert bandwidth_hz is not None
     dead_s = (period_us or 0) / US_PER_S
@@ -229,6 +231,7 @@ def start_of(
         here = np.flatnonzero(np.abs(octave - step) < 1)
         own_hz = bandwidth_hz / 2.0**step
         laws = _laws(dead_s * own_hz, resets_hz / own_hz, angle / 2.0**step)
+        # linear between octaves, thresholds and quantiles: each corner of the cell adds its share
         weight = (1 - np.abs(octave[here] - step)).astype(np.float32)
         for (on, on_weight), (off, off_weight) in product(*(((n, 1 - p), (n + 1, p)) for n, p in where)):
             node = on[here] * _NODES.size + off[here]
@@ -238,6 +241,7 @@ def start_of(
             reference[here] += all_weight * (value + part[here] * (following - value))
             dead_share[here] += all_weight * laws.dead_share[node]
             events_hz[here] += all_weight * laws.events[node] * own_hz
+    # a pixel is in its dead time with that time's share, at an even place within it
     asleep = of_dead < dead_share
     dead_us = np.where(asleep, (period_us or 0) * of_dead / np.where(asleep, dead_share, 1.0), 0.0)
     return Start(reference, dead_us, events_hz, free)
