@@ -161,7 +161,7 @@ def _rows_of(kind: Kind) -> list[dict[str, Any]]:
 
         return [{"name": name} for name in LENS_TERMS]
     if kind is Kind.truth:
-        from hesim_render.recording.truth_kinds import TRUTH_KINDS
+        from hesim_render.recording.truth_file import TRUTH_KINDS
 
         return [{"name": name} for name in TRUTH_KINDS]
     from hesim_render.core.shipped import data_folder, read_keys
