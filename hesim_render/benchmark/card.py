@@ -1,4 +1,9 @@
-"""The card of a benchmark: what it holds, how its clips differ, and how good its render is."""
+"""The card of a benchmark: what it holds, how its clips differ, and how good its render is.
+
+What hubs of data sets read of a benchmark: metadata in Croissant 1.1 (JSON-LD), and the header of the card.
+
+Neither has a date or a licence, which a benchmark does not know: who publishes it adds them.
+"""
 
 from __future__ import annotations
 

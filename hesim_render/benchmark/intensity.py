@@ -1,4 +1,14 @@
-"""Intensity from events alone: the leaky sum of their steps, and how a picture of unknown scale is measured."""
+"""Intensity from events alone: the leaky sum of their steps, and how a picture of unknown scale is measured.
+
+Event double integral: sharp images from a blurred one and the events of its exposure [pan2019].
+
+The log intensity at a time t differs from that at a reference time f by the signed number of events between, times the
+threshold: L(t) = L(f) · exp(c · E(f, t)). The blurred image is the mean of L over the exposure, so
+
+    L(f) = B / mean over t of exp(c · E(f, t))
+
+for every pixel. E is a step function of time: its mean is a sum over the events, without a loop over pixels.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 Pictures are 8-bit sRGB of the same size as the RAW frame. Coordinates of events are those of the picture: an event
 pixel has the place that it has on the mosaic, so a sparse event grid gives sparse coordinates.
+
+The cumulative representation of events of EFNet.
 """
 
 from __future__ import annotations

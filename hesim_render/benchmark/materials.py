@@ -1,4 +1,7 @@
-"""Materials of generated scenes: spectra and textures within a scene's range of reflectance, under a coat or none."""
+"""Materials of generated scenes: spectra and textures within a scene's range of reflectance, under a coat or none.
+
+Textures by seed: pictures of reflectance between two values.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Pictures of clips as measures compare them: linear sRGB of RAW, exposed alike, and encoded."""
+"""Pictures of clips as measures compare them: linear sRGB of RAW, exposed alike, and encoded.
+
+Bilinear demosaicing of any tile, a baseline: each channel is a mean of its samples around, weighted by a tent.
+"""
 
 from __future__ import annotations
 

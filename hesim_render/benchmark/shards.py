@@ -1,4 +1,7 @@
-"""Benchmarks as few large files for training: WebDataset (tar) or HDF5 shards, in a folder or at any fsspec address."""
+"""Benchmarks as few large files for training: WebDataset (tar) or HDF5 shards, in a folder or at any fsspec address.
+
+What a clip holds for training, as arrays: one sample for each frame, and each event in one of them.
+"""
 
 from __future__ import annotations
 

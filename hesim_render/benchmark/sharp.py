@@ -1,4 +1,10 @@
-"""Sharp images of a clip: noise-free flux of the frame pixels in short windows, and the RAW of a still scene of it."""
+"""Sharp images of a clip: noise-free flux of the frame pixels in short windows, and the RAW of a still scene of it.
+
+Full-colour truth of a clip: the light of every pixel through every filter of the frame pixels, rendered.
+
+A sensor reads one filter at each pixel, and none at a pixel for events alone. The truth is no interpolation: the scene
+is rendered once for each filter, by the same sensor with that filter on all pixels.
+"""
 
 from __future__ import annotations
 

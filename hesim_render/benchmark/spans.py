@@ -4,6 +4,8 @@ The flux of a window is a pure function of the window, so a span can be rendered
 in a hidden folder beside the clip, holds what it has traced. The clip itself is the last unit of work: it goes through
 the whole time, takes the light from these journals, traces what is in none of them, and makes events, noise and files.
 Its bytes are therefore those of a clip without spans, also where a span is missing or was rendered twice.
+
+Units of work of a build: clips, and spans of long clips, which come before them.
 """
 
 from __future__ import annotations

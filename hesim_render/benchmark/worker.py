@@ -1,6 +1,8 @@
 """A worker process: takes units of work from its standard input, one line each, and answers with one line each.
 
 A worker of dask calls `attempt`. Errors travel as text, because exceptions with several arguments cannot be pickled.
+
+Which GPU a worker uses: each process on a machine takes one of its own, as long as there are enough.
 """
 
 from __future__ import annotations

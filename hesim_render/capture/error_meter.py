@@ -1,4 +1,11 @@
-"""Error of a render in units of the sensor's own noise, from its two independent halves."""
+"""Error of a render in units of the sensor's own noise, from its two independent halves.
+
+Verdict on a run of the exact mode, from its stated errors alone.
+
+All pixels of the exact mode get the same number of independent rays in every slice, and no value is interpolated, so
+half the difference of a value's two halves is distributed as its error. The limit is the audit's: at most `MOST_OFF` of
+the values are off by more than `TOLERANCE` wanted errors.
+"""
 
 from __future__ import annotations
 

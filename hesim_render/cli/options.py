@@ -1,4 +1,7 @@
-"""Common parts of commands: options, completion of names, and checks before any work."""
+"""Common parts of commands: options, completion of names, and checks before any work.
+
+Names of options in errors that the Python API raised with the names of its arguments.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Events on the pixel grid: frames, time surfaces and voxel grids."""
+"""Events on the pixel grid: frames, time surfaces and voxel grids.
+
+Checks of event arrays and of intervals of time.
+"""
 
 from __future__ import annotations
 

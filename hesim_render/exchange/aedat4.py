@@ -4,6 +4,8 @@
 (stream, size, content), and the table of packets, whose places are those behind the packets' own headers. All parts
 are FlatBuffers (flatbuffers.dev) with the size in front. A packet of events is one vector of 16-byte structures, so
 NumPy writes and reads it without a library for FlatBuffers.
+
+Reader of tables in FlatBuffers (flatbuffers.dev), with every position checked.
 """
 
 from __future__ import annotations

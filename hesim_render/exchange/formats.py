@@ -1,4 +1,9 @@
-"""The formats by name, and the opening of event files."""
+"""The formats by name, and the opening of event files.
+
+RAW frames as files of other programs: 16-bit TIFF and PNG, NPY, and the ``.bin`` of the MIPI challenge.
+
+All hold the exact DN. The challenge's files are uint16, little endian: width, height, then the pixels row by row.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,8 @@ Poisson and Gaussian noise it is the generalised Anscombe transform. Below 0 the
 noise around black is not distorted. The mean of f over the noise differs from f of the mean. The inverse is therefore
 that of I → E f(I + noise), as Mäkitalo and Foi have it [makitalo2013], for a Poisson count of gain b plus Gaussian
 noise.
+
+A mosaic as planes, one for each position of a block of whole tiles. Each plane has one colour and one noise.
 """
 
 from __future__ import annotations

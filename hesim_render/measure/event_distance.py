@@ -3,6 +3,8 @@
 The time of each stream is cut into 20 parts, which are drawn anew with replacement, those of both streams
 independently. A distance of samples is never 0: each figure also has the distance of two such draws of the first
 stream, at most in 95 of 100 cases. A difference below that is none that these recordings show.
+
+Statistics of a stream of events, each for successive parts of its time, so that they can be drawn anew.
 """
 
 from __future__ import annotations

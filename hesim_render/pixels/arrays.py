@@ -1,4 +1,7 @@
-"""Device parameters that are one number or one value per pixel, and the state of an object as plain values."""
+"""Device parameters that are one number or one value per pixel, and the state of an object as plain values.
+
+Noise terms that can be switched off by name.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""RAW files of cameras, read by LibRaw through rawpy: the mosaic, its colours and its levels."""
+"""RAW files of cameras, read by LibRaw through rawpy: the mosaic, its colours and its levels.
+
+RAW frames of one file each: PNG, TIFF, DNG, NPY and npz, without a sensor file.
+"""
 
 from __future__ import annotations
 

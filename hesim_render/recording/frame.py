@@ -1,4 +1,7 @@
-"""One RAW frame and its noise-free truth."""
+"""One RAW frame and its noise-free truth.
+
+Frames of a recording on disk.
+"""
 
 from __future__ import annotations
 

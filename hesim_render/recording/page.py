@@ -1,4 +1,7 @@
-"""A recording as a web page: ``recording.html`` beside its files, and short tables for notebooks."""
+"""A recording as a web page: ``recording.html`` beside its files, and short tables for notebooks.
+
+Plots of a recording: its pictures, events over time, and the distribution of RAW values.
+"""
 
 from __future__ import annotations
 

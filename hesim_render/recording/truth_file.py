@@ -1,6 +1,8 @@
 """Geometric truth of a recording in one HDF5 file, written frame by frame.
 
 docs/ground-truth.md lists the data sets with their units. Images are chunked by frame and packed with Blosc LZ4.
+
+Kinds of ground truth that a run can be asked for.
 """
 
 from __future__ import annotations

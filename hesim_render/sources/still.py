@@ -1,4 +1,7 @@
-"""A static source: it is rendered once and serves all times."""
+"""A static source: it is rendered once and serves all times.
+
+Event samples of sources that compute one window after another.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Targets of a scene file for tone, colour and uniformity."""
+"""Targets of a scene file for tone, colour and uniformity.
+
+Targets of a scene file for resolution.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""The ``evs`` section of a sensor file: event pixels, their thresholds and their noise."""
+"""The ``evs`` section of a sensor file: event pixels, their thresholds and their noise.
+
+Pixels that misbehave, as a sensor file describes them: events that are not the scene's, values of two levels.
+
+The leak of event pixels, as a sensor file describes it.
+
+The photoreceptor of event pixels, as a sensor file describes it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A light of a scene file: its place, its spectrum, its level and its waveform."""
+"""A light of a scene file: its place, its spectrum, its level and its waveform.
+
+The waveform of a flickering light in a scene file.
+"""
 
 from __future__ import annotations
 

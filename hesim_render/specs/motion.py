@@ -1,4 +1,7 @@
-"""How an object or the camera moves: keyframes of rigid motions."""
+"""How an object or the camera moves: keyframes of rigid motions.
+
+A mesh that changes its shape: positions of its vertices at some times, in files.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Reflectances, pictures of them, and the common part of all targets: place, tilt and bend."""
+"""Reflectances, pictures of them, and the common part of all targets: place, tilt and bend.
+
+Surfaces of objects: pictures on them, and materials of Mitsuba by name.
+"""
 
 from __future__ import annotations
 

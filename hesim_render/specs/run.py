@@ -1,4 +1,7 @@
-"""The file of a whole run: what is recorded, and the steps that follow on the recording."""
+"""The file of a whole run: what is recorded, and the steps that follow on the recording.
+
+The kind of a YAML file by its keys: of a study (comparison, design, sweep), and a whole run or a scene.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 
 A matrix maps the channels of a camera (white at 1) to CIE XYZ (white at Y = 1). Errors are colour differences in CIELAB
 under the white of the light itself, so no chromatic adaptation is needed.
+
+Matrices that a study uses besides the best one: to sRGB, and against noise.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def output_noise(
 
     >>> import numpy as np
     >>> from hesim_render.studies import ChannelNoise, output_noise
-    >>> found = output_noise(np.eye(3), [1e4] * 3, ChannelNoise.of_photons(3), weights=(1, 0, 0))
+    >>> found = output_noise(np.eye(3), [1e4] * 3, ChannelNoise(np.zeros(3), np.ones(3), np.zeros(3), np.ones(3)), weights=(1, 0, 0))
     >>> round(found.ysnr**2, 6), found.amplification
     (1800.0, 1.0)
 
@@ -177,7 +177,7 @@ def light_for_snr(
     A single pixel with 20 e⁻/lux of white and 2 e⁻ of read noise: N²= 100 (N + 4) gives N = 103.85 e⁻ at 28.85 lx.
 
     >>> from hesim_render.studies import ChannelNoise, light_for_snr
-    >>> round(light_for_snr(10, [1.0], [20.0], ChannelNoise.of_photons(1, 2.0)), 2)
+    >>> round(light_for_snr(10, [1.0], [20.0], ChannelNoise(*(np.array([x]) for x in (4.0, 1.0, 0.0, 1.0)))), 2)
     28.85
 
     Returns

@@ -1,4 +1,7 @@
-"""Surfaces under a light as a camera and as the CIE observer see them."""
+"""Surfaces under a light as a camera and as the CIE observer see them.
+
+Surfaces of a study: sets of reflectances and hyperspectral cubes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What a mosaic costs in detail: resolution, false colour and zipper after the demosaicing of the real ISP."""
+"""What a mosaic costs in detail: resolution, false colour and zipper after the demosaicing of the real ISP.
+
+Test patterns as a pixel grid sees them: slanted edge, star and zone plate, each pixel the mean over its area.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Run a design from its file, judge the result by full simulation, and write all of it."""
+"""Run a design from its file, judge the result by full simulation, and write all of it.
+
+The files of a design: its filters as a palette, its tile as a filter set.
+"""
 
 from __future__ import annotations
 

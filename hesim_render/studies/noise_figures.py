@@ -1,4 +1,7 @@
-"""Noise figures of a candidate under a light: closed forms, and full simulation with intervals."""
+"""Noise figures of a candidate under a light: closed forms, and full simulation with intervals.
+
+Exposures at which sensors and filter sets are compared: equal exposure, equal light, equal white.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A table of results: named columns, and files of it."""
+"""A table of results: named columns, and files of it.
+
+What the columns of a study are called in tables for people, and which of them know the noise.
+"""
 
 from __future__ import annotations
 

@@ -239,10 +239,12 @@ def _chain(
     occurs in two successive frames [pixel].
     """
     exposures, frames, pixels = y.shape
+    # how likely each value is in either state, over the larger of the two
     rest = (y - level[0] - level[1] * t) / width
     emission = np.stack([-0.5 * rest**2, -0.5 * (rest - level[2] / width) ** 2])
     top = emission.max(axis=0)
     emission = np.exp(emission - top)
+    # forward: probability of the state from all frames up to this one
     stationary = np.stack([1 - share, share])[:, None]  # [state, 1, pixel]
     forward = np.empty((2, exposures, frames, pixels))
     scale = np.empty((exposures, frames, pixels))
@@ -253,6 +255,7 @@ def _chain(
         now = now / scale[:, k]
         forward[:, :, k] = now
         before = correlation * now + (1 - correlation) * stationary
+    # backward: the same from all later frames; together they are the probability from all frames
     high = np.empty_like(y)
     both = np.zeros(pixels)
     backward = np.ones((2, exposures, pixels))

@@ -265,18 +265,21 @@ def _solve(
     predicted = np.maximum(bins.variance_dn2, _FLOOR_DN2)
     beta, dropped = np.zeros(6), list(dropped)
     for turn in range(30):
+        # weights from the variance that the last round predicts
         weight = bins.weight(predicted + ADC_VARIANCE_DN2)
         matrix = np.tensordot(weight, exact, 1)
         keep = _identifiable(matrix, dropped)
         if turn >= _SETTLED:
             # a term identified with the weights of one round and not of the next would alternate without end
             dropped = list(np.flatnonzero(~keep))
+        # normal equations of the terms that the captures tell apart
         previous, beta = beta, np.zeros(6)
         beta[keep] = np.linalg.solve(matrix[np.ix_(keep, keep)], np.tensordot(weight, products, 1)[keep])
         predicted = np.maximum(polynomial(beta / units, bins.signal_dn, bins.exposure_s), _FLOOR_DN2)
         if np.allclose(beta, previous, rtol=1e-10, atol=1e-12):
             break
     inverse = np.linalg.inv(matrix[np.ix_(keep, keep)])
+    # covariance by the sandwich, as regressors have noise of their own; wider where χ² shows misfit
     scatter = np.tensordot(weight, noisy, 1)
     squares = float(weight @ bins.squares - 2 * beta @ np.tensordot(weight, products, 1) + beta @ scatter @ beta)
     dof = max(int(bins.pixels.sum()) - int(keep.sum()), 1)

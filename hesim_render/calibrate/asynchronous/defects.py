@@ -122,14 +122,17 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
     ours, light = steady.of(some), int(np.argmax(steady.signal_dn))
     seconds = max(float(steady.calm[light, ~bad].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
     duration = np.maximum(ours.calm[light] * steady.edges_s[-1], 1e-12)
+    # hot: hardly ever calm, or more events in the brightest light than usual pixels would give by chance
     never_calm = ours.calm[light] < _CALM * steady.calm[light].max()
     rates = [np.where(never_calm, 0, n[light].sum(axis=0, dtype=np.float64)) / duration for n in (ours.on, ours.off)]
     usual = [float(n[light][:, ~bad].sum(dtype=np.float64)) / seconds for n in (steady.on, steady.off)]
     excess = [poisson.sf(r * duration - 1, max(u, 1e-9) * duration) < 1e-3 for r, u in zip(rates, usual, strict=True)]
     hot = never_calm | excess[0] | excess[1]
+    # stuck: no event from any step
     silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm
     result.kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
     own = _own_rates(ours, light, never_calm, float(steady.calm[light].max()))
+    # flickering: a hot pixel whose events come in some parts of the time and not in others
     if steady.parts is not None:
         flickers = hot & ~silent & unsteady(steady.parts.disturbed[:, some], steady.parts.trials)
         result.kind[some[flickers]] = Defect.FLICKERING

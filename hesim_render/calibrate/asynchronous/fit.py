@@ -164,21 +164,26 @@ def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law
     light = np.array([c[1] for c in curves])
     if light.size == 0:
         raise SpecError("no S-curve rises from below ½ to above it; take steps of up to twice the threshold")
+    # the response with which all lights agree on the threshold
     tried = np.geomspace(0.3, 3000.0, 200) / light.max()
     response = float(tried[np.argmin([_disagreement(curves, r) for r in tried])])
     polarity, _, centre, variance = np.array(curves).T
+    # each curve's centre as a threshold; of all curves of a polarity, the median
     x0, x1 = 1 + response * light, 1 + response * light * np.exp(polarity * centre)
     theta_of = polarity * np.log(x1 / x0)
     theta = [float(np.median(theta_of[polarity == p])) if np.any(polarity == p) else 0.0 for p in (1, -1)]
     theta = [t or max(theta) for t in theta]
+    # width² is linear in mismatch², shot noise and read noise: least squares with none below 0
     power, power_1 = ((v if law == "sqrt" else v * v) for v in (light, light * np.exp(polarity * centre)))
     width = variance * ((x1 - 1) / x1) ** 2
     columns = np.stack([theta_of**2, power / x0**2 + power_1 / x1**2, 1 / x0**2 + 1 / x1**2], axis=1)
     result, _ = nnls(columns / width[:, None], np.ones(width.size))
+    # no noise term starts at 0, where its slope vanishes
     least = (0.02 * theta[0]) ** 2
     mismatch = [float(np.clip(np.sqrt(result[0]), 0.02, max(s, 0.02))) for s in spread]
     shot = max(result[1], 0.05 * least * (1 + response * light.max()) ** 2 / power.max())
     values = np.array([*theta, *mismatch, response, shot, max(result[2], least), 0.0, _leak_start(steady)])
+    # the bandwidth has no closed form: the likeliest of sixteen, on some of the pixels
     few = np.random.default_rng(0).permutation(np.flatnonzero(good))[:_FEW]
     sets = steady.of(few), steps.of(few)
     grids = tuple(threshold_grid(t, m)[::4] for t, m in zip(theta, mismatch, strict=True))

@@ -83,8 +83,10 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
         number = np.ones(key.size)
     else:
         number = device_uniform(device_seed, Stream.EVENT_DEFECT, key)
+    # one number per pixel decides its kind, so that no pixel has two defects
     edges = np.cumsum([spec.stuck_share, spec.hot_share, spec.flickering_share])
     stuck, hot, flickering = (np.flatnonzero(np.searchsorted(edges, number, "right") == k) for k in range(3))
+    # hot pixels always fire, at log-normal rates; flickering ones during part of the time
     decades = spec.hot_rate_spread_decades
     spread = 10.0 ** (decades * device_normal(device_seed, Stream.EVENT_DEFECT_RATE, key[hot])) if decades else 1.0
     firing, quiet = spec.flickering_firing_s or 1.0, spec.flickering_quiet_s or 1.0

@@ -80,10 +80,12 @@ class Labeller:
         assert stage.t_us is not None
         clean = self._clean_pixels.step(electrons, stage.t_us)
         through = np.ones(events.size, np.bool_) if kept is None else kept
+        # number of each event in the recording; −1 for those that are not in it
         counted = through & self._of_run(events)
         before = self._events
         number = np.where(counted, before + np.cumsum(counted) - 1, -1)
         self._events += int(np.count_nonzero(counted))
+        # first by what made it; then by whether pixels without noise give it as well
         result = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK]).astype(np.uint8)
         step = StepLabels(no_events(), np.empty(0, np.int64), np.empty(0, np.uint8))
         if self._partners is not None:
@@ -95,6 +97,7 @@ class Labeller:
             result[np.isin(place, self._key(clean))] = Label.SIGNAL
         result, new = result[counted], step.changed >= before
         result[step.changed[new] - before] = step.changed_to[new]
+        # events that the sensor lost: by the read-out, or because a pixel was in its dead time
         unread, asleep = self._in_run(events[~through]), self._in_run(step.asleep)
         lost = np.concatenate([unread, asleep])
         where = np.repeat(np.array([Lost.READOUT, Lost.REFRACTORY], np.uint8), [unread.size, asleep.size])

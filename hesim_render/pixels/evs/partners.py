@@ -3,6 +3,12 @@
 The noise-free pixels compare with the reference level that the real pixel has, wherever no step waits for its partner.
 With a dead time, each pixel begins anew from the level at its release. There, the noise-free pixels have the dead time
 as well. Others without it tell what is lost in it.
+
+Steps of a pixel with thresholds of its own that the nominal thresholds give as well.
+
+A step in one direction leads from a reference level to the pixel's own threshold. The nominal threshold gives it as
+well if the level goes on from the same reference to that one before the pixel steps back. Each step is decided by
+itself, so that the two thresholds cannot drift apart however long the pixel runs.
 """
 
 from __future__ import annotations

@@ -71,6 +71,7 @@ class Refractory:
         theta_on, theta_off = thresholds
         level_0, level_1 = levels
         rest = types.Float(self._ready_us - dr.opaque(types.Float64, begin_us))
+        # pixels whose dead time ends within the segment take the level of that moment as their reference
         rest /= dr.opaque(types.Float, end_us - begin_us)  # part of the segment that is dead
         awake = rest <= 1.0
         released = awake & (rest > 0.0)
@@ -78,6 +79,7 @@ class Refractory:
         distance = level_1 - reference
         hit = awake & ((distance >= theta_on) | (distance <= -theta_off))
         dr.eval(reference, hit)
+        # only pixels that cross, or leak, go to the host, where each may have several events
         result = np.union1d(np.flatnonzero(hit.numpy()), leak[1]).astype(np.uint32)
         if result.size == 0:
             return reference, *(np.empty(0, kind) for kind in (np.float64, np.uint32, np.float64))

@@ -5,6 +5,24 @@ thresholds, the noise and the bandwidth that the pixel has in the light of the f
 few periods of their noise, whose events nobody sees (`hesim_render.pixels.evs.comparison.LastEvent`).
 
 The laws are known at nodes of thresholds over noise and of the bandwidth. Between nodes, quantiles are interpolated.
+
+Level with which asynchronous pixels compare after a long time in steady light: the law over pixels.
+
+In units of the noise's standard deviation, a pixel with thresholds a and b compares with a level r. Its noise goes up
+through r + a at the rate ν(a + r), down through r − b at the rate ν(b − r), each after a wait of its own. Then the
+level of comparison becomes that of the crossing or, with a dead time, the level at its end; a leak event of a pixel
+with a dead time does the same at any level. So r is a semi-Markov process: the share of the time at r is the share of
+the visits to r times the mean wait there. Pixels wait longest where both thresholds are far, and there they are found.
+
+- ν is the rate at which the simulated noise, which is linear between its nodes, crosses a level. For two nodes of the
+  standard deviation A and the correlation ρ it is 2 T(L/A, √((1 − ρ)/(1 + ρ))) with Owen's function T [owen1956]; with
+  ever more nodes it is that of a Gaussian process [rice1945].
+- At a crossing the noise is at the threshold, with a speed of Rayleigh's law. A dead time later it is at
+  e^−h ((1 + h) L + h v), with the variance 1 − e^−2h (1 + 2h + 2h²) of what came since.
+- The visits are the stationary law of a Markov chain on a grid, by elimination without differences [grassmann1985]:
+  its chances differ by many powers of ten.
+
+The law holds for rare crossings; where they are frequent, a few periods of the noise bring any law to the true one.
 """
 
 from __future__ import annotations
@@ -191,6 +209,7 @@ def start_of(
     angle : rate of the poles at the largest bandwidth times the time between nodes of the noise.
     """
     chance, of_dead, free = start_chances(noise, seed)
+    # where each pixel lies between the nodes of the table: thresholds in noise units, octave of its bandwidth, quantile
     sigma = np.maximum(spread.astype(np.float64), 1e-12)
     thresholds = noise.threshold_on_map, noise.threshold_off_map
     where = [_place(np.ravel(theta) / sigma, _NODES) for theta in thresholds]
@@ -202,6 +221,7 @@ def start_of(
     low = np.minimum(z.astype(np.intp), _QUANTILES.size - 2)
     part = (z - low).astype(np.float32)
     reference, dead_share, events_hz = np.zeros(chance.size, np.float32), np.zeros(chance.size), np.zeros(chance.size)
+    # what resets a pixel besides its events, and for how long it is dead after one
     bandwidth_hz, period_us = noise.spec.photoreceptor_cutoff_hz, noise.refractory_period_us
     assert bandwidth_hz is not None
     dead_s = (period_us or 0) / US_PER_S
@@ -211,6 +231,7 @@ def start_of(
         here = np.flatnonzero(np.abs(octave - step) < 1)
         own_hz = bandwidth_hz / 2.0**step
         laws = _laws(dead_s * own_hz, resets_hz / own_hz, angle / 2.0**step)
+        # linear between octaves, thresholds and quantiles: each corner of the cell adds its share
         weight = (1 - np.abs(octave[here] - step)).astype(np.float32)
         for (on, on_weight), (off, off_weight) in product(*(((n, 1 - p), (n + 1, p)) for n, p in where)):
             node = on[here] * _NODES.size + off[here]
@@ -220,6 +241,7 @@ def start_of(
             reference[here] += all_weight * (value + part[here] * (following - value))
             dead_share[here] += all_weight * laws.dead_share[node]
             events_hz[here] += all_weight * laws.events[node] * own_hz
+    # a pixel is in its dead time with that time's share, at an even place within it
     asleep = of_dead < dead_share
     dead_us = np.where(asleep, (period_us or 0) * of_dead / np.where(asleep, dead_share, 1.0), 0.0)
     return Start(reference, dead_us, events_hz, free)

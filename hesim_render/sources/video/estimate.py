@@ -1,4 +1,7 @@
-"""Estimated time of a run of a video, from counts."""
+"""Estimated time of a run of a video, from counts.
+
+What the rate of a video's pictures does to events, for the way in which the pixels compare.
+"""
 
 from __future__ import annotations
 
