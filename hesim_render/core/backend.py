@@ -135,7 +135,7 @@ def _extra_library() -> tuple[str, tuple[str, ...]] | None:
     if not libraries:
         return None
     beside = [sorted({p for p in paths if p.name.startswith(f"{stem}.so.") and p.is_file()}) for stem in _BESIDE_EXTRA]
-    return str(libraries[-1]), tuple(str(found[0]) for found in beside if found)
+    return str(libraries[-1]), tuple(str(result[0]) for result in beside if result)
 
 
 def candidates() -> list[BackendCandidate]:

@@ -133,8 +133,9 @@ def output_noise(
 
     >>> import numpy as np
     >>> from hesim_render.studies import ChannelNoise, output_noise
-    >>> found = output_noise(np.eye(3), [1e4] * 3, ChannelNoise(np.zeros(3), np.ones(3), np.zeros(3), np.ones(3)), weights=(1, 0, 0))
-    >>> round(found.ysnr**2, 6), found.amplification
+    >>> shot_noise = ChannelNoise(np.zeros(3), np.ones(3), np.zeros(3), np.ones(3))
+    >>> outcome = output_noise(np.eye(3), [1e4] * 3, shot_noise, weights=(1, 0, 0))
+    >>> round(outcome.ysnr**2, 6), outcome.amplification
     (1800.0, 1.0)
 
     Returns
