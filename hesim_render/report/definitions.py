@@ -87,8 +87,8 @@ EVENTS: dict[str, Definition] = {
     ),
     "dead_time": Definition(
         "dead time",
-        "Time after an event in which a pixel gives no other: where the density of the intervals between its events "
-        "steps up.",
+        "Time after an event in which a pixel gives no other, and in which the fastest light changes by a threshold: "
+        "where the density of the intervals steps up.",
         "largest likelihood of a step from one density to another",
         "all recordings; whole µs",
     ),

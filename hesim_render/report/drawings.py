@@ -134,7 +134,7 @@ def _background(axes: Axes, found: EventFigures) -> None:
 def _band(axes: Axes, found: EventFigures) -> None:
     band = found.band
     assert band is not None
-    axes.set(title="Swing answered in half of the cycles", xlabel="frequency, Hz", ylabel="ln L_max/L_min")
+    axes.set(title="Swing for half of the cycles", xlabel="frequency, Hz", ylabel="ln L_max/L_min")
     there = np.isfinite(band.swing)
     if there.any():
         axes.plot(band.hz[there], band.swing[there], color=_ON_OFF[0], marker="o", markersize=3.6, label="ON")
@@ -145,13 +145,13 @@ def _band(axes: Axes, found: EventFigures) -> None:
 
 
 def _intervals(axes: Axes, found: EventFigures) -> None:
-    axes.set(title="Intervals between events of a pixel", xlabel="interval, µs", ylabel="number per µs")
+    axes.set(title="Intervals of a pixel", xlabel="interval, µs", ylabel="number per µs")
     counts = found.intervals[:-1]
     edges = np.unique(np.round(np.geomspace(1, _LONGEST_INTERVAL_US, 60)).astype(int))
     edges = edges[edges < counts.size]
     total = np.append(0, np.cumsum(counts))
     density = np.diff(total[edges]) / np.diff(edges)
-    axes.stairs(np.maximum(density, 1e-2), edges, fill=True, color=COLOURS[5], alpha=0.6)
+    axes.stairs(np.where(density > 0, density, np.nan), edges, fill=True, color=COLOURS[5], alpha=0.6)
     dead = next(one.value for one in found.entries if one.key == "dead_time")
     if dead["value"] is not None:
         axes.axvline(dead["value"], color=COLOURS[1], linewidth=1)

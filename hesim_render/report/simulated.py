@@ -45,6 +45,8 @@ _SWINGS, _FREQUENCIES = (0.6, 0.85, 1.2, 1.7, 2.4, 3.4), (1 / 8, 1 / 4, 1 / 2, 1
 _CYCLES, _SAMPLES = 8, 48
 #: Busy light: thresholds of a step, periods.
 _BUSY, _BUSY_PERIODS = 12.0, 10
+#: Rapid light: swing in thresholds, cycles.
+_RAPID, _RAPID_CYCLES = 30.0, 20
 #: Shortest steady recording, µs, and half periods in it.
 _STEADY_US, _STEADY_PERIODS = 1_000_000, 4
 
@@ -110,7 +112,7 @@ class Instrument:
         self._told("bandwidth", 0.8)
         self._modulations(theta)
         self._told("busy light", 0.95)
-        self._content["busy"].append(self._busy(theta))
+        self._content["busy"] += [self._strobe(theta), self._rapid(theta)]
         self._write()
         return self._folder
 
@@ -183,27 +185,38 @@ class Instrument:
             "reset": not has_ticks, "interval_us": [0, end_us],
         })  # fmt: skip
 
-    def _modulations(self, theta: float) -> None:
+    @property
+    def _corner_hz(self) -> float:
+        """Corner frequency of the pixels in bright light, or half of the highest frequency that ticks can see."""
         evs = self._noise.spec
         if evs.reference == "previous_sample":
-            corner_hz = US_PER_S / (evs.tick_us or 1) / 4
-        else:
-            corner_hz = evs.photoreceptor.cutoff_hz if evs.photoreceptor else (evs.photoreceptor_cutoff_hz or 1.0)
+            return US_PER_S / (evs.tick_us or 1) / 4
+        return evs.photoreceptor.cutoff_hz if evs.photoreceptor else (evs.photoreceptor_cutoff_hz or 1.0)
+
+    def _sine(self, hz: float, swing: float, cycles: int) -> tuple[NDArray[np.void], float, int]:
+        """Events of light whose logarithm swings by `swing`; the depth of the modulation, and the end, µs."""
+        depth = math.tanh(swing / 2)
+        time_us = np.unique(np.round(np.arange(cycles * _SAMPLES + 1) * (US_PER_S / hz / _SAMPLES)).astype(int))
+        lux = REFERENCE_LUX * (1 + depth * np.sin(2 * np.pi * hz * time_us * S_PER_US))
+        return self._run(zip(time_us.tolist(), lux.tolist(), strict=True)), depth, int(time_us[-1])
+
+    def _modulations(self, theta: float) -> None:
         for part in _FREQUENCIES:
-            hz = float(f"{part * corner_hz:.3g}")
+            hz = float(f"{part * self._corner_hz:.3g}")
             for swing in _SWINGS:
-                depth = math.tanh(swing * theta / 2)
-                time_us = np.unique(
-                    np.round(np.arange(_CYCLES * _SAMPLES + 1) * (US_PER_S / hz / _SAMPLES)).astype(int)
-                )
-                lux = REFERENCE_LUX * (1 + depth * np.sin(2 * np.pi * hz * time_us * S_PER_US))
-                events = self._run(zip(time_us.tolist(), lux.tolist(), strict=True))
+                events, depth, end_us = self._sine(hz, swing * theta, _CYCLES)
                 name = self._save(events, f"sine-{hz:g}hz-{swing:g}")
                 self._content["modulation"].append({
-                    "file": name, "lux": REFERENCE_LUX, "hz": hz, "depth": depth, "interval_us": [0, int(time_us[-1])],
+                    "file": name, "lux": REFERENCE_LUX, "hz": hz, "depth": depth, "interval_us": [0, end_us],
                 })  # fmt: skip
 
-    def _busy(self, theta: float) -> str:
+    def _rapid(self, theta: float) -> str:
+        """Light that changes by a threshold in a short time, always: the next event comes right after the dead time."""
+        dead_s = (self._noise.spec.refractory_period_us or 0) * S_PER_US
+        cycles = _RAPID_CYCLES + math.ceil(_RAPID_CYCLES * dead_s * self._corner_hz)
+        return self._save(self._sine(self._corner_hz, _RAPID * theta, cycles)[0], "rapid")
+
+    def _strobe(self, theta: float) -> str:
         half_us = self._half_us(REFERENCE_LUX)
         levels = [REFERENCE_LUX, REFERENCE_LUX * math.exp(_BUSY * theta)]
         points = [(0, levels[0])]
