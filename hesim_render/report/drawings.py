@@ -168,7 +168,7 @@ def _levels(found: FrameFigures) -> tuple[NDArray[np.float64], NDArray[np.float6
 def _transfer(axes: Axes, found: FrameFigures) -> None:
     _, signal, variance, _ = _levels(found)
     axes.set(
-        title="Photon transfer", xlabel="signal above the dark, DN", ylabel="temporal variance above the dark, DN²"
+        title="Photon transfer", xlabel="signal above the dark, DN", ylabel="variance above the dark, DN²"
     )
     points(axes, signal, variance, COLOURS[0], "pairs", 4.2)
     top = 0.7 * found.result.top_dn

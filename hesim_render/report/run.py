@@ -102,7 +102,7 @@ def make_report(
             begin = 0.7 if simulated else 0.0
             bench = None if bench_folder is None else EventBench(bench_folder)
             if not simulated:
-                name = bench.spec.sensor if bench is not None else str(frame_folder)
+                name = bench.spec.sensor if bench is not None else folders[0].resolve().name
                 if bench is not None and bench.spec.frames is not None and frame_folder is None:
                     frame_folder = bench.path(bench.spec.frames)
             events = None
