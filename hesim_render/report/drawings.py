@@ -167,9 +167,7 @@ def _levels(found: FrameFigures) -> tuple[NDArray[np.float64], NDArray[np.float6
 
 def _transfer(axes: Axes, found: FrameFigures) -> None:
     _, signal, variance, _ = _levels(found)
-    axes.set(
-        title="Photon transfer", xlabel="signal above the dark, DN", ylabel="variance above the dark, DN²"
-    )
+    axes.set(title="Photon transfer", xlabel="signal above the dark, DN", ylabel="variance above the dark, DN²")
     points(axes, signal, variance, COLOURS[0], "pairs", 4.2)
     top = 0.7 * found.result.top_dn
     axes.plot([0, top], [0, found.result.gain.slope * top], color=COLOURS[1], label="K, 0 to 70 % of saturation")

@@ -109,7 +109,14 @@ def make_report(
             if bench is not None and bench.names:
                 events = event_figures(bench, lambda what, part: told(what, begin + (0.9 - begin) * part))
             told("frames", 0.9)
-            frames = None if frame_folder is None else frame_figures(frame_folder)
+            frames = None
+            if frame_folder is not None:
+                try:
+                    frames = frame_figures(frame_folder)
+                except SpecError as error:
+                    if not simulated or events is None:
+                        raise
+                    events.findings.append(f"frames: {str(error).replace(f'{frame_folder}', FRAME_CAPTURES)}")
             pages = _write(folder.path, name, events, frames)
         return Report(folder.commit(), events, frames, pages)
     except BaseException:

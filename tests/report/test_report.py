@@ -239,3 +239,15 @@ def test_a_report_of_a_simulated_sensor(tmp_path):
     assert frames["dynamic_range"]["value"] == pytest.approx(20 * np.log10(well / least))
     assert frames["snr_max"]["value"] == pytest.approx(10 * np.log10(well))
     assert frame_figures(out / "captures-frames").pixels == 24 * 30
+
+
+@pytest.mark.slow
+def test_frames_that_cannot_be_evaluated_are_a_finding(tmp_path):
+    """The dark noise of `reference-mono` is below what rounding shows; its event pixels have their report."""
+    found = make_report(["reference-mono"], tmp_path / "report", size=(12, 16))
+    assert found.frames is None and found.events is not None
+    assert any(one.startswith("frames: captures-frames") and "rounding hides" in one for one in found.events.findings)
+    threshold = entry_of(found.events, "threshold", "ON").value
+    assert abs(threshold["value"] - 0.1) < 0.005  # contrast_threshold_on of its file
+    band = entry_of(found.events, "bandwidth", "ON").value
+    assert band["value"] is None
