@@ -76,7 +76,7 @@ def _s_curves(axes: Axes, found: EventFigures) -> None:
     axes.legend(frameon=False)
 
 
-def _bars(axes: Axes, lux: list[float], values: list[dict], colour: str, label: str, marker: str = "o") -> None:
+def _bars(axes: Axes, lux: list[float], values: list[dict], colour: str, label: str, line: str = "-") -> None:
     """Values with their intervals; those that are not known, or 0, are left out."""
     some = [(x, v) for x, v in zip(lux, values, strict=True) if v["value"] and "interval_95" in v]
     if some:
@@ -84,7 +84,15 @@ def _bars(axes: Axes, lux: list[float], values: list[dict], colour: str, label: 
         low, high = (np.array([v["interval_95"][k] for _, v in some]) for k in (0, 1))
         floor = np.maximum(low, 0.3 * y)
         axes.errorbar(
-            x, y, (y - floor, high - y), color=colour, marker=marker, markersize=3.6, linewidth=1, label=label
+            x,
+            y,
+            (y - floor, high - y),
+            color=colour,
+            marker="o",
+            markersize=3.6,
+            linestyle=line,
+            linewidth=1,
+            label=label,
         )
 
 
@@ -94,7 +102,7 @@ def _latency(axes: Axes, found: EventFigures) -> None:
     for every, name, colour in zip(found.latencies, POLARITIES, _ON_OFF, strict=True):
         lux = [one.lux for one in every]
         _bars(axes, lux, [one.latency for one in every], colour, f"latency {name}")
-        _bars(axes, lux, [one.jitter for one in every], colour, f"jitter {name}", "x")
+        _bars(axes, lux, [one.jitter for one in every], colour, f"jitter {name}", "--")
     _logarithmic(axes, "x", "y")
     _legend(axes)
 
