@@ -2,7 +2,7 @@
 
     python benchmarks/event_evk4.py
 
-Root, Mujo and Xu (2026, arXiv 2605.16317) fitted a probabilistic model to events of still images. Its figures are
+Root, Mujo and Xu [root2026] fitted a probabilistic model to events of still images. Its figures are
 stated; its formula is read here as: in each microsecond a pixel compares two Poisson counts N₀, N₁ of mean λ, and fires
 ON where ln((N₁ + Θ)/(N₀ + Θ)) ≥ B, OFF where it is ≤ −B, with Θ = c₁ + c₂·√λ + c₃·λ of each polarity; a floor is added.
 The threshold, its spread and the dead time of our pixel are theirs. What theirs does not state for a pixel that
