@@ -6,7 +6,7 @@ import json
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,9 @@ from hesim_render.core.guard import printable
 from hesim_render.core.output import check_place, replacing
 from hesim_render.core.plain import finite
 from hesim_render.core.progress import Progress
+from hesim_render.exchange import EventStream
+from hesim_render.measure.event_distance import event_distances
+from hesim_render.measure.event_statistics import EventStatistics, event_statistics
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.render.light_level import in_absolute_light
@@ -151,12 +154,14 @@ def _rows(
     first, last = float(times[0].mean()), float(times[-1].mean())
     shape = sensor.layout.evs_shape
     events, truth = ours.between(first, last)
+    expected = _statistics(truth, shape, first, last)
 
     def row(peer: str, made: NDArray[np.void], seconds: float) -> dict[str, Any]:
         return {
             "scene": name, "fps": fps, "peer": peer, "events": len(made), "true_events": len(truth),
             "count_error": count_error(made, truth), **timing(made, truth, shape, spec.match_us),
             **quiet_rates(made, truth, shape, last - first), "chamfer_px": chamfer(made, truth), "seconds": seconds,
+            **_distances(expected, _statistics(made, shape, first, last)),
         }  # fmt: skip
 
     rows = [row(OURS, events, ours.seconds)]
@@ -176,6 +181,31 @@ def _rows(
                 continue
             rows.append(row(peer.name, _between(run.events, first, last), run.seconds))
     return rows
+
+
+def _statistics(
+    events: NDArray[np.void], shape: tuple[int, int], first_us: float, last_us: float
+) -> EventStatistics | str:
+    """Statistics of events, or why there are none."""
+    stream = replace(EventStream.of(events, shape), interval_us=(int(first_us), int(np.ceil(last_us)) + 1))
+    try:
+        return event_statistics(stream)
+    except SpecError as error:
+        return str(error)
+
+
+def _distances(truth: EventStatistics | str, made: EventStatistics | str) -> dict[str, Any]:
+    """Distances from the true events, as `compare` has them, and the figures in which a peer differs from them."""
+    for one, whose in ((truth, "true events"), (made, "events")):
+        if isinstance(one, str):
+            return {"distances": {}, "loses": None, "no_distances": f"{whose}: {one}"}
+    assert not isinstance(truth, str) and not isinstance(made, str)
+    found = event_distances(truth, made)
+    return {
+        "distances": {one.name: {"value": one.value, "interval_95": list(one.interval_95), "within": one.within,
+                                 "differs": one.differs} for one in found},
+        "loses": [one.name for one in found if one.differs],
+    }  # fmt: skip
 
 
 def _settings(peer: Peer, sensor: Sensor, spec: PeersSpec, fps: float) -> dict[str, Any]:
@@ -214,10 +244,29 @@ def peers_table(result: dict[str, Any]) -> str:
             cells = [_cell(row, key, scale, form) for _, key, scale, form in _COLUMNS]
             cells = [f"failed: {row['error']}"] if "error" in row else cells
             lines.append(f"| {row['peer']} | {' | '.join(cells)} |")
-        lines.append("")
+        lines += ["", *_distance_lines(rows)]
     for name, facts in result["peers"].items():
         lines.append(f"{name}: " + "; ".join(f"{key} {value}" for key, value in facts.items()))
     return "\n".join(lines)
+
+
+def _distance_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Table of the distances of `compare` from the true events, and what each peer loses."""
+    names = next((list(row["distances"]) for row in rows if row.get("distances")), [])
+    if not names:
+        return []
+    lines = ["| distance from the true events | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for row in rows:
+        found = row.get("distances") or {}
+        cells = [
+            f"{found[name]['value']:.3g}{'*' if found[name]['differs'] else ''}" if found else "–" for name in names
+        ]
+        lines.append(f"| {row['peer']} | {' | '.join(cells)} |")
+    lines += ["", "*: more than parts of the true events differ from one another", ""]
+    for row in rows:
+        if row.get("no_distances"):
+            lines.append(f"{row['peer']}: {row['no_distances']}")
+    return lines
 
 
 def _cell(row: dict[str, Any], key: str, scale: float, form: str) -> str:

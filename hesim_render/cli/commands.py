@@ -8,7 +8,20 @@ from typing import Annotated, Any
 import typer
 
 from hesim_render import __version__
-from hesim_render.cli import benchmark, calibrate, compare, cube, exchange, info, measure, new, simulate, study, view
+from hesim_render.cli import (
+    benchmark,
+    calibrate,
+    compare,
+    cube,
+    exchange,
+    info,
+    measure,
+    new,
+    report,
+    simulate,
+    study,
+    view,
+)
 from hesim_render.cli.terminal import say
 
 app = typer.Typer(
@@ -36,7 +49,7 @@ def _app(
 
 for _command in (
     simulate.simulate, view.view, view.isp, exchange.export, exchange.import_, measure.measure, compare.compare,
-    cube.cube, study.study, simulate.demo, info.info, new.new,
+    report.report, cube.cube, study.study, simulate.demo, info.info, new.new,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"))(_command)
 app.add_typer(calibrate.app, name="calibrate")

@@ -93,6 +93,29 @@ def test_times_and_rates_of_streams_made_by_hand():
     assert quiet["quiet_off_hz"] == pytest.approx(1 / (165 * 0.5))
 
 
+def test_what_a_peer_loses_is_named():
+    """Streams of one law lose nothing that matters; twice the rate does; few events have a reason."""
+    rng = np.random.default_rng(4)
+    truth, same, half = (peers._statistics(random_stream(rng, n)[:n], SHAPE, 0, 20_000) for n in (60, 60, 30))
+    assert (
+        "no_distances" in peers._distances(truth, same)
+        and "true events" in peers._distances(truth, same)["no_distances"]
+    )
+
+    def long(count):
+        made = random_stream(rng, count)
+        made["t_us"] = np.sort(rng.integers(0, 90_000, count))
+        return made
+
+    truth, same, half = (peers._statistics(long(n), SHAPE, 0, 90_000) for n in (6000, 6000, 3000))
+    assert "rate" not in peers._distances(truth, same)["loses"]
+    found = peers._distances(truth, half)
+    assert "rate" in found["loses"] and found["distances"]["rate"]["value"] == pytest.approx(np.log(2), rel=0.02)
+    rows = [{"scene": "s", "fps": 9.0, "peer": "p", "events": 3, "true_events": 6000, **found}]
+    table = peers_table({"rows": rows, "peers": {"p": {"version": "1"}}})
+    assert "| distance from the true events | rate |" in table and "| p | 0.69" in table and "*" in table
+
+
 def test_pictures_are_encoded_as_asked_for():
     values = np.array([[0.0, 50.0, 100.0, 250.0]], np.float32)
     assert encoded(values, 100, "linear", 8).tolist() == [[0, 128, 255, 255]]

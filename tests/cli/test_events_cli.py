@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hesim_render.cli import main
+from tests.support.bench_pixels import Pixels
 from tests.support.event_files import written
 from tests.support.still_pixels import random_events
 
@@ -55,3 +56,16 @@ def test_compare_prints_a_line_a_distance(capsys, recordings):
     status, text, _ = call(capsys, "compare", *recordings, "--size", "21x15", "--json")
     rate = json.loads(text)["distances"][0]
     assert rate["name"] == "rate" and rate["value"] == pytest.approx(np.log(31 / 24), abs=0.06)
+
+
+def test_report_prints_its_figures_and_where_they_are(capsys, tmp_path):
+    steady = Pixels(6)
+    steady.steady_file(2.0, 20.0, (3.0, 2.0), 0.5, "a.npz")
+    folder = steady.write(tmp_path / "captures")
+    status, text, _ = call(capsys, "report", folder, "--out", tmp_path / "made")
+    assert status == 0 and "threshold" in text and "in " in text
+    assert {file.name for file in (tmp_path / "made").iterdir()} == {"report.html", "report.pdf", "report.json"}
+    status, text, _ = call(capsys, "report", folder, "--out", tmp_path / "made", "--overwrite", "--json", "--quiet")
+    assert json.loads(text)["pages"] >= 2
+    status, _, err = call(capsys, "report", tmp_path / "gone", folder, "--out", tmp_path / "more")
+    assert status == 2 and "gone" in err

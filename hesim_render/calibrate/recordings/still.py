@@ -23,6 +23,8 @@ _EVENTS_TO_BE_SILENT = 30
 #: A hot pixel has more ON events than a pixel of so many times the rate of the others, but with this chance, in each
 #: recording.
 _HOT, _HOT_CHANCE = 10.0, 1e-3
+#: Chance of a slice of three times the mean rate that counts as one of such a rate.
+_BURST_CHANCE = 1e-3
 #: Relative standard deviation of thresholds over pixels, where none was measured.
 USUAL_MISMATCH = 0.1
 #: Shift of ρ, and of a leak over ρ n₋, in squares of the mismatch.
@@ -244,15 +246,21 @@ def share(count: int, of: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
-    """Part of the pixels with many more ON events than the others, in each recording."""
-    if len(tallies) < 2:
-        return not_identifiable("it takes two recordings: in one, a pixel that sees a change looks like a hot one")
+def hot_pixels(tallies: Sequence[EventTally]) -> NDArray[np.bool_]:
+    """Pixels [pixel] with many more ON events than the others, in each recording."""
     hot = np.ones(tallies[0].pixels, np.bool_)
     for one in tallies:
         count = one.per_pixel()[0]
         usual = float(np.sort(count)[: max(1, round(0.9 * count.size))].mean()) + 1 / count.size
         hot &= count > stats.poisson.isf(_HOT_CHANCE / count.size, _HOT * usual)
+    return hot
+
+
+def hot_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
+    """Part of the pixels with many more ON events than the others, in each recording."""
+    if len(tallies) < 2:
+        return not_identifiable("it takes two recordings: in one, a pixel that sees a change looks like a hot one")
+    hot = hot_pixels(tallies)
     return share(int(np.count_nonzero(hot)), hot.size)
 
 
@@ -271,15 +279,17 @@ def silent_share(tallies: Sequence[EventTally]) -> dict[str, Any]:
 def not_still(tally: EventTally) -> str | None:
     """A line that says that a recording is not one of a still scene; None where its rate is steady enough.
 
-    The last quarter of the slices against the first, and the largest against the mean.
+    The last quarter of the slices against the first, and the largest against the mean, each beyond what counting does.
     """
-    each = tally.slices.sum(axis=(0, 2)) / (tally.pixels * tally.seconds / SLICES)
-    mean = each.mean()
-    if mean == 0:
+    count = tally.slices.sum(axis=(0, 2))
+    if count.sum() == 0:
         return None
+    each = count / (tally.pixels * tally.seconds / SLICES)
+    mean = each.mean()
     early, late = each[: SLICES // 4].mean(), each[-SLICES // 4 :].mean()
-    error = each.std(ddof=1) / np.sqrt(SLICES / 4)
-    if abs(late - early) > max(0.5 * mean, 4 * error) or each.max() > 3 * mean:
+    error = max(each.std(ddof=1), np.sqrt(2 / count.mean()) * mean) / np.sqrt(SLICES / 4)
+    burst = count.max() > stats.poisson.isf(_BURST_CHANCE / SLICES, 3 * count.mean())
+    if abs(late - early) > max(0.5 * mean, 4 * error) or burst:
         return (
             f"its rate goes from {early:.4g} to {late:.4g} Hz a pixel, at most {each.max():.4g}: the scene moves, the "
             "lamp flickers, or the camera was not settled"

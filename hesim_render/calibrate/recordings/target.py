@@ -71,7 +71,11 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     parts = np.array([_moments(count[:, group != k]) for k in range(GROUPS)])
     found, slope = simulated.fit(whole)
     every = np.concatenate([found[:, None], found[:, None] + np.linalg.solve(slope, (parts - whole).T)], axis=1)
-    errors = np.hypot(jackknife(every), np.abs(found) * np.append(unsure, 0.0))
+    # the simulated pixels scatter as the real ones do
+    of_simulated = simulated.moment_covariance(found)
+    inverse = np.linalg.inv(slope)
+    of_simulated = inverse @ of_simulated @ inverse.T
+    errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + (found * np.append(unsure, 0.0)) ** 2)
     entries = {
         "theta_on": estimated(found[0], errors[0], "ln", GROUPS),
         "theta_off": estimated(found[1], errors[1], "ln", GROUPS),
@@ -85,7 +89,8 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
             "note": "the pixels scatter no more than the place of their turns makes them",
         }  # fmt: skip
     ratio = every[1] / every[0]
-    error = float(np.hypot(jackknife(ratio), unsure.sum() * ratio[0]))
+    away = np.array([-1 / found[0], 1 / found[1], 0.0])  # slope of ln ρ
+    error = float(np.sqrt(jackknife(ratio) ** 2 + ratio[0] ** 2 * (unsure.sum() ** 2 + away @ of_simulated @ away)))
     return TargetThresholds(entries, estimated(ratio[0], error, "", GROUPS))
 
 
@@ -114,6 +119,17 @@ class _Simulated:
 
     def moments(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """`_moments` of θ₊, θ₋ and the variance of the relative mismatch."""
+        return _moments(self._counts(values))
+
+    def moment_covariance(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Covariance of `moments` from sample to sample of the simulated pixels."""
+        count = self._counts(values)
+        group = np.arange(_PIXELS) % GROUPS
+        parts = np.array([_moments(count[:, group == k]) for k in range(GROUPS)])
+        return np.asarray(np.cov(parts.T)) / GROUPS
+
+    def _counts(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """ON and OFF events a cycle of each simulated pixel."""
         spread = np.sqrt(max(values[2], 0.0))
         theta = np.maximum(values[:2, None] * (1 + spread * self._z), 0.05 * values[:2, None])
         reference, count = self._start * self._rise, np.zeros((2, _PIXELS))
@@ -124,7 +140,7 @@ class _Simulated:
             reference = reference - down * theta[1]
             if cycle >= _WARM:
                 count += np.stack([up, down])
-        return _moments(count / self._cycles)
+        return count / self._cycles
 
     def fit(self, wanted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Values of the given moments, and the slope of the moments there, over 5 %: counts are whole."""

@@ -1,0 +1,90 @@
+"""EMVA 1288 figures of frames, from the standard's captures [emva2021]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hesim_render.calibrate.aps.pairs import PairCalibration, evaluate
+from hesim_render.calibrate.aps.pairs_findings import findings
+from hesim_render.calibrate.aps.pairs_output import content
+from hesim_render.calibrate.estimate import estimated, not_identifiable
+from hesim_render.calibrate.moments import Progress
+from hesim_render.recording.pair_set import read_pair_set
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFigures:
+    """What EMVA 1288 captures tell.
+
+    Parameters
+    ----------
+    result : the evaluation.
+    entries : by name, as entries of the report.
+    findings : what the sensor or the bench has beyond a linear model.
+    """
+
+    result: PairCalibration
+    entries: dict[str, dict[str, Any]]
+    findings: list[str]
+
+    @property
+    def pixels(self) -> int:
+        rows, cols = self.result.pairs.shape
+        return rows * cols
+
+
+def frame_figures(folder: str | Path, progress: Progress | None = None) -> FrameFigures:
+    """Evaluate EMVA 1288 captures.
+
+    Parameters
+    ----------
+    folder : of the captures.
+    progress : called with a text that names the current work and the fraction done.
+    """
+    result = evaluate(read_pair_set(folder), progress)
+    section = content(result)
+    names = (
+        "K", "responsivity", "quantum_efficiency", "temporal_dark_noise_e", "dark_current_e_per_s", "full_well_e",
+        "dsnu_e", "prnu_percent", "linearity_error", "row_noise_dn", "column_noise_dn",
+    )  # fmt: skip
+    entries = {name: section[name] for name in names}
+    entries |= _of_both(entries, result)
+    bad = int(section["bad_pixels"])
+    pixels = result.defects.size
+    entries["defect_pixels"] = {"value": float(bad), "unit": "", "note": f"of {pixels}"}
+    return FrameFigures(result, entries, [one.text for one in findings(result)])
+
+
+def _of_both(entries: dict[str, dict[str, Any]], result: PairCalibration) -> dict[str, dict[str, Any]]:
+    """Signal-to-noise ratio, sensitivity threshold and dynamic range, from the other figures."""
+    well, noise, efficiency, k = (
+        entries[name] for name in ("full_well_e", "temporal_dark_noise_e", "quantum_efficiency", "K")
+    )
+    found: dict[str, dict[str, Any]] = {}
+    if well["value"] is None:
+        found["snr_max"] = not_identifiable(well["reason"])
+    else:
+        ratio = well["standard_error"] / well["value"]
+        found["snr_max"] = estimated(10 * np.log10(well["value"]), 10 / np.log(10) * ratio, "dB")
+    # σ_d of the standard has the ADC in it: σ_d² of ours and σ_q²/K²
+    dark = float(np.hypot(noise["value"], np.sqrt(1 / 12) / k["value"]))
+    error = noise["value"] / dark * noise["standard_error"]
+    found["threshold_e"] = estimated(dark + 0.5, error, "e-")
+    if efficiency["value"] is None:
+        found["threshold_photons"] = not_identifiable(efficiency["reason"])
+    else:
+        photons = (dark + 0.5) / efficiency["value"]
+        relative = float(np.hypot(error / (dark + 0.5), efficiency["standard_error"] / efficiency["value"]))
+        found["threshold_photons"] = estimated(photons, photons * relative, "photons")
+    if well["value"] is None:
+        found["dynamic_range"] = not_identifiable(well["reason"])
+    else:
+        relative = float(np.hypot(error / (dark + 0.5), ratio))
+        found["dynamic_range"] = estimated(
+            20 * np.log10(well["value"] / (dark + 0.5)), 20 / np.log(10) * relative, "dB"
+        )
+    return found

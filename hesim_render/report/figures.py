@@ -1,0 +1,285 @@
+"""All figures of event pixels from the recordings of a bench."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hesim_render.calibrate.estimate import not_identifiable
+from hesim_render.calibrate.recordings import still
+from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
+from hesim_render.report.bench import EventBench, Responses
+from hesim_render.report.latency import Answers, answers
+from hesim_render.report.limits import Bandwidth, DynamicRange, bandwidth, dynamic_range, false_share
+from hesim_render.report.s_curves import SCurve, s_curve
+from hesim_render.report.steady import Background, background, doubling
+from hesim_render.specs.event_bench import Steady
+
+#: Sizes of steps that differ by no more than this part are the same.
+_SAME_SIZE = 0.07
+#: Lights whose ratio is no larger are the same.
+_SAME_LIGHT = 1.3
+#: Contrasts from which recordings of one light are an S-curve.
+_LEAST_CONTRASTS = 4
+POLARITIES = ("ON", "OFF")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One figure of the report.
+
+    Parameters
+    ----------
+    key : of its definition, see `definitions`.
+    name : what it is of, such as ON.
+    value : entry with value, interval and unit, or the reason why there is none.
+    lux, contrast, temperature_c : of the recordings, where they have one.
+    pixels : number of pixels.
+    """
+
+    key: str
+    name: str
+    value: dict[str, Any]
+    lux: float | None
+    contrast: float | None
+    temperature_c: float | None
+    pixels: int
+
+
+@dataclass(eq=False)
+class EventFigures:
+    """Figures of event pixels, and what is drawn of them.
+
+    Parameters
+    ----------
+    bench : the recordings.
+    entries : all figures.
+    curves : S-curves, ON and OFF of each light.
+    backgrounds : of each steady recording.
+    latencies : of each polarity, in order of light.
+    ranges : dynamic range of each polarity.
+    band : bandwidth, or None.
+    intervals : [µs], intervals between events of a pixel in all recordings.
+    findings : what is odd about the recordings.
+    """
+
+    bench: EventBench
+    entries: list[Entry] = field(default_factory=list)
+    curves: list[tuple[SCurve, SCurve]] = field(default_factory=list)
+    backgrounds: list[Background] = field(default_factory=list)
+    latencies: tuple[list[Answers], list[Answers]] = ([], [])
+    ranges: tuple[DynamicRange | None, DynamicRange | None] = (None, None)
+    band: Bandwidth | None = None
+    intervals: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    findings: list[str] = field(default_factory=list)
+
+
+def event_figures(bench: EventBench, progress: Callable[[str, float], None] | None = None) -> EventFigures:
+    """Evaluate all recordings of a bench.
+
+    Parameters
+    ----------
+    bench : the recordings.
+    progress : called with a text that names the current work and the fraction done.
+
+    Raises
+    ------
+    SpecError
+        If a recording cannot be read, or has no events.
+    """
+    told = progress or (lambda what, part: None)
+    found = EventFigures(bench)
+    told("read recordings", 0.05)
+    hot, dead = _hot(bench), _dead(bench)
+    good = ~(hot | dead[0] | dead[1])
+    told("S-curves", 0.3)
+    for light in _lights(bench):
+        pair = s_curve(light, 0, good), s_curve(light, 1, good)
+        found.curves.append(pair)
+        _add_curves(found, pair, light)
+    told("latency", 0.5)
+    _add_latencies(found, good)
+    told("dynamic range", 0.6)
+    _add_ranges(found, good)
+    told("background", 0.7)
+    _add_background(found)
+    told("bandwidth", 0.8)
+    found.band = bandwidth(bench, good)
+    if found.band is None:
+        entry, lux = not_identifiable("no recordings of modulated light"), None
+    else:
+        entry, lux = found.band.entry, found.band.lux
+    found.entries.append(
+        Entry("bandwidth", "ON", entry, lux, None, bench.spec.temperature_c, int(np.count_nonzero(good)))
+    )
+    told("short intervals", 0.9)
+    _add_times(found)
+    _add_defects(found, hot, dead)
+    if any(not one.reset for one in bench.spec.steps) and not _has_ticks(bench):
+        found.findings.append(
+            "not all pixels were reset right before each jump: a pixel compares with the level of its last event, up "
+            "to a threshold away, which widens S-curves and latencies"
+        )
+    return found
+
+
+def _hot(bench: EventBench) -> NDArray[np.bool_]:
+    """Pixels that are hot in all steady recordings; none if there are fewer than two."""
+    tallies = [bench.tally(one.file) for one in bench.spec.steady]
+    return still.hot_pixels(tallies) if len(tallies) > 1 else np.zeros(bench.pixels, np.bool_)
+
+
+def _dead(bench: EventBench) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Pixels that answer fewer than half of the largest rises, and of the largest falls."""
+    lights = _lights(bench) or ([bench.responses] if bench.responses else [])
+    if not lights:
+        return np.zeros(bench.pixels, np.bool_), np.zeros(bench.pixels, np.bool_)
+    largest = max(lights[0], key=lambda one: one.size)
+    shares = [(largest.of(polarity) > 0).mean(axis=0) for polarity in (0, 1)]
+    return shares[0] < 0.5, shares[1] < 0.5
+
+
+def _lights(bench: EventBench) -> list[list[Responses]]:
+    """Recordings of steps by light, those with the most contrasts first; only lights that make an S-curve."""
+    lights: dict[float, list[Responses]] = {}
+    for one in bench.responses:
+        lights.setdefault(one.steps.lux, []).append(one)
+    curves = [every for every in lights.values() if len({one.size for one in every}) >= _LEAST_CONTRASTS]
+    return sorted(curves, key=lambda every: (-len({one.size for one in every}), -every[0].steps.lux))
+
+
+def _temperature(bench: EventBench, every: list[Responses]) -> float | None:
+    stated = {bench.temperature_c(one.steps) for one in every}
+    return stated.pop() if len(stated) == 1 else None
+
+
+def _add_curves(found: EventFigures, pair: tuple[SCurve, SCurve], light: list[Responses]) -> None:
+    for curve, name in zip(pair, POLARITIES, strict=True):
+        for key, value in curve.entries.items():
+            found.entries.append(
+                Entry(key, name, value, curve.lux, None, _temperature(found.bench, light), curve.pixels)
+            )
+
+
+def _of_size(bench: EventBench, size: float) -> list[Responses]:
+    """Recordings of steps of a size, the nearest at each light, in order of light."""
+    nearest: dict[float, Responses] = {}
+    for one in bench.responses:
+        away = abs(one.size / size - 1)
+        if away < _SAME_SIZE and (one.steps.lux not in nearest or away < abs(nearest[one.steps.lux].size / size - 1)):
+            nearest[one.steps.lux] = one
+    return [nearest[lux] for lux in sorted(nearest)]
+
+
+def _add_latencies(found: EventFigures, good: NDArray[np.bool_]) -> None:
+    """At the size of steps that the most lights have, the largest of them."""
+    bench = found.bench
+    sizes = sorted({one.size for one in bench.responses})
+    if not sizes:
+        nothing = not_identifiable("no recordings of steps")
+        found.entries += [Entry(key, "ON", nothing, None, None, None, 0) for key in ("latency", "jitter")]
+        return
+    best = max(sizes, key=lambda size: (len(_of_size(bench, size)), size))
+    for polarity, name in enumerate(POLARITIES):
+        for one in _of_size(bench, best):
+            answer = answers(one, polarity, good, bench.temperature_c(one.steps))
+            found.latencies[polarity].append(answer)
+            for key, value in (("latency", answer.latency), ("jitter", answer.jitter)):
+                found.entries.append(
+                    Entry(key, name, value, answer.lux, answer.contrast, answer.temperature_c, answer.pixels)
+                )
+
+
+def _add_ranges(found: EventFigures, good: NDArray[np.bool_]) -> None:
+    bench = found.bench
+    ranges: list[DynamicRange | None] = []
+    pixels = int(np.count_nonzero(good))
+    keys = ("least_light", "most_light", "dynamic_range")
+    for polarity, name in enumerate(POLARITIES):
+        theta = found.curves[0][polarity].theta if found.curves else float("nan")
+        if not np.isfinite(theta):
+            nothing = not_identifiable("the threshold is not known")
+            found.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
+            ranges.append(None)
+            continue
+        every, false = [], []
+        for one in _of_size(bench, 2 * theta):
+            steady = _steady(bench, one.steps.lux)
+            chance = np.nan if steady is None else false_share(bench, steady, one.window_us, polarity, good)
+            if np.isfinite(chance):
+                every.append(answers(one, polarity, good, bench.temperature_c(one.steps)))
+                false.append(float(chance))
+            else:
+                found.findings.append(
+                    f"{one.steps.file}: no steady recording of {one.steps.lux:g} lx that is at least as long as "
+                    "the time between two jumps; what chance finds is not known, and this light is left out of the "
+                    "dynamic range"
+                )
+        one_range = dynamic_range(every, false)
+        ranges.append(one_range)
+        values = one_range.least_lux, one_range.most_lux, one_range.range_db
+        contrast = float(np.expm1(2 * theta))
+        found.entries += [
+            Entry(key, name, value, None, contrast, bench.spec.temperature_c, pixels)
+            for key, value in zip(keys, values, strict=True)
+        ]
+    found.ranges = ranges[0], ranges[1]
+
+
+def _steady(bench: EventBench, lux: float) -> Steady | None:
+    """The steady recording of a light."""
+    near = [one for one in bench.spec.steady if one.lux > 0 and abs(np.log(one.lux / lux)) <= np.log(_SAME_LIGHT)]
+    return min(near, key=lambda one: float(abs(np.log(one.lux / lux)))) if near else None
+
+
+def _add_background(found: EventFigures) -> None:
+    found.backgrounds = background(found.bench)
+    for one in found.backgrounds:
+        for name, value in zip(POLARITIES, one.rates, strict=True):
+            found.entries.append(Entry("background", name, value, one.lux, None, one.temperature_c, one.pixels))
+        if one.finding:
+            found.findings.append(one.finding)
+    for polarity, name in enumerate(POLARITIES):
+        value = doubling(found.backgrounds, polarity)
+        found.entries.append(Entry("doubling", name, value, None, None, None, found.bench.pixels))
+
+
+def _add_times(found: EventFigures) -> None:
+    """Dead time and read-out limit, from all recordings."""
+    bench = found.bench
+    tallies = [bench.tally(name) for name in bench.names]
+    found.intervals = np.sum([one.intervals for one in tallies], axis=0)
+    limit, _ = readout_limit(tallies)
+    for key, value in (("dead_time", dead_time(tallies)), ("readout_limit", limit)):
+        found.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
+
+
+def _add_defects(
+    found: EventFigures, hot: NDArray[np.bool_], dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+) -> None:
+    bench = found.bench
+    if len(bench.spec.steady) > 1:
+        value = still.share(int(np.count_nonzero(hot)), bench.pixels)
+    else:
+        value = not_identifiable("it takes two steady recordings")
+    found.entries.append(Entry("hot", "", value, None, None, bench.spec.temperature_c, bench.pixels))
+    for name, mask in zip(POLARITIES, dead, strict=True):
+        value = (
+            still.share(int(np.count_nonzero(mask)), bench.pixels)
+            if bench.responses
+            else not_identifiable("no recordings of steps")
+        )
+        found.entries.append(Entry("dead", name, value, None, None, bench.spec.temperature_c, bench.pixels))
+
+
+def _has_ticks(bench: EventBench) -> bool:
+    """Whether all events of the steps have times that are multiples of one time above a µs."""
+    common = 0
+    for one in bench.spec.steps[:3]:
+        for events in bench.stream(one.file):
+            common = int(np.gcd(common, np.gcd.reduce(np.diff(events["t_us"]))))
+    return common > 1

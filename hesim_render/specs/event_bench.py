@@ -1,0 +1,84 @@
+"""``bench.yaml``: recordings that were made of event pixels on a bench, and the light of each."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from hesim_render.specs.files import Strict
+
+
+class BenchRecording(Strict):
+    """A recording of even light.
+
+    Its file is named relative to the folder of ``bench.yaml``.
+    """
+
+    file: str = Field(min_length=1)
+    lux: float = Field(ge=0, le=1e7, description="illuminance on the sensor, lx; of steps, that of the lower level")
+    temperature_c: float | None = Field(None, ge=-100, le=200, description="of the sensor; default that of the bench")
+    interval_us: tuple[int, int] | None = Field(
+        None, description="begin and end of the recording, µs; default the times of its first and last event"
+    )
+
+    @model_validator(mode="after")
+    def _check_interval(self) -> BenchRecording:
+        if self.interval_us is not None and not 0 <= self.interval_us[0] < self.interval_us[1]:
+            raise ValueError("interval_us: expected a begin of 0 or more and a later end")
+        return self
+
+
+class Steady(BenchRecording):
+    """Light that stays."""
+
+
+class LightSteps(BenchRecording):
+    """Light that jumps between `lux` and `lux`·(1 + contrast), and stays at each level for half a period."""
+
+    lux: float = Field(gt=0, le=1e7)
+    contrast: float = Field(gt=0, le=1e4, description="(L₁ − L₀)/L₀")
+    begin_us: int | None = Field(None, ge=0, le=10**15, description="time of the first rise, µs")
+    period_us: int | None = Field(None, ge=4, le=10**12, description="from one rise to the next, µs")
+    trigger: int | None = Field(None, ge=0, le=255, description="line whose rising edges are rises of the light")
+    reset: bool = Field(False, description="all pixels were reset right before each jump")
+
+    @model_validator(mode="after")
+    def _check(self) -> LightSteps:
+        if (self.begin_us is None) != (self.period_us is None) or (self.begin_us is None) == (self.trigger is None):
+            raise ValueError("give begin_us and period_us, or trigger, to say when the light jumps")
+        return self
+
+
+class Modulation(BenchRecording):
+    """Light lux·(1 + depth·sin(2π·hz·t))."""
+
+    lux: float = Field(gt=0, le=1e7, description="mean illuminance on the sensor, lx")
+    hz: float = Field(gt=0, le=1e6)
+    depth: float = Field(gt=0, lt=1, description="(L_max − L_min)/(L_max + L_min)")
+
+
+class EventBenchSpec(Strict):
+    """``bench.yaml``."""
+
+    schema_version: Literal[1] = 1
+    sensor: str = Field(min_length=1, max_length=200, description="its name, for the title of the report")
+    notes: str = ""
+    rows: int | None = Field(None, ge=1, le=65536, description="of the event grid, where files do not state it")
+    cols: int | None = Field(None, ge=1, le=65536)
+    temperature_c: float | None = Field(None, ge=-100, le=200, description="of the sensor during all recordings")
+    steady: list[Steady] = Field(default_factory=list, max_length=1000)
+    steps: list[LightSteps] = Field(default_factory=list, max_length=1000)
+    modulation: list[Modulation] = Field(default_factory=list, max_length=1000)
+    busy: list[str] = Field(
+        default_factory=list, max_length=1000, description="recordings of more events than the read-out takes"
+    )
+    frames: str | None = Field(None, description="folder of EMVA 1288 captures of the same sensor")
+
+    @model_validator(mode="after")
+    def _check(self) -> EventBenchSpec:
+        if (self.rows is None) != (self.cols is None):
+            raise ValueError("rows and cols are given together or not at all")
+        if not (self.steady or self.steps or self.modulation or self.busy or self.frames):
+            raise ValueError("names no recording: expected steady, steps, modulation, busy or frames")
+        return self

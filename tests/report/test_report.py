@@ -1,0 +1,253 @@
+"""The test report of a sensor: every figure on recordings of a generator written in NumPy alone
+(`tests/support/bench_pixels.py`), coverage of the intervals, the files, and bad input.
+"""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from hesim_render.core.errors import OutputError, RangeError, SpecError
+from hesim_render.exchange import EVENT_FORMATS, EventStream
+from hesim_render.exchange.triggers import TRIGGER_DTYPE
+from hesim_render.report import figures, make_report
+from hesim_render.report.bench import EventBench
+from hesim_render.report.definitions import EVENTS, FRAMES
+from hesim_render.report.emva import frame_figures
+from hesim_render.report.estimates import corrected, crossing, mean_error
+from hesim_render.report.s_curves import s_curve
+from hesim_render.report.texts import event_tables, figure
+from tests.support.bench_pixels import HALF_US, LUX, PIXELS, SHAPE, Pixels
+
+
+def entry_of(found, key, name):
+    """The entry of a figure; of those against light, that of the brightest step or steady recording."""
+    every = [one for one in found.entries if (one.key, one.name) == (key, name)]
+    return max(every, key=lambda one: one.lux or 0.0 if key != "background" else one.lux == 70.0)
+
+
+def covered(seeds, folder):
+    """Of each figure: how often its interval holds the truth, and errors in standard errors."""
+    hits, scores = {}, {}
+    for seed in seeds:
+        pixels = Pixels(seed).everything()
+        found = figures.event_figures(EventBench(pixels.write(folder / str(seed))))
+        for (key, name), truth in pixels.truth.items():
+            value = entry_of(found, key, name).value
+            low, high = value.get("interval_95", (np.nan, np.nan))
+            hits.setdefault((key, name), []).append(low <= truth <= high)
+            scores.setdefault((key, name), []).append((value["value"] - truth) / value["standard_error"])
+    return hits, scores
+
+
+@pytest.fixture(scope="module")
+def numpy_bench(tmp_path_factory):
+    pixels = Pixels(3).everything()
+    pixels.content["temperature_c"] = 25.0
+    folder = pixels.write(tmp_path_factory.mktemp("bench") / "captures")
+    out = folder.parent / "report"
+    return pixels, make_report([folder], out), out
+
+
+def test_figures_are_those_of_the_generator(numpy_bench):
+    """19 intervals of 4.2 standard errors: one misses in 2000 cases; the seed is fixed."""
+    pixels, found, _ = numpy_bench
+    for (key, name), truth in pixels.truth.items():
+        value = entry_of(found.events, key, name).value
+        assert abs(value["value"] - truth) < 4.2 * value["standard_error"] < 0.5 * truth, (key, name, value, truth)
+    assert entry_of(found.events, "dead", "ON").value["value"] == len(pixels.dead) / PIXELS
+    assert entry_of(found.events, "threshold", "OFF").pixels == PIXELS - len(pixels.dead)
+    assert entry_of(found.events, "threshold", "ON").lux == LUX
+    assert entry_of(found.events, "bandwidth", "ON").temperature_c == 25.0
+    assert "the captures end there" in entry_of(found.events, "dynamic_range", "ON").value["reason"]
+    assert found.events.findings == []
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_of_a_hundred_benches(tmp_path):
+    hits, scores = covered(range(20261124, 20261224), tmp_path)
+    for name, every in hits.items():
+        assert 90 <= sum(every) <= 99, (name, sum(every))
+        assert abs(np.mean(scores[name])) < 0.6, name
+
+
+def test_the_files_of_a_report(numpy_bench):
+    _, found, out = numpy_bench
+    whole = json.loads((out / "report.json").read_text())
+    listed = {one["figure"] for one in whole["events"]["figures"]}
+    assert listed == set(EVENTS) == set(whole["events"]["definitions"])
+    for one in whole["events"]["figures"]:
+        assert one["pixels"] > 0 and ("value" in one) and (one["value"] is not None or one["reason"])
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 6 and "http" not in page.replace("http://www.w3.org", "")
+    for definition in EVENTS.values():
+        assert definition.title in page
+        assert definition.sentence.endswith(".") and ". " not in definition.sentence
+    assert (out / "report.pdf").read_bytes()[:5] == b"%PDF-"
+    assert 2 <= found.pages <= 4
+    assert whole["frames"] is None
+
+
+def test_rows_of_a_figure_against_light(numpy_bench):
+    table = event_tables(numpy_bench[1].events)[1]
+    row = next(row for row in table.rows if row[0] == "4, 25 °C")
+    assert len(row) == len(table.head) == len(table.widths)
+    assert all("(" in cell for cell in row[1:7]) and "±" in row[7]
+    assert [figure(value) for value in (0.0, 12345.6, 2.5e7, 0.04321)] == ["0", "12350", "2.5e+07", "0.04321"]
+
+
+def test_edges_of_triggers_stand_for_times(tmp_path, numpy_bench):
+    """The same answers whether times are given or read from a trigger line; a last edge ends the last window."""
+    pixels = numpy_bench[0]
+    one = next(one for one in pixels.content["steps"] if one["file"] == "s5.npz")
+    edges = np.zeros(14, TRIGGER_DTYPE)
+    edges["t_us"] = 1000 + HALF_US * np.arange(14)
+    edges["edge"], edges["channel"] = np.where(np.arange(14) % 2, -1, 1), 1
+    with (tmp_path / "s5.raw").open("wb") as file:
+        events = pixels.files["s5.npz"]
+        stream = EventStream(lambda: EventStream.of(events, SHAPE), SHAPE, triggers=lambda: edges)
+        EVENT_FORMATS["evt3"].write(stream, file, "s5.raw")
+    content = {"sensor": "x", "steps": [{"file": "s5.raw", "lux": LUX, "contrast": one["contrast"], "trigger": 1}]}
+    (tmp_path / "bench.yaml").write_text(yaml.safe_dump(content))
+    read = EventBench(tmp_path).responses[0]
+    written = next(r for r in EventBench(pixels.write(tmp_path / "same")).responses if r.steps.file == "s5.npz")
+    assert read.window_us == HALF_US and list(read.rises[:3]) == [True, False, True]
+    assert np.array_equal(read.latency_us[:12], written.latency_us)
+    with pytest.raises(SpecError, match=r"s5\.raw.*0 edges of triggers on line 4"):
+        content["steps"][0]["trigger"] = 4
+        (tmp_path / "bench.yaml").write_text(yaml.safe_dump(content))
+        _ = EventBench(tmp_path).responses
+
+
+def test_what_cannot_be_told_says_why(tmp_path):
+    pixels = Pixels(5)
+    for k, part in enumerate((0.2, 0.5, 1.6, 2.0)):
+        size = part * pixels.theta.mean()
+        pixels.step_file(LUX, size, 4, lambda polarity, s=size: s > pixels.own[polarity], f"{k}.npz")
+    for one in pixels.content["steps"]:
+        one["reset"] = False
+    found = figures.event_figures(EventBench(pixels.write(tmp_path / "coarse")))
+    assert "the contrasts are too coarse: between" in entry_of(found, "threshold", "ON").value["reason"]
+    assert "the threshold is not known" in entry_of(found, "dynamic_range", "OFF").value["reason"]
+    assert "no recordings of modulated light" in entry_of(found, "bandwidth", "ON").value["reason"]
+    assert "two steady recordings" in entry_of(found, "hot", "").value["reason"]
+    assert "not all pixels were reset" in found.findings[0]
+    steady = Pixels(6)
+    steady.steady_file(2.0, None, (0.0, 1.0), 0.5, "a.npz")
+    found = figures.event_figures(EventBench(steady.write(tmp_path / "steady")))
+    assert entry_of(found, "background", "ON").value["upper_limit"] == pytest.approx(3 / PIXELS / 0.5)
+    assert "no temperature is stated" in entry_of(found, "doubling", "ON").value["reason"]
+    assert "no recordings of steps" in entry_of(found, "latency", "ON").value["reason"]
+
+
+def test_noise_or_spread_alone(tmp_path):
+    """Where one of both makes the whole width, the other is 0 with a limit, and the threshold is right."""
+    for spread, noise, key in ((0.0, 0.1, "threshold_spread"), (0.12, 1e-7, "pixel_noise")):
+        pixels = Pixels(7)
+        pixels.noise = noise * pixels.theta[0]
+        pixels.own = pixels.theta[:, None] * (1 + spread * pixels.rng.standard_normal((2, PIXELS)))
+        pixels.s_curves()
+        curve = s_curve(EventBench(pixels.write(tmp_path / key)).responses, 0, ~np.isin(np.arange(PIXELS), pixels.dead))
+        value = curve.entries[key]
+        assert value["value"] == 0 and 0 < value["upper_limit"] < 4.0, value
+        threshold = curve.entries["threshold"]
+        assert abs(threshold["value"] - pixels.theta[0]) < 4 * threshold["standard_error"]
+
+
+def test_closed_forms():
+    assert corrected(0.55, 0.1) == pytest.approx(0.5)
+    # Φ⁻¹ of 0.1587 and 0.9772 is −1 and 2: half is reached a third of the way
+    share = np.array([0.15865525, 0.97724987])
+    place, error = crossing(np.array([2.0, 5.0]), share, np.array([0.01, 0.0]), 0.5, 1e4)
+    assert place == pytest.approx(3.0, abs=1e-6)
+    assert error == pytest.approx(0.01 / 0.24197072 * 2 / 3 * 3 / 3, rel=1e-4)
+    assert crossing(np.array([2.0, 5.0]), share, share, 0.99, 1e4) is None
+    # a part that all pixels of a jump share counts once a jump
+    rng = np.random.default_rng(2)
+    values = rng.standard_normal((40, 500)) + 3 * rng.standard_normal((40, 1))
+    assert mean_error(values, np.ones(values.shape, bool)) == pytest.approx(3 / np.sqrt(40), rel=0.4)
+
+
+def test_bad_input_is_one_clear_error(tmp_path, numpy_bench):
+    _, _, report = numpy_bench
+    captures = report.parent / "captures"
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for given, told in (
+        ([bare], r"holds neither bench\.yaml"),
+        ([captures, captures], "is a second folder of events"),
+        ([captures, "davis346"], "no such folder"),
+        (["no-such-sensor"], "no sensor named"),
+    ):
+        with pytest.raises(SpecError, match=told):
+            make_report(given, tmp_path / "out")
+    with pytest.raises(RangeError, match="a sensor, or folders of captures"):
+        make_report([], tmp_path / "out")
+    with pytest.raises(RangeError, match="seed"):
+        make_report([captures], tmp_path / "out", seed=-1)
+    with pytest.raises(OutputError, match="exists"):
+        make_report([captures], report)
+    steps = {"file": "s1.npz", "lux": LUX, "contrast": 0.2}
+    np.savez(bare / "other.npz", t=[5, 9], x=[1, 2], y=[3, 4], p=[True, False])
+    for content, told in (
+        ({"sensor": "x"}, "names no recording"),
+        ({"sensor": "x", "steps": [steps]}, r"steps\.0.*begin_us and period_us, or trigger"),
+        ({"sensor": "x", "rows": 4, "steps": [{**steps, "trigger": 0}]}, "rows and cols are given together"),
+        ({"sensor": "x", "busy": ["../up.npz"]}, "leads out of the folder"),
+        ({"sensor": "x", "busy": ["gone.npz"]}, "no such file: 'gone.npz'"),
+        ({"sensor": "x", "busy": ["other.npz"]}, r"other\.npz.*does not state the size"),
+        ({"sensor": "x", "steady": [{"file": "a", "lux": -1}]}, r"steady\.0\.lux"),
+        ({"sensor": "x", "steady": [{"file": "a", "lux": 1, "interval_us": [4, 2]}]}, "a later end"),
+        (
+            {"sensor": "x", "rows": 9, "cols": 9, "steps": [
+                {"file": "other.npz", "lux": 3.0, "contrast": 0.5, "begin_us": 4, "period_us": 800}]},
+            "ends at 9 µs, before a rise and a fall",
+        ),
+    ):  # fmt: skip
+        (bare / "bench.yaml").write_text(yaml.safe_dump(content))
+        with pytest.raises(SpecError, match=told):
+            bench = EventBench(bare)
+            _ = [bench.tally(name) for name in bench.spec.busy], bench.responses
+
+
+@pytest.mark.slow
+def test_a_report_of_a_simulated_sensor(tmp_path):
+    """The figures are those that the sensor has; the captures it leaves give the same report."""
+    from hesim_render.sensor.sensor import load_sensor
+
+    out = tmp_path / "report"
+    found = make_report(["davis346"], out, size=(24, 30))
+    sensor = load_sensor("davis346").crop(30, 24)
+    for name, own in (("ON", sensor.evs.threshold_on_map), ("OFF", sensor.evs.threshold_off_map)):
+        value = entry_of(found.events, "threshold", name).value
+        assert abs(value["value"] - own.mean()) < 0.02 * own.mean()  # the noise lowers it
+        spread = entry_of(found.events, "threshold_spread", name).value
+        assert abs(spread["value"] - 100 * own.std() / own.mean()) < 1.5
+    assert found.events.entries[0].pixels <= 24 * 30
+    frames, aps = found.frames.entries, sensor.spec.aps
+    for key, truth in (
+        ("K", aps.system_gain_dn_per_e), ("quantum_efficiency", 0.24 * 0.22), ("prnu_percent", 1.0), ("dsnu_e", 60.0),
+        ("dark_current_e_per_s", aps.dark_current_e_per_s),
+    ):  # fmt: skip
+        assert abs(frames[key]["value"] - truth) < 4 * frames[key]["standard_error"] + 0.03 * truth, key
+    assert set(FRAMES) == set(frames)
+    again = make_report([out / "captures-events", out / "captures-frames"], tmp_path / "again")
+    assert [one.value for one in again.events.entries] == [one.value for one in found.events.entries]
+    noise, k, well = (frames[key]["value"] for key in ("temporal_dark_noise_e", "K", "full_well_e"))
+    least = np.sqrt(noise**2 + 1 / 12 / k**2) + 0.5
+    assert frames["dynamic_range"]["value"] == pytest.approx(20 * np.log10(well / least))
+    assert frames["snr_max"]["value"] == pytest.approx(10 * np.log10(well))
+    assert frame_figures(out / "captures-frames").pixels == 24 * 30
+
+
+@pytest.mark.slow
+def test_frames_that_cannot_be_evaluated_are_a_finding(tmp_path):
+    """The dark noise of `reference-mono` is below what rounding shows; its event pixels have their report."""
+    found = make_report(["reference-mono"], tmp_path / "report", size=(12, 16))
+    assert found.frames is None and found.events is not None
+    assert any(one.startswith("frames: captures-frames") and "rounding hides" in one for one in found.events.findings)
+    threshold = entry_of(found.events, "threshold", "ON").value
+    assert abs(threshold["value"] - 0.1) < 0.005  # contrast_threshold_on of its file
+    band = entry_of(found.events, "bandwidth", "ON").value
+    assert band["value"] is None
