@@ -142,6 +142,9 @@ class SceneSpec(Strict):
     ) = Field(None, description="one light or a list")
     camera: CameraSpec | None = None
     motion: list[TrackSpec] = []
+    labels: dict[str, Annotated[str, Field(min_length=1)] | None] = Field(
+        {}, description="class of an object in boxes and masks, by its name; null: it has none"
+    )
     max_depth: int | None = Field(
         None,
         ge=2,
@@ -194,6 +197,10 @@ class SceneSpec(Strict):
         for track in self.motion:
             if track.object not in known:
                 raise ValueError(f"motion: no object {track.object!r} in the scene; there are {', '.join(known)}")
+        for name in self.labels:
+            if name not in known or name == "camera":
+                shown = ", ".join(each for each in known if each != "camera")
+                raise ValueError(f"labels: no object {name!r} in the scene; there are {shown}")
         return self
 
     @property
