@@ -91,6 +91,12 @@ def simulate(
         bool,
         typer.Option("--framing", help="only show the framing: a quick picture without light, OUT.png", hidden=True),
     ] = False,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live", help="show the run in rerun while it goes on; without a display, in OUT/live.rrd", hidden=True
+        ),
+    ] = False,
     yes: Yes = False,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
@@ -111,14 +117,16 @@ def simulate(
         "--sensor": sensor, "--duration": duration, "--roi": roi, "--seed": seed, "--quality": quality,
         "--exact": exact, "--samples": samples, "--truth": truth, "--truth-every-us": truth_every_us, "--set": set_,
         "--clean": clean, "--without": without, "--allow-outside": allow_outside, "--scene": scene_file,
-        "--framing": framing,
+        "--framing": framing, "--live": live,
     })  # fmt: skip
     if duration is not None:
         check_duration(duration)
     console = Console(json_, quiet, dry_run)
     limits: dict[str, Any] = {"max_minutes": None if yes else LONG_MINUTES, "overwrite": overwrite}
-    common = _given(seed=seed, clean=clean, without=without or [], duration_s=duration)
+    common = _given(seed=seed, clean=clean, without=without or [], duration_s=duration, live=live)
     rendered = _given(quality=quality, exact=exact, samples=samples, truth=listed(truth), truth_every_us=truth_every_us)
+    if live and not dry_run:
+        _tell_live_file(console, out)
     if kind is InputKind.recording:
         _again(console, Path(given), out, scene_file, allow_outside, limits)
     elif kind is InputKind.run:
@@ -138,6 +146,15 @@ def simulate(
         show_recording(console, recording)
     else:
         _pictures(console, kind, given, sensor, out, keys, sensor_keys, roi, {**limits, **common})
+
+
+def _tell_live_file(console: Console, out: Path) -> None:
+    """Say where the live view is while the run goes on."""
+    from hesim_render.core.output import unfinished_place
+    from hesim_render.recording.live_view import live_file
+
+    file = live_file(unfinished_place(out.expanduser().resolve()))
+    console.text("live view: rerun" if file is None else f"live view: rerun {file}")
 
 
 def _given(**options: Any) -> dict[str, Any]:
