@@ -99,9 +99,8 @@ class AdaptiveRenderer:
         width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         closer = self.zoom.sites(row, col, windows, numbers)
-        found = take_pilot(
-            self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored, stride
-        )
+        given = self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored, stride
+        found = take_pilot(*given, lambda flux: np.float32(band.quality) * band.unit(flux))
         self.counts.pilot_rays += self.tracer.rays_done - before
         return found
 

@@ -59,12 +59,15 @@ def about_edges(
     )
     # fluxes of fits are those on the optical axis
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
-    contrast, by_scatter = (fit.high - fit.low) / wanted, gain.rays(fit.scatter / wanted)
-    is_flat = contrast < 1
-    is_edge = fit.is_edge & ~is_flat
+    # of rays that all see the same, none is above the middle
+    contrast = np.maximum(fit.high - fit.low, 0) / wanted
+    is_edge = fit.is_edge & (contrast >= 1)
+    # both sides belong to the scatter of a pair that has no edge
+    by_scatter = gain.rays(np.where(is_edge, 0, 0.5 * contrast) + fit.scatter / wanted)
+    is_flat = ~is_edge & (contrast < tuning.flat_contrast)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
     needed = np.where(is_edge, np.maximum(2 * by_scatter, tuning.edge_contrast_rays * contrast), by_scatter)
-    # no contrast at all: the neighbours gave this pair its rays, and what they show does not reach it
+    # little contrast: the neighbours gave this pair its rays, and what they show does not reach it
     part = tuning.flat_part if flat_part is None else flat_part
     needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)
     needed = np.clip(np.maximum(needed, floor[place]), tuning.edge_rays, tuning.most_rays)

@@ -7,7 +7,7 @@ a change of the scene, not of the rays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from itertools import pairwise
 
@@ -23,8 +23,8 @@ from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 
-#: Relative differences of fluxes that rounding explains.
-_ROUNDING = np.float32(1e-5)
+#: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
+_ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
 #: Scale of fluxes before they are squared, so that float32 can hold the squares.
 _SMALLER = np.float32(1e-4)
 
@@ -131,6 +131,7 @@ def take_pilot(
     closer: Sequence[Sequence[Look]] = (),
     anchored: Anchored | None = None,
     stride: int = 1,
+    wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -144,6 +145,7 @@ def take_pilot(
     closer : for each window, the sites that get extra rays; see `Zoom`.
     anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
+    wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
 
     Returns
     -------
@@ -189,7 +191,10 @@ def take_pilot(
             # what shows the same in two looks, in all pixels around, has kept its light between them
             changed = np.zeros(sites.size, np.bool_)
             for values in (pilot.lit, pilot.hidden):
-                changed |= np.abs(values[late] - values[early]) > _ROUNDING * np.abs(values[early])
+                least = _ROUNDING * np.abs(values[early])
+                if wanted is not None:
+                    least = np.maximum(least, _SAME * wanted(pilot.flux_of(early)))
+                changed |= np.abs(values[late] - values[early]) > least
             busy = sites.near(changed, REACH - 1) & near
             for values in _tables(pilot):
                 values[between] = values[early]
