@@ -41,7 +41,6 @@ _OPTIONS = {
     "--pan": "--set pan_px_per_s=[X,Y]",
     "--zoom": "--set zoom_per_s=VALUE",
     "--rotate": "--set rotation_deg_per_s=VALUE",
-    "--look": "--framing",
     "--layout": "--format",
 }  # fmt: skip
 

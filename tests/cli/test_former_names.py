@@ -20,7 +20,6 @@ from hesim_render.sources.video import VideoOptions
     (["study", "cfa", "five-cfas", "--out", "o"], "hesim-render study SPEC"),
     (["benchmark", "pack", "b", "--out", "o"], "hesim-render benchmark export --format webdataset"),
     (["simulate", "v.npy", "--sensor", "gen2", "--out", "o", "--fps", "100"], "now: --set fps=VALUE"),
-    (["simulate", "dark", "--sensor", "gen2", "--out", "o", "--look"], "now: --framing"),
     (["simulate", "c.npy", "--sensor", "gen2", "--out", "o", "--pan=3,0"], "now: --set pan_px_per_s=[X,Y]"),
 ])  # fmt: skip
 def test_a_former_name_is_answered_with_the_present_one(given, now, capsys):
@@ -40,4 +39,4 @@ def test_what_is_named_exists():
         assert below is None or rest[0] in below
     keys = set(VideoOptions.model_fields) | set(CubeOptions.model_fields)
     named = [text.removeprefix("--set ").partition("=")[0] for text in _OPTIONS.values() if text.startswith("--set ")]
-    assert set(named) <= keys and len(named) == len(_OPTIONS) - 2
+    assert set(named) <= keys and len(named) == len(_OPTIONS) - 1
