@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream
-from hesim_render.sources.render.change_driven.edges import PairEdges
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -24,6 +24,7 @@ def about_edges(
     *,
     tried: NDArray[np.bool_] | None = None,
     flat_part: float | None = None,
+    known: tuple[NDArray[np.bool_], EdgeFit] | None = None,
     stream: Stream = Stream.RENDER_EDGE,
 ) -> tuple[NDArray[np.integer], PairEdges | None]:
     """Models of the edges in listed pairs, and the numbers of rays that are left to trace.
@@ -42,6 +43,7 @@ def about_edges(
     tuning : constants.
     tried : [n], pairs that may have an edge; None for all.
     flat_part : in place of `Tuning.flat_part`.
+    known : [n], pairs whose lines are known, and these lines.
     stream : stream of the decision rays.
 
     Returns
@@ -54,9 +56,13 @@ def about_edges(
     if place.size == 0:
         return rays, None
     pixel, window, windows = pairs
-    fit = tracer.edges(
-        pixel[place], window[place], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[place], stream
-    )
+    fit, new = EdgeFit.empty(place.size), np.arange(place.size)
+    if known is not None:
+        fit.replace(np.flatnonzero(known[0][place]), known[1])
+        new = np.flatnonzero(~known[0][place])
+    some = place[new]
+    of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[some]
+    fit.replace(new, tracer.edges(*of, stream))
     # fluxes of fits are those on the optical axis
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
     # of rays that all see the same, none is above the middle

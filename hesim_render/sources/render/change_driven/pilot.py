@@ -184,23 +184,29 @@ def take_pilot(
 
         looks = np.append(np.arange(0, count - 1, stride), count - 1)
         look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
-        for early, late in pairwise(looks.tolist()):
-            between = np.arange(early + 1, late)
-            if between.size == 0:
-                continue
-            # what shows the same in two looks, in all pixels around, has kept its light between them
-            changed = np.zeros(sites.size, np.bool_)
-            for values in (pilot.lit, pilot.hidden):
-                least = _ROUNDING * np.abs(values[early])
-                if wanted is not None:
-                    least = np.maximum(least, _SAME * wanted(pilot.flux_of(early)))
-                changed |= np.abs(values[late] - values[early]) > least
-            busy = sites.near(changed, REACH - 1) & near
-            for values in _tables(pilot):
-                values[between] = values[early]
-            for values in scatters:
-                values[between] = values[early] if early else 0  # the first window has the difference to the anchor
-            look(np.repeat(between, np.count_nonzero(busy)), np.tile(np.flatnonzero(busy), between.size))
+        spans = [span for span in pairwise(looks.tolist()) if span[1] - span[0] > 1]
+        while spans:
+            windows_of, places_of = [], []
+            for early, late in spans:
+                # what shows the same in two looks, in all pixels around, has kept its light between them
+                changed = np.zeros(sites.size, np.bool_)
+                for values in (pilot.lit, pilot.hidden):
+                    least = _ROUNDING * np.abs(values[early])
+                    if wanted is not None:
+                        least = np.maximum(least, _SAME * wanted(pilot.flux_of(early)))
+                    changed |= np.abs(values[late] - values[early]) > least
+                busy = np.flatnonzero(sites.near(changed, REACH - 1) & near)
+                between = slice(early + 1, late)
+                for values in _tables(pilot):
+                    values[between] = values[early]
+                for values in scatters:
+                    values[between] = values[early] if early else 0  # the first window is compared with the anchor
+                windows_of.append(np.full(busy.size, (early + late) // 2))
+                places_of.append(busy)
+            # where something changed, one more look half way between
+            look(np.concatenate(windows_of), np.concatenate(places_of))
+            halves = [half for a, b in spans for half in ((a, (a + b) // 2), ((a + b) // 2, b))]
+            spans = [span for span in halves if span[1] - span[0] > 1]
     change = None
     if anchored is not None:
         means = [values - values[:1] for values in (pilot.lit, pilot.hidden)]

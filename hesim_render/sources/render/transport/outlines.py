@@ -91,9 +91,10 @@ def _flat(triangles: NDArray[np.float64]) -> Outline | None:
         return None
     corners = _without_straight(points[hull.vertices])
     outline = Outline(corners, one_sided=False)
-    filled = 0.5 * np.linalg.norm(
-        np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1
-    ).sum()
+    filled = (
+        0.5
+        * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1).sum()
+    )
     return outline if len(corners) <= _MOST_CORNERS and filled >= _FILLED * outline.area_m2 else None
 
 
@@ -198,8 +199,6 @@ def _margin(outline: Outline) -> float:
 
 def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
     """The largest outlines of several parts, at most `_MOST` in all."""
-    every = sorted(
-        ((outline.area_m2, -number) for number, part in enumerate(parts) for outline in part), reverse=True
-    )
+    every = sorted(((outline.area_m2, -number) for number, part in enumerate(parts) for outline in part), reverse=True)
     least = every[_MOST - 1][0] if len(every) > _MOST else 0.0
     return [[outline for outline in part if outline.area_m2 >= least] for part in parts]
