@@ -114,6 +114,9 @@ def test_items_are_the_events_of_a_clip_with_their_target(built):
                 assert boxes.classes[row["class_id"]] == names[row["track_id"]]
                 seen += 1
         assert seen == found.size > 0
+    before = [boxes.classes[k] for k in boxes[0][1]["class_id"]]
+    boxes.classes.reverse()  # as if another clip had named them first
+    assert [boxes.classes[k] for k in boxes[0][1]["class_id"]] == before
     frames = EventDataset(built.root, "train", "frames")[0][1]
     np.testing.assert_array_equal(frames["images"], [frame.raw for frame in recording.frames])
     assert frames["t_us"].tolist() == [frame.t_us for frame in recording.frames]

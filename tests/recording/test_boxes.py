@@ -187,7 +187,7 @@ def test_a_slice_has_the_cause_and_the_object_of_each_event(recorded, tmp_path, 
     events, labels, objects = recorded.events, recorded.event_labels, recorded.event_objects
     assert events.size > 40 and len(set(labels.label.tolist())) > 1
     times = np.unique(events["t_us"])
-    begin, end = int(times[1]), int(times[-2])
+    begin, end = int(times[1]) + 1, int(times[-2])  # not at a whole ms, where the index of the file begins
     low, high = np.searchsorted(events["t_us"], [begin, end])
     for given in (hr.Recording.load(recorded.path), recorded):
         found = given.labelled_slice(begin, end)

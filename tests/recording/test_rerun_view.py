@@ -127,6 +127,8 @@ def test_a_run_is_shown_while_it_goes_on(tmp_path, monkeypatch):
         blocks = []
         for last in steps:
             times = np.sort(rng.integers(last - 6_000, last + 1, 90))
+            if last == 13_000:
+                times[np.searchsorted(times, 10_000)] = 10_000  # the end of a step belongs to it
             block = np.zeros(90, EVENT_DTYPE)
             block["t_us"], block["x"], block["y"] = times, rng.integers(0, 40, 90), rng.integers(0, 28, 90)
             block["polarity"] = rng.choice([-1, 1], 90)

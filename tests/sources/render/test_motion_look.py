@@ -99,6 +99,14 @@ def test_figures_in_words_say_what_is_lost(found):
 
 
 @pytest.mark.slow
+def test_some_pixels_stand_for_all(found, monkeypatch):
+    monkeypatch.setattr("hesim_render.sources.render.truth.motion_look._PIXELS", 350)
+    some = motion_look(sliding(), hr.load_sensor("davis346").crop(44, 30), 20_000.0, DURATION_US).events
+    assert some.stride == 2 and some.density_hz.shape == (15, 22)
+    assert some.mean_hz == pytest.approx(found.events.mean_hz, rel=0.25)
+
+
+@pytest.mark.slow
 def test_the_option_writes_a_picture_and_prints_what_moves(tmp_path, capsys):
     given = ["simulate", "rotating-star", "--sensor", "davis346", "--roi", "44x30", "--look", "0.02", "--json"]
     with pytest.raises(SystemExit) as ended:
