@@ -14,6 +14,7 @@ from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import TASKS, ClipTasks, Score
+from hesim_render.benchmark.verdict import verdicts
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.output import check_place, replacing
@@ -48,6 +49,7 @@ def evaluate_benchmark(
     Returns
     -------
     ``summary`` [task][method][measure]: mean, std and number of values; ``scores``, a list of every single one;
+    ``verdicts``: a sentence for each method that is worse than doing nothing, which says why that happens;
     ``digest`` of the benchmark and ``split``; ``unused``: files of `predictions` that belong to no item of these tasks.
 
     Raises
@@ -88,12 +90,19 @@ def evaluate_benchmark(
         "clips": len(clips),
         "unused": [] if given is None else given.unused,
         "summary": summary(scores),
+        "verdicts": verdicts(scores, {clip.name for clip in clips if _is_ticked(clip)}),
         "scores": [vars(score) for score in scores],
     }
     if target is not None:
         with replacing(target) as unfinished:
             unfinished.write_text(json.dumps(finite(result), indent=1) + "\n", encoding="utf-8")
     return result
+
+
+def _is_ticked(clip: BenchmarkClip) -> bool:
+    """True if the event pixels of a clip compare at fixed ticks."""
+    evs = clip.recording.manifest["sensor"]["spec"].get("evs")
+    return evs is not None and evs["reference"] == "previous_sample"
 
 
 def _longer_exposures(clips: Sequence[BenchmarkClip]) -> dict[str, list[BenchmarkClip]]:

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
+from hesim_render.recording.box_export import PROPHESEE_BOX, box_records, classes
 
-Target = Literal["cause", "object", "frames", "sharp"]
-TARGETS = ("cause", "object", "frames", "sharp")
+Target = Literal["cause", "object", "boxes", "frames", "sharp"]
+TARGETS = ("cause", "object", "boxes", "frames", "sharp")
+#: Kind of truth that a target needs.
+_KINDS = {"cause": "events", "boxes": "ids"}
 
 
 class EventDataset:
@@ -24,15 +27,16 @@ class EventDataset:
 
     An item is a pair. Its events are a structured array with ``x``, ``y`` (px of the event grid), ``t`` (µs) and ``p``
     (True is ON), as tonic's transforms take them; `sensor_size` is (width, height, 2). Its target is the ``cause``
-    (uint8, numbers of `Label`) or the ``object`` (uint16) of each event, or the ``frames`` of the clip (RAW in DN, with
-    the end of each exposure) or its ``sharp`` images (RAW in DN, with their times), as a dictionary of ``images``
-    [n, row, col] and ``t_us`` [n].
+    (uint8, numbers of `Label`) or the ``object`` (uint16) of each event, the ``boxes`` of the clip's objects on the
+    event grid (records of Prophesee and RVT, `PROPHESEE_BOX`) at the times of ``truth: [ids]``, or the ``frames`` of
+    the clip (RAW in DN, with the end of each exposure) or its ``sharp`` images (RAW in DN, with their times), as a
+    dictionary of ``images`` [n, row, col] and ``t_us`` [n].
 
     Parameters
     ----------
     root : folder of the benchmark.
     split : ``train``, ``val``, ``test``, or None for all.
-    target : ``cause``, ``object``, ``frames`` or ``sharp``.
+    target : ``cause``, ``object``, ``boxes``, ``frames`` or ``sharp``.
     transform : called with the events.
     target_transform : called with the target.
     transforms : called with both, in place of these two.
@@ -73,13 +77,17 @@ class EventDataset:
         self._target = target
         self.transform, self.target_transform, self.transforms = transform, target_transform, transforms
         self._folders: list[Path] = []
+        #: Names of the classes of ``boxes``, of all clips, by ``class_id``.
+        self.classes: list[str] = []
         shapes = set()
         for clip in Benchmark(root).clips(split):
             counts, shape = clip.content["counts"], clip.recording.event_shape
             has = {"frames": counts["frames"], "sharp": counts["sharp"]}.get(target, True)
-            if target == "cause":
-                has = "events" in (clip.recording.manifest["settings"].get("truth") or {"kinds": ()})["kinds"]
+            if target in _KINDS:
+                has = _KINDS[target] in (clip.recording.manifest["settings"].get("truth") or {"kinds": ()})["kinds"]
             if has and 0 not in shape:
+                if target == "boxes":
+                    self.classes += [name for name in _classes(clip)[0] if name not in self.classes]
                 self._folders.append(clip.folder)
                 shapes.add(shape)
         if not self._folders:
@@ -119,6 +127,8 @@ class EventDataset:
             return labels.label
         if self._target == "object":
             return recording.event_objects
+        if self._target == "boxes":
+            return self._boxes_of(clip)
         if self._target == "frames":
             images, times = [frame.raw for frame in recording.frames], [frame.t_us for frame in recording.frames]
         else:
@@ -126,3 +136,19 @@ class EventDataset:
             assert sharp is not None
             images, times = [sharp.raw_dn(k) for k in range(len(sharp.time_us))], list(sharp.time_us)
         return {"images": np.stack(images), "t_us": np.array(times)}
+
+    def _boxes_of(self, clip: BenchmarkClip) -> NDArray[np.void]:
+        """Boxes of the clip, with the classes of all clips."""
+        names, own = _classes(clip)
+        of_all = np.array([*(self.classes.index(name) for name in names), -1], np.int64)
+        stored = clip.recording.stored_truth
+        assert stored is not None
+        images = ((t, stored.read("events/object", k)) for k, t in enumerate(stored.read("events/time_us")))
+        return box_records(images, of_all[own], PROPHESEE_BOX)
+
+
+def _classes(clip: BenchmarkClip) -> tuple[list[str], NDArray[np.int64]]:
+    """As `classes`, of a clip with stored truth."""
+    stored = clip.recording.stored_truth
+    assert stored is not None
+    return classes(stored.read("names/objects").tolist(), clip.recording.manifest["scene"]["spec"].get("labels", {}))

@@ -29,7 +29,7 @@ _EVS = {
 
 
 def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
-    """One line a parameter, with its 95 % interval or the reason why it is not known.
+    """One line a parameter, with its 95 % interval or the reason why it is not known, and the truth where it is known.
 
     Parameters
     ----------
@@ -38,7 +38,9 @@ def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
     """
     content = calibration[section]
     names = _APS if section == "aps" else _EVS
-    lines = [_line(text, content[key]) for key, text in names.items() if key in content]
+    truth = (calibration["capture"].get("truth") or {}).get(section, {})
+    lines = [_line(text, content[key]) + _beside(content[key], truth.get(key)) for key, text in names.items()
+             if key in content]  # fmt: skip
     lines += [_line(f"noise at {item['signal_dn']:.4g} DN", item) for item in content.get("noise", [])]
     if section == "aps":
         values = [c for row in content["goodness"]["chi2_per_dof"] for c in row if c is not None]
@@ -58,3 +60,12 @@ def _line(text: str, item: Mapping[str, Any]) -> str:
     interval = item.get("interval_95")
     between = f" ({interval[0]:.5g} to {interval[1]:.5g})" if interval else ""
     return " ".join([f"{text:<20} {item['value']:.5g}{between}", item.get("unit", ""), item.get("note", "")]).rstrip()
+
+
+def _beside(item: Mapping[str, Any], truth: float | None) -> str:
+    """The truth beside an estimate; one of twenty lies outside of a 95 % interval."""
+    if truth is None:
+        return ""
+    interval = item.get("interval_95")
+    is_outside = interval is not None and not interval[0] <= truth <= interval[1]
+    return f"; truth {truth:.5g}{' (outside)' if is_outside else ''}"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hesim_render.capture.bench import Bench, set_up
 from hesim_render.capture.lab_trials import TrialBench, TrialPlan, plan_trials
+from hesim_render.capture.lab_truth import truth_of
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float
 from hesim_render.core.errors import RangeError
@@ -130,7 +131,7 @@ def write_captures(
         elif bench.evs is not None:
             session.write_static(folder.path / "evs_static.npz", ticks, parts)
             session.write_steps(folder.path / "evs_steps.npz", step_trials)
-        _describe(bench, folder.path, illuminant, seed)
+        _describe(bench, folder.path, illuminant, seed, max(lit_exposures_us))
     return folder.target
 
 
@@ -292,7 +293,7 @@ class _Session:
         return on.reshape(shape), off.reshape(shape)
 
 
-def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
+def _describe(bench: Bench, folder: Path, illuminant: str, seed: int, longest_us: float) -> None:
     """Write ``capture.yaml``, and the sensor's file if it is not a shipped one."""
     spec, layout = bench.sensor.spec, bench.sensor.layout
     shipped = bench.sensor.file in list_names("sensors") and content_hash(
@@ -325,6 +326,7 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
         f"a virtual session, hesim-render calibrate lab {spec.name}: {illuminant}, {bench.lux:.4g} lux on the "
         f"brightest patch; seed {seed}"
     )
+    content["truth"] = truth_of(bench, longest_us)
     _dump(content, folder / CAPTURE_NAME)
 
 

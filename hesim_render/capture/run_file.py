@@ -255,14 +255,14 @@ def _recorded(
         made = simulate_video(
             video.beside(video.file, shipped=False), asked.sensor, duration_s=spec.duration_s, seed=spec.seed,
             clean=spec.clean, without=spec.without, out=place, overwrite=True, resume=True, max_minutes=max_minutes,
-            on_estimate=begin, progress=shown, **asked.options,
+            on_estimate=begin, progress=shown, live=False, **asked.options,
         )  # fmt: skip
     else:
         assert cube is not None
         made = simulate_cube(
             cube.beside(cube.file, shipped=False), asked.sensor, duration_s=duration_s,
             seed=spec.seed, clean=spec.clean, without=spec.without, out=place, overwrite=True, on_estimate=begin,
-            progress=shown, **asked.options,
+            progress=shown, live=False, **asked.options,
         )  # fmt: skip
     asked.note(RECORDING)
     return made

@@ -37,6 +37,7 @@ def simulate(
     progress: Progress | Literal[False] | None = None,
     on_estimate: Callable[[Estimate], None] | None = None,
     resume: bool = False,
+    live: bool = False,
     **settings: Unpack[RunOptions],
 ) -> Recording:
     """Simulate a sensor in front of a scene: RAW frames, events, and their noise-free truth.
@@ -53,6 +54,8 @@ def simulate(
         the run before anything is written.
     resume : keep what is rendered in a file beside `out`, until the recording is complete. The same call goes on from
         what an interrupted one has left there, and gives the same bytes.
+    live : show frames and events while the run goes on: in the viewer rerun or, without a display, in ``live.rrd`` of
+        the unfinished folder, which rerun can open.
     settings : fields of `RunSettings`, which says what each of them does: ``duration_s`` (0.1), ``seed`` (7), ``clean``
         and ``without`` (noise terms that are off), ``quality`` (0.5: wanted error of the render over the noise), or
         ``samples`` and ``exact`` for the exact mode, ``max_minutes``, ``truth``, ``truth_every_us``, ``audit``.
@@ -85,7 +88,8 @@ def simulate(
     TooLongError
         If the run would take longer than `max_minutes`.
     SpecError
-        If scene and sensor do not fit together (a spectrum that does not cover the response).
+        If scene and sensor do not fit together (a spectrum that does not cover the response), or `live` is asked for
+        and rerun is not installed.
     OutputError
         If `out` exists or cannot be written, or, with `resume`, if another run was interrupted there. No partial
         output is left.
@@ -118,7 +122,7 @@ def simulate(
             expect(report, expected.seconds)
         with RecordingWriter(
             out, source.sensor, scene=scene.spec, seed=seed, duration_us=duration_us, settings=stated,
-            overwrite=overwrite,
+            overwrite=overwrite, live=live,
         ) as writer, _journal(resume and renderer is None, out, writer, overwrite) as journal:  # fmt: skip
             # traced pairs are taken from the journal of an interrupted run, and kept there for the next one
             if journal is not None:

@@ -32,6 +32,7 @@ def simulate_cube(
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
     on_estimate: Callable[[object], None] | None = None,
+    live: bool = False,
     **options: object,
 ) -> Recording:
     """Simulate a sensor in front of a hyperspectral cube: RAW frames, events, and their noise-free truth.
@@ -44,6 +45,7 @@ def simulate_cube(
     seed, clean, without, out, overwrite, progress : as for `simulate`.
     on_estimate : called with the work before the run begins, a text, as a cube takes no rays; an exception that it
         raises ends the run before anything is written.
+    live : as for `simulate`.
     options : options of `sources.cube.CubeOptions`: ``quantity``, ``illuminance_lux`` or ``mean_luminance_cd_m2``,
         ``illuminant``, ``beyond``, ``fit``, ``pan_px_per_s``, ``zoom_per_s``, ``rotation_deg_per_s``, …
 
@@ -93,7 +95,14 @@ def simulate_cube(
         on_estimate(f"{len(capture.frame_exposures[1])} frames and {samples} samples of event pixels; no rays")
     mosaic = describe(sensor, chosen.illuminant.load())
     with RecordingWriter(
-        out, sensor, seed=seed, duration_us=duration_us, settings=settings, overwrite=overwrite, mosaic=mosaic
+        out,
+        sensor,
+        seed=seed,
+        duration_us=duration_us,
+        settings=settings,
+        overwrite=overwrite,
+        mosaic=mosaic,
+        live=live,
     ) as writer:
         with shown(progress, f"{Path(cube).name} → {sensor.name}") as report:
             capture.record(writer, report)

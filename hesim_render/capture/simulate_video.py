@@ -52,6 +52,7 @@ def simulate_video(
     max_minutes: float | None = None,
     on_estimate: Callable[[VideoEstimate], None] | None = None,
     resume: bool = False,
+    live: bool = False,
     **options: object,
 ) -> Recording:
     """Simulate a sensor in front of a video: RAW frames, events, and their noise-free truth.
@@ -65,6 +66,7 @@ def simulate_video(
     seed, clean, without, out, overwrite, progress, max_minutes, on_estimate : as for `simulate`.
     resume : keep the frames and events of a run of more than about 20 s in a file beside `out`, until the recording is
         complete. The same call goes on from what an interrupted one has left there, and gives the same bytes.
+    live : as for `simulate`.
     options : options of `sources.video.VideoOptions`: ``fps``, ``slow_motion``, ``duty``, ``interpolation``, colour
         tags, ``mode``, ``white_lux`` or ``white_e_per_s`` with ``white_filter``, ``fit``, ``lens_shading``, …
 
@@ -127,6 +129,7 @@ def simulate_video(
                 settings=settings,
                 overwrite=overwrite,
                 mosaic=_mosaic(sensor, flux.options),
+                live=live,
             ) as writer,
             _journal(resume, source, flux, expected, out, writer, overwrite) as journal,
         ):

@@ -167,13 +167,14 @@ def evaluate(
             progress=progress,
         )  # fmt: skip
     lines = [f"{result['clips']} clips of {result['benchmark']}, split {result['split']}"]
-    lines += [table(result["summary"]) or "no clip has what these tasks need", *([] if out is None else [f"in {out}"])]
+    lines += [table(result["summary"]) or "no clip has what these tasks need", *result["verdicts"]]
+    lines += [] if out is None else [f"in {out}"]
     for name in listed(tasks):
         if name not in result["summary"]:
             complain(f"{name}: no clip of this split has what it needs")
     for name in result["unused"]:
         complain(f"{name}: belongs to no item that was scored")
-    facts = {name: result[name] for name in ("benchmark", "split", "clips", "summary", "unused")}
+    facts = {name: result[name] for name in ("benchmark", "split", "clips", "summary", "verdicts", "unused")}
     console.result("\n".join(lines), {**facts, "values": out})
 
 

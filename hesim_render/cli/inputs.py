@@ -32,9 +32,9 @@ _CAVE = re.compile(r".+_ms_\d\d\.png")
 _SIMULATED = frozenset({"--sensor", "--duration", "--roi", "--seed", "--clean", "--without"})
 _RENDERED = frozenset({"--quality", "--exact", "--samples", "--truth", "--truth-every-us"})
 _TAKEN: Mapping[InputKind, frozenset[str]] = {
-    InputKind.scene: _SIMULATED | _RENDERED | {"--set", "--allow-outside", "--framing"},
-    InputKind.video: _SIMULATED | {"--set"},
-    InputKind.cube: _SIMULATED | {"--set"},
+    InputKind.scene: _SIMULATED | _RENDERED | {"--set", "--live", "--allow-outside", "--framing", "--look"},
+    InputKind.video: _SIMULATED | {"--set", "--live"},
+    InputKind.cube: _SIMULATED | {"--set", "--live"},
     InputKind.run: _SIMULATED | _RENDERED | {"--set", "--allow-outside"},
     InputKind.recording: frozenset({"--allow-outside", "--scene"}),
 }

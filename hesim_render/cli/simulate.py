@@ -92,6 +92,20 @@ def simulate(
         bool,
         typer.Option("--framing", help="only show the framing: a quick picture without light, OUT.png", hidden=True),
     ] = False,
+    look: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="only look: the scene at this time, trails of what moves and density of events without light, OUT.png",
+            hidden=True,
+        ),
+    ] = None,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live", help="show the run in rerun while it goes on; without a display, in OUT/live.rrd", hidden=True
+        ),
+    ] = False,
     yes: Yes = False,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
@@ -112,14 +126,16 @@ def simulate(
         "--sensor": sensor, "--duration": duration, "--roi": roi, "--seed": seed, "--quality": quality,
         "--exact": exact, "--samples": samples, "--truth": truth, "--truth-every-us": truth_every_us, "--set": set_,
         "--clean": clean, "--without": without, "--allow-outside": allow_outside, "--scene": scene_file,
-        "--framing": framing,
+        "--framing": framing, "--look": look, "--live": live,
     })  # fmt: skip
     if duration is not None:
         check_duration(duration)
     console = Console(json_, quiet, dry_run)
     limits: dict[str, Any] = {"max_minutes": None if yes else LONG_MINUTES, "overwrite": overwrite}
-    common = _given(seed=seed, clean=clean, without=without or [], duration_s=duration)
+    common = _given(seed=seed, clean=clean, without=without or [], duration_s=duration, live=live)
     rendered = _given(quality=quality, exact=exact, samples=samples, truth=listed(truth), truth_every_us=truth_every_us)
+    if live and not dry_run:
+        _tell_live_file(console, out)
     if kind is InputKind.recording:
         _again(console, Path(given), out, scene_file, allow_outside, limits)
     elif kind is InputKind.run:
@@ -127,9 +143,12 @@ def simulate(
         _run(console, Path(given), out, changes, sensor_keys, allow_outside, limits)
     elif sensor is None:
         raise ConflictError("--sensor", None, "Missing option '--sensor': the name or the file of one (info sensors)")
-    elif framing:
-        if dry_run:
-            raise ConflictError("--framing", framing, "give --framing or --dry-run, not both")
+    elif framing or look is not None:
+        if sum((framing, look is not None, dry_run)) > 1:
+            raise ConflictError("--framing", framing, "give one of --framing, --look and --dry-run")
+        if look is not None:
+            _look(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite, look, duration)
+            return
         _framing(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite)
     elif kind is InputKind.scene:
         recording = _scene(
@@ -139,6 +158,15 @@ def simulate(
         show_recording(console, recording)
     else:
         _pictures(console, kind, given, sensor, out, keys, sensor_keys, roi, {**limits, **common})
+
+
+def _tell_live_file(console: Console, out: Path) -> None:
+    """Say where the live view is while the run goes on."""
+    from hesim_render.core.output import unfinished_place
+    from hesim_render.recording.live_view import live_file
+
+    file = live_file(unfinished_place(out.expanduser().resolve()))
+    console.text("live view: rerun" if file is None else f"live view: rerun {file}")
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -267,8 +295,7 @@ def _framing(
     overwrite: bool,
 ) -> None:
     """Write the picture of ``--framing``."""
-    target = out if out.suffix == ".png" else out.with_name(f"{out.name}.png")
-    free_place(target, overwrite)
+    target = _picture_place(out, overwrite)
     from PIL import Image
 
     import hesim_render as hr
@@ -289,6 +316,47 @@ def _framing(
             "materials": {name: [str(one) for one in materials] for name, materials in found.materials.items()},
         },
     )  # fmt: skip
+
+
+def _look(
+    console: Console,
+    scene: str,
+    sensor: str,
+    out: Path,
+    scene_keys: dict[str, Any],
+    sensor_keys: dict[str, Any],
+    roi: str | None,
+    allow_outside: bool,
+    overwrite: bool,
+    look_s: float,
+    duration_s: float | None,
+) -> None:
+    """Write the picture of ``--look``, and print what moves."""
+    target = _picture_place(out, overwrite)
+    from hesim_render.capture.run_settings import RunSettings, whole_us
+    from hesim_render.core.units import US_PER_S
+    from hesim_render.describe import motion_figures, motion_lines, write_motion
+    from hesim_render.sensor.sensor import load_sensor
+    from hesim_render.sources.render.truth.motion_look import motion_look
+    from hesim_render.sources.scene import load_scene
+
+    duration_us = RunSettings().duration_us if duration_s is None else whole_us(duration_s)
+    with console.progress(f"look at {scene}"):
+        loaded = cropped(load_sensor(sensor, sensor_keys), roi)
+        found = motion_look(
+            load_scene(scene, scene_keys, allow_outside=allow_outside), loaded, look_s * US_PER_S, duration_us
+        )
+        write_motion(found, loaded, look_s * US_PER_S, target)
+    figures = motion_figures(found, loaded, duration_us)
+    text = "\n".join([*motion_lines(figures, loaded, duration_us), f"look in {target}"])
+    console.result(text, {"picture": target, **figures})
+
+
+def _picture_place(out: Path, overwrite: bool) -> Path:
+    """Place of a picture in place of a recording."""
+    target = out if out.suffix == ".png" else out.with_name(f"{out.name}.png")
+    free_place(target, overwrite)
+    return target
 
 
 def demo(

@@ -112,9 +112,13 @@ def _compare(console: Console, spec: str, out: Path, keys: dict[str, Any], overw
         console.text(f"and {len(table) - _MOST} more rows")
     if "ysnr_noise_aware" in shown:
         console.text(NOTE)
+    from hesim_render.studies.verdict import ranking
+
+    verdicts = ranking(table)
+    console.text("\n".join(verdicts))
     console.result(
         f"{len(table)} rows in {out / 'results.csv'}; report: {out / 'report.html'}",
-        {"results": out / "results.csv", "report": out / "report.html", "rows": list(table)},
+        {"results": out / "results.csv", "report": out / "report.html", "rows": list(table), "verdicts": verdicts},
     )
 
 

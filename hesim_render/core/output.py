@@ -62,6 +62,11 @@ def _prefix(target: Path) -> str:
     return f".{short_name(target)}.{socket.gethostname()[:64]}-"
 
 
+def unfinished_place(target: Path) -> Path:
+    """Where the output of this process for an absolute target lies until it is complete."""
+    return target.with_name(f"{_prefix(target)}{os.getpid()}.partial")
+
+
 def _tidy_up(target: Path) -> None:
     """Clean up after killed runs on this machine: restore old output of a target, remove unfinished output."""
     prefix = _prefix(target)
@@ -217,7 +222,7 @@ def replacing(target: Path) -> Iterator[Path]:
     with output_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         _tidy_up(target)
-        path = target.with_name(f"{_prefix(target)}{os.getpid()}.partial")
+        path = unfinished_place(target)
         _unfinished[path] = target
         try:
             yield path
@@ -278,7 +283,7 @@ class OutputFolder:
     def __init__(self, target: str | Path, marker: str, overwrite: bool = False) -> None:
         self.target = check_target(target, marker, overwrite)
         self._marker, self._overwrite = marker, overwrite
-        self.path = self.target.with_name(f"{_prefix(self.target)}{os.getpid()}.partial")
+        self.path = unfinished_place(self.target)
         with output_errors(self.target):
             self.target.parent.mkdir(parents=True, exist_ok=True)
             _remove(self.path)  # of an earlier try of this process

@@ -21,7 +21,9 @@ from hesim_render.exchange.dsec_writer import COLUMNS, LONGEST_US, EventFileWrit
 from hesim_render.exchange.stream import BLOCK
 from hesim_render.pixels.evs.events import EVENT_DTYPE, no_events
 
-__all__ = ["EventFileWriter", "read_events", "read_shape", "stream_events", "write", "write_plain"]
+__all__ = [
+    "EventFileWriter", "read_events", "read_numbered_events", "read_shape", "stream_events", "write", "write_plain",
+]  # fmt: skip
 
 _LATEST_US = 2**53  # 285 years
 _BYTES_IN_ALL = EVENT_DTYPE.itemsize + 12  # an event, and its columns while they are read
@@ -53,13 +55,25 @@ def read_events(
     SpecError
         If the file cannot be read, links to other files, or its parts do not fit each other.
     """
+    return read_numbered_events(path, begin_us, end_us, shape=shape, count=count)[0]
+
+
+def read_numbered_events(
+    path: Path,
+    begin_us: int | None = None,
+    end_us: int | None = None,
+    *,
+    shape: tuple[int, int] | None = None,
+    count: int | None = None,
+) -> tuple[NDArray, int]:
+    """As `read_events`, with the number of the first of these events in the file."""
     with reading(path, "as events"), h5py.File(path, "r") as file:
         columns, total = _columns(file, path, count)
         offset = _offset(file, path)
         first, last = _range(_index(file, total, path), offset, total, begin_us, end_us)
         require_memory((last - first) * _BYTES_IN_ALL, f"{last - first} events", path)
         if last <= first:
-            return no_events()
+            return no_events(), first
         _check_index(columns["t"], first, last, offset, begin_us, end_us, path)
         events = _block(columns, first, last, shape, path)
     if np.any(events["t_us"][1:] < events["t_us"][:-1]):
@@ -67,7 +81,7 @@ def read_events(
     events["t_us"] += offset
     low = 0 if begin_us is None else int(np.searchsorted(events["t_us"], begin_us, side="left"))
     high = events.size if end_us is None else int(np.searchsorted(events["t_us"], end_us, side="left"))
-    return events[low:high]
+    return events[low:high], first + low
 
 
 def stream_events(path: Path, count: int | None = None) -> Iterator[NDArray]:

@@ -58,6 +58,11 @@ class FolderWriter:
             self._folder.discard()
             raise
 
+    @property
+    def path(self) -> Path:
+        """The folder, which has another name until it is complete."""
+        return self._folder.path
+
     def _mosaic_mask(self) -> NDArray[np.bool_]:
         roi = self.manifest["roi"]
         return self._mosaic.tiled(np.array(self._mosaic.tile_aps), (roi["height_px"], roi["width_px"]))

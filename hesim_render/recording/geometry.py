@@ -26,7 +26,7 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     ----------
     manifest : the manifest.
     folder : folder of the recording, for errors; None for one in memory.
-    scene : the scene; None makes it from the manifest.
+    scene : the scene; None makes it from the manifest. Its `labels` may be others than those of the recording.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
         raise SpecError("the recording was made from a video, which has no geometry", file=file)
     if scene is None:
         scene = scene_of(section, file, "recording.truth_with(load_scene(PATH))")
-    elif content_hash(scene.spec) != section["sha256"]:
+    elif content_hash(_as_labelled(scene.spec, section)) != section["sha256"]:
         raise SpecError(
             f"scene {scene.name!r} is not the one of the recording, {section['name']!r}, or was changed since",
             file=file,
@@ -48,6 +48,11 @@ def geometry_of(manifest: Mapping[str, Any], folder: Path | None, scene: Scene |
     layout = Layout(spec, roi["y"], roi["x"], roi["height_px"], roi["width_px"])
     sensor = Sensor(layout, Lens.of(spec)).without(manifests.lens_terms_off(manifest))
     return SceneTruth(scene, sensor)
+
+
+def _as_labelled(spec: SceneSpec, section: Mapping[str, Any]) -> SceneSpec:
+    """The content of a scene with the classes of a manifest, which no ray sees."""
+    return spec.model_copy(update={"labels": (section["spec"] or {}).get("labels", {})})
 
 
 def scene_of(section: Mapping[str, Any], file: Path | None, remedy: str) -> Scene:

@@ -27,6 +27,7 @@ _COLUMNS = {"t_us": "i8", "x": "u2", "y": "u2", "polarity": "i1"}
 _LOST = np.dtype([*_COLUMNS.items(), ("in", "u1")])
 #: Entries that are read at once.
 _PIECE = 1 << 18
+_ALL = slice(None)
 
 
 class LabelFileWriter:
@@ -158,13 +159,14 @@ def write_objects(folder: Path, objects_at: Callable[[NDArray, NDArray, NDArray]
         made.flush()
 
 
-def read_objects(folder: Path, count: int) -> NDArray[np.uint16]:
+def read_objects(folder: Path, count: int, part: slice = _ALL) -> NDArray[np.uint16]:
     """The object of each event of a recording, [event].
 
     Parameters
     ----------
     folder : of the recording.
     count : number of its events.
+    part : the events that are wanted.
 
     Raises
     ------
@@ -173,10 +175,23 @@ def read_objects(folder: Path, count: int) -> NDArray[np.uint16]:
     """
     path = inside(folder, OBJECT_FILE)
     with reading(path, "as objects of events"), h5py.File(path, "r") as file:
-        found = _column(file, "object", path, np.uint16)
-    if found.size != count:
-        raise SpecError(f"holds {found.size} objects; the recording has {count} events", file=path)
-    return found
+        return _of_events(file, "object", path, np.uint16, count, part)
+
+
+def read_causes(folder: Path, count: int, part: slice = _ALL) -> NDArray[np.uint8]:
+    """The cause of each event, numbers of `Label`, [event]; parameters as for `read_objects`.
+
+    Raises
+    ------
+    SpecError
+        If the file is missing or damaged, or does not fit the recording.
+    """
+    path = inside(folder, LABEL_FILE)
+    with reading(path, "as labels"), h5py.File(path, "r") as file:
+        label = _of_events(file, "label", path, np.uint8, count, part)
+    if label.size and label.max() > max(Label):
+        raise SpecError(f"label holds {label.max()}; expected 0 to {int(max(Label))}", file=path)
+    return label
 
 
 def read_labels(folder: Path, shape: tuple[int, int], count: int) -> EventLabels:
@@ -193,13 +208,8 @@ def read_labels(folder: Path, shape: tuple[int, int], count: int) -> EventLabels
     SpecError
         If a file is missing or damaged, or does not fit the recording.
     """
-    path = inside(folder, LABEL_FILE)
+    path, label = inside(folder, LABEL_FILE), read_causes(folder, count)
     with reading(path, "as labels"), h5py.File(path, "r") as file:
-        label = _column(file, "label", path, np.uint8)
-        if label.size != count:
-            raise SpecError(f"holds {label.size} labels; the recording has {count} events", file=path)
-        if label.size and label.max() > max(Label):
-            raise SpecError(f"label holds {label.max()}; expected 0 to {int(max(Label))}", file=path)
         lost_in = _column(file, "lost/in", path, np.uint8)
         lost = np.empty(lost_in.size, EVENT_DTYPE)
         for name, kind in _COLUMNS.items():
@@ -210,10 +220,19 @@ def read_labels(folder: Path, shape: tuple[int, int], count: int) -> EventLabels
     return EventLabels(label, lost, lost_in, read_events(inside(folder, CLEAN_FILE), shape=shape))
 
 
-def _column(file: Any, name: str, path: Path, kind: Any) -> NDArray:
+def _of_events(file: Any, name: str, path: Path, kind: Any, count: int, part: slice) -> NDArray:
+    """Part of a column that has one entry for each event."""
+    size = dataset_of(file, name, path).size
+    if size != count:
+        raise SpecError(f"holds {size} {name}s; the recording has {count} events", file=path)
+    return _column(file, name, path, kind, part)
+
+
+def _column(file: Any, name: str, path: Path, kind: Any, part: slice = _ALL) -> NDArray:
     found = dataset_of(file, name, path)
     if found.dtype != np.dtype(kind) or found.ndim != 1:
         raise SpecError(f"{name} holds {found.dtype.name} {found.shape}; expected one column of {np.dtype(kind).name}",
                         file=path)  # fmt: skip
-    require_memory(found.shape[0] * found.dtype.itemsize, name, path)
-    return found[()]
+    begin, end, _ = part.indices(found.shape[0])
+    require_memory((end - begin) * found.dtype.itemsize, name, path)
+    return found[begin:end]

@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside
-from hesim_render.exchange.dsec import read_events
+from hesim_render.exchange.dsec import read_events, read_numbered_events
 from hesim_render.mosaic.description import Mosaic
-from hesim_render.pixels.evs.events import no_events
+from hesim_render.pixels.evs.events import EVENT_DTYPE, LABELLED_DTYPE, no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.frame import EventTruth, Frame, StoredFrames, read_maps
-from hesim_render.recording.label_file import LABEL_FILE, OBJECT_FILE, read_labels, read_objects
+from hesim_render.recording.label_file import LABEL_FILE, OBJECT_FILE, read_causes, read_labels, read_objects
 
 if TYPE_CHECKING:
     from hesim_render.pixels.evs.events import EventLabels
@@ -142,6 +142,46 @@ class Recorded:
             return read_objects(self.path, self.manifest["counts"]["events"])
         events = self.events
         return self.truth.objects_at(events["t_us"], events["x"], events["y"])
+
+    def labelled_slice(self, begin_us: int, end_us: int) -> NDArray:
+        """Events of a time interval with their causes and objects; from disk, only those of the interval are read.
+
+        Parameters
+        ----------
+        begin_us, end_us : the interval begin_us <= t_us < end_us, µs.
+
+        Returns
+        -------
+        Structured array [event] of `LABELLED_DTYPE`, in order of time: an event with ``cause`` and ``object``, as in
+        `event_labels` and `event_objects`.
+
+        Raises
+        ------
+        SpecError
+            If the run was not asked for labels (``--truth events``), a file is damaged, or the scene is not known.
+        """
+        path, count = self.path, self.manifest["counts"]["events"]
+        if self._events is None and path is not None:
+            events, first = read_numbered_events(
+                inside(path, "events.h5"), begin_us, end_us, shape=self.event_shape, count=count
+            )
+        else:
+            first = int(np.searchsorted(self.events["t_us"], begin_us, side="left"))
+            events = self.event_slice(begin_us, end_us)
+        part, found = slice(first, first + events.size), np.empty(events.size, LABELLED_DTYPE)
+        for name in EVENT_DTYPE.names or ():
+            found[name] = events[name]
+        if path is not None and (path / LABEL_FILE).is_file():
+            found["cause"] = read_causes(path, count, part)
+        elif self._labels is not None:
+            found["cause"] = self._labels.label[part]
+        else:
+            raise SpecError("events have no labels; simulate with --truth events (truth='events')", file=path)
+        if path is not None and self.has_event_objects:
+            found["object"] = read_objects(path, count, part)
+        else:
+            found["object"] = self.truth.objects_at(events["t_us"], events["x"], events["y"])
+        return found
 
     @cached_property
     def truth(self) -> SceneTruth:

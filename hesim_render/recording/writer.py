@@ -14,6 +14,7 @@ from hesim_render.pixels.evs.events import EventLabels, LabelBlock, no_events
 from hesim_render.recording import manifest as manifests
 from hesim_render.recording.folder import FolderWriter
 from hesim_render.recording.frame import EventTruth, Frame
+from hesim_render.recording.live_view import LiveView, live_file
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.truth_file import TRUTH_FILE, TruthRequest, write_truth
 from hesim_render.specs.scene import SceneSpec
@@ -39,9 +40,12 @@ class RecordingWriter:
     settings : further settings of the run (``clean``, ``without``, ``samples``, ``backend``); plain values.
     overwrite : replace an existing recording.
     mosaic : description of the mosaic; default: that of the sensor under the light of the scene. A video gives its own.
+    live : show frames and events as they come, in the viewer rerun or, without a display, in `LIVE_FILE` of the folder.
 
     Raises
     ------
+    SpecError
+        If `live` is asked for and rerun is not installed.
     OutputError
         If `path` exists (without `overwrite`) or cannot be written, at once and at any later step.
     """
@@ -57,6 +61,7 @@ class RecordingWriter:
         settings: Mapping[str, Any] | None = None,
         overwrite: bool = False,
         mosaic: Mosaic | None = None,
+        live: bool = False,
     ) -> None:
         self._manifest = manifests.build(
             sensor, scene=scene, seed=seed, duration_us=duration_us, settings=settings or {}
@@ -65,6 +70,13 @@ class RecordingWriter:
             noise = self._manifest["mosaic"]["noise_profile"]
             self._manifest["mosaic"] = mosaic.model_dump(mode="json") | {"noise_profile": noise}
         self._folder = None if path is None else FolderWriter(path, self._manifest, overwrite)
+        self._live: LiveView | None = None
+        if live:
+            try:
+                self._live = LiveView(self._manifest, live_file(None if self._folder is None else self._folder.path))
+            except BaseException as error:
+                self.__exit__(type(error))
+                raise
         self._scene = scene
         self._frames: list[Frame] = []
         self._events: list[NDArray] = []
@@ -93,6 +105,8 @@ class RecordingWriter:
             self._folder.add_frame(frame)
         else:
             self._frames.append(frame)
+        if self._live is not None:
+            self._live.add_frame(frame)
 
     def add_events(self, events: NDArray) -> None:
         """Add the next block of events; blocks come in order of time.
@@ -105,6 +119,8 @@ class RecordingWriter:
             self._folder.add_events(events)
         elif events.size:
             self._events.append(events)
+        if self._live is not None:
+            self._live.add_events(events)
 
     def set_event_truth(self, flux_mean_e_per_s: NDArray, flux_stderr_e_per_s: NDArray) -> None:
         """Set the noise-free flux of the event pixels, mean over the recording.
@@ -186,6 +202,7 @@ class RecordingWriter:
         """Finish and return the recording. A folder is now complete and has its final name."""
         from hesim_render.sources.scene import Scene
 
+        self._end_live(is_whole=True)
         scene = Scene(self._scene) if isinstance(self._scene, SceneSpec) else None
         if self._folder is not None:
             found = Recording.load(self._folder.finish())
@@ -202,9 +219,15 @@ class RecordingWriter:
             labels=EventLabels.of(self._labels) if self._labels else None,
         )  # fmt: skip
 
+    def _end_live(self, is_whole: bool) -> None:
+        if self._live is not None:
+            self._live.close(is_whole)
+            self._live = None
+
     def __enter__(self) -> RecordingWriter:
         return self
 
     def __exit__(self, *error: Any) -> None:
+        self._end_live(is_whole=False)
         if self._folder is not None:
             self._folder.__exit__(*error)

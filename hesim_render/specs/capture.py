@@ -41,6 +41,9 @@ class CaptureSpec(Strict):
         None, description="event pixels of a tile, where they are not one a pixel"
     )
     evs_tile_cols: PositiveInt | None = None
+    truth: dict[Literal["aps", "evs"], dict[str, float]] | None = Field(
+        None, description="of simulated captures: the sensor's own values, by the names that calibrations give them"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> CaptureSpec:

@@ -140,6 +140,9 @@ class SceneSpec(Strict):
     ) = Field(None, description="one light or a list")
     camera: CameraSpec | None = None
     motion: list[TrackSpec] = []
+    labels: dict[str, Annotated[str, Field(min_length=1)] | None] = Field(
+        {}, description="class of an object in boxes and masks, by its name; null: it has none"
+    )
     max_depth: int | None = Field(
         None,
         ge=2,
@@ -192,6 +195,9 @@ class SceneSpec(Strict):
         for track in self.motion:
             if track.object not in known:
                 raise ValueError(f"motion: no object {track.object!r} in the scene; there are {', '.join(known)}")
+        seen = [each for each in known if each != "camera"]
+        if unknown := [name for name in self.labels if name not in seen]:
+            raise ValueError(f"labels: no object {unknown[0]!r} in the scene; there are {', '.join(seen)}")
         return self
 
     @property

@@ -18,6 +18,7 @@ from hesim_render.studies.candidate import Seen
 from hesim_render.studies.cfa import StudyResult
 from hesim_render.studies.plots import PARETO, chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
 from hesim_render.studies.table import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, Cell, Table, level_text
+from hesim_render.studies.verdict import grouped, level_name, levels_of, ranking
 
 #: Columns that say which row it is; all but the first are left out if they say the same in every row.
 _NAMES = {"filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, ms"}
@@ -63,8 +64,8 @@ def report_page(spec: StudySpec, result: StudyResult, summary: Markup | None = N
     """
     with report_style():
         responses = [*map(response_plot, _first_of_each_set(result.seen))]
-        groups = _grouped(result.table, ("surfaces", "illuminant"))
-        drawn = [_group(*group, _levels(result.table)) for group in groups[:_MOST_GROUPS]]
+        groups = grouped(result.table, ("surfaces", "illuminant"))
+        drawn = [_group(*group, levels_of(result.table)) for group in groups[:_MOST_GROUPS]]
         patches = _patches(result.seen)
     noisy = (
         f"Simulated figures are means of {spec.noise.repeats} noisy frames, with 95 % intervals (Student's t)."
@@ -73,6 +74,7 @@ def report_page(spec: StudySpec, result: StudyResult, summary: Markup | None = N
     )
     return filled(
         "studies/report.html", title=spec.name, description=spec.description, summary=summary or "",
+        ranking=ranking(result.table),
         responses=responses, groups=drawn, has_more=len(groups) > _MOST_GROUPS, patches=patches,
         pictures=[(text, inline_picture(encode_srgb(image), text)) for text, image in result.pictures],
         matrix=spec.matrix, area_px=f"{spec.area_px:g}", noisy=noisy, note=NOTE,
@@ -119,26 +121,17 @@ def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
     return list(result.values())
 
 
-def _levels(rows: Table) -> list[str]:
-    """Columns that tell the levels of a group apart."""
-    of_sensor: dict[Cell, set[Cell]] = {}
-    for row in rows:
-        of_sensor.setdefault(row["sensor"], set()).add(row.get("nominal_exposure_us"))
-    # where each sensor has its own exposure, it is no level
-    return ["illuminance_lux", "equal", *(["nominal_exposure_us"] if max(map(len, of_sensor.values())) > 1 else [])]
-
-
 def _group(named: tuple[Cell, ...], group: Table, levels: Sequence[str]) -> dict[str, object]:
     """Drawings and tables of rows in which only sensors, filter sets and crosstalk differ."""
-    inner = _grouped(group, levels)
+    inner = grouped(group, levels)
     plots = [
-        pareto_plot(some, _level(levels, values))
+        pareto_plot(some, level_name(levels, values))
         for values, some in inner
         if any(row.get(PARETO[0]) is not None and row.get(PARETO[1]) is not None for row in some)
     ]
     tables = [
         (
-            _level(levels, values),
+            level_name(levels, values),
             [(title, *result) for title, columns in _OF_LEVEL if (result := _table(some, columns))],
         )
         for values, some in inner
@@ -149,20 +142,6 @@ def _group(named: tuple[Cell, ...], group: Table, levels: Sequence[str]) -> dict
         "title": ", ".join(map(str, named)), "plots": plots, "levels": [level for level in tables if level[1]],
         "colour": _table(Table(reversed(first.values())), _COLOUR),
     }  # fmt: skip
-
-
-def _grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
-    """The rows by the values of some columns, in the order in which these first occur."""
-    result: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
-    for row in rows:
-        result.setdefault(tuple(row[name] for name in keys), []).append(row)
-    return [(values, Table(group)) for values, group in result.items()]
-
-
-def _level(keys: Sequence[str], values: Sequence[Cell]) -> str:
-    named = dict(zip(keys, values, strict=True))
-    text = f"{named['illuminance_lux']:g} lx, equal {named['equal']}"
-    return text + (f", {named['nominal_exposure_us']:g} µs" if named.get("nominal_exposure_us") else "")
 
 
 def _table(rows: Table, columns: Mapping[str, str]) -> tuple[list[str], list[list[str]]] | None:

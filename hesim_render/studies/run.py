@@ -15,6 +15,7 @@ from hesim_render.specs.study import StudySpec, read_study
 from hesim_render.studies.cfa import run_study
 from hesim_render.studies.report import report_page
 from hesim_render.studies.table import Table, has_parquet
+from hesim_render.studies.verdict import ranking
 
 #: File that marks the folder of a study.
 MARKER = "results.json"
@@ -71,7 +72,7 @@ def study(
                 if has_parquet():
                     result.table.write(folder.path / "results.parquet")
                 content = json.loads(read.model_dump_json())
-                text = result.table.to_json(study=content, schema_version=1)
+                text = result.table.to_json(study=content, schema_version=1, verdicts=ranking(result.table))
                 (folder.path / MARKER).write_text(text, encoding="utf-8")
                 (folder.path / "report.html").write_text(report_page(read, result), encoding="utf-8")
     return result.table

@@ -13,6 +13,7 @@ from hesim_render.benchmark.evaluate import summary, table
 from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.benchmark.tasks import ClipTasks, Score
+from hesim_render.benchmark.verdict import NOTHING, verdicts
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.pixels.evs.events import Label
 from hesim_render.specs.files import data_folder
@@ -51,6 +52,35 @@ def test_every_task_has_scores(built, tmp_path):
     stored = json.loads((tmp_path / "r.json").read_text())
     assert stored["summary"]["deblur"]["blurred"] == blurred and stored["digest"] == result["digest"]
     assert "double-integral" in table(found)
+    losers = {text.partition(" loses")[0] for text in result["verdicts"]}
+    for task, (nothing, measure, way) in NOTHING.items():
+        for method in set(found.get(task, ())) - {nothing}:
+            pair = [found[task][name][measure] for name in (method, nothing)]
+            if pair[0]["count"] == pair[1]["count"] > 0:
+                assert (f"{task}: {method}" in losers) == (way * (pair[0]["mean"] - pair[1]["mean"]) < 0)
+    assert losers and stored["verdicts"] == result["verdicts"]
+
+
+def test_a_method_that_loses_to_doing_nothing_is_named_with_the_reason():
+    def of(task, method, measure, *values):
+        return [Score(f"c{k % 2}", task, method, k, {measure: value}) for k, value in enumerate(values)]
+
+    scores = of("deblur", "blurred", "raw_psnr_db", 40.0, 46.0, 30.0, np.inf)
+    scores += of("deblur", "double-integral", "raw_psnr_db", 41.0, 41.0, 25.0, 90.0)
+    scores += of("deblur", "prediction", "raw_psnr_db", 45.0, 46.5, 25.5)
+    scores += of("flow", "zero", "epe_px", 1.5, 2.5) + of("flow", "dis", "epe_px", 1.75, 2.5)
+    scores += of("flow", "farneback", "epe_px", 1.25, 2.5)
+    first, second = verdicts(scores, {"c0"})
+    assert first.startswith(
+        "deblur: double-integral loses to doing nothing (blurred): raw_psnr_db 35.67 in place of 38.67, worse in 2 of "
+        "3 items. Why: doing nothing has 38.7 dB because little blurs"
+    )
+    assert "; 2 of the items are of pixels with a fixed tick" in first
+    assert second.startswith(
+        "flow: dis loses to doing nothing (zero): epe_px 2.125 in place of 2, worse in 1 of 2 items"
+    )
+    assert "pixels move by 2 px in the mean" in second and "tick" not in second
+    assert "tick" not in verdicts(scores)[0] and not verdicts(scores[:4])
 
 
 def test_a_perfect_answer_scores_perfectly(built):

@@ -23,7 +23,7 @@ def built(tmp_path_factory):
     scenes = [{"scene": "flat-field", "split": "test"}, {"scene": "step-wedge", "split": "train"}]
     spec = small(
         scenes={"given": scenes}, duration_s=0.048, sensors=[{"sensor": "gen2", "roi": "24x16", "set": keys}],
-        exposures_us=[12_000], sharp={"times_us": [6250, 22500], "window_us": 500}, truth=["events", "depth"],
+        exposures_us=[12_000], sharp={"times_us": [6250, 22500], "window_us": 500}, truth=["events", "depth", "ids"],
         description='A "quoted" description: with a colon.\nAnd a second line.',
     )  # fmt: skip
     return build_benchmark(spec, tmp_path_factory.mktemp("published") / "b", estimate=False)
@@ -62,7 +62,7 @@ def test_the_card_begins_with_the_header_that_hubs_read(built):
     _, header, body = text.split("---\n", 2)
     values = YAML(typ="safe").load(header)
     assert values["pretty_name"] == "small" and values["size_categories"] == ["n<1K"]
-    assert values["task_categories"] == ["image-to-image", "depth-estimation"]
+    assert values["task_categories"] == ["image-to-image", "depth-estimation", "image-segmentation"]
     assert "event-camera" in values["tags"] and body.startswith("\n# small\n")
 
 
@@ -100,6 +100,23 @@ def test_items_are_the_events_of_a_clip_with_their_target(built):
     np.testing.assert_array_equal(events["p"], recording.events["polarity"] > 0)
     np.testing.assert_array_equal(cause, recording.event_labels.label)
     np.testing.assert_array_equal(EventDataset(built.root, "train", "object")[0][1], recording.event_objects)
+    boxes = EventDataset(built.root, None, "boxes")
+    assert boxes.classes == ["target", "wall"]  # of both clips
+    for clip, (_, found) in zip(built.clips(), (boxes[k] for k in range(2)), strict=True):
+        names, seen = clip.recording.truth.names.objects, 0
+        for t_us in clip.recording.stored_truth.read("events/time_us"):
+            image = clip.recording.truth.ids(float(t_us), "events").object
+            here = found[found["t"] == int(t_us)]
+            assert here["track_id"].tolist() == sorted(set(np.unique(image)) - {0})
+            for row in here:
+                rows, cols = np.nonzero(image == row["track_id"])
+                assert [row[key] for key in "xywh"] == [cols.min(), rows.min(), np.ptp(cols) + 1, np.ptp(rows) + 1]
+                assert boxes.classes[row["class_id"]] == names[row["track_id"]]
+                seen += 1
+        assert seen == found.size > 0
+    before = [boxes.classes[k] for k in boxes[0][1]["class_id"]]
+    boxes.classes.reverse()  # as if another clip had named them first
+    assert [boxes.classes[k] for k in boxes[0][1]["class_id"]] == before
     frames = EventDataset(built.root, "train", "frames")[0][1]
     np.testing.assert_array_equal(frames["images"], [frame.raw for frame in recording.frames])
     assert frames["t_us"].tolist() == [frame.t_us for frame in recording.frames]

@@ -11,9 +11,11 @@ from scipy.stats import multivariate_normal
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps
+from hesim_render.calibrate.summary import summary_lines
 from hesim_render.capture import lab_trials
 from hesim_render.capture.bench import Bench, set_up, step_target
 from hesim_render.capture.lab import DARK_EXPOSURES_US, LIT_EXPOSURES_US, _describe, _Session, write_captures
+from hesim_render.capture.lab_truth import truth_of
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.core.npz import NpzWriter
@@ -138,6 +140,52 @@ def test_the_capture_set_has_the_format_that_calibration_reads(session):
     assert static["signal_dn"].shape == static["n_on"].shape == (SIDE // 2, SIDE // 2)
     assert steps["contrast"].shape == (21,) and steps["n_on"].shape == (21, SIDE // 2, SIDE // 2)
     np.testing.assert_allclose(steps["contrast"][[0, 10, 20]], [-0.303, 0, 0.303], atol=1e-12)
+
+
+def test_the_truth_stands_beside_the_estimate(session):
+    captures, sensor, calibration = session
+    aps, evs = sensor.spec.aps, sensor.spec.evs
+    theta, one = (evs.contrast_threshold_on + evs.contrast_threshold_off) / 2, evs.coefficients[0]
+    wanted = {
+        "aps": {"K": aps.system_gain_dn_per_e, "read_noise_e": aps.read_noise_e, "dsnu_e": aps.dsnu_e,
+                "dark_current_e_per_s": aps.dark_current_e_per_s, "prnu_percent": 100 * aps.prnu_rel},
+        "evs": {"theta_on": evs.contrast_threshold_on, "theta_off": evs.contrast_threshold_off,
+                "threshold_mismatch": evs.threshold_mismatch_std, "D": one.beta5, "C": one.beta3 / one.beta4,
+                "B": theta / evs.threshold_hardware_v * one.beta2 / one.beta4,
+                "A": theta / evs.threshold_hardware_v * one.beta1 / one.beta4},
+    }  # fmt: skip
+    found, calibrated = read_captures(captures).spec.truth, read_calibration(calibration)
+    names = {"aps": 7, "evs": 9}
+    for section, values in wanted.items():
+        for name, value in values.items():
+            assert found[section][name] == pytest.approx(value, rel=1e-12), name
+        lines = summary_lines(calibrated, section)
+        assert sum("; truth " in line for line in lines) >= names[section]
+    gain = next(line for line in summary_lines(calibrated, "aps") if line.startswith("K, system gain"))
+    assert gain.endswith(f" DN/e-; truth {aps.system_gain_dn_per_e:.5g}")
+    calibrated["capture"]["truth"]["aps"]["K"] *= 1.3
+    gain = next(line for line in summary_lines(calibrated, "aps") if line.startswith("K, system gain"))
+    assert gain.endswith(" (outside)")
+    calibrated["capture"]["truth"] = None
+    assert not any("truth" in line for line in summary_lines(calibrated, "aps"))
+
+
+def test_the_truth_knows_what_is_off_or_mixed():
+    sensor = hr.load_sensor("eiger", {"aps.residual_noise_dn": 0.6, "evs.leak_rate_hz": 3.0}).crop(16, 8)
+    off = ["aps.read", "aps.dsnu", "aps.dark_current", "evs.shot", "evs.mismatch"]
+    found = truth_of(set_up(sensor, LIT_EXPOSURES_US, without=off), 80_000)
+    gain = sensor.spec.aps.system_gain_dn_per_e
+    assert found["aps"]["read_noise_e"] == pytest.approx(0.6 / gain)
+    assert found["aps"]["dsnu_e"] == found["aps"]["dark_current_e_per_s"] == found["evs"]["threshold_mismatch"] == 0
+    assert found["evs"]["leak_per_trial"] == pytest.approx(1 - np.exp(-3.0 * sensor.spec.evs.tick_us * 1e-6))
+    assert not {"A", "B", "C", "D"} & set(found["evs"])
+    aps = sensor.spec.aps
+    span = (2**aps.bit_depth - 1 - aps.black_level_dn) / gain
+    assert found["aps"]["full_well_e"] == min(span, aps.full_well_e)
+    davis = hr.load_sensor("davis346", {"aps.row_noise_dn": 0.7}).crop(16, 8)
+    found = truth_of(set_up(davis, LIT_EXPOSURES_US), 80_000)
+    assert found["aps"]["row_noise_dn"] == 0.7 and not {"read_noise_e", "full_well_e"} & set(found["aps"])
+    assert found["evs"]["photoreceptor_cutoff_hz"] == davis.spec.evs.photoreceptor_cutoff_hz and "A" not in found["evs"]
 
 
 @pytest.mark.usefixtures("few_trials")
@@ -598,7 +646,7 @@ def test_intervals_cover_the_truth_of_sensors_of_a_kind(tmp_path):
         again = _Session(bench, seed, None)
         again.write_static(folder / "evs_static.npz", 3000)
         again.write_steps(folder / "evs_steps.npz", 50)
-        _describe(bench, folder, "D65", seed)
+        _describe(bench, folder, "D65", seed, max(LIT_EXPOSURES_US))
         calibrate_evs(folder, tmp_path / "c.yaml")
         section = read_calibration(tmp_path / "c.yaml")["evs"]
         theta = 0.1515 / 0.00075

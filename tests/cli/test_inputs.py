@@ -52,6 +52,7 @@ def test_the_ends_of_cubes_are_those_that_can_be_read():
 
 @pytest.mark.parametrize(("kind", "option"), [
     (InputKind.video, "--quality"), (InputKind.cube, "--truth"), (InputKind.run, "--framing"),
+    (InputKind.video, "--look"), (InputKind.run, "--live"),
     (InputKind.recording, "--seed"), (InputKind.recording, "--set"), (InputKind.scene, "--scene"),
 ])  # fmt: skip
 def test_an_option_of_another_kind_is_refused(kind, option):

@@ -5,13 +5,15 @@ import json
 import h5py
 import numpy as np
 import pytest
+import recordings
 from test_truth_files import moving_scene, sensor
 
 import hesim_render as hr
 from hesim_render.capture.simulate import simulate
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.recording.box_export import classes, pixel_boxes, run_lengths
+from hesim_render.recording.box_export import DSEC_BOX, box_records, classes, pixel_boxes, run_lengths
 from hesim_render.recording.truth_export import export_truth
+from hesim_render.specs.files import validate
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +57,46 @@ def test_masks_are_read_by_pycocotools():
 
 
 def test_classes_are_names_without_their_numbers():
-    names, of = classes(("background", "car-2", "wall", "car 13", "solid0", "7", "2nd"))
+    objects = ("background", "car-2", "wall", "car 13", "solid0", "7", "2nd")
+    names, of = classes(objects, {})
     assert names == ["car", "wall", "solid", "7", "2nd"] and of.tolist() == [-1, 0, 1, 0, 2, 3, 4]
+
+
+def test_labels_of_the_scene_file_name_classes_or_say_that_there_is_none():
+    objects = ("background", "car-2", "wall", "van", "car 13", "tree")
+    names, of = classes(objects, {"van": "car", "wall": None, "tree": "plant 2"})
+    assert names == ["car", "plant 2"] and of.tolist() == [-1, 0, -1, 0, 0, 1]
+    with pytest.raises(SpecError, match="labels: no object 'tre' in the scene; there are car-2, wall, van"):
+        classes(objects, {"tre": "plant"})
+    with pytest.raises(SpecError, match=r"labels: no object 'wal' in the scene; there are card, wall"):
+        labelled({"wal": "x"})
+
+
+def labelled(labels):
+    scene = moving_scene()
+    return type(scene)(validate(type(scene.spec), scene.spec.model_dump(mode="json") | {"labels": labels}, None, {}))
+
+
+def test_boxes_of_a_scene_are_tight_at_odd_crops(tmp_path):
+    scene = labelled({"wall": None, "card": "sign"})
+    for name, crop in (("gen2", (44, 28, 1612, 1208)), ("davis346", (37, 29, 149, 113))):
+        truth = hr.SceneTruth(scene, hr.load_sensor(name).crop(*crop))
+        count = 0
+        for t_us in (1_300.0, 30_700.0, 59_100.0):
+            for grid in ("events", "mosaic"):
+                image = truth.ids(t_us, grid).object
+                records = box_records([(t_us, image)], np.array([-1, 0, -1]), DSEC_BOX)
+                assert (records["track_id"] == 1).all() and records.size == (image == 1).any()
+                for row in records:
+                    assert [row[key] for key in "xywh"] == around(image, 1)
+                    count += 1
+        assert count > 2, name
+    recording = recordings.make("davis346")
+    recording.__dict__["truth"] = truth
+    out = export_truth(recording, "prophesee-boxes", tmp_path / "x")
+    told = json.loads((out / "export.json").read_text())
+    assert told["classes"] == ["sign"] and told["tracks"] == {"1": "card"}
+    assert (np.load(out / "recording_bbox.npy")["class_id"] == 0).all()
 
 
 @pytest.mark.parametrize("layout", ["prophesee-boxes", "dsec-det"])
@@ -104,17 +144,26 @@ def test_frames_have_boxes_and_masks_of_coco(recorded, tmp_path):
             mask = np.repeat(np.arange(len(counts)) % 2, counts).reshape(image.shape[::-1]).T
             np.testing.assert_array_equal(mask, image == item["track_id"])
             assert item["area"] == mask.sum() and item["iscrowd"] == 0
+    recorded.__dict__["truth"] = recorded.truth_with(labelled({"wall": None, "card": "sign"}))  # as --scene
+    again = export_truth(recorded, "coco", tmp_path / "z")
+    del recorded.__dict__["truth"]
+    other = json.loads((again / "annotations" / "instances.json").read_text())
+    assert other["categories"] == [{"id": 1, "name": "sign"}] and other["images"] == content["images"]
+    cards = [item | {"id": 0} for item in content["annotations"] if item["track_id"] == 1]
+    assert [item | {"id": 0} for item in other["annotations"]] == cards
     with pytest.raises(RangeError, match="coco has none"):
         export_truth(recorded, "coco", tmp_path / "y", every_us=10)
 
 
 def test_coco_is_read_by_pycocotools(recorded, tmp_path):
-    reader = pytest.importorskip("pycocotools.coco")
+    reader, pycocotools = pytest.importorskip("pycocotools.coco"), pytest.importorskip("pycocotools.mask")
     out = recorded.export("coco", tmp_path / "x")
     coco = reader.COCO(str(out / "annotations" / "instances.json"))
     for item in coco.loadAnns(coco.getAnnIds()):
         image = recorded.stored_truth.read("frames/object", item["image_id"])
         np.testing.assert_array_equal(coco.annToMask(item), image == item["track_id"])
+        code = coco.annToRLE(item)
+        assert pycocotools.toBbox(code).tolist() == item["bbox"] and pycocotools.area(code) == item["area"]
 
 
 def test_each_event_has_the_object_that_its_pixel_shows_at_its_time(recorded, tmp_path):
@@ -132,6 +181,33 @@ def test_each_event_has_the_object_that_its_pixel_shows_at_its_time(recorded, tm
         _ = again.event_objects
     (again.path / "truth" / "event_objects.h5").unlink()
     np.testing.assert_array_equal(hr.Recording.load(again.path).event_objects, found)  # from the scene
+
+
+def test_a_slice_has_the_cause_and_the_object_of_each_event(recorded, tmp_path, monkeypatch):
+    events, labels, objects = recorded.events, recorded.event_labels, recorded.event_objects
+    assert events.size > 40 and len(set(labels.label.tolist())) > 1
+    times = np.unique(events["t_us"])
+    begin, end = int(times[1]) + 1, int(times[-2])  # not at a whole ms, where the index of the file begins
+    low, high = np.searchsorted(events["t_us"], [begin, end])
+    for given in (hr.Recording.load(recorded.path), recorded):
+        found = given.labelled_slice(begin, end)
+        assert 0 < low < high < events.size and found.size == high - low
+        for name in events.dtype.names:
+            np.testing.assert_array_equal(found[name], events[name][low:high])
+        np.testing.assert_array_equal(found["cause"], labels.label[low:high])
+        np.testing.assert_array_equal(found["object"], objects[low:high])
+        assert given.labelled_slice(end, begin).size == 0
+    from hesim_render.recording import label_file
+
+    def no_whole_column(file, name, path, kind, part=slice(None)):
+        assert part.stop is not None and part.stop - part.start < events.size
+        return column(file, name, path, kind, part)
+
+    column = label_file._column
+    monkeypatch.setattr(label_file, "_column", no_whole_column)
+    hr.Recording.load(recorded.path).labelled_slice(begin, end)
+    with pytest.raises(SpecError, match="events have no labels; simulate with --truth events"):
+        recordings.make("davis346").labelled_slice(0, 10)
 
 
 def test_objects_are_written_in_whole_pieces(tmp_path, monkeypatch):

@@ -24,6 +24,7 @@ from hesim_render.studies.filter_sets import filters_of, mixing
 from hesim_render.studies.plots import pareto_front
 from hesim_render.studies.run import study
 from hesim_render.studies.table import has_parquet
+from hesim_render.studies.verdict import ranking
 
 BASE = {"schema_version": 1, "name": "test", "sensors": ["reference-bayer"]}
 
@@ -261,17 +262,25 @@ def test_a_study_writes_tables_and_a_report_that_needs_no_other_file(tmp_path, c
     with pytest.raises(SystemExit) as stop:
         cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0
-    assert "4 rows in" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "4 rows in" in printed and "100 lx, equal exposure: noise-aware YSNR " in printed
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"results.csv", "results.json", "report.html"} <= names
     assert ("results.parquet" in names) == has_parquet()
     rows = list(csv.DictReader(io.StringIO((tmp_path / "out" / "results.csv").read_text())))
     stored = json.loads((tmp_path / "out" / "results.json").read_text())
+    of = [text.partition(":")[0] for text in stored["verdicts"]]
+    assert of == [f"{surfaces}, D65, 100 lx, equal exposure" for surfaces in ("colorchecker", "patches")]
     assert len(rows) == len(stored["rows"]) == 4 and stored["study"]["name"] == "a <study>"
     for row, other in zip(rows, stored["rows"], strict=True):
         assert float(row["ysnr"]) == other["ysnr"] and row["filter_set"] == other["filter_set"]
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "<h1>a &lt;study&gt;</h1>" in page and page.count("<svg") >= 6 and 'src="http' not in page
+    assert (
+        "<h1>a &lt;study&gt;</h1>" in page
+        and "<h2>Verdict</h2>" in page
+        and page.count("<svg") >= 6
+        and 'src="http' not in page
+    )
     HTMLParser().feed(page)
     # again: refused, then replaced, with the same figures
     with pytest.raises(SystemExit) as stop:
@@ -418,3 +427,49 @@ def test_tables(tmp_path):
 def test_pareto_fronts():
     cost, gain = np.array([1.0, 2.0, 3.0, 1.0, 2.5]), np.array([1.0, 3.0, 3.0, 1.0, 2.0])
     assert pareto_front(cost, gain).tolist() == [True, True, False, True, False]
+
+
+def ranked(**changes):
+    """Rows of three sets at one level, with figures as a study gives them."""
+    common = {"surfaces": "chart", "illuminant": "D65", "illuminance_lux": 20.0, "equal": "exposure", "sensor": "s",
+              "nominal_exposure_us": 5000.0}  # fmt: skip
+    figures = {
+        "rggb": {"": 30.2, "_low": 28.0, "_simulated": 30.0, "_high": 32.0, "delta_e": 2.0},
+        "ryyb": {"": 41.0, "_low": 39.5, "_simulated": 41.5, "_high": 43.5, "delta_e": 3.5},
+        "rccb": {"": 32.5, "_low": 31.0, "_simulated": 33.0, "_high": 35.0, "delta_e": 2.5},
+    }
+    for name, values in figures.items():
+        row = common | {"filter_set": name, "delta_e_mean_noise_aware": values["delta_e"], "white_clipped": False}
+        row |= {f"ysnr_noise_aware{end}": values[end] for end in ("", "_low", "_simulated", "_high")}
+        yield row | changes.get(name, {})
+
+
+def test_a_level_of_light_has_a_verdict_in_one_sentence():
+    (text,) = ranking(Table(ranked()))
+    assert text == (
+        "chart, D65, 20 lx, equal exposure: noise-aware YSNR ryyb 41.5 (39.5 to 43.5) > rccb 33 (31 to 35) ~ rggb 30 "
+        "(28 to 32); worse for it: the noise-aware ΔE2000 of ryyb is 3.5, that of rggb 2"
+    )
+    (text,) = ranking(Table(ranked(ryyb={"delta_e_mean_noise_aware": 2.05, "white_clipped": True})))
+    assert "ryyb 41.5 (39.5 to 43.5) CLIPPED > rccb" in text
+    assert text.endswith("; ryyb has as good a noise-aware ΔE2000 as well")
+    (text,) = ranking(Table(ranked(ryyb={"delta_e_mean_noise_aware": 1.9})))
+    assert text.endswith("; ryyb has the least noise-aware ΔE2000 as well")
+    gone = {f"ysnr_noise_aware{end}": None for end in ("", "_low", "_simulated", "_high")}
+    gone |= {"white_clipped": True, "delta_e_mean_noise_aware": None}
+    (text,) = ranking(Table(ranked(ryyb=gone)))
+    assert "YSNR rccb 33 (31 to 35) ~ rggb" in text
+    assert text.endswith("; not ranked, as even the grey card saturates: ryyb")
+
+
+def test_levels_and_candidates_of_a_verdict():
+    rows = list(ranked())
+    other = [row | {"illuminance_lux": 300.0, "nominal_exposure_us": 9000.0} for row in rows]
+    assert [text.partition(": ")[0] for text in ranking(Table([*rows, *other]))] == [
+        "chart, D65, 20 lx, equal exposure, 5000 µs", "chart, D65, 300 lx, equal exposure, 9000 µs"
+    ]  # fmt: skip
+    plain = [{key: value for key, value in row.items() if "ysnr_noise_aware_" not in key} for row in rows]
+    twice = [row | {"crosstalk": share} for row in plain for share in (0.0, 0.08)]
+    (text,) = ranking(Table(twice))
+    assert "YSNR ryyb crosstalk 0 41 ~ ryyb crosstalk 0.08 41 > rccb crosstalk 0 32.5 ~ " in text
+    assert ranking(Table(rows[:1])) == ranking(Table([{"sensor": "s"}, {"sensor": "t"}])) == []

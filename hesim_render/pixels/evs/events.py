@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 #: the top left; polarity: +1 (ON) or -1 (OFF).
 EVENT_DTYPE = np.dtype([("t_us", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "i1")])
 
+#: An event with its cause (number of `Label`) and the object that its pixel shows (0 is the background).
+LABELLED_DTYPE = np.dtype([*((name, EVENT_DTYPE[name]) for name in EVENT_DTYPE.names or ()), ("cause", "u1"),
+                           ("object", "u2")])  # fmt: skip
+
 
 class Origin(IntEnum):
     """What in the pixel gave an event."""

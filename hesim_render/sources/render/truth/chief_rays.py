@@ -6,6 +6,7 @@ them at every instant. Directions and positions are computed in float64 from the
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,6 +32,9 @@ from hesim_render.sources.scene import Scene
 
 #: Part of the way to a point in which nothing may lie if the point is visible. The rest is left to rounding.
 FREE_PART = 1 - 1e-4
+#: Brightness that stands for glass and metal, of the sky, and of what is seen at a grazing angle over what faces the
+#: camera (`ChiefRays.brightness`).
+CLEAR, SKY, _GRAZING = 0.3, 0.3, 0.35
 
 
 class Hits(NamedTuple):
@@ -145,19 +149,11 @@ class ChiefRays:
         import drjit as dr
 
         mi, types = mitsuba(), jit()
-        moments, share = self._moment(at.t_us)
-        offset = dr.opaque(types.Float, offset_px[0]), dr.opaque(types.Float, offset_px[1])
         near = dr.opaque(types.Float, self.view.near_m)
-        count = share.size
+        count = at.t_us.size
         distance, normal = np.empty(count, np.float32), np.empty((count, 3), np.float32)
         shape, material = np.empty(count, np.uint32), np.empty(count, np.uint32)
-        for first in range(0, count, BLOCK_RAYS):
-            part = slice(first, min(first + BLOCK_RAYS, count))
-            row, col, shares = (
-                types.Float(np.ascontiguousarray(values[part], np.float32)) for values in (at.row, at.col, share)
-            )
-            now = self._now(moments, shares)
-            ray, along = self._seen(row, col, offset, now)
+        for part, ray, along, now in self._blocks(at, offset_px):
             surface = self.parts.intersect(ray, now, True, mi.Bool(True), mi.RayFlags.Minimal)
             rest, lanes = surface.rest, part.stop - part.start
             met = rest.is_valid()
@@ -176,6 +172,56 @@ class ChiefRays:
             distance[part], shape[part], material[part] = t, met_shape, met_material
             normal[part] = np.stack([x, y, z], axis=1)
         return Hits(distance, shape, material, normal)
+
+    def _blocks(self, at: Placed, offset_px: tuple[float, float]) -> Iterator[tuple[slice, Ray, Float, Moment]]:
+        """Rays block by block: which they are, the rays, their depth at distance 1, and their times."""
+        import drjit as dr
+
+        types = jit()
+        moments, share = self._moment(at.t_us)
+        offset = dr.opaque(types.Float, offset_px[0]), dr.opaque(types.Float, offset_px[1])
+        for first in range(0, share.size, BLOCK_RAYS):
+            part = slice(first, min(first + BLOCK_RAYS, share.size))
+            row, col, shares = (
+                types.Float(np.ascontiguousarray(values[part], np.float32)) for values in (at.row, at.col, share)
+            )
+            now = self._now(moments, shares)
+            yield part, *self._seen(row, col, offset, now), now
+
+    def brightness(self, at: Placed, wavelengths_nm: Sequence[float]) -> NDArray[np.float32]:
+        """Light that surfaces send to the camera if it came from there, over that of a white card; no light is traced.
+
+        Parameters
+        ----------
+        at : places and times.
+        wavelengths_nm : four wavelengths, nm.
+
+        Returns
+        -------
+        [n, 4]: diffuse reflectance, darker where a surface is seen at a grazing angle. `CLEAR` where glass or metal has
+        none, 1 for lamps, `SKY` where nothing was met.
+        """
+        import drjit as dr
+
+        mi = mitsuba()
+        found = np.empty((at.t_us.size, 4), np.float32)
+        bands = mi.UnpolarizedSpectrum(*(dr.opaque(mi.Float, float(value)) for value in wavelengths_nm))
+        for part, ray, _, now in self._blocks(at, (0.0, 0.0)):
+            ray.wavelengths = bands
+            surface = self.parts.intersect(ray, now, True, mi.Bool(True))
+            rest = surface.rest
+            met = rest.is_valid()
+            bsdf = rest.bsdf()
+            reflected = bsdf.eval_diffuse_reflectance(rest, met)
+            clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+            reflected = dr.select(clear & ~dr.any(reflected > 0), CLEAR, reflected)
+            shade = _GRAZING + (1 - _GRAZING) * dr.abs(dr.dot(surface.world.n, ray.d))
+            value = dr.select(met, dr.select(rest.shape.is_emitter(), 1.0, reflected * shade), SKY)
+            columns = [value[k] + dr.zeros(mi.Float, part.stop - part.start) for k in range(4)]
+            dr.eval(columns)
+            for k, column in enumerate(columns):
+                found[part, k] = np.array(column)
+        return found
 
     def sees(
         self, points: NDArray[np.float64], t_us: NDArray[np.float64], origin: NDArray[np.float64]

@@ -1,0 +1,129 @@
+"""Verdicts of a comparison: at each level of light one sentence that ranks the filter sets, and says what got worse."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from hesim_render.studies.table import Cell, Table
+
+#: What is ranked, and what may be worse for it, without the ends of their columns; both know the noise.
+_RANKED, _COST = "ysnr_noise_aware", "delta_e_mean_noise_aware"
+#: Names of a candidate, but for those that are the same in every row.
+_OWN = ("filter_set", "sensor", "crosstalk")
+#: A cost within this part of the least one is no cost.
+_ALIKE = 0.05
+
+
+def grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
+    """The rows by the values of some columns, in the order in which these first occur."""
+    found: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[name] for name in keys), []).append(row)
+    return [(values, Table(group)) for values, group in found.items()]
+
+
+def levels_of(rows: Table) -> list[str]:
+    """Columns that tell the levels of a group apart."""
+    of_sensor: dict[Cell, set[Cell]] = {}
+    for row in rows:
+        of_sensor.setdefault(row["sensor"], set()).add(row.get("nominal_exposure_us"))
+    # where each sensor has its own exposure, it is no level
+    return ["illuminance_lux", "equal", *(["nominal_exposure_us"] if max(map(len, of_sensor.values())) > 1 else [])]
+
+
+def level_name(keys: Sequence[str], values: Sequence[Cell]) -> str:
+    """A level in words."""
+    named = dict(zip(keys, values, strict=True))
+    text = f"{named['illuminance_lux']:g} lx, equal {named['equal']}"
+    return text + (f", {named['nominal_exposure_us']:g} µs" if named.get("nominal_exposure_us") else "")
+
+
+@dataclass(frozen=True)
+class _Ranked:
+    """A candidate at one level: its figure with an interval, which closed forms do not have."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    cost: float | None
+    clips: bool
+
+    def __str__(self) -> str:
+        interval = f" ({self.low:.3g} to {self.high:.3g})" if self.low < self.high else ""
+        return f"{self.name} {self.value:.3g}{interval}{' CLIPPED' if self.clips else ''}"
+
+
+def ranking(table: Table) -> list[str]:
+    """One sentence for each light level, with the order of the noise-aware YSNR and what is worse for it.
+
+    ``>`` stands between two whose 95 % intervals do not meet, ``~`` where they do. Where white clips, the candidate is
+    flagged; where the grey card does, it has no figure and is named at the end.
+
+    Parameters
+    ----------
+    table : of a study.
+
+    Returns
+    -------
+    The sentences; none without noise figures, or where there is one candidate alone.
+    """
+    if _RANKED not in table.columns:
+        return []
+    own = [name for name in _OWN if name in table.columns and len({row[name] for row in table}) > 1]
+    levels = levels_of(table)
+    found = []
+    for outer, group in grouped(table, ("surfaces", "illuminant")):
+        for values, some in grouped(group, levels):
+            sentence = _sentence(some, own)
+            if sentence:
+                found.append(f"{', '.join(map(str, outer))}, {level_name(levels, values)}: {sentence}")
+    return found
+
+
+def _sentence(rows: Table, own: Sequence[str]) -> str | None:
+    """The verdict of one level."""
+    if len(rows) < 2:
+        return None
+    ranked = sorted((_ranked(row, own) for row in rows if row[_RANKED] is not None), key=lambda one: -one.value)
+    saturated = [_name(row, own) for row in rows if row[_RANKED] is None and row.get("white_clipped")]
+    order = str(ranked[0]) if ranked else "none"
+    for before, after in zip(ranked[:-1], ranked[1:], strict=True):
+        order += f" {'>' if before.low > after.high else '~'} {after}"
+    text = f"noise-aware YSNR {order}"
+    known = [(one.cost, one) for one in ranked if one.cost is not None]
+    if known:
+        least, best = min(known, key=lambda pair: pair[0])
+        first = ranked[0]
+        if first.cost is not None and first.cost > (1 + _ALIKE) * least:
+            text += (
+                f"; worse for it: the noise-aware ΔE2000 of {first.name} is {first.cost:.3g}, that of {best.name} "
+                f"{least:.3g}"
+            )
+        elif first.cost is not None:
+            text += f"; {first.name} has {'the least' if first is best else 'as good a'} noise-aware ΔE2000 as well"
+    if saturated:
+        text += f"; not ranked, as even the grey card saturates: {', '.join(saturated)}"
+    return text
+
+
+def _name(row: Mapping[str, Cell], own: Sequence[str]) -> str:
+    parts = ((name, row[name]) for name in own)
+    return " ".join(f"{name} {value:g}" if isinstance(value, float) else str(value) for name, value in parts) or "it"
+
+
+def _ranked(row: Mapping[str, Cell], own: Sequence[str]) -> _Ranked:
+    """A row with the interval of its simulation, where there is one."""
+
+    def number(column: str) -> float | None:
+        value = row.get(column)
+        return float(value) if isinstance(value, int | float) and value == value else None
+
+    simulated, low, high = (number(f"{_RANKED}_{end}") for end in ("simulated", "low", "high"))
+    value = number(_RANKED) if simulated is None else simulated
+    assert value is not None
+    return _Ranked(
+        _name(row, own), value, value if low is None else low, value if high is None else high, number(_COST),
+        bool(row.get("white_clipped")),
+    )  # fmt: skip
