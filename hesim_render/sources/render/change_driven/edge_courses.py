@@ -114,7 +114,7 @@ def courses(
     first, second = first[both], second[both]
     # one edge: nearly the same direction and levels on both sides
     contrast = np.minimum(fit.high[first] - fit.low[first], fit.high[second] - fit.low[second])
-    turn: NDArray[np.float64] = _angle(fit, second) - _angle(fit, first)
+    turn = _angle(fit, second) - _angle(fit, first)
     turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
     same = np.abs(turn) <= _TURN
     for level in (fit.low, fit.high):
@@ -139,19 +139,19 @@ def courses(
     def between(values: NDArray[np.floating]) -> NDArray[np.float64]:
         return values[one] + part * (values[other].astype(np.float64) - values[one])
 
-    offset, low, high = between(fit.offset), between(fit.low), between(fit.high)
+    offset, dark, bright = between(fit.offset), between(fit.low), between(fit.high)
     # something else may pass between both fits: the pilot's few rays must see the same edge
-    seen = low + (high - low) * coverage(*normal, offset / footprint_px)
-    differs = np.abs(pilot[now, pixel[one]] - seen) > _PILOT * (high - low)
+    seen = dark + (bright - dark) * coverage(*normal, offset / footprint_px)
+    differs = np.abs(pilot[now, pixel[one]] - seen) > _PILOT * (bright - dark)
     differs |= barred[now, pixel[one]]
     fails = np.bincount(segment, differs, minlength=first.size) > 0
     keep = ~fails[segment]
-    level = low + (high - low) * coverage(*normal, offset)
+    share = dark + (bright - dark) * coverage(*normal, offset)
     ends = [
         fit.low[k] + (fit.high[k] - fit.low[k]) * coverage(fit.normal_x[k], fit.normal_y[k], fit.offset[k])
         for k in (one, other)
     ]
-    model = level - (ends[0] + part * (ends[1] - ends[0]))
+    model = share - (ends[0] + part * (ends[1] - ends[0]))
     found = now, pixel[one], window[one], window[other], model.astype(np.float32)
     return Courses(*(values[keep] for values in found))
 

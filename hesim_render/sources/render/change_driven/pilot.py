@@ -189,12 +189,12 @@ def take_pilot(
             windows_of, places_of = [], []
             for early, late in spans:
                 # what shows the same in two looks, in all pixels around, has kept its light between them
-                changed = np.zeros(sites.size, np.bool_)
-                for values in (pilot.lit, pilot.hidden):
-                    least = _ROUNDING * np.abs(values[early])
-                    if wanted is not None:
-                        least = np.maximum(least, _SAME * wanted(pilot.flux_of(early)))
-                    changed |= np.abs(values[late] - values[early]) > least
+                is_lit = pilot.lit_scatter[early] <= pilot.hidden_scatter[early]
+                begin, end = (np.where(is_lit, pilot.lit[k], pilot.hidden[k]) for k in (early, late))
+                least = _ROUNDING * np.abs(begin)
+                if wanted is not None:
+                    least = np.maximum(least, _SAME * wanted(begin))
+                changed = np.abs(end - begin) > least
                 busy = np.flatnonzero(sites.near(changed, REACH - 1) & near)
                 between = slice(early + 1, late)
                 for values in _tables(pilot):

@@ -36,8 +36,8 @@ class Tuning:
         of the exposure are missed.
     look_stride : windows, C. The pilot of an asynchronous sensor looks at every so many windows; where two looks
         differ, it looks again half way between, and so on. Within this time, nothing moves by more than 0.8 pixels, so
-        that nothing crosses the pixels around between two looks. Without (1): most of a pilot's rays see what
-        the last ones saw.
+        that nothing crosses the pixels around between two looks. Without (1): most of a pilot's rays see what the last
+        ones saw.
     zoom_rays : rays, H. Largest number of pilot rays for a pixel that is crossed by an object which few rays could
         miss; a pair gets as many if the object is small. Without: objects smaller than a pixel come and go unseen, or
         one ray hits them and weighs far too much.
