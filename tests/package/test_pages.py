@@ -167,7 +167,7 @@ def test_every_claim_has_an_oracle_a_figure_and_a_command():
     for row in rows:
         assert len(row) in (4, 5) and all(row), row
         command, _, fold = row[-1].partition("<details><summary>tests</summary>")
-        assert command.startswith("`python ") and not NAMED_TEST.search(command), row
+        assert command.startswith(("`python ", "`hesim-render ")) and not NAMED_TEST.search(command), row
         assert bool(NAMED_TEST.search(fold)) == ("tests.claim" in command), row
     named = claim.claims()
     assert len(named) > 70 and all(tests for _, tests in named.values())

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject, Point3, Vector3
+from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.irradiance import outline_above_horizon
 
 #: Largest number of outlines of a scene, the largest ones; each takes the time of a few dozen operations a ray.
@@ -60,11 +61,7 @@ def outlines_of(scene: MitsubaObject) -> list[Outline]:
     shapes = scene.shapes()
     if not shapes or len(shapes) > _MOST_SHAPES or not all(shape.is_mesh() for shape in shapes):
         return []
-    meshes = [
-        (np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3), np.array(shape.faces_buffer()))
-        for shape in shapes
-    ]
-    triangles = [corners[faces.astype(np.int64).reshape(-1, 3)] for corners, faces in meshes]
+    triangles = [mesh_vertices(shape)[mesh_faces(shape)] for shape in shapes]
     together = _flat(np.concatenate(triangles))
     if together is not None:
         return [together]
