@@ -10,6 +10,8 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
+from hesim_render.calibrate.aps import light_curve
+from hesim_render.calibrate.aps.pair_levels import pair_statistics
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
 from hesim_render.calibrate.aps.sensor_file import write_sensor
@@ -71,6 +73,22 @@ def test_the_black_levels_error_at_few_exposures_is_that_of_rows_and_pixels_of_t
     found = [evaluate(emva_camera.in_memory(camera, seed)).black.error for seed in range(3)]
     # the noise of the rows is itself known to 3 %
     assert min(found) == pytest.approx(expected, rel=0.1)
+
+
+def test_light_that_changes_between_two_frames_is_no_noise_of_columns_or_rows():
+    rng = np.random.default_rng(3)
+    first, second = (np.rint(rng.normal(300, 9, (14, 23))).astype(np.uint16) for _ in range(2))
+    plain, brighter = pair_statistics(first, second, 4095), pair_statistics(first, second + np.uint16(21), 4095)
+    assert brighter[0] == pytest.approx(plain[0] + 10.5) and brighter[1] == pytest.approx(plain[1] - 21)
+    np.testing.assert_allclose(brighter[2:-2], plain[2:-2], rtol=1e-5)
+
+
+def test_the_gradient_of_the_curve_is_that_of_finite_differences():
+    p, h, step = np.array([0.04, 5.0, -1.3, 0.7]), np.linspace(0.1, 1.1, 7), 1e-6
+    expected = [(light_curve._value(p + d, h) - light_curve._value(p - d, h)) / (2 * step) for d in step * np.eye(4)]
+    np.testing.assert_allclose(light_curve._gradient(p, h), expected, rtol=1e-7)
+    curve = light_curve.MeanCurve(p[0], 0.0, p[1:], np.zeros((4, 4)), 0.0)
+    np.testing.assert_allclose(curve.gradient(h), expected, rtol=1e-7)
 
 
 def test_saturation_is_between_the_levels_around_it(sections):
