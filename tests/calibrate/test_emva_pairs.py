@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import emva_camera
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
-from hesim_render.calibrate.aps import light_curve
+from hesim_render.calibrate.aps import light_curve, pair_levels
 from hesim_render.calibrate.aps.pair_levels import pair_statistics
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
@@ -81,6 +83,18 @@ def test_light_that_changes_between_two_frames_is_no_noise_of_columns_or_rows():
     plain, brighter = pair_statistics(first, second, 4095), pair_statistics(first, second + np.uint16(21), 4095)
     assert brighter[0] == pytest.approx(plain[0] + 10.5) and brighter[1] == pytest.approx(plain[1] - 21)
     np.testing.assert_allclose(brighter[2:-2], plain[2:-2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("factor", (0.99, 1.01))
+def test_light_drifts_beyond_six_deviations_of_rows_and_pixels(factor):
+    """The mean of 14 rows, of variance 9 each and twice that in a difference, and of their 14 · 96 pixels of 4 DN²."""
+    frames = np.random.default_rng(4).integers(280, 320, (2, 14, 96), np.uint16)
+    change = factor * 6 * np.sqrt(2 * 9 / 14 + 2 * 4 / (14 * 96))
+    entry = SimpleNamespace(lit=True, error=lambda text: SpecError(text))
+    found = 300.0, change, 4.0, 0.1, 9.0, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0
+    drifts = pytest.raises(SpecError, match=r"the second frame is 2.3 % darker") if factor > 1 else nullcontext()
+    with drifts:
+        pair_levels._check(entry, found, *frames, 4095)
 
 
 def test_the_gradient_of_the_curve_is_that_of_finite_differences():
