@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from hesim_render.core.distinct import distinct_columns
 from hesim_render.sources.render.change_driven.aim import PairAims
+from hesim_render.sources.render.change_driven.edge_courses import Courses, courses
 from hesim_render.sources.render.change_driven.edge_rays import about_edges
-from hesim_render.sources.render.change_driven.edges import PairEdges
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Band, Counts, Flux, Still
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites, of_own_row, turns
@@ -99,9 +100,8 @@ class AdaptiveRenderer:
         width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
         closer = self.zoom.sites(row, col, windows, numbers)
-        found = take_pilot(
-            self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored, stride
-        )
+        given = self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored, stride
+        found = take_pilot(*given, lambda flux: np.float32(band.quality) * band.unit(flux))
         self.counts.pilot_rays += self.tracer.rays_done - before
         return found
 
@@ -121,7 +121,32 @@ class AdaptiveRenderer:
 
     def plan(self, pilot: Pilot, band: Band, is_knot: bool) -> Plan:
         """Which pairs of a band are rendered, with how many rays; see `plan`."""
-        return plan(pilot, band.sites, band.unit, band.quality, self.gain, self.tuning, is_knot=is_knot)
+        given = pilot, band.sites, band.unit, band.quality, self.gain, self.tuning
+        # windows of synchronous sensors are too far apart for an edge to stay within a pixel
+        return plan(*given, is_knot=is_knot, follows=self.look_stride > 1 and self.tracer.rays.is_box)
+
+    def follow(
+        self, band: Band, windows: Windows, numbers: NDArray[np.int64], what: Plan
+    ) -> tuple[Plan, EdgeFit | None, Courses]:
+        """Follow edges from window to window: a plan without the windows between two fits of one edge, the fits, and
+        those windows; this traces decision rays.
+
+        Parameters
+        ----------
+        numbers : [w, n], window number of each pair.
+        """
+        window, pixel = np.nonzero(what.fitted)
+        if window.size == 0:
+            return what, None, Courses.none()
+        index, tuning, before = band.index[pixel], self.tuning, self.tracer.rays_done
+        of = index, numbers[what.fitted], windows, tuning.edge_rays, tuning.edge_footprint_px, what.lit[what.fitted]
+        fit = self.tracer.edges(*of)
+        self.counts.rays += self.tracer.rays_done - before
+        own = fit.scaled(self.tracer.axis_factor(index))
+        centre_us = 0.5 * (windows.begin_us + windows.end_us)
+        given = what.pilot, self._footprint_px(band), what.wanted[what.fitted], centre_us, what.barred
+        found = courses(window, pixel, own, *given)
+        return what.without(found.window, found.pixel), fit, found
 
     def render(
         self,
@@ -131,6 +156,7 @@ class AdaptiveRenderer:
         what: Plan,
         span_us: tuple[float, float] | None = None,
         first: Flux | None = None,
+        fit: EdgeFit | None = None,
     ) -> tuple[Flux, NDArray[np.bool_]]:
         """Render the pairs that a plan names, except differences, which need an anchor; see `Anchor.render`.
 
@@ -138,6 +164,7 @@ class AdaptiveRenderer:
         ----------
         numbers : [w, n], window number of each pair.
         first : [1, n], flux in the first window, if it is already known.
+        fit : lines of the pairs `fitted` of the plan, where they are known.
 
         Returns
         -------
@@ -153,7 +180,7 @@ class AdaptiveRenderer:
         window, place = np.nonzero(todo)
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
-        rays, edges = self.rays_of(pairs, what, todo, aims)
+        rays, edges = self.rays_of(pairs, what, todo, aims, fit)
         got = self.tracer.trace(*pairs, rays, what.lit[todo], span_us=span_us, aims=aims, edges=edges)
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
@@ -170,6 +197,7 @@ class AdaptiveRenderer:
         what: Plan,
         todo: NDArray[np.bool_],
         aims: PairAims | None,
+        fit: EdgeFit | None = None,
     ) -> tuple[NDArray[np.integer], PairEdges | None]:
         """Numbers of rays of the pairs `todo` of a plan, and models of their edges; this traces decision rays.
 
@@ -177,13 +205,15 @@ class AdaptiveRenderer:
         ----------
         pairs : pixels on the full sensor, their windows, and all windows.
         aims : small objects of these pairs, at which rays are aimed.
+        fit : lines of the pairs `fitted` of the plan, where they are known.
         """
         rays: NDArray[np.integer] = what.rays[todo]
         if not self.tracer.rays.is_box:
             return rays, None
         tried = None if aims is None else aims.count == 0
         given = rays, what.lit[todo], what.wanted[todo], what.floor[todo]
-        return about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried)
+        known = None if fit is None else (what.fitted[todo], fit.at(todo[what.fitted]))
+        return about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried, known=known)
 
     def alone(
         self, pixel: NDArray[np.uint32], begin: NDArray[np.float64], end: NDArray[np.float64], role: Role, out: Flux

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.rng import Stream
-from hesim_render.sources.render.change_driven.edges import PairEdges
+from hesim_render.sources.render.change_driven.edges import EdgeFit, PairEdges
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
@@ -24,6 +24,7 @@ def about_edges(
     *,
     tried: NDArray[np.bool_] | None = None,
     flat_part: float | None = None,
+    known: tuple[NDArray[np.bool_], EdgeFit] | None = None,
     stream: Stream = Stream.RENDER_EDGE,
 ) -> tuple[NDArray[np.integer], PairEdges | None]:
     """Models of the edges in listed pairs, and the numbers of rays that are left to trace.
@@ -42,6 +43,7 @@ def about_edges(
     tuning : constants.
     tried : [n], pairs that may have an edge; None for all.
     flat_part : in place of `Tuning.flat_part`.
+    known : [n], pairs whose lines are known, and these lines.
     stream : stream of the decision rays.
 
     Returns
@@ -54,17 +56,24 @@ def about_edges(
     if place.size == 0:
         return rays, None
     pixel, window, windows = pairs
-    fit = tracer.edges(
-        pixel[place], window[place], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[place], stream
-    )
+    fit, new = EdgeFit.empty(place.size), np.arange(place.size)
+    if known is not None:
+        fit.replace(np.flatnonzero(known[0][place]), known[1])
+        new = np.flatnonzero(~known[0][place])
+    some = place[new]
+    of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[some]
+    fit.replace(new, tracer.edges(*of, stream))
     # fluxes of fits are those on the optical axis
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
-    contrast, by_scatter = (fit.high - fit.low) / wanted, gain.rays(fit.scatter / wanted)
-    is_flat = contrast < 1
-    is_edge = fit.is_edge & ~is_flat
+    # of rays that all see the same, none is above the middle
+    contrast = np.maximum(fit.high - fit.low, 0) / wanted
+    is_edge = fit.is_edge & (contrast >= 1)
+    # both sides belong to the scatter of a pair that has no edge
+    by_scatter = gain.rays(np.where(is_edge, 0, 0.5 * contrast) + fit.scatter / wanted)
+    is_flat = ~is_edge & (contrast < tuning.flat_contrast)
     # an edge: its contrast says how much a ray weighs that finds the model wrong; half of the rays start in the strip
     needed = np.where(is_edge, np.maximum(2 * by_scatter, tuning.edge_contrast_rays * contrast), by_scatter)
-    # no contrast at all: the neighbours gave this pair its rays, and what they show does not reach it
+    # little contrast: the neighbours gave this pair its rays, and what they show does not reach it
     part = tuning.flat_part if flat_part is None else flat_part
     needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)
     needed = np.clip(np.maximum(needed, floor[place]), tuning.edge_rays, tuning.most_rays)

@@ -13,7 +13,7 @@ from all of them, if there is one that separates those above the middle of their
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,7 @@ class EdgeFit:
     low, high : mean flux of either side.
     scatter : standard deviation of single rays about the mean of their side.
     fewer : number of rays on the side that has fewer.
+    rays : number of decision rays.
     """
 
     normal_x: NDArray[np.float32]
@@ -115,6 +116,7 @@ class EdgeFit:
     high: NDArray[np.float32]
     scatter: NDArray[np.float32]
     fewer: NDArray[np.float32]
+    rays: NDArray[np.float32]
 
     @classmethod
     def empty(cls, count: int) -> EdgeFit:
@@ -130,6 +132,15 @@ class EdgeFit:
     def is_edge(self) -> NDArray[np.bool_]:
         """True where a line separates two even levels."""
         return self.is_line & (self.fewer >= _LEAST_ON_A_SIDE)
+
+    def at(self, part: NDArray) -> EdgeFit:
+        """Fits of some pairs."""
+        return EdgeFit(*(values[part] for values in astuple_of(self)))
+
+    def scaled(self, factor: NDArray[np.float32]) -> EdgeFit:
+        """The same lines, their fluxes times a factor."""
+        fluxes = {name: getattr(self, name) * factor for name in ("low", "high", "scatter")}
+        return replace(self, **fluxes)
 
     def replace(self, part: slice | NDArray[np.int64], fits: EdgeFit) -> None:
         """Put in the fits of some pairs."""
@@ -178,7 +189,8 @@ class EdgeFit:
         sine, cosine = dr.sincos(angle)
         values = cosine, sine, -at, gap, low, high, scatter, dr.minimum(above_count, below_count)
         dr.eval(values)
-        for out, value in zip(astuple_of(self), values, strict=True):
+        self.rays[part] = rays
+        for out, value in zip(astuple_of(self)[:-1], values, strict=True):
             out[part] = np.array(value)
 
 

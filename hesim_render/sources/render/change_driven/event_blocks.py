@@ -75,11 +75,14 @@ class Blocks:
                 # by itself, so that the other windows are traced by the calls of a run that comes from the block before
                 first = renderer.render(band, windows, numbers[:1], what.first())[0]
                 anchor.render(windows, what.first(), None, first)
-            flux, _ = renderer.render(band, windows, numbers, what, first=first)
+            what, fit, followed = renderer.follow(band, windows, numbers, what)
+            flux, _ = renderer.render(band, windows, numbers, what, first=first, fit=fit)
             anchor.render(windows, what, first, flux)
-            for values in flux.arrays[:2]:
-                fill_in(values, what.rendered, centre)
-            fill_in(flux.error, what.rendered, centre)
+            followed.fill(flux, centre)
+            known = what.rendered.copy()
+            known[followed.window, followed.pixel] = True
+            for values in flux.arrays:
+                fill_in(values, known, centre)
             out.put(band.place, flux)
         # where a block goes on after the run, its last window may be unknown
         is_whole = bool(block.wanted[-1])

@@ -229,6 +229,10 @@ class ChangeDrivenFlux:
             what = renderer.plan(pilot, band, is_knot=role == "events").until(
                 windows.size - 1 if until is None else until
             )
+            before, fit = self._tracer.rays_done, None
+            if windows.size > 1:
+                what, fit, _ = renderer.follow(band, windows, numbers[:, : band.place.size], what)
+            rays[0] += self._tracer.rays_done - before
             todo = what.rendered.copy()
             todo[:-later] = False
             if anchor is not None:
@@ -237,7 +241,7 @@ class ChangeDrivenFlux:
             window, place = np.nonzero(todo)
             aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
             before = self._tracer.rays_done
-            each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims)
+            each, _ = renderer.rays_of((band.index[place], window, windows), what, todo, aims, fit)
             rays[0] += int(each.sum(dtype=np.int64)) + self._tracer.rays_done - before
         renderer.counts, self._tracer.rays_done = counts, done
         return rays / pixel.size

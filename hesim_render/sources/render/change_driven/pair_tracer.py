@@ -191,7 +191,7 @@ class PairTracer(PacketTracer):
             inputs = "edges", *lanes, lit[part], samples, footprint_px, stream, *told_of(windows, None, None)
             trace = partial(self._edge_block, lanes, lit[part], moments, key, samples, footprint, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
-            self._report((part.stop - first) * samples)
+            self._report(int(out.rays[part].sum(dtype=np.int64)))
         return out
 
     def _edge_block(

@@ -7,7 +7,7 @@ a change of the scene, not of the rays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from itertools import pairwise
 
@@ -23,8 +23,8 @@ from hesim_render.sources.render.change_driven.small_objects import Look
 from hesim_render.sources.render.change_driven.tuning import Gain, Tuning
 from hesim_render.sources.render.change_driven.windows import Windows
 
-#: Relative differences of fluxes that rounding explains.
-_ROUNDING = np.float32(1e-5)
+#: Relative differences of fluxes that rounding explains, and differences over the wanted error that count as none.
+_ROUNDING, _SAME = np.float32(1e-5), np.float32(0.2)
 #: Scale of fluxes before they are squared, so that float32 can hold the squares.
 _SMALLER = np.float32(1e-4)
 
@@ -131,6 +131,7 @@ def take_pilot(
     closer: Sequence[Sequence[Look]] = (),
     anchored: Anchored | None = None,
     stride: int = 1,
+    wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
 ) -> tuple[Pilot, NDArray[np.bool_]]:
     """Trace the pilot pass.
 
@@ -144,6 +145,7 @@ def take_pilot(
     closer : for each window, the sites that get extra rays; see `Zoom`.
     anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
+    wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
 
     Returns
     -------
@@ -182,20 +184,29 @@ def take_pilot(
 
         looks = np.append(np.arange(0, count - 1, stride), count - 1)
         look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
-        for early, late in pairwise(looks.tolist()):
-            between = np.arange(early + 1, late)
-            if between.size == 0:
-                continue
-            # what shows the same in two looks, in all pixels around, has kept its light between them
-            changed = np.zeros(sites.size, np.bool_)
-            for values in (pilot.lit, pilot.hidden):
-                changed |= np.abs(values[late] - values[early]) > _ROUNDING * np.abs(values[early])
-            busy = sites.near(changed, REACH - 1) & near
-            for values in _tables(pilot):
-                values[between] = values[early]
-            for values in scatters:
-                values[between] = values[early] if early else 0  # the first window has the difference to the anchor
-            look(np.repeat(between, np.count_nonzero(busy)), np.tile(np.flatnonzero(busy), between.size))
+        spans = [span for span in pairwise(looks.tolist()) if span[1] - span[0] > 1]
+        while spans:
+            windows_of, places_of = [], []
+            for early, late in spans:
+                # what shows the same in two looks, in all pixels around, has kept its light between them
+                is_lit = pilot.lit_scatter[early] <= pilot.hidden_scatter[early]
+                begin, end = (np.where(is_lit, pilot.lit[k], pilot.hidden[k]) for k in (early, late))
+                least = _ROUNDING * np.abs(begin)
+                if wanted is not None:
+                    least = np.maximum(least, _SAME * wanted(begin))
+                changed = np.abs(end - begin) > least
+                busy = np.flatnonzero(sites.near(changed, REACH - 1) & near)
+                between = slice(early + 1, late)
+                for values in _tables(pilot):
+                    values[between] = values[early]
+                for values in scatters:
+                    values[between] = values[early] if early else 0  # the first window is compared with the anchor
+                windows_of.append(np.full(busy.size, (early + late) // 2))
+                places_of.append(busy)
+            # where something changed, one more look half way between
+            look(np.concatenate(windows_of), np.concatenate(places_of))
+            halves = [half for a, b in spans for half in ((a, (a + b) // 2), ((a + b) // 2, b))]
+            spans = [span for span in halves if span[1] - span[0] > 1]
     change = None
     if anchored is not None:
         means = [values - values[:1] for values in (pilot.lit, pilot.hidden)]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.sources.render.change_driven.aim import Aims
 from hesim_render.sources.render.change_driven.differences import Differences, differences
+from hesim_render.sources.render.change_driven.edge_courses import fitted_windows
 from hesim_render.sources.render.change_driven.error_target import NoiseUnit
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, allocate
@@ -65,6 +66,9 @@ class Plan:
     wanted : wanted standard error, e⁻/s.
     floor : number of rays that a pair gets whatever is known of its edges.
     differences : pairs that are rendered as differences to another window.
+    fitted : rendered pairs in which lines are fitted, to follow edges from one to the next; see `edge_courses`.
+    barred : pairs between which no edge is followed.
+    pilot : flux of the pilot, e⁻/s.
     aims : small objects at which rays are aimed, by window and site; None if there are none.
     """
 
@@ -75,27 +79,51 @@ class Plan:
     wanted: NDArray[np.float32]
     floor: NDArray[np.int16]
     differences: Differences
+    fitted: NDArray[np.bool_]
+    barred: NDArray[np.bool_]
+    pilot: NDArray[np.float32]
     aims: Aims | None = None
 
     def until(self, window: int) -> Plan:
         """The plan without the pairs on which no value up to a window depends.
 
         The last block of a run goes beyond its end, since blocks are the same for all runs. Of each pixel, the first
-        rendered window after the end is needed for interpolation; later ones are not, and are left as unknown.
+        rendered window after the end is needed for interpolation, and the first one in which a line is fitted; later
+        ones are not, and are left as unknown.
         """
-        later = self.rendered[window:].copy()
+        later, fitted = self.rendered[window:].copy(), self.fitted[window:].copy()
         # rendered windows after the first one: those before which another one was rendered
-        later &= np.cumsum(later, axis=0) <= 1
-        return replace(self, rendered=np.concatenate([self.rendered[:window], later]))
+        for which in (later, fitted):
+            which &= np.cumsum(which, axis=0) <= 1
+        later |= fitted
+        return replace(
+            self,
+            rendered=np.concatenate([self.rendered[:window], later]),
+            fitted=np.concatenate([self.fitted[:window], fitted]),
+        )
+
+    def without(self, window: NDArray[np.int64], pixel: NDArray[np.int64]) -> Plan:
+        """The plan, some pairs of which are not rendered."""
+        rendered = self.rendered.copy()
+        rendered[window, pixel] = False
+        return replace(self, rendered=rendered)
 
     def first(self) -> Plan:
         """The plan of the first window alone."""
-        first = {name: getattr(self, name)[:1] for name in ("rendered", "rays", "lit", "error", "wanted", "floor")}
+        names = "rendered", "rays", "lit", "error", "wanted", "floor", "fitted", "barred", "pilot"
+        first = {name: getattr(self, name)[:1] for name in names}
         return replace(self, differences=self.differences.first(), **first)
 
 
 def plan(
-    pilot: Pilot, sites: Sites, unit: NoiseUnit, quality: float, gain: Gain, tuning: Tuning, is_knot: bool
+    pilot: Pilot,
+    sites: Sites,
+    unit: NoiseUnit,
+    quality: float,
+    gain: Gain,
+    tuning: Tuning,
+    is_knot: bool,
+    follows: bool = False,
 ) -> Plan:
     """Plan a block, or a single window, from the pilot pass.
 
@@ -107,6 +135,7 @@ def plan(
     gain : error law of stratified rays.
     tuning : constants.
     is_knot : True if the first and the last window may be ends of blocks.
+    follows : True if edges are followed from window to window.
 
     Returns
     -------
@@ -123,6 +152,9 @@ def plan(
         np.float32(quality) * units[:, sites.listed],
         np.zeros(shape, np.int16),
         Differences.none(*shape),
+        np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_),
+        pilot.steady_flux[:, sites.listed],
         pilot.aims,
     )
     if last > 1:
@@ -138,12 +170,16 @@ def plan(
             looked_at = np.zeros(flux.shape, np.bool_)
             for window, closer in enumerate(pilot.closer):
                 looked_at[window, closer.place] = True
-            out.rendered[1:last] |= longer(looked_at, 1)[1:last, sites.listed]
+            out.barred[:] = longer(looked_at, 1)[:, sites.listed]
+            out.rendered[1:last] |= out.barred[1:last]
     for window in range(count):
         at_end = is_knot and window in (0, last)
         part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
         out.rays[window], out.lit[window], out.error[window], out.floor[window] = part
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
+    if follows and last > 1:
+        worth = out.rendered & (out.rays >= tuning.edge_least_rays) & (chosen.rays == 0) & ~out.barred
+        out.fitted[:] = fitted_windows(worth)
     return replace(out, differences=chosen)
 
 

@@ -34,9 +34,10 @@ class Tuning:
         as `pilot_rays`): changes are missed, because such pixels have no neighbours to show them.
     frame_pilot_rays : rays, H. Pilot rays of a frame pixel in an exposure. Without: objects that pass in a small part
         of the exposure are missed.
-    look_stride : windows, C. The pilot of an asynchronous sensor looks at every so many windows; in the others, it
-        looks at pixels that changed. Within this time, nothing moves by more than a fifth of a pixel. Without (1): more
-        than half of a pilot's rays see what the last ones saw.
+    look_stride : windows, C. The pilot of an asynchronous sensor looks at every so many windows; where two looks
+        differ, it looks again half way between, and so on. Within this time, nothing moves by more than 0.8 pixels, so
+        that nothing crosses the pixels around between two looks. Without (1): most of a pilot's rays see what the last
+        ones saw.
     zoom_rays : rays, H. Largest number of pilot rays for a pixel that is crossed by an object which few rays could
         miss; a pair gets as many if the object is small. Without: objects smaller than a pixel come and go unseen, or
         one ray hits them and weighs far too much.
@@ -90,6 +91,8 @@ class Tuning:
         line that only just enters a pixel, or passes beside it, is not seen.
     edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
         its sides. Without (0): what the decision rays missed makes single values that are far off.
+    flat_contrast : wanted errors, C. Where decision rays find less contrast, and no line, a pair gets the rays that
+        their scatter asks for. Without (0): pixels beside an edge take the rays that its contrast asks for.
     flat_part : part, C. Of the rays by the law, a pair in which decision rays find no contrast keeps this part at
         least. Without (0): thin objects between the decision rays make single values that are far off.
     least_difference_rays : rays, C. Least number of rays of a difference. Without: no pilot ray sees a change, and few
@@ -118,7 +121,7 @@ class Tuning:
     pilot_rays: int = 16
     lone_pilot_rays: int = 32
     frame_pilot_rays: int = 64
-    look_stride: int = 4
+    look_stride: int = 16
     zoom_rays: int = 256
     zoom_room: float = 64.0
     gloss_room: float = 16.0
@@ -147,6 +150,7 @@ class Tuning:
     edge_rays: int = 64
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.4
+    flat_contrast: float = 4.0
     flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0

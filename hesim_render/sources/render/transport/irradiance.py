@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,9 +39,7 @@ class RectangleLight:
     def irradiance(self, point: Point3, normal: Vector3) -> Float:
         """∫ cos θ dω over the part of the rectangle above the horizon, sr.
 
-        Lambert's formula, ½ |Σ γ_i (Γ_i · n)|, with γ_i the angle that edge i subtends and Γ_i the unit normal of the
-        plane through the point and that edge ([lambert1760]; for polygons [baum1989]).
-        Clipping a convex polygon at a plane shortens its edges and adds one edge along the horizon.
+        See `outline_above_horizon`.
 
         Parameters
         ----------
@@ -54,20 +54,7 @@ class RectangleLight:
 
         mi = self._mi
         rays = [corner - point for corner in self._corners]
-        heights = [dr.dot(ray, normal) for ray in rays]
-        total = mi.Float(0.0)
-        leaving, entering = dr.zeros(mi.Vector3f), dr.zeros(mi.Vector3f)
-        crosses = mi.Bool(False)
-        for k in range(4):
-            a, b, height_a, height_b = rays[k], rays[(k + 1) % 4], heights[k], heights[(k + 1) % 4]
-            above_a, above_b = height_a >= 0, height_b >= 0
-            on_horizon = dr.fma(b - a, height_a / (height_a - height_b), a)
-            first, second = dr.select(above_a, a, on_horizon), dr.select(above_b, b, on_horizon)
-            total += dr.select(above_a | above_b, _edge(first, second, normal), 0.0)
-            leaving = dr.select(above_a & ~above_b, on_horizon, leaving)
-            entering = dr.select(~above_a & above_b, on_horizon, entering)
-            crosses |= above_a != above_b
-        total += dr.select(crosses, _edge(leaving, entering, normal), 0.0)
+        total = outline_above_horizon(mi, rays, normal)
         to = self._middle - point
         square = dr.squared_norm(to)
         before = -dr.dot(to, self._normal)
@@ -94,6 +81,38 @@ class RectangleLight:
         square = dr.squared_norm(to)
         cosines = dr.maximum(dr.dot(to, normal), 0.0) * dr.maximum(-dr.dot(to, self._normal), 0.0)
         return drawn, dr.select(square > 0, self._area_m2 * cosines / (square * square), 0.0)
+
+
+def outline_above_horizon(mi: MitsubaModule, rays: Sequence[Vector3], normal: Vector3) -> Float:
+    """Twice ∫ cos θ dω over the part above the horizon of a convex polygon, sr; its sign is that of the order of the
+    corners.
+
+    Lambert's formula, Σ γ_i (Γ_i · n), with γ_i the angle that edge i subtends and Γ_i the unit normal of the plane
+    through the point and that edge ([lambert1760]; for polygons [baum1989]). Clipping a convex polygon at a plane
+    shortens its edges and adds one edge along the horizon.
+
+    Parameters
+    ----------
+    rays : from the point to each corner, in order.
+    normal : unit Vector3f per lane.
+    """
+    import drjit as dr
+
+    heights = [dr.dot(ray, normal) for ray in rays]
+    total = mi.Float(0.0)
+    leaving, entering = dr.zeros(mi.Vector3f), dr.zeros(mi.Vector3f)
+    crosses = mi.Bool(False)
+    for k, (a, height_a) in enumerate(zip(rays, heights, strict=True)):
+        following = (k + 1) % len(rays)
+        b, height_b = rays[following], heights[following]
+        above_a, above_b = height_a >= 0, height_b >= 0
+        on_horizon = dr.fma(b - a, height_a / (height_a - height_b), a)
+        first, second = dr.select(above_a, a, on_horizon), dr.select(above_b, b, on_horizon)
+        total += dr.select(above_a | above_b, _edge(first, second, normal), 0.0)
+        leaving = dr.select(above_a & ~above_b, on_horizon, leaving)
+        entering = dr.select(~above_a & above_b, on_horizon, entering)
+        crosses |= above_a != above_b
+    return total + dr.select(crosses, _edge(leaving, entering, normal), 0.0)
 
 
 def _edge(first: Vector3, second: Vector3, normal: Vector3) -> Float:

@@ -200,7 +200,12 @@ class MattIntegrator:
                 (number * self._filters + filter_index) * self._colours + mi.UInt32(colour),
                 asks,
             )
-            lit = dr.fma(scale, dr.select(blocked, open_ - share, open_), lit)
+            known = open_
+            if isinstance(light, _Sky) and scene.outlines:
+                # a share of the sky that is known to be hidden, and whether it hides this ray
+                part, hides = scene.hidden_sky(surface.world.p, normal, shadow.d, moment, asks)
+                known = open_ - part + hides
+            lit = dr.fma(scale, dr.select(blocked, known - share, known), lit)
             hidden = dr.fma(scale, dr.select(blocked, 0.0, share), hidden)
             unshadowed = dr.fma(scale, open_, unshadowed)
         return lit, hidden, unshadowed, met

@@ -25,6 +25,7 @@ from hesim_render.core.device_types import (
     Mask,
     MitsubaModule,
     MitsubaObject,
+    Point3,
     Ray,
     UInt32,
     Vector3,
@@ -37,6 +38,7 @@ from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.motion_bounds import stays_in
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode, require_paths
+from hesim_render.sources.render.transport.outlines import Screen, largest, outlines_of
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
 #: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
@@ -50,12 +52,14 @@ class Group:
     Parameters
     ----------
     name : name of the object.
+    scene : Mitsuba scene of the shapes at rest.
     part : the shapes at rest.
     trajectory : their motion.
     corners : bounding-box corners at rest, [n, 3], m.
     """
 
     name: str
+    scene: MitsubaObject
     part: Part
     trajectory: Trajectory
     corners: NDArray[np.float64]
@@ -168,11 +172,43 @@ class MovingScene:
         self._resting = Part(mi, self.static, apart=False)
         self.groups, faces = [], self._resting.face_count
         for name, shapes in parts.items():
-            part = Part(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False), apart=True, faces_before=faces)
+            own = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+            part = Part(mi, own, apart=True, faces_before=faces)
             corners = np.concatenate([part.corners for part in built.groups[name]])
-            self.groups.append(Group(name, part, built.trajectories[name], corners))
+            self.groups.append(Group(name, own, part, built.trajectories[name], corners))
             faces += part.face_count
         self._sort_groups()
+        self._find_outlines()
+
+    def _find_outlines(self) -> None:
+        """Outlines of what may hide the sky, in the frames of the resting part and of each group."""
+        known = largest([outlines_of(self.static), *(outlines_of(group.scene) for group in self.groups)])
+        #: Frame of each screen: number of the group, None for the resting part.
+        self.outlines = [
+            (None if number == 0 else number - 1, Screen(self.mi, found)) for number, found in enumerate(known) if found
+        ]
+
+    def hidden_sky(
+        self, point: Point3, normal: Vector3, direction: Vector3, moment: Moment, active: Mask
+    ) -> tuple[Float, Float]:
+        """Share of a uniform sky that outlines hide from surface points, and how many of them hide a direction; see
+        `Screen.hides`.
+
+        Parameters
+        ----------
+        point, normal, direction : in world space.
+        moment : time of each ray.
+        active : lanes in which a result is needed.
+        """
+        share, count = self.mi.Float(0.0), self.mi.Float(0.0)
+        for number, screen in self.outlines:
+            own = point, normal, direction
+            if number is not None:
+                pose = self._tracks.pose(number, moment.local_us(number))
+                own = pose.to_rest(point), pose.turn_to_rest(normal), pose.turn_to_rest(direction)
+            part, hides = screen.hides(*own)
+            share, count = share + part, count + hides
+        return share, count
 
     def _sort_groups(self) -> None:
         """Sort groups into those tested one by one and those tested in a loop."""

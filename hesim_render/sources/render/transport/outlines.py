@@ -1,0 +1,204 @@
+"""Flat convex outlines of what may hide a uniform sky, and the share of the sky that they hide, in closed form.
+
+A flat target hides from a point of a wall a part of the sky that Lambert's formula gives, and so does a closed convex
+body, face by face. Direct light takes these shares as a control variate (`matt`): shadow rays then only correct what
+the outlines do not describe, such as holes, other forms, and two outlines behind each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject, Point3, Vector3
+from hesim_render.sources.render.transport.irradiance import outline_above_horizon
+
+#: Largest number of outlines of a scene, the largest ones; each takes the time of a few dozen operations a ray.
+_MOST = 8
+#: Largest number of corners of an outline, and of shapes of a part that are searched for outlines.
+_MOST_CORNERS, _MOST_SHAPES = 8, 64
+#: Distance from a plane, over the size of what lies in it, up to which a point lies in the plane.
+_IN_PLANE = 1e-5
+#: Least part of an outline that the surface must fill.
+_FILLED = 0.98
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A flat convex polygon.
+
+    Parameters
+    ----------
+    corners : in order, [n, 3], m.
+    one_sided : True if only the side towards which the corners run anticlockwise hides anything: a face of a closed
+        body, whose other faces hide what lies behind.
+    """
+
+    corners: NDArray[np.float64]
+    one_sided: bool
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit normal of the side towards which the corners run anticlockwise."""
+        found = _twice_area(self.corners)
+        return found / np.linalg.norm(found)
+
+    @property
+    def area_m2(self) -> float:
+        return 0.5 * float(np.linalg.norm(_twice_area(self.corners)))
+
+
+def outlines_of(scene: MitsubaObject) -> list[Outline]:
+    """Outlines of the shapes of a part: of all of them together, if they lie in one plane and fill their hull; else of
+    each mesh that is flat, or closed and convex with few faces.
+    """
+    shapes = scene.shapes()
+    if not shapes or len(shapes) > _MOST_SHAPES or not all(shape.is_mesh() for shape in shapes):
+        return []
+    meshes = [
+        (np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3), np.array(shape.faces_buffer()))
+        for shape in shapes
+    ]
+    triangles = [corners[faces.astype(np.int64).reshape(-1, 3)] for corners, faces in meshes]
+    together = _flat(np.concatenate(triangles))
+    if together is not None:
+        return [together]
+    return [outline for each in triangles for outline in _of_mesh(each)]
+
+
+def _of_mesh(triangles: NDArray[np.float64]) -> list[Outline]:
+    flat = _flat(triangles)
+    if flat is not None:
+        return [flat]
+    return _faces_of_body(triangles)
+
+
+def _flat(triangles: NDArray[np.float64]) -> Outline | None:
+    """Outline of triangles [n, 3, 3] that lie in one plane and fill their convex hull; None of others."""
+    points = np.unique(triangles.reshape(-1, 3), axis=0)
+    middle = points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(points - middle, full_matrices=True)
+    if len(points) < 3 or sizes[1] <= _IN_PLANE * sizes[0] or (len(sizes) > 2 and sizes[2] > _IN_PLANE * sizes[0]):
+        return None
+    try:
+        hull = ConvexHull((points - middle) @ axes[:2].T)
+    except QhullError:
+        return None
+    corners = _without_straight(points[hull.vertices])
+    outline = Outline(corners, one_sided=False)
+    filled = (
+        0.5
+        * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1).sum()
+    )
+    return outline if len(corners) <= _MOST_CORNERS and filled >= _FILLED * outline.area_m2 else None
+
+
+def _faces_of_body(triangles: NDArray[np.float64]) -> list[Outline]:
+    """Faces of a closed convex body with few faces; empty for other triangles [n, 3, 3]."""
+    if len(triangles) > 2 * _MOST:
+        return []
+    points = np.unique(triangles.reshape(-1, 3), axis=0)
+    size = float(np.ptp(points, axis=0).max())
+    found: list[Outline] = []
+    done = np.zeros(len(triangles), np.bool_)
+    for number, triangle in enumerate(triangles):
+        if done[number]:
+            continue
+        normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+        length = np.linalg.norm(normal)
+        if length <= _IN_PLANE * size**2:
+            return []
+        heights = (triangles - triangle[0]) @ (normal / length)
+        # outside of every face lies nothing
+        if heights.max() > _IN_PLANE * size:
+            return []
+        own = np.abs(heights).max(axis=1) <= _IN_PLANE * size
+        done |= own
+        face = _flat(triangles[own])
+        if face is None:
+            return []
+        forward = _twice_area(face.corners) @ normal > 0
+        found.append(Outline(face.corners if forward else face.corners[::-1], one_sided=True))
+    # the vector areas of a closed body add up to nothing
+    total = np.sum([_twice_area(face.corners) for face in found], axis=0)
+    return found if np.linalg.norm(total) <= _IN_PLANE * size**2 else []
+
+
+def _twice_area(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Twice the vector area of a polygon; about its first corner, so that places far away keep their digits."""
+    sides = corners[1:] - corners[0]
+    return np.cross(sides[:-1], sides[1:]).sum(axis=0)
+
+
+def _without_straight(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners of a polygon, without those on a straight line between their neighbours."""
+    before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    turn = np.linalg.norm(np.cross(before, after), axis=1)
+    return corners[turn > _IN_PLANE * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)]
+
+
+class Screen:
+    """Outlines of one part, on the device, in the frame in which the part rests.
+
+    Parameters
+    ----------
+    mi : the mitsuba module.
+    outlines : one or more.
+    """
+
+    def __init__(self, mi: MitsubaModule, outlines: Sequence[Outline]) -> None:
+        import drjit as dr
+
+        self._mi = mi
+        self._sides = [each.one_sided for each in outlines]
+        self._corners = [[mi.Point3f(corner) for corner in each.corners] for each in outlines]
+        self._planes = [
+            (mi.Vector3f(each.normal), mi.Float(float(each.normal @ each.corners[0])), mi.Float(_margin(each)))
+            for each in outlines
+        ]
+        dr.make_opaque(self._corners, self._planes)
+
+    def hides(self, point: Point3, normal: Vector3, direction: Vector3) -> tuple[Float, Float]:
+        """Share of a uniform sky that the outlines hide from surface points, and how many outlines hide a direction.
+
+        The mean of the second over directions with a cosine distribution about the normal is the first, to rounding.
+
+        Parameters
+        ----------
+        point, normal : of each lane, at rest with the part; unit normals.
+        direction : unit Vector3f above the horizon of each lane.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        share, count = mi.Float(0.0), mi.Float(0.0)
+        for corners, (plane, offset, margin), one_sided in zip(self._corners, self._planes, self._sides, strict=True):
+            height = dr.dot(plane, point) - offset
+            # from within its plane, an outline is a line and hides nothing
+            counts = height > margin if one_sided else abs(height) > margin
+            rays = [corner - point for corner in corners]
+            total = outline_above_horizon(mi, rays, normal)
+            share += dr.select(counts, abs(total) * (0.5 / pi), 0.0)
+            # seen from above, corners run anticlockwise, so that a direction inside is on the right of all edges
+            above = height > 0
+            for ray, following in zip(rays, [*rays[1:], rays[0]], strict=True):
+                side = dr.dot(direction, dr.cross(ray, following))
+                counts &= dr.select(above, side < 0, side > 0)
+            count += dr.select(counts, 1.0, 0.0)
+        return share, count
+
+
+def _margin(outline: Outline) -> float:
+    return _IN_PLANE * float(np.linalg.norm(np.ptp(outline.corners, axis=0)))
+
+
+def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
+    """The largest outlines of several parts, at most `_MOST` in all."""
+    every = sorted(((outline.area_m2, -number) for number, part in enumerate(parts) for outline in part), reverse=True)
+    least = every[_MOST - 1][0] if len(every) > _MOST else 0.0
+    return [[outline for outline in part if outline.area_m2 >= least] for part in parts]
