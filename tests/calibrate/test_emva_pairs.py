@@ -12,7 +12,7 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
-from hesim_render.calibrate.aps import light_curve, pair_levels
+from hesim_render.calibrate.aps import light_curve, pair_levels, spatial
 from hesim_render.calibrate.aps.pair_levels import pair_statistics
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
@@ -172,6 +172,16 @@ def test_errors_of_spatial_variances_are_their_scatter(fixed):
     if not fixed:
         true = np.array([0.64, 0.25, 5.29, 6.18])
         assert np.all(np.abs(values.mean(axis=0) - true) < 4.5 * errors / np.sqrt(800))
+
+
+def test_a_pixel_far_from_all_others_loses_only_its_own_noise():
+    """Nine deviations off, where six make a pixel an individual; the others are scaled to their variance."""
+    values = np.random.default_rng(9).standard_normal((50, 70))
+    values[3, 4] = 9.0
+    found = spatial._scaled(values, 0.36)
+    assert found[3, 4] == pytest.approx(np.sqrt(81 - 0.36))
+    rest = np.arange(3500).reshape(50, 70) != 3 * 70 + 4
+    assert np.mean(found[rest] ** 2) == pytest.approx(np.mean(values[rest] ** 2) - 0.36)
 
 
 def test_frames_that_neighbours_share_nothing_of_have_no_correlation(sections):

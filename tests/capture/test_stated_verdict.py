@@ -23,6 +23,15 @@ def meter(scatter, outliers=0.0, count=20_000, seed=3):
     return found
 
 
+def test_an_error_is_in_units_of_the_noise_at_the_mean_of_both_halves():
+    """Half of their difference: 4 at a level of 16, whose noise is 8."""
+    found = ErrorMeter()
+    found.add(
+        *(jit().Float(np.full(50, half, np.float32)) for half in (12.0, 20.0)), lambda level, _: 2 * np.sqrt(level)
+    )
+    assert found.as_dict()["rms"] == pytest.approx(0.5)
+
+
 def test_event_truth_is_the_mean_of_both_halves_and_half_of_their_difference():
     flux = EventFlux(2)
     for a, b in (([3.0, 8.0], [5.0, 7.0]), ([4.0, 2.0], [9.0, 3.0]), ([2.0, 5.0], [1.0, 11.0])):
