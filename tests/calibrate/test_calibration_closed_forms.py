@@ -98,6 +98,16 @@ def test_goodness_of_the_variance_fit(more):
     assert found.p_value == pytest.approx(ndtr(-deviation), rel=1e-4)
 
 
+def test_dark_current_is_the_mean_of_good_pixels():
+    rates = np.array([[60.0, 64.0, 900.0], [68.0, 72.0, 0.0]])
+    none = np.zeros((2, 3), bool)
+    bad, hot = none.copy(), none.copy()
+    hot[0, 2], bad[1, 2] = True, True
+    found = photon_transfer._dark_current(SimpleNamespace(n_dp=rates, bad=bad, hot=hot), {}, 0.4, 0.03)
+    assert found["value"] == pytest.approx(66 / 0.4)
+    assert found["standard_error"] == pytest.approx(np.hypot(np.sqrt(20 / 4) / 0.4, 66 / 0.4 * 0.03))
+
+
 def test_read_noise_is_the_root_of_the_mean_variance_with_its_error():
     """σ = √β0: an error e of β0 is e/2σ of σ; of two positions the mean has half the root of the sum."""
     fits = {
