@@ -39,6 +39,15 @@ class _ClipContent(BaseModel):
     name: FileName
     split: Split
     scene: int
+    motion: int
+    light: int
+    sensor: str
+    noise: str
+    seed: int
+    exposure_us: float | None
+    counts: dict[str, int]
+    figures: dict[str, Any]
+    render: dict[str, Any]
     parts: list[str]
     files: dict[PathBelow, _FileEntry]
 

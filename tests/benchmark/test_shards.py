@@ -208,6 +208,17 @@ def test_a_clip_with_another_name_than_its_folder_writes_nothing(built, tmp_path
     assert found == before
 
 
+@pytest.mark.parametrize("key", ["sensor", "noise", "seed", "motion", "exposure_us", "counts", "figures", "render"])
+def test_a_clip_that_lacks_a_key_is_told(built, tmp_path, key):
+    """`pack` ended with a KeyError."""
+    root = shutil.copytree(built.root, tmp_path / "b")
+    file = next(Benchmark(root).clips()).folder / "clip.json"
+    file.write_text(json.dumps({name: value for name, value in json.loads(file.read_text()).items() if name != key}))
+    with pytest.raises(SpecError, match=rf"clip\.json.*{key}"):
+        pack_benchmark(root, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("key", ["name", "split"])
 def test_a_manifest_that_names_other_folders_is_refused_and_nothing_is_discarded(built, tmp_path, key):
     root = shutil.copytree(built.root, tmp_path / "b")

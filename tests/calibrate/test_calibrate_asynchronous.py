@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
-from hesim_render.calibrate.asynchronous import checks
+from hesim_render.calibrate.asynchronous import checks, defects
 from hesim_render.calibrate.asynchronous.defects import classify, plainly_bad
 from hesim_render.calibrate.asynchronous.first_event import first_event
 from hesim_render.calibrate.asynchronous.trials import Parts, Trials, read_trials
@@ -147,6 +147,24 @@ def test_a_column_is_judged_from_25_events_and_25_trials_without_one(monkeypatch
     columns = checks._columns(SimpleNamespace(likelihood=likelihood, values=np.zeros(12), law="sqrt"))
     assert columns.expected == pytest.approx([26, 20, 74]) and columns.silent == pytest.approx([74, 80, 26])
     assert columns.residual == pytest.approx(np.array([[-2, 1, 3], [1, 7, 0]])) and columns.family.tolist() == [1, 0, 1]
+
+
+def test_events_where_there_can_be_none_are_counted_in_those_trials_alone(monkeypatch):
+    """Three steps with 400 trials each, that never, sometimes and always give an event; chance 1e-7 a pixel."""
+    chance = np.array([[1e-6, 0.45, 1 - 1e-6]]).T * np.ones((1, 2))
+    on = np.array([[0, 3, 0], [180, 180, 180], [400, 400, 390]])[:, None]
+    steps = Trials(
+        np.full(3, 100.0), np.array([0.05, 0.2, 0.4]), 1e-3, np.array([0.0, 1e-3]), np.full((3, 3), 400), on, 0 * on,
+        (1, 3),
+    )  # fmt: skip
+    steady = replace(steps, signal_dn=np.array([100.0]), contrast=np.zeros(1), calm=np.full((1, 3), 400), on=0 * on[:1])
+    steady = replace(steady, off=steady.on)
+    monkeypatch.setattr(defects, "chances", lambda _, trials, *__: chance[: len(trials.contrast), None])
+    monkeypatch.setattr(defects, "log_prior", lambda *_: np.zeros(2))
+    monkeypatch.setattr(defects.TrialCounts, "log_likelihood", lambda *_: np.zeros((3, 2)))
+    fit = SimpleNamespace(values=np.zeros(12), law="sqrt", likelihood=SimpleNamespace(grids=[np.array([0.2, 0.3])] * 2))
+    found = defects._tests(fit, steady, steps, 1)
+    assert found.tolist() == [[False] * 3, [False, False, True], [False, True, False]]
 
 
 def test_report_shows_curves_rates_and_maps(plain):

@@ -156,7 +156,7 @@ def test_mismatch_is_recovered_and_part_of_the_fit(mismatched):
 
 @pytest.mark.slow
 def test_mismatch_from_the_static_counts_alone(tmp_path):
-    capture_sets.write_events(tmp_path / "set", size=128, trials=20000, mismatch=0.05)
+    capture_sets.write_events(tmp_path / "set", size=(120, 136), trials=20000, mismatch=0.05)
     calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")
     section = read_calibration(tmp_path / "c.yaml")["evs"]
     assert section["threshold_mismatch"]["value"] == pytest.approx(0.05, rel=0.06)
@@ -172,7 +172,7 @@ def test_large_mismatch_is_recovered_from_steps_and_from_the_static_counts_alone
     """A z beyond 4 has a chance of 6e-5. No good one of 16,384 pixels is called bad, at a chance of 1e-7 each, but for
     those whose threshold came out at 0 or below (4 of its spreads at 25 %), which have an event at every tick."""
     both = capture_sets.generated(7, size=128, frames=8, mismatch=mismatch)
-    capture_sets.write_events(tmp_path / "set", size=128, trials=20000, mismatch=mismatch)
+    capture_sets.write_events(tmp_path / "set", size=(120, 136), trials=20000, mismatch=mismatch)
     injected = np.load(both / "truth_maps.npz")["evs_bad"]
     injected |= 1 + mismatch * np.random.default_rng(8).standard_normal(injected.shape) < 0.05
     for folder, source, bad in ((both, "steps", injected), (tmp_path / "set", "static counts", 0 * injected)):
@@ -231,13 +231,13 @@ def test_noise_differenced_from_tick_to_tick_gives_wider_errors(tmp_path):
 
 @pytest.mark.slow
 def test_asymmetry_and_leak_are_told_apart(tmp_path):
-    capture_sets.write_events(tmp_path / "a", size=96, trials=20000, rho=0.01)
+    capture_sets.write_events(tmp_path / "a", size=(88, 104), trials=20000, rho=0.01)
     calibrate_evs(tmp_path / "a", tmp_path / "a.yaml")
     section = read_calibration(tmp_path / "a.yaml")["evs"]
     assert section["asymmetry"]["value"] == pytest.approx(0.01, abs=4.5 * section["asymmetry"]["standard_error"])
     assert section["asymmetry"]["standard_error"] < 0.001
     assert section["leak_per_trial"]["value"] == 0
-    capture_sets.write_events(tmp_path / "b", size=96, trials=20000, leak=3e-4)
+    capture_sets.write_events(tmp_path / "b", size=(88, 104), trials=20000, leak=3e-4)
     calibrate_evs(tmp_path / "b", tmp_path / "b.yaml")
     section = read_calibration(tmp_path / "b.yaml")["evs"]
     leak = section["leak_per_trial"]
@@ -246,7 +246,7 @@ def test_asymmetry_and_leak_are_told_apart(tmp_path):
 
 
 def test_the_sqrt_law_is_recognised(tmp_path):
-    capture_sets.write_events(tmp_path / "set", size=128, trials=20000, law="sqrt", c=0.25, d=0.1)
+    capture_sets.write_events(tmp_path / "set", size=(120, 136), trials=20000, law="sqrt", c=0.25, d=0.1)
     calibrate_evs(tmp_path / "set", tmp_path / "c.yaml")
     section = read_calibration(tmp_path / "c.yaml")["evs"]
     assert section["shot_law"] == "sqrt"

@@ -2,13 +2,15 @@
 (`tests/support/still_pixels.py`), coverage of the intervals, what is not identifiable, and bad input.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from hesim_render.calibrate.recordings import calibrate_recordings, calibration, still
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
-from hesim_render.calibrate.recordings.tally import GROUPS, tally
+from hesim_render.calibrate.recordings.tally import GROUPS, LONG_US, tally
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.exchange import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
@@ -141,6 +143,16 @@ def test_dead_time(dead_us):
     assert hits >= 6
     slow = random_events(rng, np.full(PIXELS, 30.0), 0.0, seconds=3.0, shape=SHAPE)
     assert "no step" in dead_time([tally(EventStream.of(slow, SHAPE))])["reason"]
+
+
+def test_the_shortest_dead_time_is_judged_by_the_four_microseconds_after_it():
+    """30 intervals in each µs from 2 µs on: 120 of them are within a factor of two and a µs, and 100 are needed."""
+    counts = np.full(LONG_US, 30)
+    counts[:2] = 0
+    found = dead_time([SimpleNamespace(intervals=counts)])
+    assert found["value"] == pytest.approx(2, abs=0.01) and "90 % at 2 µs; 0 intervals are shorter" in found["note"]
+    counts[2:] = 24
+    assert "no step" in dead_time([SimpleNamespace(intervals=counts)])["reason"]
 
 
 def limited(rng, per_ms):

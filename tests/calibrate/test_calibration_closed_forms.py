@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.special import betainc, gammaincc, ndtr
+from scipy.stats import norm
 
 import hesim_render as hr
 from hesim_render.calibrate.aps import checks as frame_checks
@@ -22,6 +23,8 @@ from hesim_render.calibrate.asynchronous.first_event import correlation
 from hesim_render.calibrate.estimate import Spread, estimated
 from hesim_render.calibrate.evs import checks as event_checks
 from hesim_render.calibrate.evs import counts, dispersion
+from hesim_render.calibrate.evs import fitted as fitted_events
+from hesim_render.calibrate.evs import goodness as event_goodness
 from hesim_render.calibrate.evs.analysis import _with_conversion_error, step_in_ln
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.counts import StaticCapture
@@ -93,6 +96,16 @@ def test_goodness_of_the_variance_fit(more):
     assert found.expected_chi2 == pytest.approx(expected, rel=1e-6)
     deviation = (found.chi2_per_dof / expected - 1) * np.sqrt((count - 6) / (2 + 12 / (FRAMES - 1)))
     assert found.p_value == pytest.approx(ndtr(-deviation), rel=1e-4)
+
+
+def test_dark_current_is_the_mean_of_good_pixels():
+    rates = np.array([[60.0, 64.0, 900.0], [68.0, 72.0, 0.0]])
+    none = np.zeros((2, 3), bool)
+    bad, hot = none.copy(), none.copy()
+    hot[0, 2], bad[1, 2] = True, True
+    found = photon_transfer._dark_current(SimpleNamespace(n_dp=rates, bad=bad, hot=hot), {}, 0.4, 0.03)
+    assert found["value"] == pytest.approx(66 / 0.4)
+    assert found["standard_error"] == pytest.approx(np.hypot(np.sqrt(20 / 4) / 0.4, 66 / 0.4 * 0.03))
 
 
 def test_read_noise_is_the_root_of_the_mean_variance_with_its_error():
@@ -419,6 +432,37 @@ def test_counts_of_a_trinomial_law_have_no_dispersion(between, monkeypatch):
     found = dispersion.dispersion_in_time(given, fit, 0.7)
     assert abs(found.total - 1) < 5 * 0.011 and abs(found.difference - 1) < 5 * 0.011
     assert 0.006 < found.total_error < 0.02 and 0.006 < found.difference_error < 0.02
+
+
+def test_goodness_weighs_on_and_off_by_their_own_covariance(monkeypatch):
+    """In the dark all pixels are one group: χ² = Sᵀ Q⁻¹ S, S the sum of the residuals and Q that of their products.
+
+    Both polarities lie a little high and correlate by 0.8, which halves χ² against independent ones.
+    """
+    rng, trials, chance = np.random.default_rng(14), 900, {0: 0.31, 1: 0.17}
+    shared = rng.normal(0, 11, 400)
+    counts = np.stack([trials * chance[k] + 1.5 + shared + rng.normal(0, 5, 400) for k in (0, 1)])
+    pixels = SimpleNamespace(
+        is_dark=np.array([True, True]), cells=SimpleNamespace(trials=trials), single=lambda k: k, counts=counts,
+        signal_dn=np.zeros(400), weight=None,
+    )  # fmt: skip
+    monkeypatch.setattr(event_goodness, "probability", lambda _, k, *__: np.full(400, chance[k]))
+    found = event_goodness.goodness(pixels, np.zeros(6), 0.7, "linear", 1)
+    residual = counts - trials * np.array([[0.31], [0.17]])
+    total = residual.sum(axis=1)
+    assert found.chi2 == pytest.approx(total @ np.linalg.solve(residual @ residual.T, total), rel=1e-9)
+    assert found.dof == 1 and found.chi2 < 0.7 * np.sum(total**2 / np.sum(residual**2, axis=1))
+
+
+def test_likelihood_of_spread_thresholds_is_that_of_normal_counts(monkeypatch):
+    """Of their own variances, which may differ between laws: without constants."""
+    events, total, p = np.array([31.0, 40.0, 55.0]), np.array([100.0, 130.0, 150.0]), np.array([0.3, 0.33, 0.34])
+    variance = np.array([25.0, 90.0, 41.0])
+    cells = SimpleNamespace(events=events, total=total, relative=np.array([0.9, 1.0, 1.2]))
+    monkeypatch.setattr(fitted_events, "log_probability", lambda *_: (np.log(p), None))
+    monkeypatch.setattr(fitted_events, "cell_variance", lambda *_: variance)
+    found = fitted_events._log_likelihood(cells, np.zeros(6), 0.7, "linear", np.ones(3))
+    assert found == pytest.approx(norm.logpdf(events, total * p, np.sqrt(variance)).sum() + 1.5 * np.log(2 * np.pi))
 
 
 def test_the_error_of_the_mismatch_is_that_of_scores_along_the_fitted_thresholds():

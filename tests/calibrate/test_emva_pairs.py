@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import emva_camera
 import numpy as np
@@ -10,6 +12,8 @@ import pytest
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
+from hesim_render.calibrate.aps import light_curve, pair_levels, spatial
+from hesim_render.calibrate.aps.pair_levels import pair_statistics
 from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
 from hesim_render.calibrate.aps.sensor_file import write_sensor
@@ -71,6 +75,34 @@ def test_the_black_levels_error_at_few_exposures_is_that_of_rows_and_pixels_of_t
     found = [evaluate(emva_camera.in_memory(camera, seed)).black.error for seed in range(3)]
     # the noise of the rows is itself known to 3 %
     assert min(found) == pytest.approx(expected, rel=0.1)
+
+
+def test_light_that_changes_between_two_frames_is_no_noise_of_columns_or_rows():
+    rng = np.random.default_rng(3)
+    first, second = (np.rint(rng.normal(300, 9, (14, 23))).astype(np.uint16) for _ in range(2))
+    plain, brighter = pair_statistics(first, second, 4095), pair_statistics(first, second + np.uint16(21), 4095)
+    assert brighter[0] == pytest.approx(plain[0] + 10.5) and brighter[1] == pytest.approx(plain[1] - 21)
+    np.testing.assert_allclose(brighter[2:-2], plain[2:-2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("factor", (0.99, 1.01))
+def test_light_drifts_beyond_six_deviations_of_rows_and_pixels(factor):
+    """The mean of 14 rows, of variance 9 each and twice that in a difference, and of their 14 · 96 pixels of 4 DN²."""
+    frames = np.random.default_rng(4).integers(280, 320, (2, 14, 96), np.uint16)
+    change = factor * 6 * np.sqrt(2 * 9 / 14 + 2 * 4 / (14 * 96))
+    entry = SimpleNamespace(lit=True, error=lambda text: SpecError(text))
+    found = 300.0, change, 4.0, 0.1, 9.0, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0
+    drifts = pytest.raises(SpecError, match=r"the second frame is 2.3 % darker") if factor > 1 else nullcontext()
+    with drifts:
+        pair_levels._check(entry, found, *frames, 4095)
+
+
+def test_the_gradient_of_the_curve_is_that_of_finite_differences():
+    p, h, step = np.array([0.04, 5.0, -1.3, 0.7]), np.linspace(0.1, 1.1, 7), 1e-6
+    expected = [(light_curve._value(p + d, h) - light_curve._value(p - d, h)) / (2 * step) for d in step * np.eye(4)]
+    np.testing.assert_allclose(light_curve._gradient(p, h), expected, rtol=1e-7)
+    curve = light_curve.MeanCurve(p[0], 0.0, p[1:], np.zeros((4, 4)), 0.0)
+    np.testing.assert_allclose(curve.gradient(h), expected, rtol=1e-7)
 
 
 def test_saturation_is_between_the_levels_around_it(sections):
@@ -140,6 +172,16 @@ def test_errors_of_spatial_variances_are_their_scatter(fixed):
     if not fixed:
         true = np.array([0.64, 0.25, 5.29, 6.18])
         assert np.all(np.abs(values.mean(axis=0) - true) < 4.5 * errors / np.sqrt(800))
+
+
+def test_a_pixel_far_from_all_others_loses_only_its_own_noise():
+    """Nine deviations off, where six make a pixel an individual; the others are scaled to their variance."""
+    values = np.random.default_rng(9).standard_normal((50, 70))
+    values[3, 4] = 9.0
+    found = spatial._scaled(values, 0.36)
+    assert found[3, 4] == pytest.approx(np.sqrt(81 - 0.36))
+    rest = np.arange(3500).reshape(50, 70) != 3 * 70 + 4
+    assert np.mean(found[rest] ** 2) == pytest.approx(np.mean(values[rest] ** 2) - 0.36)
 
 
 def test_frames_that_neighbours_share_nothing_of_have_no_correlation(sections):

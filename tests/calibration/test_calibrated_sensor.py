@@ -20,7 +20,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.pixels.evs.stage import EvsStage
 
 ROOT = Path(__file__).parents[2]
-SIZE = 32
+SHAPE = 24, 40
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +29,10 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     reference = "{k: 0.2, t_ref_us: 10000}"
     keys = {"tile_rows": 1, "tile_cols": 1, "signal_reference": reference}
-    capture_sets.write_events(folder / "set", size=SIZE, trials=200_000, a=200.0, c=0.1, mismatch=0.05, **keys)
-    capture_sets.write_frames(folder / "set", size=SIZE, frames=16, **keys, theta_hardware_v=0.75e-3)
+    capture_sets.write_events(folder / "set", size=SHAPE, trials=200_000, a=200.0, c=0.1, mismatch=0.05, **keys)
+    capture_sets.write_frames(folder / "set", size=SHAPE, frames=16, **keys, theta_hardware_v=0.75e-3)
     rng, trials, contrast = np.random.default_rng(1), 400, np.linspace(-0.4, 0.4, 9)
-    own = 0.2 * (1 + 0.05 * rng.standard_normal((2, SIZE, SIZE)))
+    own = 0.2 * (1 + 0.05 * rng.standard_normal((2, *SHAPE)))
     on = rng.binomial(trials, ndtr((contrast[:, None, None] - own[0]) / 0.06))
     off = rng.binomial(trials - on, ndtr((-contrast[:, None, None] - own[1]) / 0.06))
     np.savez(folder / "set" / "evs_steps.npz", contrast=contrast, signal_dn=20.0, n_on=on, n_off=off, n_trials=trials)
@@ -42,7 +42,8 @@ def folder(tmp_path_factory):
     calibrate_evs(folder / "set", folder / "c.yaml")
     shutil.rmtree(folder / "set")
     text = (ROOT / "sensors" / "reference-mono.yaml").read_text()
-    for old, new in (("rows: 1024", "rows: 32"), ("cols: 1024", "cols: 32"), ("bit_depth: 12", "bit_depth: 10")):
+    changes = {"rows: 1024": f"rows: {SHAPE[0]}", "cols: 1024": f"cols: {SHAPE[1]}", "bit_depth: 12": "bit_depth: 10"}
+    for old, new in changes.items():
         assert old in text
         text = text.replace(old, new)
     text = re.sub(r"(?m)^quantum_efficiency:.*(\n +.*)*", "quantum_efficiency: qe.csv", text)
@@ -55,7 +56,7 @@ def drawn(sensor):
     """A frame, and events of three samples."""
     frame = sensor.aps.sample(np.full(sensor.layout.shape, 100.0), 10_000, seed=1)
     stage = EvsStage(sensor.evs, seed=2)
-    light = [jit().Float(np.full(SIZE * SIZE, value, np.float32)) for value in (50.0, 62.0, 50.0)]
+    light = [jit().Float(np.full(SHAPE[0] * SHAPE[1], value, np.float32)) for value in (50.0, 62.0, 50.0)]
     tick_us = sensor.spec.evs.tick_us
     events = np.concatenate([stage.step(values, (k + 1) * tick_us) for k, values in enumerate(light)])
     return frame.tobytes(), events.tobytes()
@@ -77,7 +78,7 @@ def test_a_sensor_that_was_loaded_needs_no_file(folder, tmp_path, used):
     response, dump = sensor.spectral_response(wavelength), sensor.spec.model_dump(mode="json")
     shutil.rmtree(here)
     kept["pickle"] = pickle.loads(kept["pickle"])
-    frame = pickle.loads(kept.pop("model")).sample(np.full((SIZE, SIZE), 100.0), 10_000, seed=1)
+    frame = pickle.loads(kept.pop("model")).sample(np.full(SHAPE, 100.0), 10_000, seed=1)
     assert frame.tobytes() == expected[0]
     for name, other in kept.items():
         assert drawn(other) == expected, name
@@ -178,7 +179,7 @@ def test_telegraph_pixels_forget_their_state_at_the_frame_rate_of_the_captures(f
     file = tmp_path / "here" / "c.yaml"
     section = read_calibration(file)["aps"]
     maps = tmp_path / "here" / section["maps"]["file"]
-    jumps = {name: np.zeros((SIZE, SIZE), np.float32) for name in ("amplitude_dn", "high_share", "correlation")}
+    jumps = {name: np.zeros(SHAPE, np.float32) for name in ("amplitude_dn", "high_share", "correlation")}
     for name, value in (("amplitude_dn", 40.0), ("high_share", 0.3), ("correlation", 0.8)):
         jumps[name][4, 9] = value
     capture_sets.change(maps, telegraph_change_hz=None, **{f"telegraph_{name}": array for name, array in jumps.items()})
@@ -186,7 +187,7 @@ def test_telegraph_pixels_forget_their_state_at_the_frame_rate_of_the_captures(f
     file.write_text(text)
     for changes in ({}, {"aps.frame_rate_hz": 90}):
         found = hr.load_sensor(tmp_path / "here" / "s.yaml", changes).aps.telegraph
-        assert found.place.tolist() == [4 * SIZE + 9]
+        assert found.place.tolist() == [4 * SHAPE[1] + 9]
         assert found.change_hz[0] == pytest.approx(-np.log(0.8) * 30, rel=1e-5)
     file.write_text(re.sub(r"(?m)^aps:$", "aps:\n  frame_rate_hz: 12.5", text))
     found = hr.load_sensor(tmp_path / "here" / "s.yaml").aps.telegraph

@@ -17,7 +17,7 @@ from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.capture_set import read_captures
 
-SIZE, TICK_US, LEAK = 32, 1700, 3e-4
+ROWS, COLS, TICK_US, LEAK = 24, 40, 1700, 3e-4
 HOT, FLICKERING = (3, 5), (20, 7)
 
 
@@ -29,13 +29,13 @@ def captured(tmp_path_factory):
     """
     folder = tmp_path_factory.mktemp("rates")
     keys = {"tile_rows": 1, "tile_cols": 1, "signal_reference": "{k: 0.2, t_ref_us: 10000}"}
-    capture_sets.write_events(folder / "set", size=SIZE, trials=64_000, a=200.0, c=0.1, leak=LEAK, **keys)
+    capture_sets.write_events(folder / "set", size=(ROWS, COLS), trials=64_000, a=200.0, c=0.1, leak=LEAK, **keys)
     rng, trials, parts = np.random.default_rng(8), 64_000, 64
     with np.load(folder / "set" / "evs_static.npz") as static:
         counts = {name: static[name] for name in ("n_on", "dark_n_on", "n_off", "dark_n_off")}
     by_part = np.stack(
         [rng.multinomial(n, np.full(parts, 1 / parts)) for n in (counts["dark_n_on"] + counts["dark_n_off"]).ravel()], 1
-    ).reshape(parts, SIZE, SIZE)
+    ).reshape(parts, ROWS, COLS)
     for name in ("n_on", "dark_n_on"):
         own = rng.binomial(trials // parts, 0.2, parts)
         counts[name][HOT] += own.sum()
@@ -50,7 +50,7 @@ def captured(tmp_path_factory):
         stream.write(f"tick_us: {TICK_US}\n")
     calibrate_evs(folder / "set", folder / "c.yaml")
     text = (Path(hr.__file__).parents[1] / "sensors" / "reference-mono.yaml").read_text()
-    text = text.replace("rows: 1024", "rows: 32").replace("cols: 1024", "cols: 32")
+    text = text.replace("rows: 1024", f"rows: {ROWS}").replace("cols: 1024", f"cols: {COLS}")
     (folder / "s.yaml").write_text(text + "\nnoise: c.yaml\n")
     (folder / "untold-s.yaml").write_text(text + "\nnoise: untold.yaml\n")
     return folder
@@ -79,7 +79,7 @@ def test_rates_do_not_depend_on_the_tick_of_the_simulation(captured):
         sensor = hr.load_sensor(captured / "s.yaml", {"evs.tick_us": tick_us})
         assert sensor.spec.evs.leak_rate_hz == pytest.approx(leak, rel=1e-9)
         found = sensor.evs.defects
-        assert sorted(found.place) == [HOT[0] * SIZE + HOT[1], FLICKERING[0] * SIZE + FLICKERING[1]]
+        assert sorted(found.place) == [HOT[0] * COLS + HOT[1], FLICKERING[0] * COLS + FLICKERING[1]]
         np.testing.assert_allclose(found.on_hz, hot.ravel()[found.place], rtol=1e-6)
         assert (found.change_hz > 0).tolist() == [False, True]
 
@@ -87,7 +87,7 @@ def test_rates_do_not_depend_on_the_tick_of_the_simulation(captured):
 def test_events_of_leak_come_as_often_at_any_tick(captured):
     """1024 pixels for 8 s at two ticks: 1463 events expected, 5 standard deviations."""
     sensors = [hr.load_sensor(captured / "s.yaml", {"evs.tick_us": tick_us}) for tick_us in (4000, 16000)]
-    expected = sensors[0].spec.evs.leak_rate_hz * SIZE**2 * 8
+    expected = sensors[0].spec.evs.leak_rate_hz * ROWS * COLS * 8
     for sensor in sensors:
         counted = 0
 
@@ -97,7 +97,7 @@ def test_events_of_leak_come_as_often_at_any_tick(captured):
                 counted += int(np.sum(origin == Origin.LEAK))
 
         stage = EvsStage(sensor.evs.without("shot", "dark_current"), 5, labels=Count())
-        light = jit().Float(np.full(SIZE**2, 300.0, np.float32))
+        light = jit().Float(np.full(ROWS * COLS, 300.0, np.float32))
         for t_us in range(0, 8_000_001, sensor.spec.evs.tick_us):
             stage.step(light, t_us)
         assert counted == pytest.approx(expected, abs=5 * expected**0.5)
@@ -120,6 +120,7 @@ def test_captures_without_a_tick_count_as_made_at_that_of_the_sensor_file(captur
         assert measured_maps(again.noise).intervals_s["evs"] == pytest.approx(1e-3)
     told = hr.load_sensor(captured / "untold-s.yaml", {"noise.tick_us": TICK_US})
     known = hr.load_sensor(captured / "s.yaml")
+    assert known.layout.maps.intervals_s["evs"] == pytest.approx(1.7e-3)  # that of the captures, not of the file
     assert told.spec.evs.leak_rate_hz == pytest.approx(known.spec.evs.leak_rate_hz, rel=1e-6)
     np.testing.assert_allclose(told.evs.defects.on_hz, known.evs.defects.on_hz, rtol=1e-5)
     np.testing.assert_allclose(told.evs.defects.change_hz, known.evs.defects.change_hz, rtol=1e-3)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
+from hesim_render.capture.event_flux import EventFlux
 from hesim_render.capture.scene_run import require_short
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import TooLongError
@@ -19,6 +20,22 @@ def meter(scatter, outliers=0.0, count=20_000, seed=3):
         types.Float(level + error * noise), types.Float(level - error * noise), lambda e, _: np.full(e.size, noise)
     )
     return found
+
+
+def test_an_error_is_in_units_of_the_noise_at_the_mean_of_both_halves():
+    """Half of their difference: 4 at a level of 16, whose noise is 8."""
+    found = ErrorMeter()
+    found.add(
+        *(jit().Float(np.full(50, half, np.float32)) for half in (12.0, 20.0)), lambda level, _: 2 * np.sqrt(level)
+    )
+    assert found.as_dict()["rms"] == pytest.approx(0.5)
+
+
+def test_event_truth_is_the_mean_of_both_halves_and_half_of_their_difference():
+    flux = EventFlux(2)
+    for a, b in (([3.0, 8.0], [5.0, 7.0]), ([4.0, 2.0], [9.0, 3.0]), ([2.0, 5.0], [1.0, 11.0])):
+        flux.add(*(jit().Float(np.array(half, np.float32)) for half in (a, b)))
+    assert flux.mean_e_per_s() == pytest.approx([4, 6]) and flux.stderr_e_per_s() == pytest.approx([1, 1])
 
 
 def test_a_run_is_too_long_beyond_its_limit_in_minutes():

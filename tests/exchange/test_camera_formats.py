@@ -375,6 +375,11 @@ def test_other_packings_of_prophesees_layout_are_read(tmp_path):
     with pytest.raises(SpecError, match="does not state the size"):
         open_events(path)
     np.testing.assert_array_equal(joined(open_events(path, "prophesee", SHAPE)), events)
+    for polarity in (2, -2):  # −1 is OFF in some files, as 0 is
+        with h5py.File(path, "r+") as file:
+            file["CD/events"][301, "p"] = polarity
+        with pytest.raises(SpecError, match="events that are none, from number 297"):
+            joined(open_events(path, "prophesee", SHAPE))
 
 
 def damaged(path, change):

@@ -283,7 +283,7 @@ def test_an_offset_counts_up_to_four_deviations_of_what_is_likely():
     """
     noise, row_std = noise_of(((0,),)), 3.0
     limit = 4 * np.sqrt(1.5 * (row_std**2 + (0.64 + 1 / 12 + 0.16 * 50) / 96))
-    for factor, share in ((0.98, 0.818), (1.02, 0.658), (1.96, 0.656), (2.04, 0.0)):
+    for factor, share in ((0.998, 0.818), (1.002, 0.658), (1.96, 0.656), (2.04, 0.0)):
         flat = np.full((31, 96), 50.0, np.float32)
         flat[15] += factor * limit
         found = row_offsets(flat, [[0]], noise, row_std)

@@ -7,6 +7,7 @@ from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 from hesim_render.core.errors import RangeError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
 from hesim_render.spectral import transfer
+from hesim_render.spectral.transfer import from_root, to_root
 
 RNG = np.random.default_rng(11)
 
@@ -215,6 +216,26 @@ def test_noise_reduction_lowers_noise_and_keeps_edges():
     np.testing.assert_allclose(step, [0.5, 0.3, 0.4], rtol=0.06)
     np.testing.assert_allclose(smooth.reduce_noise(noisy, 0, 0), noisy, atol=1e-6)
     assert psnr(found, clean) > psnr(noisy, clean) + 4
+
+
+def test_colour_is_smoothed_over_twice_the_radius():
+    """An even brightness guides nothing: two means over 2 · 2 · 3 + 1 pixels reach 12 pixels far."""
+    root = np.full((41, 49, 3), 0.5, np.float32)
+    root[20, 24] += [0.06, -0.02, -0.04]
+    found = to_root(smooth.reduce_noise(from_root(root), luma=0, chroma=0.05, radius_px=3)) - 0.5
+    row, col = np.nonzero(np.abs(found).max(axis=2) > 1e-5)
+    assert (row.min(), row.max(), col.min(), col.max()) == (8, 32, 12, 36)
+
+
+def test_a_patch_is_as_far_to_each_side_of_its_centre():
+    """On a ramp its mean is that of its centre, whatever its size; rows and columns are as far apart as they are."""
+    row, col = np.mgrid[0:90, 0:160]
+    image = np.stack([row, col, row + 2 * col], axis=-1).astype(np.float32)
+    corners = [(12, 15), (12, 140), (72, 140), (72, 15)]
+    found = chart.patch_means(image, corners)
+    centres = chart.patch_centres(corners)
+    np.testing.assert_allclose(found[:, :2], centres, atol=0.51)
+    np.testing.assert_allclose(found[:, :2].mean(axis=0), [42, 77.5], atol=0.02)
 
 
 def test_guided_filter_against_its_definition():

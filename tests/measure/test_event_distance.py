@@ -1,10 +1,13 @@
 """Distances of two streams of events: equal laws are not far apart, each change shows in its own figure."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange import EventStream
+from hesim_render.measure import event_distance
 from hesim_render.measure.event_distance import event_distances, event_statistics
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
@@ -96,3 +99,11 @@ def test_bad_input_is_one_clear_error():
     other = EventStream.of(made(rng.integers(0, 10**6, 5000), rng.integers(0, 100, 5000), np.ones(5000, int)), (31, 40))
     with pytest.raises(SpecError, match="is of 40x31 px; expected 37x31"):
         event_distances(one, event_statistics(other))
+
+
+def test_neighbours_that_are_active_together_more_often_than_by_chance_correlate():
+    """A quarter of 4 by 6 pixels is active; neighbours at four distances together in 0.1, 0.0625, 0.25 and 0.04."""
+    pairs, both = np.array([4 * 5, 3 * 6, 4 * 4, 2 * 6]), np.array([0.1, 0.0625, 0.25, 0.04])
+    active = np.append(0.25 * 24, pairs * both)[None] * 400
+    found = event_distance._over_space(SimpleNamespace(active=active, shape=(4, 6), windows=400), np.array([0]))
+    assert found == pytest.approx((both - 0.0625) / (0.25 * 0.75)) and found[1] == 0

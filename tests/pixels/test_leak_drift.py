@@ -10,7 +10,9 @@ from scipy import stats
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.evs.events import EVENT_DTYPE, Origin
 from hesim_render.pixels.evs.labels import Labeller
+from hesim_render.pixels.evs.leak_drift import LeakDrift
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.sensor.reading import read_sensor
@@ -160,6 +162,18 @@ def test_changing_light_is_integrated():
     assert one.size == int(0.4 * (5.0 + last) / 2)
     # between two samples a noiseless level is one straight line: the mean current
     assert abs(one[-1] - expected[-1]) < 1.1e6 / (0.5 * (5.0 + last))
+
+
+def test_an_on_event_is_the_drifts_from_half_a_threshold_on():
+    """At 2 Hz the drift has passed 0.45 and 0.55 of a threshold after 225 and 275 ms; OFF events are never its own."""
+    drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.0, "rate_hz_per_dn": 0.0, "spread": 0.0}))
+    dark = jit().Float(np.zeros(PIXELS, np.float32))
+    drift.start(dark, True, np.zeros(PIXELS), np.zeros(PIXELS))
+    given = [(225, 3, 1, 1), (275, 4, 1, 1), (290, 2, 7, -1), (490, 4, 1, 1), (530, 3, 1, 1), (560, 2, 7, 1)]
+    events = np.array([(1000 * ms + 50, x, y, p) for ms, x, y, p in given], EVENT_DTYPE)
+    drift.pass_by(events, SHAPE[1], dark, 50, 600_050)
+    # the third pixel's ON comes 0.54 after its own OFF, the others' second ones 0.43 and 0.61 after their first
+    assert (events["polarity"] == Origin.DRIFT).tolist() == [False, True, False, False, True, True]
 
 
 def test_origin_and_label():

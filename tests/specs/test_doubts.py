@@ -61,10 +61,11 @@ def test_dark_and_overexposed_frames_are_told():
     frame.electrons_mean[valid] = 3.0
     with pytest.warns(HesimWarning, match=r"frame 1, .*nearly dark: 99 % .* fewer than 3 e⁻, at a read noise of 5 e⁻"):
         warn_of_exposure(recording)
-    frame.electrons_mean[valid] = 0.0  # no light at all is meant
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_of_exposure(recording)
+    for electrons in (5.1, 0.0):  # more than the read noise; no light at all is meant
+        frame.electrons_mean[valid] = electrons
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warn_of_exposure(recording)
     frame.electrons_mean[:] = mean
     places = valid.nonzero()
     count = places[0].size * 2 // 3

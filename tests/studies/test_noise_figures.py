@@ -1,13 +1,14 @@
 """Noise after colour correction: hand calculations, and samples of the noise model."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hesim_render as hr
 from hesim_render.core.errors import RangeError
-from hesim_render.studies import ChannelNoise, channel_noise, dynamic_range_db, light_for_snr, output_noise
+from hesim_render.studies import ChannelNoise, channel_noise, chart_noise, dynamic_range_db, light_for_snr, output_noise
 from hesim_render.studies.colour_noise import saturation_e
 
 MATRIX = np.array([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.7, 1.7]])
@@ -157,3 +158,15 @@ def test_a_matrix_of_another_size_is_refused():
         output_noise(MATRIX, [1.0, 2.0], photon_noise(2))
     with pytest.raises(RangeError, match="above 0"):
         output_noise(MATRIX, [1.0, 2.0, 0.0], photon_noise(3))
+
+
+def test_colours_of_noisy_frames_are_those_of_the_matrix_to_xyz():
+    """Frames whose patches have their true colours, and noise on the grey card alone: no difference is left."""
+    rng = np.random.default_rng(4)
+    rgb_matrix, xyz_matrix = np.eye(3) + 0.1 * rng.random((2, 3, 3))
+    xyz, white = rng.uniform(0.2, 0.7, (5, 3)), np.array([0.95, 1.0, 1.09])
+    patches = np.broadcast_to((xyz @ np.linalg.inv(xyz_matrix).T)[None, :, None], (3, 5, 8, 3))
+    grey = 0.18 + 0.01 * rng.standard_normal((3, chart_noise.GREYS, 8, 3))
+    samples = SimpleNamespace(xyz=xyz, white_xyz=white)
+    found = chart_noise.measured_figures(np.concatenate([patches, grey], axis=1), rgb_matrix, xyz_matrix, samples)
+    assert found["delta_e_noisy"].value < 1e-6 < found["noise_amplification"].value

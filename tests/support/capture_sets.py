@@ -26,6 +26,11 @@ def truth(folder):
     return json.loads((folder / "truth.json").read_text())
 
 
+def shape_of(size):
+    """Rows and columns: a pair of them, or one number for both."""
+    return (size, size) if isinstance(size, int) else size
+
+
 def write_description(folder, **keys):
     folder.mkdir(parents=True, exist_ok=True)
     lines = {"bit_depth": 10, "tile_rows": 2, "tile_cols": 2} | keys
@@ -33,21 +38,21 @@ def write_description(folder, **keys):
 
 
 def write_frames(
-    folder, *, size=64, frames=32, dark_s=(2e-3, 5e-3, 20e-3), lit_s=(2e-3, 5e-3, 20e-3), gain=0.25, read_noise_e=6.0,
-    dark_e_per_s=2000.0, dsnu_e=4.0, prnu=0.0, full_well_e=1e9, brightest_e_per_s=1.6e5, dimmest=0.02, black=64.0,
-    full_scale=1023, flat=False, seed=5, **keys,
+    folder, *, size=(56, 72), frames=32, dark_s=(2e-3, 5e-3, 20e-3), lit_s=(2e-3, 5e-3, 20e-3), gain=0.25,
+    read_noise_e=6.0, dark_e_per_s=2000.0, dsnu_e=4.0, prnu=0.0, full_well_e=1e9, brightest_e_per_s=1.6e5,
+    dimmest=0.02, black=64.0, full_scale=1023, flat=False, seed=5, **keys,
 ):  # fmt: skip
     """Frames of the physical form, DN = clip(round(K min(Poisson((1 + PRNU) I + D t), full well) + read + N_FP))."""
-    rng = np.random.default_rng(seed)
-    xx = np.mgrid[0:size, 0:size][1] / (size - 1)
-    rate = brightest_e_per_s * (np.ones((size, size)) if flat else dimmest + (1 - dimmest) * xx)
-    rate = rate * (1 + prnu * rng.standard_normal((size, size)))
-    offset = black + gain * dsnu_e * rng.standard_normal((size, size))
+    rng, shape = np.random.default_rng(seed), shape_of(size)
+    xx = np.linspace(0, 1, shape[1]) + np.zeros(shape)
+    rate = brightest_e_per_s * (np.ones(shape) if flat else dimmest + (1 - dimmest) * xx)
+    rate = rate * (1 + prnu * rng.standard_normal(shape))
+    offset = black + gain * dsnu_e * rng.standard_normal(shape)
 
     def shoot(exposures_s, light):
-        stack = np.empty((len(exposures_s), frames, size, size), np.uint16)
+        stack = np.empty((len(exposures_s), frames, *shape), np.uint16)
         for k, t in enumerate(exposures_s):
-            electrons = np.minimum(rng.poisson((light + dark_e_per_s) * t, (frames, size, size)), full_well_e)
+            electrons = np.minimum(rng.poisson((light + dark_e_per_s) * t, (frames, *shape)), full_well_e)
             value = gain * (electrons + read_noise_e * rng.standard_normal(electrons.shape)) + offset
             stack[k] = np.clip(np.rint(value), 0, full_scale)
         return stack
@@ -65,16 +70,16 @@ def save_frames(folder, name, frames, exposures_s, **more):
 
 
 def write_events(
-    folder, *, size=64, trials=5000, brightest=40.0, a=29.0, b=6240.0, c=0.03, d=0.0, theta_v=0.75e-3, rho=0.0,
+    folder, *, size=(56, 72), trials=5000, brightest=40.0, a=29.0, b=6240.0, c=0.03, d=0.0, theta_v=0.75e-3, rho=0.0,
     leak=0.0,     law="linear", dark=True, ramp=True, seed=3, mismatch=0.0, **keys,
 ):  # fmt: skip
     """Static counts of the event model with thresholds θ (1 ∓ ρ), leak events and a choice of shot law."""
     from scipy.special import ndtr
 
-    rng = np.random.default_rng(seed)
-    xx = np.mgrid[0:size, 0:size][1] / (size - 1)
-    signal = 0.5 + brightest * xx if ramp else np.full((size, size), brightest)
-    scale = 1 + mismatch * rng.standard_normal((size, size))
+    rng, shape = np.random.default_rng(seed), shape_of(size)
+    xx = np.linspace(0, 1, shape[1]) + np.zeros(shape)
+    signal = 0.5 + brightest * xx if ramp else np.full(shape, brightest)
+    scale = 1 + mismatch * rng.standard_normal(shape)
 
     def draw(light):
         y = c * (light if law == "linear" else np.sqrt(light))
