@@ -1,89 +1,151 @@
-"""Outlines of moving objects and steps of motion hold for lenses with distortion and with a depth of field."""
+"""Flat outlines that hide a part of a uniform sky: closed forms against rays that are intersected in NumPy."""
 
-import cv2
 import numpy as np
 import pytest
-import rendering
-from scipy.spatial.transform import Rotation
 
-from hesim_render.mosaic.schedule import CELL_US
-from hesim_render.sources.render.camera import place_camera
-from hesim_render.sources.render.change_driven.sample_instants import STEP_PX, MotionClock
-from hesim_render.sources.render.change_driven.small_objects import Zoom
-from hesim_render.sources.render.change_driven.tuning import TUNING
-from hesim_render.sources.render.scene.trajectory import Trajectory
-from hesim_render.specs.motion import TrackSpec
+import hesim_render as hr
+from hesim_render.core.rng import Stream
+from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
+from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport.outlines import Outline, Screen, largest, outlines_of
 
-END_US = 8_000
-TRACK = [{"t_us": 0}, {"t_us": END_US, "translation_m": [0.2, 0.1, 0.15], "rotation_deg": 35}]
-SIZE, PLACE = np.array([0.9, 0.04, 0.3]), np.array([0.3, 0.55, -0.1])
-LENSES = {
-    "barrel": {"lens__distortion": {"model": "opencv", "k1": -0.28, "k2": 0.06, "p1": 2e-3}},
-    "fisheye": {"lens__distortion": {"model": "fisheye"}},
-    "pincushion, out of focus": {
-        "lens__distortion": {"model": "opencv", "k1": 0.2}, "lens__depth_of_field": True, "lens__f_number": 0.12,
-        "lens__magnification": "focus", "geometry__pitch_um": 100.0},
-}  # fmt: skip
+#: A skew quadrilateral in a tilted plane.
+QUAD = np.array([[-0.7, -0.2, 0.1], [0.5, -0.4, 0.3], [0.9, 0.6, 0.52], [-0.3, 0.8, 0.28]])
+QUAD[:, 2] = 0.2 * QUAD[:, 0] - 0.1 * QUAD[:, 1] + 0.4
 
 
-def scene():
-    """A long bar near the upper border of a wide picture, which moves and turns."""
-    bar = {"name": "bar", "shape": "box", "size_m": SIZE.tolist(), "position_m": PLACE.tolist(), "reflectance": 0.5}
-    return rendering.make_scene(
-        objects=[bar], light=rendering.FURNACE, motion=[{"object": "bar", "keyframes": TRACK}],
-        camera={"origin_m": [0, 0, 1], "horizontal_fov_deg": 85, "focus_distance_m": 0.6},
-    )  # fmt: skip
+def directions(normal, count, rng):
+    """Cosine-distributed directions about a normal."""
+    radius, angle = np.sqrt(rng.random(count)), 2 * np.pi * rng.random(count)
+    side = np.cross(normal, [0.3, 0.5, -0.8])
+    side /= np.linalg.norm(side)
+    other = np.cross(normal, side)
+    return (
+        (radius * np.cos(angle))[:, None] * side
+        + (radius * np.sin(angle))[:, None] * other
+        + np.sqrt(1 - radius**2)[:, None] * normal
+    )
 
 
-@pytest.mark.parametrize("name", LENSES)
-def test_an_outline_contains_all_that_the_lens_shows_of_an_object(name):
-    tracer = rendering.pair_tracer(scene(), rendering.mono(320, 240, **LENSES[name]))
-    view, rng = tracer.view, np.random.default_rng(3)
-    zoom = Zoom(view, None, tracer.parts.groups, False, TUNING)
-    begin, end = 2_000.0, 3_000.0
-    outline = zoom._outline(0, tracer.parts.groups[0], begin, end)
-    assert outline is not None
-    # points all over the bar's surface, at times of the window
-    points = rng.uniform(-0.5, 0.5, (20_000, 3))
-    points[np.arange(20_000), rng.integers(0, 3, 20_000)] = rng.choice([-0.5, 0.5], 20_000)
-    share = rng.uniform(begin, end, 20_000) / END_US
-    turn = Rotation.from_rotvec(np.outer(share * np.radians(35), [0, 0, 1]))
-    world = turn.apply(points * SIZE + PLACE) + share[:, None] * TRACK[1]["translation_m"]
-    local = (world - [0, 0, 1]) * [1, -1, -1]
-    tangent = local[:, :2] / local[:, 2:]
-    optics, lens = view.sensor.optics, view.sensor.lens
-    if optics.depth_of_field:
-        # through a point of the pupil, the point is seen where that ray meets the plane in focus
-        around, out = rng.uniform(0, 2 * np.pi, 20_000), np.sqrt(rng.uniform(0, 1, 20_000)) * lens.pupil_radius_m
-        pupil = out[:, None] * np.stack([np.cos(around), np.sin(around)], axis=1)
-        tangent = tangent - pupil / local[:, 2:] + pupil / lens.focus_distance_m
-        assert 4 < lens.pupil_radius_m * view.projection.focal_px * abs(1 / local[:, 2].max() - 1 / 0.6) < 20
-    project = cv2.fisheye.projectPoints if optics.distortion.model == "fisheye" else cv2.projectPoints
-    k = np.diag([view.projection.focal_px] * 2 + [1.0])
-    k[:2, 2] = view.projection.centre_px
-    direction = np.column_stack([tangent, np.ones(20_000)]).reshape(-1, 1, 3)
-    place = project(direction, np.zeros(3), np.zeros(3), k, np.array(optics.distortion.coefficients))[0].reshape(-1, 2)
-    place = place[np.hypot(*tangent.T) < view.projection.distortion.limit] + 0.5
-    assert len(place) > 10_000
-    assert outline.inside(*place.T, TUNING.zoom_margin_px).all()
-    # and not by being everywhere: a straight outline of the corners alone is not much smaller
-    assert np.ptp(place, axis=0).prod() > 0.5 * np.prod(outline.high - outline.low)
+def meets_polygon(corners, point, along):
+    """Which rays meet a convex polygon: by its plane, and by the sides of its edges in that plane."""
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    t = ((corners[0] - point) @ normal) / (along @ normal)
+    at = point + t[:, None] * along
+    turns = [
+        np.cross(following - corner, at - corner) @ normal
+        for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
+    return (t > 0) & np.all(np.array(turns) >= 0, axis=0)
 
 
-@pytest.mark.parametrize("name", ["barrel", "fisheye"])
-def test_nothing_moves_farther_than_a_step_between_two_instants_of_a_turning_camera(name):
-    sensor = rendering.mono(320, 240, **LENSES[name])
-    view = place_camera(scene().spec, sensor)
-    keys = [{"t_us": 0}, {"t_us": 1_000_000, "rotation_axis": [0.3, 1, 0.2], "rotation_deg": 50}]
-    turn = Trajectory(TrackSpec.model_validate({"object": "camera", "pivot_m": [0, 0, 1], "keyframes": keys}))
-    instants = MotionClock(view, turn, [], lambda t: 1.0).instants_us(0, 4 * CELL_US)
-    left, right, top, bottom = view.region_mm
-    x, y = np.meshgrid(np.linspace(left, right, 21) / 5e-3 + 511.5, np.linspace(top, bottom, 17) / 5e-3 + 511.5)
-    rays = view.projection.unproject(np.stack([x.ravel(), y.ravel()], axis=-1))
-    worst = 0.0
-    for begin, end in zip(instants[:-1], instants[1:], strict=True):
-        first, second = (turn.matrix(float(t))[:3, :3] @ view.camera_to_world[:3, :3] for t in (begin, end))
-        moved = view.projection.project(rays @ first.T @ second) - view.projection.project(rays)
-        worst = max(worst, np.abs(np.linalg.norm(moved, axis=1)).max())
-    assert np.diff(instants).max() > 20  # 10 µs is the least
-    assert 0.03 * STEP_PX < worst <= STEP_PX
+def hides(outlines, points, normals, along):
+    """`Screen.hides` of one point, normal and direction for each lane."""
+    mi = mitsuba()
+    vectors = [mi.Vector3f(np.ascontiguousarray(v.T, np.float32)) for v in (points, normals, along)]
+    share, count = Screen(mi, outlines).hides(mi.Point3f(vectors[0]), vectors[1], vectors[2])
+    return np.array(share), np.array(count)
+
+
+@pytest.mark.parametrize("point", [
+    (0.1, 0.2, -0.35), (0.3, -0.1, 1.1), (1.4, 0.2, 0.45), (-2.0, 1.3, 0.9), (0.15, 0.1, 0.37),
+])  # fmt: skip
+@pytest.mark.parametrize("normal", [(0.2, -0.1, 0.97), (-0.6, 0.3, -0.74), (0.9, 0.35, 0.26)])
+def test_the_share_is_that_of_rays(point, normal):
+    point, normal = np.array(point), np.array(normal) / np.linalg.norm(normal)
+    along = directions(normal, 60_000, np.random.default_rng(5))
+    outline = Outline(QUAD, one_sided=False)
+    share, count = hides([outline], np.tile(point, (60_000, 1)), np.tile(normal, (60_000, 1)), along)
+    expected = meets_polygon(QUAD, point, along)
+    assert np.mean(count != expected) < 2e-4  # rounding at edges
+    assert share[0] == pytest.approx(expected.mean(), abs=float(4 * np.sqrt(share[0] * (1 - share[0]) / 60_000) + 1e-5))
+
+
+def test_a_closed_body_hides_its_silhouette_once():
+    low, high = np.array([-0.4, -0.3, 0.2]), np.array([0.5, 0.1, 0.9])
+    body = mitsuba().load_dict({"type": "cube", "to_world": box_transform(low, high)})
+    outlines = outlines_of(mitsuba().load_dict({"type": "scene", "body": body}))
+    assert len(outlines) == 6 and all(face.one_sided for face in outlines)
+    rng = np.random.default_rng(3)
+    for point, normal in (((1.1, 0.4, -0.2), (-0.6, 0.2, 0.77)), ((0.1, -0.9, 0.6), (0.3, 0.9, 0.31))):
+        point, normal = np.array(point), np.array(normal) / np.linalg.norm(normal)
+        along = directions(normal, 40_000, rng)
+        t = np.sort(np.stack([(low - point) / along, (high - point) / along]), axis=0)
+        inside = (t[0].max(axis=1) <= t[1].min(axis=1)) & (t[1].min(axis=1) > 0)
+        share, count = hides(outlines, np.tile(point, (40_000, 1)), np.tile(normal, (40_000, 1)), along)
+        assert np.mean(count != inside) < 3e-4
+        assert 0.02 < inside.mean() and share[0] == pytest.approx(inside.mean(), abs=0.01)
+    # from its own faces, and from within, it hides nothing
+    own = np.array([[0.05, -0.1, 0.9], [0.5, 0.02, 0.44], [0.1, -0.1, 0.5]])
+    up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    share, count = hides(outlines, own, up, up)
+    np.testing.assert_allclose(share, 0, atol=1e-5)
+    np.testing.assert_array_equal(count, 0)
+
+
+def box_transform(low, high):
+    mi = mitsuba()
+    middle, half = (low + high) / 2, (high - low) / 2
+    return mi.ScalarTransform4f().translate(middle.tolist()).scale(half.tolist())
+
+
+def mesh(corners, faces):
+    """A Mitsuba scene of one mesh."""
+    mi = mitsuba()
+    made = mi.Mesh("made", vertex_count=len(corners), face_count=len(faces))
+    parameters = mi.traverse(made)
+    parameters["vertex_positions"] = np.asarray(corners, np.float32).ravel()
+    parameters["faces"] = np.asarray(faces, np.uint32).ravel()
+    parameters.update()
+    return mi.load_dict({"type": "scene", "made": made})
+
+
+def test_only_flat_and_filled_shapes_have_an_outline():
+    grid = np.array([[0.3 * x, 0.2 * y, 0.7] for y in range(4) for x in range(5)])
+    cell = [(5 * y + x, 5 * y + x + 1, 5 * y + x + 6, 5 * y + x + 5) for y in range(3) for x in range(4)]
+    triangles = [t for a, b, c, d in cell for t in ((a, b, c), (a, c, d))]
+    (outline,) = outlines_of(mesh(grid, triangles))
+    assert len(outline.corners) == 4 and not outline.one_sided
+    assert outline.area_m2 == pytest.approx(1.2 * 0.6)
+    assert abs(outline.normal[2]) == pytest.approx(1)
+    # a hole, a bend
+    assert outlines_of(mesh(grid, triangles[:8] + triangles[10:])) == []
+    bent = grid + np.where(grid[:, :1] > 0.7, [0, 0, 0.02], [0, 0, 0.0])
+    assert outlines_of(mesh(bent, triangles)) == []
+    # five faces of a box: it is open
+    mi = mitsuba()
+    cube = mi.load_dict({"type": "cube"})
+    corners = np.array(cube.vertex_positions_buffer()).reshape(-1, 3)
+    faces = np.array(cube.faces_buffer()).reshape(-1, 3)
+    assert len(outlines_of(mesh(corners, faces))) == 6
+    assert outlines_of(mesh(corners, faces[2:])) == []
+    # its corners the other way round: from outside, every face is a back
+    assert outlines_of(mesh(corners, faces[:, ::-1])) == []
+    assert outlines_of(mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})) == []
+
+
+def test_the_largest_outlines_count():
+    squares = [Outline(size * QUAD, one_sided=False) for size in np.linspace(0.5, 2.7, 12)]
+    kept = largest([squares[::2], squares[1::2]])
+    assert sorted(each.area_m2 for part in kept for each in part) == [each.area_m2 for each in squares[4:]]
+    assert kept[0] == squares[4::2] and kept[1] == squares[5::2]
+
+
+def test_light_beside_a_moving_target_has_no_bias_and_little_noise():
+    """A wall that a turning plate hides from a part of the sky: both estimators have one mean, and one little scatter."""
+    sensor = hr.load_sensor("davis346").crop(90, 40, 190, 205)
+    source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=3)
+    tracer, index = source._tracer, source._index
+    window, first = Windows(np.array([3700.0]), np.array([4100.0])), np.zeros(index.size, np.int64)
+    lit, hidden = (
+        tracer.trace(index, first, window, np.full(index.size, 256), np.full(index.size, by), Stream.AUDIT).mean
+        for by in (True, False)
+    )
+    pilot = tracer.pilot(index, first, window, 64, 1.0)
+    shadowed = (pilot.hidden < 0.97 * pilot.unshadowed) & (pilot.hidden_scatter > 0.1 * pilot.unshadowed)
+    assert np.count_nonzero(shadowed) > 500
+    difference = (lit - hidden)[shadowed] / pilot.unshadowed[shadowed]
+    assert abs(difference.mean()) < 4 * difference.std() / np.sqrt(difference.size)
+    calm = shadowed & (pilot.lit_scatter < 0.05 * pilot.hidden_scatter)
+    assert np.count_nonzero(calm) > 0.6 * np.count_nonzero(shadowed)
