@@ -1,4 +1,4 @@
-"""What `core.distinct` gains over NumPy's `unique`, at the sizes that a full sensor asks for; the results are compared.
+"""What `core.distinct` gains over NumPy's `unique` at the sizes of a full sensor; the results are compared.
 
     python benchmarks/distinct.py [--rows 2448] [--cols 3264]
 

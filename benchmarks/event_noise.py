@@ -6,7 +6,7 @@ A pixel of unit noise with thresholds a and b compares with the level at the end
 white noise through two equal poles that are -3 dB at 1/period together, exact at 16 nodes a period and linear between
 them, its amplitude scaled so that the time average of its variance is 1: the law of the simulator, written out again.
 
-The rate of a pixel in the stationary state is that of `hesim_render.pixels.evs.reference_law`, for any thresholds, dead
+The rate of a pixel in the stationary state is that of `hesim_render.pixels.evs.start`, for any thresholds, dead
 time and rate of leak events. That law holds for rare crossings. So it is corrected: pixels that begin in it are
 simulated for some hundred periods, and the ratio of both rates, without leak, is a factor of the table's entries. Where
 events are too rare to be counted, the factor is that of the next lower threshold. It is 1.7 where noise is as large as
@@ -24,7 +24,7 @@ import numpy as np
 from hesim_render.core.backend import jit
 from hesim_render.pixels.evs.formulas import POLE
 from hesim_render.pixels.evs.noise_rates import RateTable
-from hesim_render.pixels.evs.reference_law import Law, Pixels, law
+from hesim_render.pixels.evs.start import Law, Pixels, law
 
 LOWER = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.25, 7.0)
 DIFFERENCE = (0.0, 0.1, 0.25, 0.5, 0.8, 1.2, 1.8, 2.6, 3.6, 5.0, 7.5)

@@ -19,17 +19,17 @@ import argparse
 import time
 
 import numpy as np
+from learned_filter import LearnedFilter, area_under_curve, uniform_noise
 
 import hesim_render as hr
 from hesim_render.benchmark.event_filters import FILTERS
-from hesim_render.benchmark.learned_filter import LearnedFilter, area_under_curve, uniform_noise
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core import backend
 from hesim_render.pixels.evs.events import EventLabels, Label, no_events
+from hesim_render.sources.still import WindowByWindow
 from hesim_render.sources.video.flux import VideoFlux
 from hesim_render.sources.video.options import VideoOptions
-from hesim_render.sources.window_by_window import WindowByWindow
 
 SHAPE = (48, 64)
 #: Hot pixels of the known sensors, and defects of those of the test: more of them, of other rates, and another kind.

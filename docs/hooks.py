@@ -19,6 +19,8 @@ PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.
 CITED = re.compile(r"(?<!\])\[([a-z]+\d{4}[a-z]?(?:, [a-z]+\d{4}[a-z]?)*)\](?![(\[])")
 #: A symbol of one letter with an index.
 INDEXED = re.compile(r"(?<![\w/.:])([A-Za-zΔΘΛΣΦΨΩαβγδηθκλμνρσςτφχψωϱ])_([A-Za-z0-9]+)(?![A-Za-z0-9_/])")
+#: Characters of a cell from which a table does not fit on a telephone.
+LONG_CELL = 40
 #: Where docs/cli.md is to have what `--help-all` says of each command.
 COMMANDS = "<!-- commands -->"
 
@@ -91,6 +93,29 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     pieces[::2] = (INDEXED.sub(r"\1<sub>\2</sub>", piece) for piece in pieces[::2])
     markdown = "".join(pieces)
     return CITED.sub(linked, re.sub(r"(\]\([^)]*)\.ipynb\)", r"\1.md)", markdown))
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Fold the tests of equations; name cells of tables with long text by their heads, for narrow screens."""
+
+    def named(table: re.Match) -> str:
+        heads = [plain_text(head) for head in re.findall(r"<th[^>]*>(.*?)</th>", table.group(0), re.DOTALL)]
+        cells = re.findall(r"<td[^>]*>(.*?)</td>", table.group(0), re.DOTALL)
+        has_keys = len(heads) == 2 and any("<code>" in cell for cell in cells[::2])
+        if not (len(heads) > 2 or has_keys) or not any(len(plain_text(cell)) > LONG_CELL for cell in cells):
+            return table.group(0)
+        count = iter(range(len(cells)))
+        label = lambda match: f'<td data-label="{heads[next(count) % len(heads)]}"{match.group(1)}>'  # noqa: E731
+        return re.sub(r"<td([^>]*)>", label, table.group(0)).replace("<table", "<table data-long", 1)
+
+    folded = r"<details class=tests><summary>Checked by tests</summary>\1</details>"
+    html = re.sub(r"<p><em>Checked by</em> (.*?)</p>", folded, html, flags=re.DOTALL)
+    return re.sub(r"<table>.*?</table>", named, html, flags=re.DOTALL)
+
+
+def plain_text(html: str) -> str:
+    """The text of a piece of a page, for an attribute."""
+    return re.sub(r"<[^>]*>", "", html).strip().replace('"', "&quot;")
 
 
 @functools.cache

@@ -106,8 +106,8 @@ _FORMS = "tests/calibrate/test_calibration_closed_forms.py"
 FIXED = (
     Fixed(
         "variance polynomial: no correction for the noise of the signals",
-        "found[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]",
-        "found[:, n] += 0 * sums[:, n - 2 * j]",
+        "result[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]",
+        "result[:, n] += 0 * sums[:, n - 2 * j]",
         (_FORMS,),
     ),
     Fixed(
@@ -130,8 +130,8 @@ FIXED = (
     ),
     Fixed(
         "pixels that fire too little: the tail of the wrong threshold",
-        "found[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE",
-        "found[under] = binom.cdf(counts[under], trials, high[group[under]]) < _CHANCE",
+        "result[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE",
+        "result[under] = binom.cdf(counts[under], trials, high[group[under]]) < _CHANCE",
         (_FORMS,),
     ),
     Fixed(

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render import __version__
-from hesim_render.benchmark.card import write_card
+from hesim_render.benchmark.card import CROISSANT_FILE, croissant, write_card
 from hesim_render.benchmark.clip import CLIP_FILE, Clip, clip_folder, is_complete
-from hesim_render.benchmark.croissant import CROISSANT_FILE, croissant
 from hesim_render.benchmark.folder import CARD_FILE, MANIFEST_FILE, PLAN_FILE, SCHEMA, Benchmark, read_clip
 from hesim_render.benchmark.forecast import BuildEstimate, estimate_build
 from hesim_render.benchmark.generator import file_hash

@@ -8,10 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hesim_render.benchmark.colour_truth import COLOURS_FILE, frame_filters, write_colours
 from hesim_render.benchmark.generator import file_hash
 from hesim_render.benchmark.plan import BenchmarkPlan, Clip
-from hesim_render.benchmark.sharp import SHARP_FILE, sharp_flux, windows, write_sharp
+from hesim_render.benchmark.sharp import (
+    COLOURS_FILE,
+    SHARP_FILE,
+    frame_filters,
+    sharp_flux,
+    windows,
+    write_colours,
+    write_sharp,
+)
 from hesim_render.benchmark.spans import (
     Span,
     discard_spans,
@@ -96,16 +103,12 @@ def build_clip(plan: BenchmarkPlan, clip: Clip, root: Path) -> Built:
             content = json.loads(read_text(folder / CLIP_FILE))
             return Built(clip.name, 0.0, sum(entry["bytes"] for entry in content["files"].values()))
     begin = time.monotonic()
-    output = OutputFolder(folder, CLIP_FILE, overwrite=True)  # another worker may finish the same clip first
-    try:
+    # another worker may finish the same clip first
+    with OutputFolder(folder, CLIP_FILE, overwrite=True) as output:
         content = _fill(plan, clip, output.path, folder)
         with output_errors(folder):
             text = json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n"
             (output.path / CLIP_FILE).write_text(text, encoding="utf-8")
-        output.commit()
-    except BaseException:
-        output.discard()
-        raise
     discard_spans(folder)
     size = sum(entry["bytes"] for entry in content["files"].values())
     return Built(clip.name, time.monotonic() - begin, size)

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from hesim_render.benchmark.plan import Clip
-from hesim_render.benchmark.spans import Span
-from hesim_render.benchmark.units import Unit
+from hesim_render.benchmark.spans import Span, Unit
 from hesim_render.benchmark.worker import attempt
 from hesim_render.core.errors import BackendError, OutputError, RangeError
 from hesim_render.core.extras import how_to_install

@@ -104,12 +104,12 @@ def _longer_exposures(clips: Sequence[BenchmarkClip]) -> dict[str, list[Benchmar
         if content.get("exposure_us") is not None:
             key = tuple(content[name] for name in ("scene", "motion", "light", "sensor", "noise", "seed"))
             alike.setdefault(key, []).append(clip)
-    found = {}
+    result = {}
     for group in alike.values():
         first, *others = sorted(group, key=lambda clip: clip.content["exposure_us"])
         if others:
-            found[first.folder.name] = others
-    return found
+            result[first.folder.name] = others
+    return result
 
 
 def summary(scores: Sequence[Score]) -> Summary:
@@ -123,20 +123,20 @@ def summary(scores: Sequence[Score]) -> Summary:
     for score in scores:
         for name, value in score.values.items():
             values.setdefault((score.task, score.method, name), []).append(value)
-    found: Summary = {}
+    result: Summary = {}
     for (task, method, name), given in values.items():
         finite = np.array([value for value in given if np.isfinite(value)])
         entry: dict[str, float] = {"count": len(finite)}
         if len(finite):
             entry |= {"mean": float(finite.mean()), "std": float(finite.std())}
-        found.setdefault(task, {}).setdefault(method, {})[name] = entry
-    return found
+        result.setdefault(task, {}).setdefault(method, {})[name] = entry
+    return result
 
 
-def table(found: Summary) -> str:
+def table(result: Summary) -> str:
     """The means as a text table, one block for each task."""
     lines = []
-    for task, methods in found.items():
+    for task, methods in result.items():
         names = list(dict.fromkeys(name for values in methods.values() for name in values))
         lines.append(f"{task:<20}" + "".join(f"{name:>15}" for name in names))
         for method, values in methods.items():

@@ -43,9 +43,9 @@ def last_before(
     span = int(events["t_us"][-1]) - first + 1
     keys = np.sort(place * span + (given["t_us"].astype(np.int64) - first))  # by pixel, then by time
     wanted = asked * span + (events["t_us"].astype(np.int64) - first)
-    found = np.searchsorted(keys, wanted, side="left" if step_row == step_col == 0 else "right") - 1
-    last = keys[np.maximum(found, 0)]
-    same = (found >= 0) & inside & (last // span == asked)
+    result = np.searchsorted(keys, wanted, side="left" if step_row == step_col == 0 else "right") - 1
+    last = keys[np.maximum(result, 0)]
+    same = (result >= 0) & inside & (last // span == asked)
     return np.where(same, last % span + first, _LONG_AGO)
 
 

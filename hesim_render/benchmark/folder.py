@@ -12,9 +12,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from hesim_render.benchmark.clip import CLIP_FILE, RECORDING, SCENE
-from hesim_render.benchmark.colour_truth import COLOURS_FILE, ColourTruth
 from hesim_render.benchmark.generator import SCENE_FILE
-from hesim_render.benchmark.sharp import SHARP_FILE, SharpImages
+from hesim_render.benchmark.sharp import COLOURS_FILE, SHARP_FILE, ColourTruth, SharpImages
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, read_text, reading
 from hesim_render.core.names import FileName, PathBelow

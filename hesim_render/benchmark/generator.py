@@ -130,18 +130,18 @@ class Generator:
         if self.spec.scenes.parts is None:
             return {split: [] for split in SPLITS}
         folder = self.spec.folder / self.spec.scenes.parts
-        found: dict[str, Path] = {}
+        result: dict[str, Path] = {}
         if folder.is_dir():
             for path in sorted(folder.rglob("*")):
                 if path.suffix.lower() in _MESHES + _PICTURES and path.is_file():
-                    found.setdefault(file_hash(path), path)
-        if not found:
+                    result.setdefault(file_hash(path), path)
+        if not result:
             raise SpecError(f"no mesh (OBJ) or picture (PNG, JPEG) in {folder}", key="scenes.parts")
         pools: dict[str, list[Path]] = {split: [] for split in SPLITS}
         for kinds in (_MESHES, _PICTURES):
-            names = [key for key, path in found.items() if path.suffix.lower() in kinds]
+            names = [key for key, path in result.items() if path.suffix.lower() in kinds]
             for split, keys in zip(SPLITS, shares(names, self._weights, f"{self._key}/parts"), strict=True):
-                pools[split] += [found[key] for key in keys]
+                pools[split] += [result[key] for key in keys]
         return pools
 
     def given_files(self) -> list[Path]:

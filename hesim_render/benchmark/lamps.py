@@ -98,15 +98,15 @@ def lamps(rng: np.random.Generator, spec: LightsSpec) -> tuple[dict[str, Any], d
     count = int(rng.integers(int(spec.lamps[0]), int(spec.lamps[1]) + 1))
     parts = rng.dirichlet(np.full(count, 2.0))
     kinds = ["sky", "sun", "point", "panel", "ball"]
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for k, part in enumerate(parts):
         kind = str(rng.choice(kinds, p=[0.25, 0.15, 0.15, 0.25, 0.2]))
         if kind == "sky":
-            kinds_left = [name for name in found if found[name]["type"] == "constant"]
+            kinds_left = [name for name in result if result[name]["type"] == "constant"]
             kind = "panel" if kinds_left else kind  # a scene has one sky
         name = spec.illuminants[int(rng.integers(len(spec.illuminants)))]
         irradiance = scale_to_lux(illuminant(name), max(total * float(part), 1e-6))
-        found[f"lamp{k}"] = _lamp(rng, kind, irradiance)
+        result[f"lamp{k}"] = _lamp(rng, kind, irradiance)
     waveforms = {}
     if rng.random() < spec.flicker:
         name = f"lamp{int(rng.integers(count))}"
@@ -114,4 +114,4 @@ def lamps(rng: np.random.Generator, spec: LightsSpec) -> tuple[dict[str, Any], d
             "type": "mains", "frequency_hz": float(rng.choice([50.0, 60.0])),
             "depth": float(rng.uniform(0.1, 0.95)), "phase_deg": float(rng.uniform(0, 360)),
         }  # fmt: skip
-    return found, waveforms
+    return result, waveforms

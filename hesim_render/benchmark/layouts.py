@@ -2,6 +2,8 @@
 
 Pictures are 8-bit sRGB of the same size as the RAW frame. Coordinates of events are those of the picture: an event
 pixel has the place that it has on the mosaic, so a sparse event grid gives sparse coordinates.
+
+The cumulative representation of events of EFNet.
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hesim_render.benchmark.cumulative import cumulative_grid
 from hesim_render.benchmark.folder import Benchmark, BenchmarkClip
 from hesim_render.benchmark.pictures import ClipDevelopment
 from hesim_render.core.errors import OutputError, RangeError, did_you_mean
@@ -50,18 +51,14 @@ class _Clip:
     def events(self, begin_us: float, end_us: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """x, y (px of the picture), t (µs) and polarity (0, 1) of the events after `begin_us`, up to `end_us`."""
         first, last = int(np.floor(begin_us)) + 1, int(np.floor(end_us)) + 1
-        found = self.clip.recording.event_slice(first, max(first, last))
+        result = self.clip.recording.event_slice(first, max(first, last))
         layout = self.development.layout
-        place = layout.evs_pixel.reshape(layout.evs_shape)[found["y"], found["x"]].astype(np.int64)
-        return place % layout.cols, place // layout.cols, found["t_us"], (found["polarity"] > 0).astype(np.uint8)
+        place = layout.evs_pixel.reshape(layout.evs_shape)[result["y"], result["x"]].astype(np.int64)
+        return place % layout.cols, place // layout.cols, result["t_us"], (result["polarity"] > 0).astype(np.uint8)
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.development.layout.shape
-
-    def sharp_times(self) -> NDArray[np.float64]:
-        sharp = self.clip.sharp
-        return np.empty(0) if sharp is None else sharp.time_us
 
     def sequence(self) -> list[tuple[float, Callable[[], NDArray]]]:
         """Times and RAW of the frames of an interpolation set: the sharp images, or else the frames themselves."""
@@ -73,14 +70,14 @@ class _Clip:
 
     def pairs(self) -> list[tuple[Frame, int]]:
         """Frames with the number of the sharp image in the middle of their exposure."""
-        sharp, found = self.clip.sharp, []
+        sharp, result = self.clip.sharp, []
         for frame in self.clip.recording.frames if sharp is not None and len(sharp.time_us) else ():
             middle = frame.exposure_start_us + frame.exposure_us / 2
             assert sharp is not None
             number = sharp.nearest(middle)
             if abs(sharp.time_us[number] - middle) <= frame.exposure_us / 4:
-                found.append((frame, number))
-        return found
+                result.append((frame, number))
+        return result
 
 
 def _save(picture: NDArray[np.uint8], path: Path) -> None:
@@ -231,21 +228,49 @@ def export_benchmark(
     if layout not in LAYOUTS:
         raise RangeError("layout", layout, f"one of {', '.join(LAYOUTS)}{did_you_mean(layout, LAYOUTS)}")
     clips = list(Benchmark(root).clips())
-    output, count = OutputFolder(out, _MARKER, overwrite), 0
-    try:
-        with output_errors(output.target):
-            for done, clip in enumerate(clips):
-                if len(clip.recording.frames):
-                    count += LAYOUTS[layout](_Clip(clip), clip.split, output.path)
-                if progress is not None:
-                    progress(done + 1, len(clips), "clips")
-            if count == 0:
-                raise OutputError(
-                    f"{out}: no clip has what the layout {layout} holds (frames, and sharp images beside)"
-                )
-            (output.path / _MARKER).write_text(f"{layout}\n", encoding="utf-8")
-        output.commit()
-    except BaseException:
-        output.discard()
-        raise
+    count = 0
+    with OutputFolder(out, _MARKER, overwrite) as output, output_errors(output.target):
+        for done, clip in enumerate(clips):
+            if len(clip.recording.frames):
+                count += LAYOUTS[layout](_Clip(clip), clip.split, output.path)
+            if progress is not None:
+                progress(done + 1, len(clips), "clips")
+        if count == 0:
+            raise OutputError(f"{out}: no clip has what the layout {layout} holds (frames, and sharp images beside)")
+        (output.path / _MARKER).write_text(f"{layout}\n", encoding="utf-8")
     return count
+
+
+def cumulative_grid(
+    events: NDArray, shape: tuple[int, int], begin_us: float, end_us: float, bins: int = 6
+) -> NDArray[np.float32]:
+    """Symmetric cumulative event representation [sun2022]: sums of polarities from the middle of the exposure outwards.
+
+    Parameters
+    ----------
+    events : structured array of `EVENT_DTYPE`.
+    shape : rows and columns of the event grid.
+    begin_us, end_us : the exposure, µs.
+    bins : even number of bins. The first half holds minus the sums from each of the times begin, begin + h, … to the
+        middle, the second half the sums from the middle to middle + h, …, end, with h the exposure over `bins`.
+
+    Returns
+    -------
+    float32 [bin, y, x].
+
+    Raises
+    ------
+    RangeError
+        If the number of bins is odd.
+    """
+    if bins < 2 or bins % 2:
+        raise RangeError("bins", bins, "an even number, 2 or more")
+    rows, cols = shape
+    edges = np.linspace(begin_us, end_us, bins + 1)
+    part = np.searchsorted(edges, events["t_us"], side="left") - 1  # (edge, next edge]: a time stamp is an end
+    inside = (part >= 0) & (part < bins)
+    place = part[inside] * rows * cols + events["y"][inside].astype(np.int64) * cols + events["x"][inside]
+    each = np.bincount(place, events["polarity"][inside], bins * rows * cols).reshape(bins, rows, cols)
+    half = bins // 2
+    before = -np.cumsum(each[:half][::-1], axis=0)[::-1]
+    return np.concatenate([before, np.cumsum(each[half:], axis=0)]).astype(np.float32)

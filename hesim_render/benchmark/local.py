@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import selectors
 import subprocess
 from collections.abc import Callable, Sequence
@@ -12,8 +11,8 @@ from dataclasses import dataclass
 from typing import IO, Any
 
 from hesim_render.benchmark.plan import Clip
-from hesim_render.benchmark.spans import Span
-from hesim_render.benchmark.units import Unit, Waiting
+from hesim_render.benchmark.spans import Span, Unit, Waiting
+from hesim_render.core.bands import processors
 from hesim_render.core.child import child_environment, python_command, with_package
 from hesim_render.core.errors import BackendError, OutputError
 
@@ -56,7 +55,7 @@ class LocalWorkers:
 
     def __init__(self, order: str, count: int, threads: int = 0) -> None:
         self._order, self._count = order, count
-        self._threads = threads or max(1, len(os.sched_getaffinity(0)) // count)
+        self._threads = threads or max(1, processors() // count)
         self._waits = selectors.DefaultSelector()
         self._workers: list[_Worker] = []
 

@@ -109,13 +109,13 @@ def tracks(
     low, high = spec.speed
     names = list(sizes)
     first = names[int(rng.integers(len(names)))]
-    found = []
+    result = []
     for name in names:
         moves = rng.random() < spec.moving or name == first
         own = float(np.clip(speed * log_uniform(rng, (0.6, 1.7)), low, high))
         track = solid_track(rng, name, own, sizes[name], duration_us)
         if moves:
-            found.append(track)
+            result.append(track)
     if rng.random() < spec.camera:
-        found.append(camera_track(rng, speed, duration_us))
-    return found
+        result.append(camera_track(rng, speed, duration_us))
+    return result

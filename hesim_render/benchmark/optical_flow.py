@@ -79,7 +79,7 @@ def plane_fit(events: NDArray, shape: tuple[int, int]) -> NDArray[np.float64]:
     -------
     [y, x, 2], px per µs to the right and downwards; NaN without events, or where they lie in no plane.
     """
-    found = np.full((*shape, 2), np.nan)
+    result = np.full((*shape, 2), np.nan)
     best = np.zeros(shape)
     for sign in (1, -1):
         part = events[events["polarity"] == sign]
@@ -87,8 +87,8 @@ def plane_fit(events: NDArray, shape: tuple[int, int]) -> NDArray[np.float64]:
         time[part["y"], part["x"]] = part["t_us"]  # later events replace earlier ones
         velocity, count = _planes(time)
         better = (count > best) & np.isfinite(velocity[..., 0])
-        found[better], best[better] = velocity[better], count[better]
-    return found
+        result[better], best[better] = velocity[better], count[better]
+    return result
 
 
 def _planes(time: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

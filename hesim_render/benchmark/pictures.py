@@ -1,11 +1,15 @@
-"""Pictures of clips as measures compare them: linear sRGB of RAW, exposed alike, and encoded."""
+"""Pictures of clips as measures compare them: linear sRGB of RAW, exposed alike, and encoded.
+
+Bilinear demosaicing of any tile, a baseline: each channel is a mean of its samples around, weighted by a tent.
+"""
 
 from __future__ import annotations
 
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import correlate1d
 
 from hesim_render.benchmark.folder import BenchmarkClip
 from hesim_render.benchmark.metrics import learned, learned_measures
@@ -84,9 +88,9 @@ class ClipDevelopment:
         pitch = np.array([len(tile[0]) / grid.cols_per_tile, len(tile) / grid.rows_per_tile])
         given: NDArray[np.bool_] = np.asarray(np.isfinite(flow).all(axis=-1))
         known: NDArray[np.float64] = np.where(given[..., None], flow, 0.0) * pitch
-        found = np.stack([self.on_mosaic(known[..., k]) for k in range(2)], axis=-1)
+        result = np.stack([self.on_mosaic(known[..., k]) for k in range(2)], axis=-1)
         near = self.on_mosaic(given.astype(np.float64)) >= 0.5
-        return np.where(near[..., None], found, np.nan)
+        return np.where(near[..., None], result, np.nan)
 
     def grey_pair(self, first: NDArray, second: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Two RAW frames as 8-bit grey pictures (BT.709 luma, encoded as sRGB), both with the exposure of the first.
@@ -117,8 +121,8 @@ class ClipDevelopment:
         black = mosaic.black_level_dn
         span = 2**mosaic.bit_depth - 1 - black
         valid = self.layout.aps_mask
-        found = {"raw_psnr_db": psnr((raw - black) / span, (truth - black) / span, valid=valid)}
-        return found | self._compared(self.linear(raw), self.linear(truth))
+        result = {"raw_psnr_db": psnr((raw - black) / span, (truth - black) / span, valid=valid)}
+        return result | self._compared(self.linear(raw), self.linear(truth))
 
     def full_dn(self, flux: NDArray, exposure_us: float) -> NDArray[np.float64]:
         """What the sensor without noise would read of a flux, DN, not rounded; at most the white level.
@@ -162,8 +166,8 @@ class ClipDevelopment:
         """
         mosaic = self._clip.recording.mosaic
         black, span = mosaic.black_level_dn, mosaic.white_level_dn - mosaic.black_level_dn
-        found = {"channel_psnr_db": psnr((channels - black) / span, (truth - black) / span)}
-        return found | self._compared(self.linear_of_channels(channels), self.linear_of_channels(truth))
+        result = {"channel_psnr_db": psnr((channels - black) / span, (truth - black) / span)}
+        return result | self._compared(self.linear_of_channels(channels), self.linear_of_channels(truth))
 
     def _compared(self, picture: NDArray[np.float32], wanted: NDArray[np.float32]) -> dict[str, float]:
         """Measures of a picture in linear sRGB against the wanted one."""
@@ -171,7 +175,40 @@ class ClipDevelopment:
         gain = _WHITE / bright if bright > 0 else 1.0
         picture, wanted = (np.minimum(image * gain, 1) for image in (picture, wanted))
         a, b = (np.copysign(encode_exactly(np.abs(image)), image) for image in (picture, wanted))
-        found = {"psnr_db": psnr(a, b), "delta_e": delta_e(picture, wanted)}
+        result = {"psnr_db": psnr(a, b), "delta_e": delta_e(picture, wanted)}
         if min(a.shape[:2]) >= 11:
-            found["ssim"] = ssim(a, b)
-        return found | {name: learned(name, a, b) for name in learned_measures()}
+            result["ssim"] = ssim(a, b)
+        return result | {name: learned(name, a, b) for name in learned_measures()}
+
+
+def bilinear(raw: NDArray, tile: ArrayLike) -> NDArray[np.float64]:
+    """Every channel at every pixel.
+
+    The tent falls to zero one tile away, so that every pixel has samples of every channel. On a Bayer tile this is the
+    usual bilinear interpolation. Measured values stay as they are.
+
+    Parameters
+    ----------
+    raw : [row, col], DN.
+    tile : [tile_row, tile_col], channel number of each position from 0 on, -1 where there is no value.
+
+    Returns
+    -------
+    float64 [row, col, channel], DN.
+    """
+    block = np.asarray(tile)
+    rows, cols = np.ogrid[: raw.shape[0], : raw.shape[1]]
+    channel = block[rows % block.shape[0], cols % block.shape[1]]
+    out = np.empty((*raw.shape, int(block.max()) + 1))
+    for number in range(out.shape[-1]):
+        own = channel == number
+        total, weight = (_tent(values.astype(np.float64), block.shape) for values in (np.where(own, raw, 0), own))
+        out[..., number] = np.where(own, raw, total / np.maximum(weight, 1e-12))
+    return out
+
+
+def _tent(values: NDArray[np.float64], period: tuple[int, ...]) -> NDArray[np.float64]:
+    for axis, width in enumerate(period):
+        weights = 1 - np.abs(np.arange(1 - width, width)) / width
+        values = correlate1d(values, weights, axis=axis, mode="constant")
+    return values

@@ -141,7 +141,7 @@ class BenchmarkPlan:
             If a sensor, a scene or a combination is not valid, or a given scene stands in two splits.
         """
         from hesim_render.capture.noise_terms import noise_models
-        from hesim_render.recording.truth_kinds import truth_kinds
+        from hesim_render.recording.truth_file import truth_kinds
 
         truth_kinds(self.spec.truth)
         seen: set[tuple[int, int]] = set()
@@ -225,9 +225,9 @@ def shared_parts(parts: Mapping[str, tuple[str, set[str]]]) -> list[tuple[str, s
     Part and the two splits, for each part of that kind.
     """
     owner: dict[str, str] = {}
-    found = []
+    result = []
     for split, names in parts.values():
         for name in sorted(names):
             if owner.setdefault(name, split) != split:
-                found.append((name, owner[name], split))
-    return sorted(set(found))
+                result.append((name, owner[name], split))
+    return sorted(set(result))

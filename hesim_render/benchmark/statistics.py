@@ -34,15 +34,15 @@ def figures(recording: Recording, scene: Scene, sensor: Sensor) -> dict[str, flo
     """
     counts, seconds = recording.manifest["counts"], recording.duration_us / US_PER_S
     pixels = recording.event_shape[0] * recording.event_shape[1]
-    found: dict[str, float | None] = dict.fromkeys(FIGURES)
+    result: dict[str, float | None] = dict.fromkeys(FIGURES)
     flux = _flux(recording)
     if flux is not None:
-        found["brightness_e_per_s"] = float(np.nanmean(flux))
-        found["contrast"] = _contrast(flux, sensor)
+        result["brightness_e_per_s"] = float(np.nanmean(flux))
+        result["contrast"] = _contrast(flux, sensor)
     if pixels:
-        found["activity_hz"] = counts["events"] / pixels / seconds
-    found["speed_widths_per_s"] = _speed(scene, sensor, recording.duration_us)
-    return found
+        result["activity_hz"] = counts["events"] / pixels / seconds
+    result["speed_widths_per_s"] = _speed(scene, sensor, recording.duration_us)
+    return result
 
 
 def _flux(recording: Recording) -> NDArray[np.float32] | None:
@@ -57,14 +57,14 @@ def _contrast(flux: NDArray[np.float32], sensor: Sensor) -> float:
     rows, cols = len(sensor.spec.tile_rows), len(sensor.spec.tile_rows[0])
     if flux.shape != sensor.layout.shape:
         rows = cols = 1
-    found = []
+    result = []
     for i in range(rows):
         for j in range(cols):
             part = flux[i::rows, j::cols]
             part = part[np.isfinite(part)]
             if part.size and part.mean() > 0:
-                found.append(part.std() / part.mean())
-    return float(np.mean(found)) if found else 0.0
+                result.append(part.std() / part.mean())
+    return float(np.mean(result)) if result else 0.0
 
 
 def _speed(scene: Scene, sensor: Sensor, duration_us: int) -> float:

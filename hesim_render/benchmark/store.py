@@ -58,18 +58,13 @@ class FolderStore:
 
     @contextmanager
     def writing(self, marker: str, overwrite: bool) -> Iterator[Put]:
-        folder = OutputFolder(self._root, marker, overwrite)
+        with OutputFolder(self._root, marker, overwrite) as folder:
 
-        def put(name: str, file: Path) -> None:
-            with output_errors(folder.target):
-                shutil.copyfile(file, folder.path / file_name(name))
+            def put(name: str, file: Path) -> None:
+                with output_errors(folder.target):
+                    shutil.copyfile(file, folder.path / file_name(name))
 
-        try:
             yield put
-            folder.commit()
-        except BaseException:
-            folder.discard()
-            raise
 
     def blocks(self, name: str) -> Iterator[bytes]:
         path = inside(self._root, require_file_name(name, self._root))

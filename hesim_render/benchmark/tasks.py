@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.benchmark.bilinear import bilinear
-from hesim_render.benchmark.double_integral import sharp_over_blurred
 from hesim_render.benchmark.event_filters import FILTERS
 from hesim_render.benchmark.exposure_merge import flux_of, flux_scores, merged
 from hesim_render.benchmark.folder import BenchmarkClip
-from hesim_render.benchmark.intensity import intensity_scores, leaky_sum
+from hesim_render.benchmark.intensity import intensity_scores, leaky_sum, sharp_over_blurred
 from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error
 from hesim_render.benchmark.optical_flow import flow_scores, of_pictures, picture_methods, plane_fit
-from hesim_render.benchmark.pictures import ClipDevelopment
+from hesim_render.benchmark.pictures import ClipDevelopment, bilinear
 from hesim_render.benchmark.predictions import Predictions
 from hesim_render.pixels.evs.events import Label
 from hesim_render.recording.frame import Frame

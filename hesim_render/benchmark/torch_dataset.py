@@ -105,17 +105,17 @@ class BenchmarkDataset(_Dataset):
             return frame.exposure_start_us + frame.exposure_us / 2
 
         nearest = sharp.nearest(middle(frame))
-        found: dict[str, Any] = {"clip": clip.name, "index": k, "t_us": float(sharp.time_us[nearest])}
-        found["sharp"] = signal(sharp.raw_dn(nearest))
-        found["valid"] = torch.from_numpy(np.ascontiguousarray(frame.valid))[None]
+        result: dict[str, Any] = {"clip": clip.name, "index": k, "t_us": float(sharp.time_us[nearest])}
+        result["sharp"] = signal(sharp.raw_dn(nearest))
+        result["valid"] = torch.from_numpy(np.ascontiguousarray(frame.valid))[None]
         if self._task == "deblur":
-            found["frame"] = signal(frame.raw)
+            result["frame"] = signal(frame.raw)
             begin, end = float(frame.exposure_start_us), float(frame.exposure_start_us + frame.exposure_us)
         else:
             first, last = recording.frames[k - 1], recording.frames[k + 1]
-            found |= {"before": signal(first.raw), "after": signal(last.raw)}
+            result |= {"before": signal(first.raw), "after": signal(last.raw)}
             begin, end = middle(first), middle(last)
         events = recording.event_slice(int(np.floor(begin)), int(np.ceil(end)) + 1)
         if 0 not in recording.event_shape:
-            found["voxels"] = torch.from_numpy(voxel_grid(events, recording.event_shape, self._bins, begin, end))
-        return found if self._transform is None else self._transform(found)
+            result["voxels"] = torch.from_numpy(voxel_grid(events, recording.event_shape, self._bins, begin, end))
+        return result if self._transform is None else self._transform(result)

@@ -84,13 +84,13 @@ def discard_damaged(root: str | Path, problems: Sequence[str]) -> list[str]:
     """
     benchmark = Benchmark(root)
     wrong = {line.split(":")[0].split("/")[0] for line in problems}
-    found = [clip.folder for clip in benchmark.clips() if clip.folder.name in wrong]
-    if found:
+    result = [clip.folder for clip in benchmark.clips() if clip.folder.name in wrong]
+    if result:
         with output_errors(benchmark.root):
             (benchmark.root / MANIFEST_FILE).unlink()
-            for folder in found:
+            for folder in result:
                 shutil.rmtree(folder, ignore_errors=not folder.exists())
-    return [folder.name for folder in found]
+    return [folder.name for folder in result]
 
 
 def _files(folder: Path, files: dict[str, dict[str, object]]) -> list[str]:

@@ -92,6 +92,7 @@ def measure(
     for number, frame in enumerate(stack):
         source, index = divmod(number, frames)
         k = place[source]
+        # the first frame of an exposure: what all others are compared with, and the halves of equal light
         if index == 0:
             first[k] = lowest[k] = highest[k] = frame
             total[:], squares[:] = 0, 0
@@ -103,6 +104,7 @@ def measure(
             half_first = [float((first[k] * m).sum()) / n for m, n in zip(halves, half_pixels, strict=True)]
             half_means[k, 0] = half_first
         else:
+            # differences from it are small whole numbers, so that no sum below is rounded
             np.subtract(frame, first[k], out=difference, dtype=np.int32)
             row_means[k, index] = row_first + np.einsum("ij,ij->i", difference, taken) / row_pixels
             for side, mask in enumerate(halves):
@@ -113,6 +115,7 @@ def measure(
             squares += difference
             np.minimum(lowest[k], frame, out=lowest[k], casting="unsafe")
             np.maximum(highest[k], frame, out=highest[k], casting="unsafe")
+        # the last frame: the sums become mean and variance
         if index == frames - 1:
             shift = total / frames
             mean[k] = shift + first[k]

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from hesim_render.calibration.file import file_digest, read_calibration, read_maps
 from hesim_render.calibration.spec import SCHEMA_VERSION
@@ -20,6 +19,7 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.core.guard import read_text
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import alone_in, check_place, output_errors, replacing
+from hesim_render.core.yaml_file import write_yaml
 
 __all__ = ["check_calibration", "plain", "read_calibration", "read_maps", "write_section"]
 
@@ -66,7 +66,7 @@ def _write_section(
         about = {"file": target.name, "sha256": file_digest(target), **{name: name for name in names}}
         data[section] = {**content, "maps": about}
         with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as stream:
-            _yaml().dump(plain(data), stream)
+            write_yaml(plain(data), stream)
     finally:
         with contextlib.suppress(OSError, SpecError):  # not what was asked for, and the next run does it
             _remove_unnamed(path, section)
@@ -110,9 +110,9 @@ def _digest(maps: Mapping[str, NDArray]) -> str:
 def _remove_unnamed(path: Path, section: str) -> None:
     """Remove map files of a section that no calibration in the folder names, those of killed runs among them."""
     ours = re.compile(rf"{re.escape(path.stem)}_{section}_maps(-[0-9a-f]{{12}})?\.npz")
-    found = [other for other in path.parent.iterdir() if ours.fullmatch(other.name)]
-    texts = [read_text(other) for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if found else []
-    for other in found:
+    result = [other for other in path.parent.iterdir() if ours.fullmatch(other.name)]
+    texts = [read_text(other) for other in {path, *path.parent.glob("*.y*ml")} if other.is_file()] if result else []
+    for other in result:
         if not any(other.name in text for text in texts):
             other.unlink(missing_ok=True)
 
@@ -163,11 +163,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(f"{value:.{_SIGNIFICANT}g}") if np.isfinite(value) else None
     return value
-
-
-def _yaml() -> YAML:
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # ruamel declares None
-    yaml.width = 110
-    return yaml

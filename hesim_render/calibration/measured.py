@@ -97,12 +97,12 @@ def interval_s(noise: NoiseFile, name: str, section: FrameSection | EventSection
     SpecError
         If neither states it.
     """
-    found = section.interval_s or _stated_s(noise, name)
-    if found is None:
+    result = section.interval_s or _stated_s(noise, name)
+    if result is None:
         key = "frame_rate_hz" if name == "aps" else "tick_us"
         text = "is not stated, and values per frame or comparison tell no rate per second without it"
         raise SpecError(f"{text}; add that of the captures", file=noise.path, key=f"{name}.{key}")
-    return found
+    return result
 
 
 def _stated_s(noise: NoiseFile, name: str) -> float | None:

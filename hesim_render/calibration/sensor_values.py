@@ -68,11 +68,11 @@ def apply_calibration(sensor: dict[str, Any], noise: NoiseFile, data: Calibratio
         }
     if data.evs is not None:
         if isinstance(data.evs, AsynchronousSection):
-            found = _asynchronous_values(sensor, data.evs, noise.path)
+            result = _asynchronous_values(sensor, data.evs, noise.path)
         else:
-            found = _evs_values(sensor, data.evs, noise)
+            result = _evs_values(sensor, data.evs, noise)
         sensor["evs"].pop("leak", None)  # leak_rate_hz is the calibrated one
-        changed |= {f"evs.{key}": value for key, value in (found | _signal_reference(data)).items()}
+        changed |= {f"evs.{key}": value for key, value in (result | _signal_reference(data)).items()}
     # each value that was measured says so; what the file said of its source does not hold any more
     for key, value in changed.items():
         section, name = key.split(".")
@@ -134,9 +134,9 @@ def _evs_values(sensor: Mapping[str, Any], evs: EventSection, noise: NoiseFile) 
     pooled = [_needed(evs.A, "evs.A", file), _needed(evs.B, "evs.B", file), evs.C.value or 0.0, evs.D.value or 0.0]
     coefficients = []
     for position in evs.positions:
-        found = [position.A.value, position.B.value, position.C.value, position.D.value]
-        known = [value for value in found if value is not None]
-        a, b, c, d = known if len(known) == len(found) else pooled
+        result = [position.A.value, position.B.value, position.C.value, position.D.value]
+        known = [value for value in result if value is not None]
+        a, b, c, d = known if len(known) == len(result) else pooled
         beta4 = theta / theta_v / b
         coefficients.append({"beta1": a / b, "beta2": 1.0, "beta3": c * beta4, "beta4": beta4, "beta5": d})
     values = {

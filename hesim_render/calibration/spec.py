@@ -268,5 +268,5 @@ class CalibrationSpec(Strict):
     @property
     def sections(self) -> dict[str, FrameSection | EventSection | AsynchronousSection]:
         """The sections that the file has, by name."""
-        found = {"aps": self.aps, "evs": self.evs}
-        return {name: section for name, section in found.items() if section is not None}
+        result = {"aps": self.aps, "evs": self.evs}
+        return {name: section for name, section in result.items() if section is not None}

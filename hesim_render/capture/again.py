@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypedDict, Unpack
 
 from hesim_render.capture.simulate import simulate
 from hesim_render.core import backend
 from hesim_render.core.errors import HesimWarning, SpecError
+from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
 from hesim_render.recording import manifest as manifests
@@ -20,8 +22,21 @@ from hesim_render.sources.scene import Scene
 from hesim_render.specs.files import content_hash
 
 
+class RerunOptions(TypedDict, total=False):
+    """Options of `simulate` that do not change the result."""
+
+    overwrite: bool
+    progress: Progress | Literal[False] | None
+    on_estimate: Callable[[object], None] | None
+    max_minutes: float | None
+    resume: bool
+
+
 def simulate_again(
-    recording: Recording | str | Path, out: str | Path | None = None, scene: Scene | None = None, **options: Any
+    recording: Recording | str | Path,
+    out: str | Path | None = None,
+    scene: Scene | None = None,
+    **options: Unpack[RerunOptions],
 ) -> Recording:
     """Simulate a recording again: same scene, sensor, region, times, seed, terms and quality.
 
@@ -76,11 +91,11 @@ def simulate_again(
         exact=exact, samples=settings["samples"] if exact else None, truth=truth.get("kinds", ()),
         truth_every_us=truth.get("every_us"), out=out, **options,
     )  # fmt: skip
-    _tell_differences(manifest, again.manifest)
+    _warn_of_differences(manifest, again.manifest)
     return again
 
 
-def _tell_differences(before: dict[str, Any], now: dict[str, Any]) -> None:
+def _warn_of_differences(before: Mapping[str, Mapping[str, object]], now: Mapping[str, Mapping[str, object]]) -> None:
     """Warn where other software or another backend may give other bits."""
     others = [
         f"{name} {before['software'].get(name, 'none')} and now {version}"

@@ -1,14 +1,22 @@
-"""Error of a render in units of the sensor's own noise, from its two independent halves."""
+"""Error of a render in units of the sensor's own noise, from its two independent halves.
+
+Verdict on a run of the exact mode, from its stated errors alone.
+
+All pixels of the exact mode get the same number of independent rays in every slice, and no value is interpolated, so
+half the difference of a value's two halves is distributed as its error. The limit is the audit's: at most `MOST_OFF` of
+the values are off by more than `TOLERANCE` wanted errors.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import Float, UInt32
+from hesim_render.sources.render.audit.audit import MOST_OFF, TOLERANCE
 
 #: Number of values sampled per picture, and bins per decade of the histogram after its first bin.
 _VALUES, _BINS, _FIRST, _DECADES = 1 << 15, 50, 1e-5, 10
@@ -74,11 +82,11 @@ class ErrorMeter:
         """
         if not self.values:
             return None
-        found = {"rms": float(np.sqrt(self._square / self.values))}
-        found |= {name: self.quantile(part) for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
+        result = {"rms": float(np.sqrt(self._square / self.values))}
+        result |= {name: self.quantile(part) for name, part in (("median", 0.5), ("p95", 0.95), ("p99", 0.99))}
         if wanted is not None:
-            found["share_above_wanted"] = self.share_from(wanted)
-        return found
+            result["share_above_wanted"] = self.share_from(wanted)
+        return result
 
     def quantile(self, part: float) -> float:
         """Error that a part of the values does not exceed, to 5 %."""
@@ -89,3 +97,33 @@ class ErrorMeter:
     def share_from(self, limit: float) -> float:
         """Share of the values with an error of `limit` or more; the limit is rounded up to the begin of a bin."""
         return float(self._counts[limit * (1 - 1e-9) <= _LOWER].sum() / self.values)
+
+
+def stated_verdict(errors: Mapping[str, ErrorMeter], samples: int, wanted: float) -> dict[str, object]:
+    """The entry ``audit`` of a run in the exact mode, as plain values.
+
+    Parameters
+    ----------
+    errors : error meters of frames and events.
+    samples : rays per pixel and slice.
+    wanted : largest error that is good enough, over the sensor's noise.
+
+    Returns
+    -------
+    The verdict, shares that are off, and where it is not met ``samples_needed``: the next power of two that suffices,
+    as the error of independent rays falls with the root of their number.
+    """
+    limit = TOLERANCE * wanted
+    measured = {name: meter for name, meter in errors.items() if meter.values}
+    off = {f"{name}_off": meter.share_from(limit) for name, meter in measured.items()}
+    failed = any(share > MOST_OFF for share in off.values())
+    enough = [samples * (meter.quantile(1 - MOST_OFF) / limit) ** 2 for meter in measured.values()]
+    needed = max([samples + 1.0, *enough])
+    return {
+        "compares_with": "the two halves of each value's own rays; nothing was rendered again",
+        "tolerance_noise": limit,
+        "off_wanted_at_most": MOST_OFF,
+        **off,
+        "verdict": "not met" if failed else "met",
+        "samples_needed": 1 << int(np.ceil(np.log2(needed))) if failed else None,
+    }

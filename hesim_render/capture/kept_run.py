@@ -5,7 +5,6 @@ again for what has passed.
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from hesim_render.capture.loop import Capture
 from hesim_render.core.journal import Journal, key_of
 from hesim_render.core.plain_bytes import from_bytes, to_bytes
 from hesim_render.core.progress import Progress
+from hesim_render.pixels.arrays import SavedState
 from hesim_render.recording.frame import Frame
 from hesim_render.recording.writer import RecordingWriter
 
@@ -48,15 +48,15 @@ class KeptRun:
         writer, progress : as for `Capture.record`.
         """
         state = None
-        while (part := self._read("part", self._parts)) is not None:
+        while part := self._read("part", self._parts):
             frames, chunks = range(self._frames, part["frames"]), range(self._chunks, part["chunks"])
             whole = [("frame", k) for k in frames] + [("events", k) for k in chunks]
             if any(self._journal.read(key_of(*name)) is None for name in whole):  # before any of it is written
                 break
             for k in chunks:
-                found = self._read("events", k)
+                result = self._read("events", k)
                 # in the blocks in which they came, which decide the bytes of the file
-                for block in np.split(found["events"], np.cumsum(found["sizes"])[:-1]):
+                for block in np.split(result["events"], np.cumsum(result["sizes"])[:-1]):
                     writer.add_events(block)
             for k in frames:
                 writer.add_frame(self._frame(self._read("frame", k)))
@@ -76,15 +76,16 @@ class KeptRun:
         ----------
         item : a frame, or a block of events.
         """
-        if isinstance(item, Frame):
-            assert not np.any(item.electrons_stderr > 0)
-            frame = {"times": item.times, "raw": item.raw, "electrons": item.electrons_mean}
-            self._write("frame", self._frames, frame)
-            self._frames += 1
-        elif item.size:
-            self._blocks.append(item)
-            if sum(block.size for block in self._blocks) >= _MOST_EVENTS:
-                self._keep_events()
+        match item:
+            case Frame():
+                assert not np.any(item.electrons_stderr > 0)
+                frame = {"times": item.times, "raw": item.raw, "electrons": item.electrons_mean}
+                self._write("frame", self._frames, frame)
+                self._frames += 1
+            case events if events.size:
+                self._blocks.append(events)
+                if sum(block.size for block in self._blocks) >= _MOST_EVENTS:
+                    self._keep_events()
         if time.monotonic() >= self._end_s:
             self._keep_events()
             part = {"frames": self._frames, "chunks": self._chunks, "progress": self._capture.progress}
@@ -99,19 +100,20 @@ class KeptRun:
             self._blocks = []
             self._chunks += 1
 
-    def _frame(self, found: dict[str, Any]) -> Frame:
+    def _frame(self, result: SavedState) -> Frame:
         valid = self._capture.frame_mask
         return Frame(
-            raw=found["raw"],
+            raw=result["raw"],
             valid=valid,
-            electrons_mean=found["electrons"],
+            electrons_mean=result["electrons"],
             electrons_stderr=np.where(valid, np.float32(0), np.float32(np.nan)),
-            **found["times"],
+            **result["times"],
         )
 
-    def _read(self, *name: object) -> Any:
+    def _read(self, *name: object) -> SavedState:
+        """What was kept under a name; empty where there is nothing."""
         data = self._journal.read(key_of(*name))
-        return None if data is None else from_bytes(data)
+        return {} if data is None else from_bytes(data)
 
-    def _write(self, kind: str, number: int, value: dict[str, Any]) -> None:
+    def _write(self, kind: str, number: int, value: SavedState) -> None:
         self._journal.keep(key_of(kind, number), [np.frombuffer(to_bytes(value), np.uint8)])

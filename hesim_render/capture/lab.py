@@ -7,14 +7,12 @@ is that of `hesim_render.capture.bench`.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
 from hesim_render.capture.bench import Bench, set_up
 from hesim_render.capture.lab_trials import TrialBench, TrialPlan, plan_trials
@@ -25,6 +23,7 @@ from hesim_render.core.npz import NpzWriter
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.sensor.reading import read_sensor
 from hesim_render.sensor.sensor import Sensor, as_sensor
@@ -101,9 +100,47 @@ def write_captures(
         If `out` exists or cannot be written.
     """
     sensor = as_sensor(sensor)
-    for name, exposures in (("dark exposures", dark_exposures_us), ("lit exposures", lit_exposures_us)):
-        if len(set(exposures)) < max(2, len(exposures)) or min(exposures) <= 0:
-            raise RangeError(name, list(exposures), "two or more different times above 0, in µs")
+    _require(
+        sensor,
+        frames,
+        ticks,
+        trials,
+        seed,
+        parts,
+        {"dark exposures": dark_exposures_us, "lit exposures": lit_exposures_us},
+    )
+    bench = set_up(sensor, lit_exposures_us, illuminant, without)
+    session = _Session(bench, seed, progress)
+    step_trials = max(_LEAST_TRIALS, ticks // 100)
+    plans: dict[str, TrialPlan] = {}
+    if bench.evs is not None and bench.evs.spec.reference == "last_event":
+        plans = plan_trials(bench.evs, trials, parts)
+        session.total += sum(session.work_of(plan.duration_s) for plan in plans.values())
+    shots = 0 if bench.aps is None else frames * (len(dark_exposures_us) + len(lit_exposures_us))
+    comparisons = 0 if bench.evs is None or plans else 2 * ticks + 2 * step_trials * _CONTRASTS
+    session.total += _FRAME_WORK * shots + comparisons
+    if on_estimate is not None:
+        on_estimate(_size_in_words(sensor, shots, comparisons, plans))
+    with OutputFolder(out, CAPTURE_NAME, overwrite) as folder, output_errors(folder.target):
+        if bench.aps is not None:
+            session.write_frames(folder.path / "aps_dark.npz", dark_exposures_us, frames, 0.0)
+            session.write_frames(folder.path / "aps_lit.npz", lit_exposures_us, frames, 1.0)
+        if plans:
+            session.write_trials(folder.path, plans)
+        elif bench.evs is not None:
+            session.write_static(folder.path / "evs_static.npz", ticks, parts)
+            session.write_steps(folder.path / "evs_steps.npz", step_trials)
+        _describe(bench, folder.path, illuminant, seed)
+    return folder.target
+
+
+def _require(
+    sensor: Sensor, frames: int, ticks: int, trials: int, seed: int, parts: int, exposures: Mapping[str, Sequence[int]]
+) -> None:
+    """Refuse numbers that a session cannot have; see `write_captures`."""
+    for name, times in exposures.items():
+        if len(set(times)) < max(2, len(times)) or min(times) <= 0:
+            raise RangeError(name, list(times), "two or more different times above 0, in µs")
     if frames < _FEWEST_FRAMES:
         raise RangeError("frames", frames, f"{_FEWEST_FRAMES} or more, to get a variance")
     if not 1 <= ticks < 2**31:
@@ -117,43 +154,17 @@ def write_captures(
         raise RangeError("parts", parts, f"0, or {_FEWEST_PARTS} to {_MOST_PARTS}")
     if not 0 <= seed < 2**64:
         raise RangeError("seed", seed, "0 to 2^64 - 1")
-    bench = set_up(sensor, lit_exposures_us, illuminant, without)
-    session = _Session(bench, seed, progress)
-    if bench.aps is not None:
-        session.total += _FRAME_WORK * frames * (len(dark_exposures_us) + len(lit_exposures_us))
-    step_trials = max(_LEAST_TRIALS, ticks // 100)
-    plans: dict[str, TrialPlan] = {}
-    if bench.evs is not None and bench.evs.spec.reference == "last_event":
-        plans = plan_trials(bench.evs, trials, parts)
-        session.total += sum(session.work_of(plan.duration_s) for plan in plans.values())
-    elif bench.evs is not None:
-        session.total += 2 * ticks + 2 * step_trials * _CONTRASTS
-    if on_estimate is not None:
-        shots = 0 if bench.aps is None else frames * (len(dark_exposures_us) + len(lit_exposures_us))
-        gigabytes = shots * sensor.rows * sensor.cols * 2e-9
-        parts_of_estimate = [f"{shots} frames, {gigabytes:.3g} GB"] if shots else []
-        if plans:
-            seconds = sum(plan.duration_s for plan in plans.values())
-            parts_of_estimate.append(f"event pixels for {seconds:.3g} s, in {len(plans)} kinds of trials")
-        elif bench.evs is not None:
-            parts_of_estimate.append(f"{2 * ticks + 2 * step_trials * _CONTRASTS} comparisons of event pixels")
-        on_estimate("; ".join(parts_of_estimate))
-    folder = OutputFolder(out, CAPTURE_NAME, overwrite)
-    try:
-        with output_errors(folder.target):
-            if bench.aps is not None:
-                session.write_frames(folder.path / "aps_dark.npz", dark_exposures_us, frames, 0.0)
-                session.write_frames(folder.path / "aps_lit.npz", lit_exposures_us, frames, 1.0)
-            if plans:
-                session.write_trials(folder.path, plans)
-            elif bench.evs is not None:
-                session.write_static(folder.path / "evs_static.npz", ticks, parts)
-                session.write_steps(folder.path / "evs_steps.npz", step_trials)
-            _describe(bench, folder.path, illuminant, seed)
-        return folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
+
+
+def _size_in_words(sensor: Sensor, shots: int, comparisons: int, plans: Mapping[str, TrialPlan]) -> str:
+    """What a session takes: frames, and trials or comparisons of event pixels."""
+    sizes = [f"{shots} frames, {shots * sensor.rows * sensor.cols * 2e-9:.3g} GB"] if shots else []
+    if plans:
+        seconds = sum(plan.duration_s for plan in plans.values())
+        sizes.append(f"event pixels for {seconds:.3g} s, in {len(plans)} kinds of trials")
+    if comparisons:
+        sizes.append(f"{comparisons} comparisons of event pixels")
+    return "; ".join(sizes)
 
 
 @dataclass
@@ -290,7 +301,7 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
     if not shipped:
         _dump(spec.model_dump(mode="json", exclude_none=True, exclude={"noise"}), folder / "sensor.yaml")
     tile_rows, tile_cols = layout.tile_shape
-    content: dict[str, Any] = {
+    content: dict[str, object] = {
         "bit_depth": 16 if bench.aps is None else bench.aps.spec.bit_depth,
         "tile_rows": tile_rows,
         "tile_cols": tile_cols,
@@ -317,12 +328,7 @@ def _describe(bench: Bench, folder: Path, illuminant: str, seed: int) -> None:
     _dump(content, folder / CAPTURE_NAME)
 
 
-def _dump(content: dict[str, Any], file: Path) -> None:
-    yaml: Any = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.sort_base_mapping_type_on_output = False
-    yaml.allow_unicode = True
-    yaml.width = 110
+def _dump(content: Mapping[str, object], file: Path) -> None:
     text = io.StringIO()
-    yaml.dump(content, text)
+    write_yaml(dict(content), text)
     file.write_text(text.getvalue(), encoding="utf-8")

@@ -10,12 +10,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
+from hesim_render.core.device_types import Float
 from hesim_render.core.npz import NpzWriter
 from hesim_render.core.units import S_PER_US, US_PER_S
 from hesim_render.pixels.evs.defects import DefectEvents
@@ -165,12 +165,12 @@ class TrialBench:
                 archive.add("part_trials", np.array(each))
                 archive.add("part_us", np.array(each * (plan.trial_us + _PAUSE_US)))
 
-    def _electrons(self, signal_dn: float) -> Any:
+    def _electrons(self, signal_dn: float) -> Float:
         seconds = self.noise.spec.window_us * S_PER_US
         return jit().Float((signal_dn / self.dn_per_e_per_s * seconds).astype(np.float32).ravel())
 
     def _trial(
-        self, before: Any, after: Any, plan: TrialPlan
+        self, before: Float, after: Float | None, plan: TrialPlan
     ) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int8]]:
         """Which pixels were calm while settling, the time bin of each one's first event (−1: none), its polarity."""
         # waits for leak events begin with the stage: each needs its own seed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import tee
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from hesim_render.mosaic.schedule import (
     without_first,
 )
 from hesim_render.pixels.aps.model import ApsNoise
-from hesim_render.pixels.arrays import restore, saved
+from hesim_render.pixels.arrays import SavedState, restore, saved
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
@@ -72,7 +72,7 @@ class Capture:
         duration_us: int,
         seed: int,
         begin_us: int = 0,
-        pixels: dict[str, Any] | None = None,
+        pixels: SavedState | None = None,
         labels: bool = False,
     ) -> None:
         self._sensor, self._seed = sensor, seed
@@ -99,7 +99,7 @@ class Capture:
         self._known_us = self._stage.t_us if self._stage is not None else None
         #: Number of event samples taken, and time that has been simulated, µs.
         self._samples, self._t_us = 0, begin_us
-        self._pixel_state: dict[str, Any] = {}
+        self._pixel_state: SavedState = {}
         self._event_flux = EventFlux(self._evs_pixel.size)
         self.errors = {"frames": self._frames.errors, "events": ErrorMeter()}
 
@@ -117,7 +117,7 @@ class Capture:
         return self._evs_pixel
 
     @property
-    def pixel_state(self) -> dict[str, Any]:
+    def pixel_state(self) -> SavedState:
         """State of the event pixels at the end of the run, for a run that continues it; plain values, NumPy arrays."""
         return self._pixel_state
 
@@ -180,7 +180,7 @@ class Capture:
         """Time that has been simulated, and end of the run, µs."""
         return self._t_us, self._duration_us
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> SavedState:
         """State between two items that `run` yields: plain values, NumPy arrays. Not of labels and errors of a render.
 
         Unlike `pixel_state`, it belongs to the same run, and holds frames in exposure.
@@ -193,7 +193,7 @@ class Capture:
             "flux": saved(self._event_flux),
         }
 
-    def go_on(self, state: dict[str, Any]) -> None:
+    def go_on(self, state: SavedState) -> None:
         """Let `run` yield what comes after a `state` of the same run. The source is asked for nothing before it.
 
         Parameters
@@ -279,12 +279,13 @@ class Capture:
         keep : called with each frame and block of events as well; it may ask for the `state`.
         """
         for item in self.run(progress):
-            if isinstance(item, np.ndarray):
-                writer.add_events(item)
-                if self.labeller is not None:
-                    writer.add_event_labels(self.labeller.taken())
-            else:
-                writer.add_frame(item)
+            match item:
+                case Frame():
+                    writer.add_frame(item)
+                case events:
+                    writer.add_events(events)
+                    if self.labeller is not None:
+                        writer.add_event_labels(self.labeller.taken())
             if keep is not None:
                 keep(item)
         if self._stage is not None:

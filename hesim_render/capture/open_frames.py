@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
 from itertools import islice, pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from hesim_render.core.device_types import Float
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.schedule import Exposure
 from hesim_render.pixels.aps.model import ApsNoise
-from hesim_render.pixels.arrays import restore, saved
+from hesim_render.pixels.arrays import SavedState, restore, saved
 from hesim_render.recording.frame import Frame
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.protocol import FluxSource
@@ -69,11 +68,11 @@ class OpenFrames:
         self._exposed, self._open = 0, dict[int, OpenFrame]()
         self.errors = ErrorMeter()
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> SavedState:
         """State between two pieces: plain values and NumPy arrays; not of the errors."""
         return {"exposed": self._exposed, "open": {str(index): saved(frame) for index, frame in self._open.items()}}
 
-    def go_on(self, state: dict[str, Any]) -> None:
+    def go_on(self, state: SavedState) -> None:
         """Go on after a `state` of the same run."""
         self._exposed = state["exposed"]
         self._open = {e.index: OpenFrame(e) for e in self._exposures if str(e.index) in state["open"]}

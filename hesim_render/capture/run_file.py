@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from pydantic import BaseModel, ValidationError
 
@@ -18,7 +18,7 @@ from hesim_render.capture.simulate_video import simulate_video
 from hesim_render.core.errors import HesimError, OutputError, SpecError
 from hesim_render.core.journal import journal_of
 from hesim_render.core.output import check_target, output_errors, replacing
-from hesim_render.core.progress import Progress, ProgressReport
+from hesim_render.core.progress import Progress, expect
 from hesim_render.core.region import parse_roi
 from hesim_render.isp import DENOISED_PICTURE, Pipeline, develop_recording, load_pipeline
 from hesim_render.mosaic.colour_profile import load_camera
@@ -67,14 +67,14 @@ class _Run:
     file: Path
     sensor: Sensor
     scene: Scene | None
-    options: dict[str, Any]
+    options: dict[str, object]
     pipeline: Pipeline | None
     folder: Path
     done: list[str] = field(default_factory=list)
 
     def identity(self) -> str:
         """A hash of all that decides the results: the file, and the content of the files that it names."""
-        named: list[Any] = [
+        named: list[object] = [
             content_hash(self.sensor.spec),
             None if self.scene is None else content_hash(self.scene.spec),
         ]
@@ -103,7 +103,7 @@ def run(
     file: str | Path,
     out: str | Path,
     *,
-    overrides: dict[str, Any] | None = None,
+    overrides: dict[str, object] | None = None,
     allow_outside: bool = False,
     overwrite: bool = False,
     max_minutes: float | None = None,
@@ -140,8 +140,7 @@ def run(
     _open(asked, overwrite)
     kept = tuple(asked.done)
     recording = _recorded(asked, max_minutes, progress, on_estimate)
-    if isinstance(progress, ProgressReport):
-        progress.expect(None)  # the estimate was that of the recording
+    expect(progress, None)  # the estimate was that of the recording
     written = {RECORDING: asked.folder / RECORDING}
     for name, make in _steps(asked, recording, progress).items():
         target = written[name] = asked.folder / name
@@ -151,10 +150,10 @@ def run(
     return RunResult(recording, written, kept)
 
 
-def _read(file: Path, out: Path, overrides: dict[str, Any], allow_outside: bool) -> _Run:
+def _read(file: Path, out: Path, overrides: dict[str, object], allow_outside: bool) -> _Run:
     """The content of the file, and all files that it names, checked."""
     spec = read_run(file, overrides)
-    sets: dict[bool, dict[str, Any]] = {True: {}, False: {}}
+    sets: dict[bool, dict[str, object]] = {True: {}, False: {}}
     for key, value in spec.set.items():
         sets[key.startswith("sensor.")][key.removeprefix("sensor.")] = value
     try:
@@ -164,7 +163,7 @@ def _read(file: Path, out: Path, overrides: dict[str, Any], allow_outside: bool)
         scene = None
         if spec.scene is not None:
             scene = load_scene(spec.beside(spec.scene), sets[False], allow_outside=allow_outside)
-        options: dict[str, Any] = {}
+        options: dict[str, object] = {}
         for key, given, model in (("video", spec.video, VideoOptions), ("cube", spec.cube, CubeOptions)):
             if given is not None:
                 options = _options(file, key, given, model)
@@ -185,13 +184,14 @@ def _read(file: Path, out: Path, overrides: dict[str, Any], allow_outside: bool)
     return _Run(spec, file, sensor, scene, options, pipeline, check_target(out, STATE, overwrite=True))
 
 
-def _options(file: Path, key: str, given: FileInput, model: type[BaseModel]) -> dict[str, Any]:
+def _options(file: Path, key: str, given: FileInput, model: type[BaseModel]) -> dict[str, object]:
     """The options of a video or cube, checked here so that a mistake has its line."""
     if not Path(given.beside(given.file, shipped=False)).exists():
         raise SpecError(f"{given.file}: no such file", file=file, key=f"{key}.file")
     options = dict(given.options)
-    if isinstance(options.get("camera"), str):
-        options["camera"] = load_camera(Path(given.beside(options["camera"], shipped=False)))
+    match options.get("camera"):
+        case str(name):
+            options["camera"] = load_camera(Path(given.beside(name, shipped=False)))
     try:
         model.model_validate(options)
     except ValidationError as error:
@@ -206,8 +206,8 @@ def _open(asked: _Run, overwrite: bool) -> None:
     if not state.is_file():
         return
     try:
-        found = json.loads(state.read_text(encoding="utf-8"))
-        identity, done = found["sha256"], [str(name) for name in found["done"]]
+        result = json.loads(state.read_text(encoding="utf-8"))
+        identity, done = result["sha256"], [str(name) for name in result["done"]]
     except (OSError, ValueError, KeyError, TypeError):
         identity, done = None, []
     if identity == asked.identity():
@@ -241,25 +241,29 @@ def _recorded(
             _clear(asked.folder)
         asked.note()
 
-    common: dict[str, Any] = {
-        "seed": spec.seed, "clean": spec.clean, "without": spec.without, "out": place, "overwrite": True,
-        "progress": False if progress is None else progress,
-    }  # fmt: skip
-    if spec.duration_s is not None:
-        common["duration_s"] = spec.duration_s
-    limits: dict[str, Any] = {"max_minutes": max_minutes, "on_estimate": begin}
+    shown: Progress | Literal[False] = False if progress is None else progress
+    video, cube = spec.video, spec.cube
+    duration_s = 0.1 if spec.duration_s is None else spec.duration_s  # a video has its own
     if asked.scene is not None:
         made = simulate(
-            asked.scene, asked.sensor, quality=spec.quality, exact=spec.exact, samples=spec.samples, truth=spec.truth,
-            truth_every_us=spec.truth_every_us, resume=True, **limits, **common,
+            asked.scene, asked.sensor, duration_s=duration_s, seed=spec.seed,
+            clean=spec.clean, without=spec.without, quality=spec.quality, exact=spec.exact, samples=spec.samples,
+            truth=spec.truth, truth_every_us=spec.truth_every_us, out=place, overwrite=True, resume=True,
+            max_minutes=max_minutes, on_estimate=begin, progress=shown,
         )  # fmt: skip
-    elif spec.video is not None:
-        source = spec.video.beside(spec.video.file, shipped=False)
-        made = simulate_video(source, asked.sensor, resume=True, **limits, **common, **asked.options)
+    elif video is not None:
+        made = simulate_video(
+            video.beside(video.file, shipped=False), asked.sensor, duration_s=spec.duration_s, seed=spec.seed,
+            clean=spec.clean, without=spec.without, out=place, overwrite=True, resume=True, max_minutes=max_minutes,
+            on_estimate=begin, progress=shown, **asked.options,
+        )  # fmt: skip
     else:
-        assert spec.cube is not None
-        source = spec.cube.beside(spec.cube.file, shipped=False)
-        made = simulate_cube(source, asked.sensor, on_estimate=begin, **common, **asked.options)
+        assert cube is not None
+        made = simulate_cube(
+            cube.beside(cube.file, shipped=False), asked.sensor, duration_s=duration_s,
+            seed=spec.seed, clean=spec.clean, without=spec.without, out=place, overwrite=True, on_estimate=begin,
+            progress=shown, **asked.options,
+        )  # fmt: skip
     asked.note(RECORDING)
     return made
 

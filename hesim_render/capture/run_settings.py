@@ -8,7 +8,7 @@ from typing import TypedDict
 
 from hesim_render.core.errors import ConflictError, RangeError
 from hesim_render.core.units import US_PER_S
-from hesim_render.recording.truth_kinds import truth_kinds
+from hesim_render.recording.truth_file import truth_kinds
 
 
 class RunOptions(TypedDict, total=False):
@@ -101,10 +101,10 @@ class RunSettings:
 
     def as_dict(self) -> dict[str, object]:
         """For the manifest, but what the renderer says of itself."""
-        found: dict[str, object] = {"clean": self.clean, "without": list(self.without)}
+        result: dict[str, object] = {"clean": self.clean, "without": list(self.without)}
         if self.kinds:
-            found["truth"] = {"kinds": list(self.kinds), "every_us": self.truth_every_us}
-        return found
+            result["truth"] = {"kinds": list(self.kinds), "every_us": self.truth_every_us}
+        return result
 
 
 def whole_us(duration_s: float) -> int:

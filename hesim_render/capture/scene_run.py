@@ -6,14 +6,14 @@ import warnings
 from collections.abc import Callable
 from functools import cached_property
 
+from hesim_render.capture.error_meter import stated_verdict
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import Noise
 from hesim_render.capture.overheads import with_overheads
 from hesim_render.capture.run_settings import RunSettings
-from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core.errors import SpecError, TooLongError
 from hesim_render.core.progress import Progress
-from hesim_render.recording.truth_kinds import EVENTS
+from hesim_render.recording.truth_file import EVENTS
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.demand import Demand, Estimate
@@ -110,19 +110,19 @@ class SceneRun:
     def verdict(self) -> dict[str, object]:
         """The entry ``render`` of the manifest: errors, work, and whether the render is good enough."""
         renderer, errors = self._renderer, self._capture.errors
-        found: dict[str, object] = {
+        result: dict[str, object] = {
             "error_noise": {name: meter.as_dict(renderer.quality) for name, meter in errors.items()}
         }
-        found |= renderer.work
+        result |= renderer.work
         if renderer.samples is not None:
-            found["audit"] = stated_verdict(errors, renderer.samples, QUALITY)
+            result["audit"] = stated_verdict(errors, renderer.samples, QUALITY)
         elif renderer.quality is not None and self._noted is not None and renderer.auditable is not None:
             if self._progress is not None:
                 self._progress(0, 1, "audit")
             evs = renderer.sensor.evs if renderer.sensor.spec.evs is not None else None
             pixels, seed = self._demand.event_pixel, self._settings.seed
-            found["audit"] = Audit(self._noted, renderer.auditable, renderer.quality, evs, pixels, seed).run()
-        return found
+            result["audit"] = Audit(self._noted, renderer.auditable, renderer.quality, evs, pixels, seed).run()
+        return result
 
     def write_truth(self, writer: RecordingWriter, scene: Scene, sensor: Sensor) -> None:
         """Write the kinds of geometric truth that were asked for.
@@ -160,6 +160,6 @@ def require_short(expected: Estimate, most_minutes: float, cheaper: str) -> None
         raise TooLongError(
             "max_minutes",
             most_minutes,
-            f"this run takes {expected}, and one of more than {most_minutes:g} min has to be wanted: add --yes "
+            f"this run takes {expected}, and more than {most_minutes:g} min must be allowed: add --yes "
             f"(max_minutes=None), or ask for less: {cheaper}",
         )

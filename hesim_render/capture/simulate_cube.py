@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import ValidationError
+from typing import Literal
 
 from hesim_render.capture.loop import Capture
 from hesim_render.capture.noise_terms import noise_models
 from hesim_render.capture.run_settings import require_seed, whole_us
 from hesim_render.core import backend
-from hesim_render.core.errors import RangeError
 from hesim_render.core.progress import Progress, shown
 from hesim_render.mosaic.description import describe
 from hesim_render.mosaic.schedule import require_countable
@@ -35,7 +32,7 @@ def simulate_cube(
     overwrite: bool = False,
     progress: Progress | Literal[False] | None = None,
     on_estimate: Callable[[object], None] | None = None,
-    **options: Any,
+    **options: object,
 ) -> Recording:
     """Simulate a sensor in front of a hyperspectral cube: RAW frames, events, and their noise-free truth.
 
@@ -83,15 +80,7 @@ def simulate_cube(
     require_seed(seed)
     duration_us = whole_us(duration_s)
     require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
-    try:
-        chosen = CubeOptions.model_validate(options)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        name = ".".join(map(str, problem["loc"])) or "options"
-        given = problem.get("input")
-        raise RangeError(
-            name, given if not isinstance(given, dict) else "…", problem["msg"].removeprefix("Value error, ")
-        ) from None
+    chosen = CubeOptions.of(options)
     backend.jit()
     aps, evs = noise_models(sensor, clean, without)
     flux = CubeFlux(cube, sensor, chosen)

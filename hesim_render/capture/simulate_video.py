@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -52,7 +52,7 @@ def simulate_video(
     max_minutes: float | None = None,
     on_estimate: Callable[[VideoEstimate], None] | None = None,
     resume: bool = False,
-    **options: Any,
+    **options: object,
 ) -> Recording:
     """Simulate a sensor in front of a video: RAW frames, events, and their noise-free truth.
 
@@ -105,8 +105,7 @@ def simulate_video(
     aps, evs = noise_models(sensor, clean, without)
     flux = VideoFlux(source, sensor, VideoOptions.of(**options))
     try:
-        name = "array" if isinstance(source, np.ndarray) else str(source)
-        duration_us = _duration_us(duration_s, flux, name)
+        duration_us = _duration_us(duration_s, flux)
         require_countable(sensor.spec.aps, sensor.spec.evs, duration_us)
         capture = Capture(flux, sensor, aps, evs, duration_us, seed)
         expected = flux.estimate(capture.demand)
@@ -131,7 +130,7 @@ def simulate_video(
             ) as writer,
             _journal(resume, source, flux, expected, out, writer, overwrite) as journal,
         ):
-            with shown(progress, f"{Path(name).name} → {sensor.name}") as report:
+            with shown(progress, f"{Path(flux.name).name} → {sensor.name}") as report:
                 expect(report, expected.seconds)
                 flux.start_digest()
                 kept = None if journal is None else KeptRun(capture, journal, _PART_S)
@@ -160,19 +159,19 @@ def _journal(
     return Journal(out, {**writer.run, "software": made_by, **flux.settings, "input": stamp_of(source)}, overwrite)
 
 
-def _duration_us(duration_s: float | None, flux: VideoFlux, name: str) -> int:
+def _duration_us(duration_s: float | None, flux: VideoFlux) -> int:
     """Length of the run in whole µs, within the video."""
     length_us = flux.clock.end_us
     if duration_s is None:
         if flux.cut_short:
             raise SpecError(
-                f"ends after {length_us * S_PER_US:.6g} s, but it once was longer ({flux.cut_short}): copy it anew, or "
-                "give a duration that is there",
-                file=name,
+                f"ends after {length_us * S_PER_US:.6g} s, but it once was longer ({flux.cut_short}): copy it again, "
+                "or give a duration within that time",
+                file=flux.name,
             )
         duration_us = int(length_us + 1e-3)
         if duration_us < 1:
-            raise SpecError(f"lasts {length_us:g} µs, less than one", file=name)
+            raise SpecError(f"lasts {length_us:g} µs, less than one", file=flux.name)
         return duration_us
     if not 0 < duration_s < float("inf"):
         raise RangeError("duration_s", duration_s, "a time above 0, in seconds")

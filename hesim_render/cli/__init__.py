@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.former_names import name_now
 from hesim_render.cli.interrupts import Interrupts
-from hesim_render.cli.option_names import in_options
+from hesim_render.cli.options import in_options
 from hesim_render.cli.terminal import complain, silence_stdout
 from hesim_render.core.errors import HesimError, HesimWarning
 from hesim_render.core.output import discard_unfinished
@@ -94,8 +93,7 @@ def _run(given: list[str], interrupts: Interrupts) -> int:
         if isinstance(error, HesimError):
             complain(*in_options(error, program(), given).splitlines())
         elif isinstance(error, usage_error):
-            now = name_now(given)
-            complain(error.format_message().replace("Value error, ", "") + (f" It is now: {now}" if now else ""))
+            complain(error.format_message().replace("Value error, ", ""))
         elif isinstance(error, OSError):
             silence_stdout()
             where = error.filename or ("standard output" if _is_of_stdout(error) else "a file cannot be written")

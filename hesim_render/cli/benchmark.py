@@ -27,8 +27,8 @@ _Folder = Annotated[Path, typer.Argument(help="folder of a benchmark")]
 @app.command()
 def build(
     spec: Annotated[Path, typer.Argument(help="YAML file of the benchmark")],
-    out: Annotated[Path, typer.Option(help="folder to build in; a build that was stopped goes on")],
-    workers: Annotated[int, typer.Option(help="processes on this machine; 0: this one alone")] = 1,
+    out: Annotated[Path, typer.Option(help="folder to build in; an interrupted build continues")],
+    workers: Annotated[int, typer.Option(help="processes on this machine; 0: only this process")] = 1,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="dask.distributed scheduler, in place of --workers")
     ] = None,
@@ -96,7 +96,7 @@ def _estimated(
     if seconds > 60 * LONG_MINUTES and not is_wanted:
         raise TooLongError(
             "max_minutes", LONG_MINUTES,
-            f"this build takes {expected}; one of more than {LONG_MINUTES} min has to be wanted: add --yes, or ask "
+            f"this build takes {expected}; to start one of more than {LONG_MINUTES} min, add --yes, or ask "
             "for fewer clips (--set clips=100), a shorter duration_s, or a larger quality",
         )  # fmt: skip
     progress.expect(seconds)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from hesim_render.cli.calibrate_recording import recording
 from hesim_render.cli.console import Console, DryRun, Json, Quiet
+from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.options import (
     SENSOR_HELP,
     HelpAll,
@@ -19,8 +20,7 @@ from hesim_render.cli.options import (
     names_of,
     sensor_keys_only,
 )
-from hesim_render.cli.terminal import parse_exposures, split_overrides
-from hesim_render.cli.twin import twin
+from hesim_render.cli.terminal import parse_exposures, parse_size, split_overrides
 from hesim_render.core.errors import RangeError
 from hesim_render.core.output import check_target, free_place
 
@@ -50,7 +50,8 @@ def lab(
     parts: Annotated[
         int,
         typer.Option(
-            help="parts of the dark ticks (of bright trials) counted too: tells flickering pixels", hidden=True
+            help="parts of dark ticks (bright trials) counted separately as well, to find flickering pixels",
+            hidden=True,
         ),
     ] = 0,
     seed: Annotated[int, typer.Option(help="of all temporal noise", hidden=True)] = 7,
@@ -154,6 +155,109 @@ def _show(console: Console, part: str, out: Path, report: Path | None, sensor_fi
     where = [f"in {out}", *(f"{name}: {file}" for name, file in written.items() if file is not None)]
     facts = {"calibration": out, "report": report, "sensor_file": sensor_file, "part": part, "summary": lines}
     console.result("\n".join([*lines, *where]), facts)
+
+
+#: Figures of a recording and of all together, as the command prints them.
+_OF_ONE = {
+    "on_rate_hz": "ON events", "off_rate_hz": "OFF events", "leak_rate_hz": "leak",
+    "on_rate_spread": "spread of ON rates", "off_rate_spread": "spread of OFF rates",
+    "on_local_variation": "local variation",
+}  # fmt: skip
+_OF_ALL = {
+    "theta_on": "θ₊", "theta_off": "θ₋", "threshold_ratio": "θ₋/θ₊", "threshold_mismatch": "threshold mismatch",
+    "leak_dark_hz": "leak in the dark", "leak_growth_hz_per_lux": "growth of the leak", "hot_share": "hot pixels",
+    "silent_share": "silent pixels", "dead_time_us": "dead time", "readout_limit_events_per_s": "read-out limit",
+}  # fmt: skip
+
+
+def recording(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="recordings of still scenes, one for each light")
+    ],
+    out: Annotated[Path | None, typer.Option(help="YAML file of the figures")] = None,
+    lux: Annotated[
+        str | None, typer.Option(help="illuminance on the sensor of each recording, lx, such as 0.1,161,3000")
+    ] = None,
+    target: Annotated[
+        Path | None, typer.Option(help="recording of a target of two grey levels that moves through the picture")
+    ] = None,
+    contrast: Annotated[
+        float | None, typer.Option(help="light of the target's bright parts over that of its dark ones")
+    ] = None,
+    target_hz: Annotated[
+        float | None, typer.Option(help="bright-dark cycles a pixel sees per second; default as recorded", hidden=True)
+    ] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if files do not state it")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file of figures")] = False,
+    json_: Json = False,
+    quiet: Quiet = False,
+    help_all: HelpAll = False,
+) -> None:
+    """Noise and thresholds of event pixels from recordings.
+
+    Still scenes at two lights or more and, for the thresholds, a moving target of known contrast.
+    """
+    from hesim_render.calibrate.recordings import calibrate_recordings
+
+    shape, levels = None if size is None else parse_size(size), None if lux is None else _levels(lux)
+    console = Console(json_, quiet)
+    with console.progress("calibrate recording") as move:
+        result = calibrate_recordings(
+            files, out, lux=levels, target_file=target, target_contrast=contrast, target_hz=target_hz, shape=shape,
+            overwrite=overwrite, progress=lambda what, part: move(part, 1.0, what),
+        )  # fmt: skip
+    lines = []
+    for one in result["recordings"]:
+        light = "" if one["lux"] is None else f", {one['lux']:g} lx"
+        lines.append(f"{one['file']}{light}: {one['events']} events in {one['seconds']:.4g} s")
+        lines += [f"  {_line(text, one[name])}" for name, text in _OF_ONE.items()]
+    lines += [_line(text, result[name]) for name, text in _OF_ALL.items()]
+    lines += [f"look at: {finding['file']}: {finding['text']}" for finding in result["findings"]]
+    lines += [] if out is None else [f"in {out}"]
+    console.result("\n".join(lines), {"calibration": out, **result})
+
+
+def _levels(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise RangeError("--lux", text, "numbers with commas, such as 0.1,161,3000") from None
+
+
+def _line(text: str, item: Mapping[str, Any]) -> str:
+    if item["value"] is None:
+        return f"{text:<20} not identifiable: {item['reason']}"
+    interval, limit = item.get("interval_95"), item.get("upper_limit")
+    between = f" ({interval[0]:.5g} to {interval[1]:.5g})" if interval else f" (below {limit:.5g})" if limit else ""
+    return " ".join([f"{text:<20} {item['value']:.5g}{between}", item.get("unit", ""), item.get("note", "")]).rstrip()
+
+
+def twin(
+    captures: Annotated[Path, typer.Argument(help="folder of EMVA 1288 captures")],
+    out: Annotated[Path, typer.Option(help="folder to write: calibration, sensor file, page and figures of the twin")],
+    seed: Annotated[int, typer.Option(help="of the simulated noise")] = 7,
+    overwrite: Overwrite = False,
+    json_: Json = False,
+    quiet: Quiet = False,
+    help_all: HelpAll = False,
+) -> None:
+    """Calibrate on half of the captures, test on the rest.
+
+    The other half is simulated, and each statistic passes or fails.
+    """
+    from hesim_render.twin import make_twin
+    from hesim_render.twin.page import check_line
+
+    console = Console(json_, quiet)
+    with console.progress("twin") as move:
+        result = make_twin(
+            captures, out, seed=seed, overwrite=overwrite, progress=lambda what, fraction: move(fraction, 1.0, what)
+        )
+    lines = [check_line(check) for check in result.checks]
+    passed = sum(check.passed for check in result.checks)
+    text = "\n".join([*lines, f"{passed} of {len(lines)} pass", f"in {out}"])
+    facts = {"twin": result.folder, "passed": result.passed, "checks": {c.name: c.passed for c in result.checks}}
+    console.result(text, facts, ExitStatus.DONE if result.passed else ExitStatus.NOT_MET)
 
 
 app.command()(recording)

@@ -1,4 +1,4 @@
-"""Two recordings of events of like scenes: ``compare``."""
+"""Two recordings of events of similar scenes: ``compare``."""
 
 from __future__ import annotations
 
@@ -14,19 +14,18 @@ from hesim_render.cli.terminal import parse_size
 
 def compare(
     first: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file, such as that of a real camera")],
-    second: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file of a like scene")],
+    second: Annotated[Path, typer.Argument(metavar="RECORDING", help="event file of a similar scene")],
     size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if files do not state it")] = None,
     json_: Json = False,
     quiet: Quiet = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Compare the events of two recordings of like scenes.
+    """Compare the events of two recordings of similar scenes.
 
     Rates, intervals, correlations, polarity, hot pixels and bursts, each as a distance with an interval.
     """
     from hesim_render.exchange import open_events
-    from hesim_render.measure.event_distance import event_distances
-    from hesim_render.measure.event_statistics import event_statistics
+    from hesim_render.measure.event_distance import event_distances, event_statistics
 
     shape = None if size is None else parse_size(size)
     console = Console(json_, quiet)
@@ -36,9 +35,9 @@ def compare(
             move(0.4 * k, 1.0, f"read {file.name}")
             statistics.append(event_statistics(open_events(file, shape=shape, keep_stated=True)))
         move(0.8, 1.0, "compare")
-        found = event_distances(statistics[0], statistics[1])
+        result = event_distances(statistics[0], statistics[1])
     lines = [f"{'':<11} {'distance':>9} {'95 % interval':>19} {'within first':>12}  {'first':>9} {'second':>9}"]
-    for one in found:
+    for one in result:
         low, high = one.interval_95
         numbers = "" if one.first is None else f"{one.first:>9.4g} {one.second:>9.4g}"
         mark = "differs" if one.differs else ""
@@ -46,5 +45,5 @@ def compare(
         lines.append(
             f"{one.name:<11} {one.value:>9.4g} {between:>19} {one.within:>12.4g}  {numbers:<19} {mark}".rstrip()
         )
-    lines += [f"{one.name}: {one.definition}" for one in found]
-    console.result("\n".join(lines), {"distances": [one.described() for one in found]})
+    lines += [f"{one.name}: {one.definition}" for one in result]
+    console.result("\n".join(lines), {"distances": [one.described() for one in result]})

@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
 
 #: Options of every command that makes something; `--help-all` shows them.
-Json = Annotated[
-    bool, typer.Option("--json", help="print the result as one JSON object, and nothing else, on stdout", hidden=True)
-]
-Quiet = Annotated[bool, typer.Option("--quiet", help="print errors and notes alone", hidden=True)]
+Json = Annotated[bool, typer.Option("--json", help="print only the result, as one JSON object, on stdout", hidden=True)]
+Quiet = Annotated[bool, typer.Option("--quiet", help="print only errors and notes", hidden=True)]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="check everything and print the estimate; write nothing", hidden=True)
 ]

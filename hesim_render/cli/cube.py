@@ -56,14 +56,14 @@ def cube(
     scene_changes, sensor_changes = split_overrides(set_ or [])
     loaded_sensor = cropped(hr.load_sensor(sensor, sensor_changes), roi)
     loaded_scene = hr.load_scene(scene, scene_changes, allow_outside=allow_outside)
-    found, radiance, stderr = hr.render_cube(
+    result, radiance, stderr = hr.render_cube(
         loaded_scene, loaded_sensor, wavelengths, samples, begin_us, end_us=end_us, seed=seed
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    hr.write_spectral_exr(out, radiance, found)
+    hr.write_spectral_exr(out, radiance, result)
     mean = float(radiance.mean())
     share = math.sqrt(float((stderr.astype("f8") ** 2).mean())) / mean if mean > 0 else 0.0
-    say(f"{found.size} bands of {radiance.shape[1]}x{radiance.shape[0]} px, mean {mean:.4g} W m^-2 sr^-1 nm^-1, "
+    say(f"{result.size} bands of {radiance.shape[1]}x{radiance.shape[0]} px, mean {mean:.4g} W m^-2 sr^-1 nm^-1, "
         f"standard error of a pixel {100 * share:.2g} % of it (rms), in {out}")  # fmt: skip
 
 

@@ -13,31 +13,26 @@ from hesim_render.cli.simulate import show_recording
 from hesim_render.cli.terminal import parse_size
 from hesim_render.core.errors import ConflictError
 
-_EXPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "dsec-gzip", "npz", "txt", "nmnist", "tiff", "png",
-            "npy", "mipi")  # fmt: skip
-#: How many of them are of events.
-_EVENTS = 10
-#: Of events and frames together.
-_WHOLE = ("mcap", "mcap-evt3", "raw-npz", "mp4", "mp4-colour", "mp4-events")
-_GEOMETRY = ("exr", "dsec-flow", "tum", "kalibr", "opencv", "prophesee-boxes", "dsec-det", "coco")
-_IMPORTS = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
-
 
 def _complete_export(incomplete: str) -> list[str]:
-    return [name for name in (*_EXPORTS, *_WHOLE, *_GEOMETRY) if name.startswith(incomplete)]
+    from hesim_render.recording.exports import every_format
+
+    return [name for name in every_format() if name.startswith(incomplete)]
 
 
 def _complete_import(incomplete: str) -> list[str]:
-    return [name for name in _IMPORTS if name.startswith(incomplete)]
+    from hesim_render.exchange.formats import READABLE
+
+    return [name for name in READABLE if name.startswith(incomplete)]
 
 
 def export(
     recording: Annotated[Path, typer.Argument(help="folder of a recording")],
     format: Annotated[
         str,
-        typer.Option(help=f"events: {', '.join(_EXPORTS[:_EVENTS])}; frames: {', '.join(_EXPORTS[_EVENTS:])}; "
-                     f"both: {', '.join(_WHOLE)}; "
-                     f"geometric truth: {', '.join(_GEOMETRY)}", autocompletion=_complete_export),
+        typer.Option(help="of events, such as evt3 or dsec; frames, such as tiff; both, such as mcap; geometric truth, "
+                     "such as exr or coco. A name that does not exist is answered with all (docs/formats.md)",
+                     autocompletion=_complete_export),
     ],
     out: Annotated[Path, typer.Option(help="file of the events, or folder of the frames or of the truth")],
     every_us: Annotated[
@@ -55,13 +50,12 @@ def export(
 
     Its events, its RAW frames or its geometric truth.
     """
+    from hesim_render.recording.exports import WHOLE_FORMATS, check_name
     from hesim_render.recording.recording import Recording
+    from hesim_render.recording.truth_export import FORMATS, export_truth
 
     loaded, console = Recording.load(recording), Console(json_, quiet)
-    if format in _GEOMETRY:
-        from hesim_render.recording.exports import check_name
-        from hesim_render.recording.truth_export import export_truth
-
+    if format in FORMATS:
         check_name(format, out)
         if scene is not None:
             from hesim_render.sources.scene import load_scene
@@ -72,10 +66,10 @@ def export(
         return
     for name, value in (("--every-us", every_us), ("--scene", scene)):
         if value is not None:
-            raise ConflictError(name, value, f"only formats of geometric truth take it: {', '.join(_GEOMETRY)}")
+            raise ConflictError(name, value, f"only formats of geometric truth take it: {', '.join(FORMATS)}")
     written = loaded.export(format, out, overwrite)
     counts = loaded.manifest["counts"]
-    if format in _WHOLE:
+    if format in WHOLE_FORMATS:
         facts = {"format": format, "written": written, "events": counts["events"], "frames": counts["frames"]}
         console.result(f"{format} of {counts['frames']} frames and {counts['events']} events in {written}", facts)
         return
@@ -97,9 +91,9 @@ def import_(
     out: Annotated[Path, typer.Option(help="HDF5 file to write; with --sensor the folder of the recording")],
     format: Annotated[
         str | None,
-        typer.Option(help=f"{', '.join(_IMPORTS)}; default: what the file says", autocompletion=_complete_import),
+        typer.Option(help="of the file, such as evt3; default: as the file states", autocompletion=_complete_import),
     ] = None,
-    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, where the file does not say it")] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT of the sensor, if the file does not state it")] = None,
     sensor: Annotated[
         str | None,
         typer.Option(help=f"make a recording of this sensor: {SENSOR_HELP}", autocompletion=names_of("sensors")),

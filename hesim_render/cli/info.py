@@ -63,7 +63,7 @@ def info(
     json_: Json = False,
     help_all: HelpAll = False,
 ) -> None:
-    """Show what runs here, what ships, or a sensor.
+    """Show backends, shipped names, or a sensor.
 
     What this machine can run, the names that can be used, or the figures and curves of a sensor.
     """
@@ -84,11 +84,13 @@ def info(
         _show_machine(console)
     elif what == _NAMES:
         rows = {kind.value: _rows_of(kind) for kind in Kind}
-        text = [line for name, found in rows.items() for line in (f"{name}:", *(f"  {line}" for line in _lines(found)))]
+        text = [
+            line for name, result in rows.items() for line in (f"{name}:", *(f"  {line}" for line in _lines(result)))
+        ]
         console.result("\n".join(text), rows)
     else:
-        found = _rows_of(Kind(what))
-        console.result("\n".join(_lines(found)), {what: found})
+        result = _rows_of(Kind(what))
+        console.result("\n".join(_lines(result)), {what: result})
 
 
 def _show_machine(console: Console) -> None:
@@ -99,14 +101,14 @@ def _show_machine(console: Console) -> None:
     versions = software_versions()
     for name, version in versions.items():
         console.text(f"{name:<14}{version}")
-    found = [backend.probe(candidate) for candidate in backend.candidates()]
-    for candidate in found:
+    result = [backend.probe(candidate) for candidate in backend.candidates()]
+    for candidate in result:
         verdict = "works" if candidate.works else f"does not work: {candidate.reason}"
         console.text(f"{'candidate':<14}{candidate.describe()} - {verdict}")
-    chosen = next((candidate for candidate in found if candidate.works), None)
+    chosen = next((candidate for candidate in result if candidate.works), None)
     facts: dict[str, Any] = {
         "versions": versions,
-        "candidates": {candidate.describe(): candidate.works for candidate in found},
+        "candidates": {candidate.describe(): candidate.works for candidate in result},
         "backend": None if chosen is None else chosen.describe(),
     }
     if chosen is None:
@@ -132,9 +134,9 @@ def _show_sensor(sensor: str, out: Path | None, changes: list[str], as_json: boo
         section: [
             {"name": row.name, "value": None if math.isnan(row.value) else row.value, "unit": row.unit}
             | ({} if row.stated is None else {"data_sheet": row.stated})
-            for row in found
+            for row in result
         ]
-        for section, found in figures.items()
+        for section, result in figures.items()
     }
     lines = [f"{loaded.name}: {loaded.spec.description}", *table_lines(figures)]
     if out is not None:
@@ -159,7 +161,7 @@ def _rows_of(kind: Kind) -> list[dict[str, Any]]:
 
         return [{"name": name} for name in LENS_TERMS]
     if kind is Kind.truth:
-        from hesim_render.recording.truth_kinds import TRUTH_KINDS
+        from hesim_render.recording.truth_file import TRUTH_KINDS
 
         return [{"name": name} for name in TRUTH_KINDS]
     from hesim_render.core.shipped import data_folder, read_keys

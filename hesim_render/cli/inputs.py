@@ -60,7 +60,7 @@ def input_kind(given: str, keys: Collection[str]) -> InputKind:
             return InputKind.recording
         return InputKind.cube if any(map(_CAVE.fullmatch, names)) else InputKind.video
     if end in (".yaml", ".yml") and os.path.isfile(given):
-        from hesim_render.specs.kinds import is_run_file
+        from hesim_render.specs.run import is_run_file
 
         return InputKind.run if is_run_file(path) else InputKind.scene
     if end in _CUBES or (end == ".npy" and "wavelength_nm" in keys):

@@ -53,19 +53,19 @@ def measure(
     region = None if roi is None else _region(roi)
     if out is not None:
         free_place(out, overwrite, (".csv",))
-    found = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
+    result = measure_mtf(Recording.load(recording), frame, region, signal=signal.value, filter_name=filter_)
     if signal is SignalKind.raw:
         say("of RAW values, noise included")
     else:
         say("of the noise-free electrons of the truth, which no camera gives")
-    if found.clipped:
+    if result.clipped:
         say("CLIPPED: RAW values of this part are saturated, and the electrons are not; use less light or exposure")
     for frequency in (0.125, 0.25, 0.5):
-        value = found.mtf[abs(found.frequency_cy_per_px - frequency).argmin()]
+        value = result.mtf[abs(result.frequency_cy_per_px - frequency).argmin()]
         say(f"MTF at {frequency:g} cycles per pixel: {value:.3f}")
-    say(f"MTF50: {found.frequency_at(0.5):.3f} cycles per pixel; edge {found.angle_deg:.2f}° from the vertical")
+    say(f"MTF50: {result.frequency_at(0.5):.3f} cycles per pixel; edge {result.angle_deg:.2f}° from the vertical")
     if out is not None:
-        rows = zip(found.frequency_cy_per_px, found.mtf, strict=True)
+        rows = zip(result.frequency_cy_per_px, result.mtf, strict=True)
         table = "".join(f"{frequency:.6g},{value:.6g}\n" for frequency, value in rows)
         with replacing(out) as unfinished:
             unfinished.write_text(f"frequency_cy_per_px,mtf\n{table}", encoding="utf-8")

@@ -32,7 +32,7 @@ def new(
     ] = "hybrid",
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a sensor file to begin with.
+    """Write a sensor file to start from.
 
     A template in which comments explain every key, or a copy of a shipped one.
     """

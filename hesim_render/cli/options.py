@@ -1,8 +1,11 @@
-"""Common parts of commands: options, completion of names, and checks before any work."""
+"""Common parts of commands: options, completion of names, and checks before any work.
+
+Names of options in errors that the Python API raised with the names of its arguments.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hesim_render.cli.terminal import say
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import HesimError, RangeError
 from hesim_render.core.output import check_target
 from hesim_render.core.region import parse_roi
 
@@ -83,7 +86,7 @@ Truth = Annotated[
 ]
 #: Runs with a longer estimate need a confirmation.
 LONG_MINUTES = 30
-Yes = Annotated[bool, typer.Option("--yes", help=f"also where it takes more than {LONG_MINUTES} minutes", hidden=True)]
+Yes = Annotated[bool, typer.Option("--yes", help=f"also if it takes more than {LONG_MINUTES} minutes", hidden=True)]
 AllowOutside = Annotated[
     bool, typer.Option("--allow-outside", help="let the scene name files outside of its folder", hidden=True)
 ]
@@ -116,3 +119,29 @@ def sensor_keys_only(scene_changes: dict[str, object], example: str) -> None:
 def cropped(sensor: Sensor, roi: str | None) -> Sensor:
     """The sensor with the region of ``--roi``."""
     return sensor if roi is None else sensor.crop(*parse_roi(roi))
+
+
+def in_options(error: HesimError, program: Any, given: Sequence[str]) -> str:
+    """The message of an error, with the option of the command in place of the argument of a function.
+
+    Parameters
+    ----------
+    error : what was raised.
+    program : all commands.
+    given : the command line.
+
+    Returns
+    -------
+    ``--filter is 'rde'; …`` for ``filter_name is 'rde'; …``. An argument without an option of its name, or with one as
+    its begin or end, as ``duration_s``, keeps its name.
+    """
+    name, text = getattr(error, "name", None), str(error)
+    if not isinstance(name, str) or not text.startswith(f"{name} is "):
+        return text
+    command = program
+    for word in given:
+        command = getattr(command, "commands", {}).get(word, command)
+    options = {param.name.rstrip("_"): max(param.opts, key=len) for param in command.params if param.opts}
+    fitting = [option for own, option in options.items() if own == name]
+    fitting += [option for own, option in options.items() if name.startswith(f"{own}_") or name.endswith(f"_{own}")]
+    return next((f"{option}{text[len(name) :]}" for option in fitting if option.startswith("--")), text)

@@ -50,16 +50,17 @@ def simulate(
             autocompletion=names_of("scenes"),
         ),
     ],
-    out: Annotated[Path, typer.Option(help="folder to write to; the same command goes on with a run that was ended")],
+    out: Annotated[Path, typer.Option(help="folder to write to; the same command continues an interrupted run")],
     sensor: Annotated[str | None, typer.Option(help=SENSOR_HELP, autocompletion=names_of("sensors"))] = None,
     duration: Annotated[float | None, typer.Option(help="simulated time, s; default 0.1, of a video all of it")] = None,
     roi: Region = None,
     seed: Annotated[int | None, typer.Option(help="of all noise and of the render; default 7")] = None,
     quality: Annotated[
-        float | None, typer.Option(help="error of the render as a part of the sensor's noise (default 0.5)")
+        float | None, typer.Option(help="error of the render as a fraction of the sensor's noise (default 0.5)")
     ] = None,
     exact: Annotated[
-        bool, typer.Option("--exact", help="render every pixel of every slice, all alike", hidden=True)
+        bool,
+        typer.Option("--exact", help="every pixel of every slice, with equally many rays", hidden=True),
     ] = False,
     samples: Annotated[
         int | None, typer.Option(help="with --exact: rays per pixel and slice of time", hidden=True)

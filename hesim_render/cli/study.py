@@ -33,12 +33,12 @@ def study(
             autocompletion=names_of("studies"),
         ),
     ],
-    out: Annotated[Path, typer.Option(help="folder of tables and report; a sweep that was ended goes on there")],
+    out: Annotated[Path, typer.Option(help="folder of tables and report; an interrupted sweep continues there")],
     surfaces: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME or FILE",
-            help="what a comparison looks at, in place of its own: a scene, a cube, patches; repeatable",
+            help="surfaces of a comparison, in place of its own: a scene, a cube, patches; repeatable",
         ),
     ] = None,
     set_: Annotated[
@@ -57,7 +57,7 @@ def study(
     Ends with status 3 where the audits find runs of a sweep that are worse than it asks for.
     """
     from hesim_render.specs.files import parse_override
-    from hesim_render.specs.kinds import StudyKind, study_kind
+    from hesim_render.specs.run import StudyKind, study_kind
     from hesim_render.specs.study import surfaces_of
 
     kind = study_kind(spec)
@@ -85,8 +85,8 @@ def _compare(console: Console, spec: str, out: Path, keys: dict[str, Any], overw
     from hesim_render.specs.study import read_study
 
     chosen = read_study(spec, keys)
-    from hesim_render.studies.headings import NOTE, level_text
     from hesim_render.studies.run import MARKER
+    from hesim_render.studies.table import NOTE, level_text
 
     check_target(out, MARKER, overwrite)
     import hesim_render as hr
@@ -131,12 +131,12 @@ def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwr
     chosen = read_design(spec, keys)
     check_target(out, MARKER, overwrite)
     with console.progress(chosen.name) as progress:
-        found = design(chosen, out=out, overwrite=overwrite, progress=progress)
-    costs = found.result.costs
+        result = design(chosen, out=out, overwrite=overwrite, progress=progress)
+    costs = result.result.costs
     console.text(
         f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs)
     )
-    for verdict in found.verdicts:
+    for verdict in result.verdicts:
         aware, free = (
             ", ".join(
                 f"{value:.3f} at {key.split('_')[-2]} lx" for key, value in verdict.items() if key.startswith(start)
@@ -151,7 +151,7 @@ def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwr
         )
     console.result(
         f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",
-        {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": found.verdicts},
+        {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": result.verdicts},
     )
 
 

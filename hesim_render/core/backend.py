@@ -5,7 +5,7 @@ this process before a child process has compiled and run a kernel with it. Candi
 
 1. ``DRJIT_LIBLLVM_PATH``, if set;
 2. the system's ``libLLVM``, version 17 or newer, newest first;
-3. the library inside the optional ``llvm`` extra (the ``tadashi`` wheel carries LLVM 17).
+3. the library of the optional ``llvm`` extra (LLVM 17.0.6, from the wheel `EXTRA`).
 
 Dr.Jit loads its LLVM the moment it is imported, so `hesim_render` prepares the choice when it is
 imported itself (`prepare`). The verdict on a library is cached by path, size and modification time.
@@ -18,6 +18,7 @@ import ctypes
 import ctypes.util
 import functools
 import importlib
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -28,13 +29,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hesim_render.core.child import child_environment, python_command
+from hesim_render.core.child import child_environment, interrupts_held, python_command
 from hesim_render.core.errors import BackendError
 from hesim_render.core.extras import how_to_install
-from hesim_render.core.interrupts import interrupts_held
 
 OLDEST_LLVM = 17
 BACKEND_VARIABLE = "HESIM_RENDER_BACKEND"  # "llvm" or "cuda" forces one
+EXTRA = "karellen-llvm-core"
+#: Libraries beside that of the extra, in the order in which they need one another. They are loaded by their own paths:
+#: the links by which libLLVM finds them are made at Python's first start, and only where that may write.
+_BESIDE_EXTRA = ("libunwind", "libc++abi", "libc++")
 
 #: The value that this process itself wrote into DRJIT_LIBLLVM_PATH, as opposed to a choice of the user.
 _chosen_here = ""
@@ -56,7 +60,7 @@ import ctypes, os, sys
 backend, library, *preload = sys.argv[1:]
 if backend == "llvm":
     for name in preload:
-        ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+        ctypes.CDLL(name)
     handle = ctypes.CDLL(library)
     try:
         version = (ctypes.c_uint * 3)()
@@ -121,16 +125,17 @@ def _system_libraries() -> list[Path]:
 
 
 def _extra_library() -> tuple[str, tuple[str, ...]] | None:
-    """libLLVM inside the ``llvm`` extra, and the two libraries it needs loaded first."""
-    spec = importlib.util.find_spec("tadashi")
-    if spec is None or not spec.submodule_search_locations:
+    """libLLVM of the ``llvm`` extra, and the libraries that must be loaded before it."""
+    try:
+        files = importlib.metadata.files(EXTRA) or []
+    except importlib.metadata.PackageNotFoundError:
         return None
-    folder = Path(next(iter(spec.submodule_search_locations))).parent / "tadashi.libs"
-    library = sorted(folder.glob("libLLVM-*.so*"))
-    if not library:
+    paths = [Path(str(file.locate())).resolve() for file in files if ".so" in file.name]
+    libraries = sorted({path for path in paths if _major(path) >= OLDEST_LLVM and path.is_file()}, key=_major)
+    if not libraries:
         return None
-    preload = [str(p) for stem in ("libffi", "libtinfo") for p in sorted(folder.glob(f"{stem}-*.so*"))]
-    return str(library[-1]), tuple(preload)
+    beside = [sorted({p for p in paths if p.name.startswith(f"{stem}.so.") and p.is_file()}) for stem in _BESIDE_EXTRA]
+    return str(libraries[-1]), tuple(str(result[0]) for result in beside if result)
 
 
 def candidates() -> list[BackendCandidate]:
@@ -278,7 +283,7 @@ def select() -> BackendCandidate:
         result = _adopt(result)
         if result.backend == "llvm":
             for name in result.preload:
-                ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+                ctypes.CDLL(name)  # local: libc++ must not serve libraries that were built with libstdc++
             _chosen_here = result.path
             os.environ["DRJIT_LIBLLVM_PATH"] = result.path
         return result

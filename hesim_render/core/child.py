@@ -1,10 +1,15 @@
-"""Child processes of Python: they run the package of their parent, and no module that lies in the working folder."""
+"""Child processes of Python, which run the package of their parent, and interrupts that wait."""
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 #: Imports the package from its file: the parent may have found it where the child does not look.
@@ -44,3 +49,28 @@ def child_environment() -> dict[str, str]:
     if kept := [path for path in paths if os.path.isabs(path)]:
         environment["PYTHONPATH"] = os.pathsep.join(kept)
     return environment
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Delay SIGINT and SIGTERM until the end of the block, if Python handles them.
+
+    A KeyboardInterrupt during the import of a native extension turns into another exception, ends the process from
+    C++, or is lost. Only the main thread receives signals; in other threads nothing is delayed.
+    """
+    held: list[tuple[int, FrameType | None]] = []
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before = signal.getsignal(number)
+            if callable(before):
+                handlers[number] = before
+                signal.signal(number, lambda *arguments: held.append(arguments))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if held:
+            first, frame = held[0]
+            handlers[signal.Signals(first)](first, frame)

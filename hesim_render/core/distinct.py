@@ -43,5 +43,5 @@ def distinct_columns(values: NDArray[_Number]) -> tuple[NDArray[_Number], NDArra
     differs = np.ones(values.shape[1], np.bool_)
     differs[1:] = (values[:, 1:] != values[:, :-1]).any(axis=0)
     first = np.flatnonzero(differs)
-    found, place = np.unique(values[:, first], axis=1, return_inverse=True)
-    return found, np.repeat(place.ravel(), np.diff(first, append=values.shape[1]))
+    result, place = np.unique(values[:, first], axis=1, return_inverse=True)
+    return result, np.repeat(place.ravel(), np.diff(first, append=values.shape[1]))

@@ -27,8 +27,8 @@ def closest(given: str, known: Iterable[str]) -> str | None:
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
     """Text to append to a message about an unknown name."""
-    found = closest(given, known)
-    return f" (did you mean {found!r}?)" if found is not None else ""
+    result = closest(given, known)
+    return f" (did you mean {result!r}?)" if result is not None else ""
 
 
 class HesimError(Exception):

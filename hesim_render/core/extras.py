@@ -18,8 +18,8 @@ def how_to_install(extra: str) -> str:
     except PackageNotFoundError:  # run from a source tree that was never installed
         stated = []
     own = re.compile(rf"""extra\s*==\s*["']{re.escape(extra)}["']""")
-    found = [line.partition(";")[0].strip() for line in stated if own.search(line)]
-    packages = [re.sub(r"^([\w.-]+(?:\[[^\]]*\])?)\s*\(?([^)]*)\)?$", r"\1\2", text) for text in found] or [
+    result = [line.partition(";")[0].strip() for line in stated if own.search(line)]
+    packages = [re.sub(r"^([\w.-]+(?:\[[^\]]*\])?)\s*\(?([^)]*)\)?$", r"\1\2", text) for text in result] or [
         f".[{extra}]"
     ]
     return "pip install " + " ".join(f"'{name}'" for name in packages)

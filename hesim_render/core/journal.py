@@ -33,14 +33,14 @@ _LONGEST_LINE = 1 << 20
 
 def key_of(*inputs: object) -> bytes:
     """Hash of inputs: arrays with their types, and plain values."""
-    found = hashlib.blake2b(digest_size=16)
+    result = hashlib.blake2b(digest_size=16)
     for given in inputs:
         if isinstance(given, np.ndarray):
-            found.update(f"{given.dtype.str}{given.shape};".encode())
-            found.update(np.ascontiguousarray(given).data)
+            result.update(f"{given.dtype.str}{given.shape};".encode())
+            result.update(np.ascontiguousarray(given).data)
         else:
-            found.update(f"{given!r};".encode())
-    return found.digest()
+            result.update(f"{given!r};".encode())
+    return result.digest()
 
 
 def journal_of(target: str | Path) -> Path:
@@ -79,7 +79,7 @@ class Journal:
     Attributes
     ----------
     path : the file, from `journal_of`. It appears with the first result.
-    found : number of results of an earlier run, those of `others` included.
+    count : number of results of an earlier run, those of `others` included.
 
     Raises
     ------
@@ -110,7 +110,7 @@ class Journal:
                 self._places.update(self._results_in(other))
         with output_errors(self.path):
             self._open(target, overwrite)
-        self.found = len(self._places)
+        self.count = len(self._places)
 
     def _open(self, target: str | Path, overwrite: bool) -> None:
         if not self.path.is_file():
@@ -127,7 +127,7 @@ class Journal:
                 changed = [name for name in {**self._run, **before} if before.get(name) != self._run.get(name)]
                 if not overwrite and before:
                     raise OutputError(
-                        f"{target}: an interrupted run, which would go on there, had another {', '.join(changed)}; "
+                        f"{target}: the interrupted run at this place differs in {', '.join(changed)}; "
                         f"repeat that run, or begin anew (--overwrite, overwrite=True), or remove {self.path}"
                     )
                 self.path.unlink()

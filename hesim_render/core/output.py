@@ -311,6 +311,17 @@ class OutputFolder:
     def discard(self) -> None:
         _remove(self.path)
 
+    def __enter__(self) -> OutputFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Give the folder its name at the end of the with statement; remove it after an exception."""
+        try:
+            if kind is None:
+                self.commit()
+        finally:
+            self.discard()
+
 
 def _is_alive_elsewhere(pid: int) -> bool:
     """True if another process with this number is running."""

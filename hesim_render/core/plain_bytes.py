@@ -73,10 +73,10 @@ def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
         return outline, begin
     ((kind, given),) = outline.items()
     if kind == "type":
-        found = getattr(jit(), given, None)
-        if not dr.is_array_v(found):  # the bytes may name anything
+        result = getattr(jit(), given, None)
+        if not dr.is_array_v(result):  # the bytes may name anything
             raise TypeError(f"no type of Dr.Jit arrays: {given!r}")
-        return found, begin
+        return result, begin
     if kind == "array":
         descr, shape, is_scalar = given
         dtype = np.dtype(descr if isinstance(descr, str) else [tuple(field) for field in descr])
@@ -85,8 +85,8 @@ def _filled(outline: Any, data: bytes, begin: int) -> tuple[Any, int]:
         return (array[()] if is_scalar else array), begin + array.nbytes
     entries = []
     for entry in given if kind == "tuple" else [entry for _, entry in given]:
-        found, begin = _filled(entry, data, begin)
-        entries.append(found)
+        result, begin = _filled(entry, data, begin)
+        entries.append(result)
     if kind == "tuple":
         return tuple(entries), begin
     return dict(zip([key for key, _ in given], entries, strict=True)), begin

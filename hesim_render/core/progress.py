@@ -302,7 +302,7 @@ def progress_report(title: str, stream: TextIO | None = None, first_s: float | N
     return ProgressReport(_Bar(title, target) if target.isatty() else _Lines(title, target, first_s))
 
 
-def expect(progress: Progress | None, seconds: float) -> None:
+def expect(progress: Progress | None, seconds: float | None) -> None:
     """Let a report know the estimated time of the run from now on, s; a function of a caller does not get it."""
     if isinstance(progress, ProgressReport):
         progress.expect(seconds)

@@ -50,5 +50,5 @@ def read_keys(file: Path, keys: Collection[str]) -> dict[str, Any]:
             is_wanted = line.partition(":")[0] in keys
         if is_wanted:
             parts.append(line)
-    found = YAML(typ="safe", pure=True).load("".join(parts)) if parts else {}
-    return found if isinstance(found, dict) else {}
+    result = YAML(typ="safe", pure=True).load("".join(parts)) if parts else {}
+    return result if isinstance(result, dict) else {}

@@ -18,9 +18,9 @@ def table(kind: Any, values: ArrayLike) -> Any:
 
     host = kind(np.ravel(values))
     index = dr.opaque(dr.uint32_array_t(kind), 0) + dr.arange(dr.uint32_array_t(kind), len(host))
-    found = dr.gather(kind, host, index)
-    dr.eval(found)
-    return found
+    result = dr.gather(kind, host, index)
+    dr.eval(result)
+    return result
 
 
 def spread_out(kind: Any, table: NDArray, lane: Any) -> Any:

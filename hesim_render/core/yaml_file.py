@@ -1,9 +1,9 @@
-"""Reading of YAML files without trust in their size, depth or aliases."""
+"""YAML files: read without trust in their size, depth or aliases, and written."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
@@ -52,6 +52,22 @@ def parse_yaml(text: str, file: Path, with_lines: bool = True) -> Any:
     if not isinstance(data, CommentedMap if with_lines else dict):
         raise SpecError("expected a mapping of keys to values at the top level", file=file, line=1)
     return data
+
+
+def write_yaml(content: object, stream: IO[str], width: int = 110, is_sorted: bool = False) -> None:
+    """Write plain values as YAML, short lists and mappings on one line each.
+
+    Parameters
+    ----------
+    content : mappings, lists, texts and numbers.
+    stream : what takes the text.
+    width : of a line, characters.
+    is_sorted : keys in alphabetical order; default in their own.
+    """
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style, yaml.width = None, width
+    yaml.sort_base_mapping_type_on_output = is_sorted  # type: ignore[assignment]  # ruamel declares None
+    yaml.dump(content, stream)
 
 
 def _check_aliases(text: str, file: Path) -> None:

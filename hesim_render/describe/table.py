@@ -46,7 +46,7 @@ def figures_of(sensor: Sensor) -> dict[str, list[Row]]:
     {section: rows}; sections that the sensor lacks are left out.
     """
     geometry, sensor = sensor.spec.geometry, sensor.calibrated_part
-    found = {
+    result = {
         "geometry": [
             Row("columns", geometry.cols, "px"), Row("rows", geometry.rows, "px"),
             Row("pixel pitch", geometry.pitch_um, "µm"), Row("fill factor", geometry.fill_factor, ""),
@@ -55,11 +55,11 @@ def figures_of(sensor: Sensor) -> dict[str, list[Row]]:
         ]
     }  # fmt: skip
     if sensor.spec.aps is not None:
-        found["frames"] = _frames(sensor)
+        result["frames"] = _frames(sensor)
     if sensor.spec.evs is not None:
-        found["events"] = _events(sensor)
-        found["events against light"] = _against_light(sensor)
-    return found
+        result["events"] = _events(sensor)
+        result["events against light"] = _against_light(sensor)
+    return result
 
 
 def _frames(sensor: Sensor) -> list[Row]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError
 from hesim_render.core.units import US_PER_S
-from hesim_render.events.checks import check_form, interval, within
+from hesim_render.events.grids import check_form, interval, within
 
 #: Largest number of intervals.
 _MOST_INTERVALS = 10_000_000

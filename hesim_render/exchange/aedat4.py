@@ -4,6 +4,8 @@
 (stream, size, content), and the table of packets, whose places are those behind the packets' own headers. All parts
 are FlatBuffers (flatbuffers.dev) with the size in front. A packet of events is one vector of 16-byte structures, so
 NumPy writes and reads it without a library for FlatBuffers.
+
+Reader of tables in FlatBuffers (flatbuffers.dev), with every position checked.
 """
 
 from __future__ import annotations
@@ -19,9 +21,66 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import printable, reading, require_memory
-from hesim_render.exchange.flatbuffer import FlatTable
 from hesim_render.exchange.stream import EventStream
 from hesim_render.pixels.evs.events import EVENT_DTYPE
+
+
+class FlatTable:
+    """A table in a buffer.
+
+    Parameters
+    ----------
+    data : the buffer.
+    position : of the table, byte.
+
+    Raises
+    ------
+    ValueError
+        If a part of it lies outside of the buffer; so do all methods.
+    """
+
+    def __init__(self, data: bytes, position: int) -> None:
+        self._data, self._position = data, position
+        fields = position - self._at(position, "<i")
+        size = self._at(fields, "<H")
+        self._fields = [self._at(fields + at, "<H") for at in range(4, size - 1, 2)]
+
+    @classmethod
+    def root(cls, data: bytes, identifier: bytes) -> FlatTable:
+        """The root table of a buffer without a size in front, which must have an identifier of 4 bytes."""
+        if data[4:8] != identifier:
+            raise ValueError(f"a part says {data[4:8]!r}; expected {identifier!r}")
+        (position,) = struct.unpack_from("<I", data)
+        return cls(data, position)
+
+    def _at(self, position: int, form: str) -> int:
+        if not 0 <= position <= len(self._data) - struct.calcsize(form):
+            raise ValueError("a position lies outside of its part")
+        return struct.unpack_from(form, self._data, position)[0]
+
+    def _field(self, number: int) -> int | None:
+        offset = self._fields[number] if number < len(self._fields) else 0
+        return self._position + offset if offset else None
+
+    def number(self, field: int, form: str, default: int) -> int:
+        """A field with a number of the `struct` format `form`."""
+        position = self._field(field)
+        return default if position is None else self._at(position, form)
+
+    def text(self, field: int) -> str:
+        """A field with a text; empty without one."""
+        return self.structures(field, np.dtype("u1")).tobytes().decode("utf-8")
+
+    def structures(self, field: int, dtype: np.dtype) -> NDArray:
+        """A field with a vector of numbers or structures; empty without one."""
+        position = self._field(field)
+        if position is None:
+            return np.empty(0, dtype=dtype)
+        position += self._at(position, "<I")
+        count = self._at(position, "<I")
+        # NumPy checks that the vector ends within the buffer
+        return np.frombuffer(self._data, dtype, count, position + 4)
+
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 _EVENT = np.dtype({
@@ -157,9 +216,9 @@ def _events_stream(info: str, path: Path) -> tuple[tuple[int, int], int]:
     if "<!" in info:
         raise SpecError("declares a document type or entities in its XML, as no such file does", file=path)
     for node in ElementTree.fromstring(info).iterfind("./node/node"):
-        found = {attribute.get("key"): attribute.text or "" for attribute in node.iter("attr")}
-        if found.get("typeIdentifier") == "EVTS":
-            name, cols, rows = node.get("name", ""), found.get("sizeX", ""), found.get("sizeY", "")
+        result = {attribute.get("key"): attribute.text or "" for attribute in node.iter("attr")}
+        if result.get("typeIdentifier") == "EVTS":
+            name, cols, rows = node.get("name", ""), result.get("sizeX", ""), result.get("sizeY", "")
             if not all(re.fullmatch(r"\d{1,6}", value) for value in (name, cols, rows)):
                 entry = printable(f"{name!r} of {cols!r} x {rows!r}")
                 raise SpecError(f"has a stream of events without number and size ({entry[:80]})", file=path)
@@ -203,7 +262,7 @@ def _unpacked(content: bytes, compression: int, path: Path) -> bytes:
         import lz4.frame
 
         with lz4.frame.LZ4FrameDecompressor() as unpack:
-            found = unpack.decompress(content, max_length=_LARGEST_PACKET)
+            result = unpack.decompress(content, max_length=_LARGEST_PACKET)
             whole = unpack.eof
     elif compression in _ZSTD:
         import zstandard
@@ -213,12 +272,12 @@ def _unpacked(content: bytes, compression: int, path: Path) -> bytes:
         while size <= _LARGEST_PACKET and (part := unpacker.read(_PIECE)):
             parts.append(part)
             size += len(part)
-        found, whole = b"".join(parts), size <= _LARGEST_PACKET
+        result, whole = b"".join(parts), size <= _LARGEST_PACKET
     else:
         raise SpecError(f"has the compression {compression}; expected 0 to 4", file=path)
     if not whole:
         raise SpecError(f"a packet ends early, or is larger than {_LARGEST_PACKET >> 20} MiB", file=path)
-    return found
+    return result
 
 
 def _exactly(file: IO[bytes], size: int, path: Path) -> bytes:

@@ -27,7 +27,6 @@ FILTER, MOST_EVENTS = 0x8ECF, 65535
 #: Coordinates have 11 bits.
 LARGEST_SIDE = 1 << 11
 _ALL_PACKED, _COLUMNS_PACKED = 2, 1
-_HEAD_BYTES = 12  # number of events, and the first time
 _LONG_STEP, _LONG_RUN = 15, 15
 
 
@@ -139,9 +138,9 @@ class _Chunk:
         size = np.dtype(kind).itemsize * count
         if len(self._data) < self._at + size:
             raise self.problem(f"ends at byte {len(self._data)}, within its values")
-        found = np.frombuffer(self._data, kind, count, self._at)
+        result = np.frombuffer(self._data, kind, count, self._at)
         self._at += size
-        return found
+        return result
 
     def _rest(self, kind: str, per_event: int) -> NDArray:
         """All numbers that the next part can have at most, which are not yet taken."""
@@ -219,8 +218,8 @@ def _chain(size: NDArray[np.int64]) -> NDArray[np.int64]:
     reached[0] = True
     # after k steps, followers are 2^k entries away, and all that are nearer have been reached
     while True:
-        found = follower[reached]
-        if reached[found].all():
+        result = follower[reached]
+        if reached[result].all():
             return np.flatnonzero(reached[:end])
-        reached[found] = True
+        reached[result] = True
         follower = follower[follower]

@@ -1,4 +1,9 @@
-"""The formats by name, and the opening of event files."""
+"""The formats by name, and the opening of event files.
+
+RAW frames as files of other programs: 16-bit TIFF and PNG, NPY, and the ``.bin`` of the MIPI challenge.
+
+All hold the exact DN. The challenge's files are uint16, little endian: width, height, then the pixels row by row.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
-from hesim_render.core.guard import reading
+from hesim_render.core.guard import printable, reading
 from hesim_render.exchange import (
     aedat4,
     dat,
@@ -20,13 +25,45 @@ from hesim_render.exchange import (
     event_packets,
     evt2,
     evt3,
-    frame_files,
     mcap_file,
     nmnist,
     prophesee_hdf5,
     raw_file,
 )
 from hesim_render.exchange.stream import EventStream
+
+
+def write_tiff(path: Path, raw: NDArray[np.uint16]) -> None:
+    """Write a frame [row, col] as an uncompressed grey TIFF file of one strip."""
+    import tifffile
+
+    tifffile.imwrite(path, raw, photometric="minisblack", rowsperstrip=raw.shape[0], metadata=None, software=False)
+
+
+def write_png(path: Path, raw: NDArray[np.uint16]) -> None:
+    """Write a frame [row, col] as a grey 16-bit PNG file."""
+    from PIL import Image
+
+    Image.fromarray(raw).save(path, format="PNG", compress_level=1)
+
+
+def write_npy(path: Path, raw: NDArray[np.uint16]) -> None:
+    """Write a frame [row, col] as a NumPy file."""
+    np.save(path, raw)
+
+
+def write_mipi(path: Path, raw: NDArray[np.uint16]) -> None:
+    """Write a frame [row, col] as a file of the MIPI challenge.
+
+    Raises
+    ------
+    SpecError
+        If the frame has more than 65535 rows or columns.
+    """
+    rows, cols = raw.shape
+    if max(rows, cols) >= 1 << 16:
+        raise SpecError(f"the format holds at most 65535 rows and columns, not {cols}x{rows} px", file=path)
+    path.write_bytes(np.array([cols, rows], dtype="<u2").tobytes() + raw.astype("<u2").tobytes())
 
 
 @dataclass(frozen=True)
@@ -52,9 +89,10 @@ class FrameFormat:
     write: Callable[[Path, NDArray[Any]], None]
 
 
+#: Formats of Prophesee's RAW files, which one header is common to.
+_RAW = {"evt2": evt2, "evt3": evt3}
 EVENT_FORMATS = {
-    "evt2": EventFormat(".raw", evt2.write),
-    "evt3": EventFormat(".raw", evt3.write),
+    **{name: EventFormat(".raw", kind.write) for name, kind in _RAW.items()},
     "dat": EventFormat(".dat", dat.write),
     "prophesee": EventFormat(".hdf5", prophesee_hdf5.write),
     "aedat4": EventFormat(".aedat4", aedat4.write),
@@ -65,14 +103,14 @@ EVENT_FORMATS = {
     "nmnist": EventFormat(".bin", nmnist.write),
 }
 FRAME_FORMATS = {
-    "tiff": FrameFormat(".tiff", frame_files.write_tiff),
-    "png": FrameFormat(".png", frame_files.write_png),
-    "npy": FrameFormat(".npy", frame_files.write_npy),
-    "mipi": FrameFormat(".bin", frame_files.write_mipi),
+    "tiff": FrameFormat(".tiff", write_tiff),
+    "png": FrameFormat(".png", write_png),
+    "npy": FrameFormat(".npy", write_npy),
+    "mipi": FrameFormat(".bin", write_mipi),
 }
 #: Formats that can be read, by the first bytes of their files.
 _BEGINS = {b"% ": "raw", b"#!AER-DAT": "aedat4", b"\x89HDF\r\n\x1a\n": "dsec", b"PK": "npz", mcap_file.BEGIN: "mcap"}
-READABLE = ("evt2", "evt3", "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
+READABLE = (*_RAW, "dat", "prophesee", "aedat4", "dsec", "npz", "mcap")
 
 
 def open_events(
@@ -103,13 +141,13 @@ def open_events(
     file = Path(path).expanduser()
     if format is not None and format not in READABLE:
         raise RangeError("format", format, f"one of {', '.join(READABLE)}")
-    found = _detect(file)
-    if format is not None and found != format:
-        actual = f"which is {found}" if found else "which has another begin"
+    result = _detect(file)
+    if format is not None and result != format:
+        actual = f"which is {result}" if result else "which has another begin"
         raise SpecError(f"was to be read as {format}, {actual}", file=file)
-    if found is None:
+    if result is None:
         raise SpecError(f"is of no known event format; expected one of {', '.join(READABLE)}", file=file)
-    stream = _OPENERS[found](file)
+    stream = _OPENERS[result](file)
     if shape is not None and not (keep_stated and stream.shape != (0, 0)):
         return replace(stream, shape=shape)
     if stream.shape == (0, 0):
@@ -138,15 +176,21 @@ def is_event_file(path: str | Path) -> bool:
 def _detect(file: Path) -> str | None:
     with reading(file), file.open("rb") as opened:
         begin = opened.read(16)
-    found = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
-    if found == "raw":
-        return "dat" if dat.is_dat(file) else raw_file.read_header(file)[0].lower()
-    return "prophesee" if found == "dsec" and prophesee_hdf5.holds(file) else found
+    result = next((name for start, name in _BEGINS.items() if begin.startswith(start)), None)
+    if result == "raw" and dat.is_dat(file):
+        return "dat"
+    if result == "raw":
+        name = raw_file.read_header(file)[0]
+        if name.lower() not in _RAW or not name.isupper():
+            expected = " or ".join(_RAW).upper()
+            raise SpecError(f"has the format {printable(name)!r}; expected {expected}", file=file)
+        return name.lower()
+    return "prophesee" if result == "dsec" and prophesee_hdf5.holds(file) else result
 
 
 def _open_raw(file: Path) -> EventStream:
     name, shape, begin = raw_file.read_header(file)
-    kind = {"EVT2": evt2, "EVT3": evt3}[name]
+    kind = _RAW[name.lower()]
     return EventStream(
         lambda: kind.read(file, begin), shape or (0, 0), file, triggers=lambda: kind.read_triggers(file, begin)
     )
@@ -187,8 +231,7 @@ def _open_mcap(file: Path) -> EventStream:
 
 
 _OPENERS: dict[str, Callable[[Path], EventStream]] = {
-    "evt2": _open_raw,
-    "evt3": _open_raw,
+    **dict.fromkeys(_RAW, _open_raw),
     "dat": _open_dat,
     "prophesee": _open_prophesee,
     "aedat4": _open_aedat4,

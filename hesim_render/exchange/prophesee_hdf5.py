@@ -109,9 +109,9 @@ class _Index:
         known = sum(part.size for part in self._first)
         periods = np.arange(known, int(since[-1]) // _PERIOD_US + 1)
         at = np.searchsorted(since, periods * _PERIOD_US)
-        found = np.empty(periods.size, _INDEX)
-        found["id"], found["ts"] = at + self._done, since[at]
-        self._first.append(found)
+        result = np.empty(periods.size, _INDEX)
+        result["id"], result["ts"] = at + self._done, since[at]
+        self._first.append(result)
         self._done += times_us.size
 
     def write(self, made: Any, group: str) -> None:
@@ -221,9 +221,9 @@ def read_triggers(path: Path) -> NDArray:
         rows = stored[:]
     if rows.size and not 0 <= rows["id"].min() <= rows["id"].max() < 256:
         raise SpecError(f"{TRIGGERS} names a line that is none; expected 0 to 255", file=path)
-    found = np.empty(rows.size, TRIGGER_DTYPE)
-    found["t_us"], found["channel"], found["edge"] = rows["t"], rows["id"], np.where(rows["p"] > 0, 1, -1)
-    return found
+    result = np.empty(rows.size, TRIGGER_DTYPE)
+    result["t_us"], result["channel"], result["edge"] = rows["t"], rows["id"], np.where(rows["p"] > 0, 1, -1)
+    return result
 
 
 def _records(file: Any, name: str, fields: Any, path: Path) -> Any:

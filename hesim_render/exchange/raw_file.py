@@ -100,27 +100,25 @@ def read_lines(path: Path) -> tuple[dict[str, str], int]:
 
 
 def read_header(path: Path) -> tuple[str, tuple[int, int] | None, int]:
-    """Format (``EVT2``, ``EVT3``), shape (rows, columns; None if the header has none), and first byte of the words.
+    """Format (``EVT2``, ``EVT3``, …), shape (rows, columns; None if the header has none), and first byte of the words.
 
     Raises
     ------
     SpecError
-        If the file has no such header, or states a format that cannot be read.
+        If the file has no such header.
     """
     keys, begin = read_lines(path)
     if not keys:
         raise SpecError("is not a Prophesee RAW file (no header of lines with %)", file=path)
     stated, *details = keys.get("format", "").split(";")
     name = stated or _VERSIONS.get(keys.get("evt", ""), keys.get("evt", ""))
-    if name not in ("EVT2", "EVT3"):
-        raise SpecError(f"has the format {printable(name)!r}; expected EVT2 or EVT3", file=path)
     return name, _shape(keys, details, path), begin
 
 
 def _shape(keys: dict[str, str], details: list[str], path: Path) -> tuple[int, int] | None:
-    found = dict(detail.partition("=")[::2] for detail in details)
+    result = dict(detail.partition("=")[::2] for detail in details)
     size = re.fullmatch(r"(\d{1,5})x(\d{1,5})", keys.get("geometry", ""))
-    width, height = size.groups() if size else (found.get("width", ""), found.get("height", ""))
+    width, height = size.groups() if size else (result.get("width", ""), result.get("height", ""))
     if not (width or height):
         return None
     return stated_size(width, height, LARGEST_SIDE, path)
@@ -168,9 +166,9 @@ def require_types(types: NDArray[np.uint8], known: NDArray[np.bool_], name: str,
     """
     unknown = ~known[types]
     if unknown.any():
-        found = int(types[unknown.argmax()])
+        result = int(types[unknown.argmax()])
         raise SpecError(
-            f"holds a word of type {found:#x}, which {name} does not have; the file is damaged or of another format",
+            f"holds a word of type {result:#x}, which {name} does not have; the file is damaged or of another format",
             file=path,
         )
 

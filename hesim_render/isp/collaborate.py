@@ -112,10 +112,10 @@ def _coefficients(values: NDArray[np.float32], basis: NDArray[np.float32], rows:
 
 def _features(coefficients: NDArray[np.float32], is_noisy: bool) -> NDArray[np.float32]:
     """Features by which patches are compared, [row, col, feature]."""
-    found = coefficients[..., :_COMPARED].copy()
+    result = coefficients[..., :_COMPARED].copy()
     if is_noisy:
-        found[..., 1:][np.abs(found[..., 1:]) < _STANDS_OUT] = 0
-    return found
+        result[..., 1:][np.abs(result[..., 1:]) < _STANDS_OUT] = 0
+    return result
 
 
 def _alike(features: NDArray[np.float32], inside: slice) -> NDArray[np.int64]:

@@ -94,16 +94,16 @@ def fit_matrix(patches: ArrayLike, reference: ArrayLike) -> ColourFit:
 
     best = start
     if camera.shape[1] > 1:
-        found = minimize(loss, start, method="Powell", options={"maxiter": 20, "xtol": 1e-4, "ftol": 1e-5})
-        best = found.x if found.fun < loss(start) else start
+        result = minimize(loss, start, method="Powell", options={"maxiter": 20, "xtol": 1e-4, "ftol": 1e-5})
+        best = result.x if result.fun < loss(start) else start
     matrix, scale = unpack(best)
     return ColourFit(matrix.tolist(), scale, delta_e_2000(scale * camera @ matrix.T, target).tolist())
 
 
 def _constrained_least_squares(camera: NDArray, target: NDArray) -> NDArray[np.float64]:
     """Columns but the first of the matrix [3, channel] whose rows sum to 1, by least squares."""
-    found, *_ = np.linalg.lstsq(camera[:, 1:] - camera[:, :1], target - camera[:, :1], rcond=None)
-    return found.T
+    result, *_ = np.linalg.lstsq(camera[:, 1:] - camera[:, :1], target - camera[:, :1], rcond=None)
+    return result.T
 
 
 def _with_unit_rows(free: NDArray) -> NDArray[np.float64]:

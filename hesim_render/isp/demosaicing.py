@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from hesim_render.core.bands import in_bands
 from hesim_render.core.errors import RangeError
 from hesim_render.isp import kriging
-from hesim_render.isp.blocks import BAND_BLOCKS, block_of, bordered, join, split
 from hesim_render.isp.guide import predict_guide
+from hesim_render.isp.stabilise import BAND_BLOCKS, block_of, bordered, join, split
 from hesim_render.spectral.transfer import from_root, to_root
 
 #: Ridge of the regression on the guide, square-root units squared.

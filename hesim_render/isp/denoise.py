@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from hesim_render.isp import collaborate, kriging
-from hesim_render.isp.blocks import block_of, bordered, join, split
 from hesim_render.isp.collaborate import SampleBlocks
 from hesim_render.isp.frame_noise import FrameNoise
-from hesim_render.isp.stabilise import Stabiliser
+from hesim_render.isp.stabilise import Stabiliser, block_of, bordered, join, split
 
 #: The block means correct only longer wavelengths than this: standard deviation of a Gaussian, blocks.
 _LONG_BLOCKS = 2.0
@@ -52,13 +51,13 @@ def denoise(
 def _stabilisers(noise: FrameNoise, tile: NDArray, top_dn: float) -> dict[tuple[int, int], Stabiliser]:
     """The transform of each tile position; positions with equal noise share one."""
     made: dict[tuple[float, float, float], Stabiliser] = {}
-    found = {}
+    result = {}
     for row, col in np.argwhere(tile >= 0):
         law = noise.variance((int(row), int(col)))
         if law not in made:
             made[law] = Stabiliser(*law, top_dn)
-        found[int(row), int(col)] = made[law]
-    return found
+        result[int(row), int(col)] = made[law]
+    return result
 
 
 def _each(

@@ -72,10 +72,9 @@ def develop_recording(
         noise = FrameNoise.of_recording(recording.manifest, calibration, recording.path)
     elif calibration is not None:
         raise RangeError("calibration", str(calibration), "none, as no step of the pipeline reduces noise")
-    target = OutputFolder(out or recording.path.with_name(f"{recording.path.name}-pictures"), MARKER, overwrite)
-    illumination = _illumination(recording) if any(item.step == "lens_shading" for item in chain.steps) else None
-    total = len(recording.frames)
-    try:
+    with OutputFolder(out or recording.path.with_name(f"{recording.path.name}-pictures"), MARKER, overwrite) as target:
+        illumination = _illumination(recording) if any(item.step == "lens_shading" for item in chain.steps) else None
+        total = len(recording.frames)
         gain, entries = None, []
         if any(item.step == "exposure" and item.auto for item in chain.steps):
             middle = recording.frames[total // 2]
@@ -99,10 +98,7 @@ def develop_recording(
         }
         with output_errors(target.target):
             (target.path / MARKER).write_text(manifests.to_text(about) + "\n", encoding="utf-8")
-        return target.commit()
-    except BaseException:
-        target.discard()
-        raise
+    return target.target
 
 
 def write_picture(path: Path, picture: NDArray) -> None:

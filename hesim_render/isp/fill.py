@@ -114,7 +114,7 @@ def _fill_phase(
 
 def _bridges(tile: NDArray, channel: int, row: int, col: int) -> list[tuple[_Offset, _Offset]]:
     """Offsets of the nearest samples of a channel on both sides, for each direction that has them."""
-    found = []
+    result = []
     for dy, dx in _DIRECTIONS:
         sides = []
         for sign in (1, -1):
@@ -124,8 +124,8 @@ def _bridges(tile: NDArray, channel: int, row: int, col: int) -> list[tuple[_Off
                     sides.append((y, x))
                     break
         if len(sides) == 2:
-            found.append((sides[0], sides[1]))
-    return found
+            result.append((sides[0], sides[1]))
+    return result
 
 
 def _mean_of_bridges(

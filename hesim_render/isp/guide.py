@@ -75,12 +75,12 @@ def predict_guide(planes: NDArray[np.float32], block: NDArray, channel: int) -> 
         for first in range(0, width, _PART_BLOCKS):
             cols = slice(first, min(first + _PART_BLOCKS, width))
             around = slice(rows.start, rows.stop + 2), slice(cols.start, cols.stop + 2)
-            found = kriging.apply(wide, weights, *around)
-            found = found.reshape(len(PRIORS), -1, *found.shape[1:])
-            energy = _energy(found[:, len(wanted) :], member, counts)
+            result = kriging.apply(wide, weights, *around)
+            result = result.reshape(len(PRIORS), -1, *result.shape[1:])
+            energy = _energy(result[:, len(wanted) :], member, counts)
             energy *= _handicap(colour[rows, cols])
             share = _shares(energy)
-            inner = found[:, : len(wanted), 1:-1, 1:-1]
+            inner = result[:, : len(wanted), 1:-1, 1:-1]
             for k, (row, col) in enumerate(wanted):
                 np.einsum("krc,krc->rc", inner[:, k], share[cell_of[k]], out=out[row, col, rows, cols])
 

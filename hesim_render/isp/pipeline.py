@@ -203,8 +203,10 @@ def _charts_measured(state: Development, chain: Pipeline) -> list[Step]:
             continue
         item.run(linear)
         if k in charts:
-            found = linear.report or {}
-            result = {"gains": found["white_balance"]} if item.step == "white_balance" else {"matrix": found["matrix"]}
+            outcome = linear.report or {}
+            result = (
+                {"gains": outcome["white_balance"]} if item.step == "white_balance" else {"matrix": outcome["matrix"]}
+            )
             steps[k] = item.model_copy(update={"method": "given", **result})
     state.report = linear.report
     return steps

@@ -56,12 +56,12 @@ def row_offsets(
     height = signal_dn.shape[0]
     if row_std_dn <= 0 or height < 3:
         return np.zeros(height, dtype=np.float32)
-    found = [
+    result = [
         comparison
         for row, col in np.argwhere(channels >= 0)
         for comparison in _compared(signal_dn, channels, (int(row), int(col)), noise, row_std_dn)
     ]
-    return _likeliest(found, height, row_std_dn).astype(np.float32)
+    return _likeliest(result, height, row_std_dn).astype(np.float32)
 
 
 def _nearest(column: NDArray, row: int, step: int) -> int:
@@ -104,13 +104,13 @@ def _compared(
     return [_Comparison(rows, up, down, centre, variance)]
 
 
-def _likeliest(found: list[_Comparison], height: int, row_std_dn: float) -> NDArray[np.float64]:
+def _likeliest(result: list[_Comparison], height: int, row_std_dn: float) -> NDArray[np.float64]:
     """Offsets that minimise Σ (difference - predicted difference)² / variance + Σ offset² / prior variance."""
-    reach = max((item.up + item.down for item in found), default=0)
+    reach = max((item.up + item.down for item in result), default=0)
     band = np.zeros((reach + 1, height))  # lower form of solveh_banded
     band[0] = 1 / row_std_dn**2
     right = np.zeros(height)
-    for item in found:
+    for item in result:
         share = item.down / (item.up + item.down)
         weight = 1 / item.variance
         parts = ((-item.up, -share), (0, 1.0), (item.down, share - 1))

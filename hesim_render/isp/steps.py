@@ -51,8 +51,8 @@ class Development:
     span_dn: float | None = None
     report: dict[str, Any] | None = None
 
-    def note(self, **found: Any) -> None:
-        self.report = {**(self.report or {}), **found}
+    def note(self, **result: Any) -> None:
+        self.report = {**(self.report or {}), **result}
 
 
 class MapFile(Strict):
@@ -246,9 +246,9 @@ class ColourMatrix(Strict):
             from hesim_render.spectral import spectrum as spectra
 
             reference = chart.reference_linear_srgb(spectra.illuminant(self.illuminant))
-            found = colour.fit_matrix(chart.patch_means(state.image, self.corners), reference)
-            matrix = found.matrix
-            state.note(matrix=matrix, mean_delta_e_2000=found.mean_delta_e, max_delta_e_2000=found.max_delta_e)
+            result = colour.fit_matrix(chart.patch_means(state.image, self.corners), reference)
+            matrix = result.matrix
+            state.note(matrix=matrix, mean_delta_e_2000=result.mean_delta_e, max_delta_e_2000=result.max_delta_e)
         state.image = colour.colour_matrix(state.image, matrix)
 
 

@@ -93,5 +93,5 @@ def measure_mtf(
     clipped = largest >= mosaic.white_level_dn
     if signal == "raw" and clipped:
         raise RangeError("raw", largest, "values below saturation; use less light or exposure")
-    found = edge_response(values, used, frequency_cy_per_px=FREQUENCIES, oversampling=oversampling)
-    return replace(found, clipped=clipped)
+    result = edge_response(values, used, frequency_cy_per_px=FREQUENCIES, oversampling=oversampling)
+    return replace(result, clipped=clipped)

@@ -167,15 +167,15 @@ def _find_edge(x: NDArray, y: NDArray, value: NDArray) -> tuple[float, float]:
             step = erf((np.cos(p[0]) * u + np.sin(p[0]) * v - p[1]) / np.exp(p[2]))
             return p[3] + p[4] * step - seen
 
-        found = least_squares(
+        result = least_squares(
             residual, [angle, distance, np.log(width), 0.5, 0.5], x_scale=[0.01, 0.1, 0.1, 0.01, 0.01]
         )
-        angle, distance = float(found.x[0]), float(found.x[1])
-        width = float(np.clip(np.exp(found.x[2]), 0.1, width))
-    if found.x[4] < 0:
+        angle, distance = float(result.x[0]), float(result.x[1])
+        width = float(np.clip(np.exp(result.x[2]), 0.1, width))
+    if result.x[4] < 0:
         angle, distance = angle + np.pi, -distance
-    scatter = float(np.sqrt(np.mean(found.fun**2)))
-    if abs(found.x[4]) < 2 * scatter:
+    scatter = float(np.sqrt(np.mean(result.fun**2)))
+    if abs(result.x[4]) < 2 * scatter:
         raise RangeError("values", scatter, "one straight edge that stands out of the noise; none was found")
     return angle, distance
 

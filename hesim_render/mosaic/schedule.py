@@ -78,13 +78,13 @@ def exposures(spec: ApsSpec, rows: int, duration_us: int) -> list[Exposure]:
     row starts the frame.
     """
     line_time_us = spec.line_time_us if spec.shutter == "rolling" else 0.0
-    found: list[Exposure] = []
+    result: list[Exposure] = []
     while True:
-        start_us = round(len(found) * US_PER_S / spec.frame_rate_hz)
-        exposure = Exposure(len(found), start_us, spec.exposure_us, rows, line_time_us)
+        start_us = round(len(result) * US_PER_S / spec.frame_rate_hz)
+        exposure = Exposure(len(result), start_us, spec.exposure_us, rows, line_time_us)
         if exposure.end_us > duration_us:
-            return found
-        found.append(exposure)
+            return result
+        result.append(exposure)
 
 
 #: Number of intervals between windows in a block; interpolation never crosses the border of a block.
@@ -226,10 +226,10 @@ def sample_of_blocks(
         return BlockSample(list(blocks(begin_us, end_us)), 1.0)
     part = np.arange(_STRETCHES) + np.random.default_rng(seed).random(_STRETCHES)
     chosen = ((begin_us + part / _STRETCHES * (end_us - begin_us)) // stretch_us).astype(np.int64)
-    found = [block for k in chosen.tolist() for block in blocks(k * stretch_us, (k + 1) * stretch_us)]
+    result = [block for k in chosen.tolist() for block in blocks(k * stretch_us, (k + 1) * stretch_us)]
     # a source adds a single window where a run begins, and these stretches are not runs
-    found = [block for block in found if block.wanted.size > 1]
-    return BlockSample(found, _STRETCHES * stretch_us / (end_us - begin_us))
+    result = [block for block in result if block.wanted.size > 1]
+    return BlockSample(result, _STRETCHES * stretch_us / (end_us - begin_us))
 
 
 def without_first(blocks: Iterable[Block], count: int) -> Iterator[Block]:

@@ -1,14 +1,22 @@
-"""Device parameters that are one number or one value per pixel, and the state of an object as plain values."""
+"""Device parameters that are one number or one value per pixel, and the state of an object as plain values.
+
+Noise terms that can be switched off by name.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.backend import jit
 from hesim_render.core.device_types import DeviceArray, Float, UInt32
+from hesim_render.core.errors import RangeError
+
+#: State of an object between two calls, by name: plain values, NumPy arrays, and tuples and states of these.
+SavedState: TypeAlias = dict[str, Any]
 
 
 def to_device(value: float | NDArray) -> Float:
@@ -30,12 +38,12 @@ def take(value: DeviceArray, index: UInt32) -> DeviceArray:
     return value if dr.width(value) == 1 else dr.gather(type(value), value, index)
 
 
-def saved(part: Any) -> dict[str, Any]:
+def saved(part: Any) -> SavedState:
     """State of an object between two calls, as plain values and NumPy arrays: the attributes named in its `STATE`."""
     return {name: _off_device(getattr(part, name)) for name in part.STATE}
 
 
-def restore(part: Any, state: dict[str, Any]) -> None:
+def restore(part: Any, state: SavedState) -> None:
     """Put the result of `saved` back into an object made from the same parameters."""
     for name in part.STATE:
         own = getattr(part, name)
@@ -62,3 +70,17 @@ def _on_device(value: Any) -> Any:
             return kind(entries)
         return tuple(_on_device(entry) for entry in value)
     return value
+
+
+def switched_off(already: frozenset[str], terms: Iterable[str], known: tuple[str, ...]) -> frozenset[str]:
+    """`already` and `terms` together.
+
+    Raises
+    ------
+    RangeError
+        If a name is not among `known`; the message lists them.
+    """
+    for term in terms:
+        if term not in known:
+            raise RangeError("noise term", term, f"one of {', '.join(known)}")
+    return already | frozenset(terms)

@@ -67,12 +67,12 @@ def frame_maps(layout: Layout) -> dict[str, NDArray[np.float32]] | None:
 
     ``response`` [row, col], 1 + PRNU, is there if a flat field was captured.
     """
-    found = _read(layout, "aps", ("n_row", "n_blc", "n_dp", "response"))
-    if found is None:
+    result = _read(layout, "aps", ("n_row", "n_blc", "n_dp", "response"))
+    if result is None:
         return None
-    maps, (row, _) = found
+    maps, (row, _) = result
     rows = slice(row, row + layout.rows)
-    cut = _frame_region(layout, found, tuple(name for name in ("n_blc", "n_dp", "response") if name in maps))
+    cut = _frame_region(layout, result, tuple(name for name in ("n_blc", "n_dp", "response") if name in maps))
     return {name: values.astype(np.float32) for name, values in (cut | {"n_row": maps["n_row"][rows, None]}).items()}
 
 
@@ -95,7 +95,7 @@ def event_defect_rates(layout: Layout) -> EventDefectRates | None:
     return None if counted is None else counted.per_second(_interval_s(layout, "evs"))
 
 
-_Found = tuple[Mapping[str, NDArray], tuple[int, int]]
+_Placed = tuple[Mapping[str, NDArray], tuple[int, int]]
 _Kind = TypeVar("_Kind", bound=RateMaps)
 
 
@@ -103,13 +103,13 @@ def _all_of(
     kind: type[_Kind],
     layout: Layout,
     section: str,
-    cut: Callable[[Layout, _Found, tuple[str, ...]], dict[str, NDArray]],
+    cut: Callable[[Layout, _Placed, tuple[str, ...]], dict[str, NDArray]],
 ) -> _Kind | None:
     """Maps of one kind over the region, all of them or none."""
-    found = _read(layout, section, kind.names())
-    if found is None or len(found[0]) < len(kind.names()):
+    result = _read(layout, section, kind.names())
+    if result is None or len(result[0]) < len(kind.names()):
         return None
-    return kind.of(cut(layout, found, kind.names()))
+    return kind.of(cut(layout, result, kind.names()))
 
 
 def _interval_s(layout: Layout, section: str) -> float:
@@ -126,13 +126,13 @@ def _maps_of(layout: Layout) -> MeasuredMaps:
     return layout.maps
 
 
-def _frame_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict[str, NDArray]:
-    maps, (row, col) = found
+def _frame_region(layout: Layout, result: _Placed, names: tuple[str, ...]) -> dict[str, NDArray]:
+    maps, (row, col) = result
     return {name: maps[name][row : row + layout.rows, col : col + layout.cols] for name in names}
 
 
-def _event_region(layout: Layout, found: _Found, names: tuple[str, ...]) -> dict[str, NDArray]:
-    maps, (row, col) = found
+def _event_region(layout: Layout, result: _Placed, names: tuple[str, ...]) -> dict[str, NDArray]:
+    maps, (row, col) = result
     grid = layout.spec.evs_grid
     assert grid is not None
     tile_rows, tile_cols = layout.tile_shape
@@ -153,15 +153,15 @@ def relative_threshold(layout: Layout, polarity: str, spread: float) -> NDArray[
     spread : relative standard deviation over pixels.
     """
     name = f"threshold_{polarity}_rel"
-    found = _read(layout, "evs", (name, "bad_pixels", "defect"))
-    if found is None or name not in found[0]:
+    result = _read(layout, "evs", (name, "bad_pixels", "defect"))
+    if result is None or name not in result[0]:
         return None
-    values = found[0][name].astype(np.float64)
-    good = values[~found[0]["bad_pixels"]]
+    values = result[0][name].astype(np.float64)
+    good = values[~result[0]["bad_pixels"]]
     scaled = 1 + (values - good.mean()) * (spread / max(float(good.std()), 1e-12))
-    if "defect" in found[0]:  # events of their own hide the threshold of these: they would count twice
-        scaled[np.isin(found[0]["defect"], (Defect.HOT, Defect.FLICKERING))] = 1.0
-    return _event_region(layout, ({name: scaled}, found[1]), (name,))[name].astype(np.float32)
+    if "defect" in result[0]:  # events of their own hide the threshold of these: they would count twice
+        scaled[np.isin(result[0]["defect"], (Defect.HOT, Defect.FLICKERING))] = 1.0
+    return _event_region(layout, ({name: scaled}, result[1]), (name,))[name].astype(np.float32)
 
 
 def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping[str, NDArray], tuple[int, int]] | None:
@@ -172,8 +172,8 @@ def _read(layout: Layout, section: str, names: tuple[str, ...]) -> tuple[Mapping
     if section not in measured.sections:
         return None
     offset = _offset(layout, measured)
-    found = measured.sections[section]
-    maps = {name: found[name] for name in names if name in found}
+    result = measured.sections[section]
+    maps = {name: result[name] for name in names if name in result}
     height, width = _region(layout, measured)[2:]
     grid = layout.spec.evs_grid
     if section == "evs" and grid is not None:

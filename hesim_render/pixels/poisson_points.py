@@ -52,12 +52,12 @@ class PoissonPoints:
         count = last - first + 1
         which = np.repeat(np.arange(count.size), count)
         cell = np.arange(which.size) - np.repeat(np.cumsum(count) - count, count) + first[which]
-        found = [(np.empty(0, np.intp), np.empty(0, np.int64), np.empty(0))]
+        result = [(np.empty(0, np.intp), np.empty(0, np.int64), np.empty(0))]
         for here, order, offset_us in self._points(which, cell):
             t_us = cell[here] * self._cell_us[which[here]] + offset_us
             inside = (t_us > begin_us) & (t_us <= end_us)
-            found.append((here[inside], order[inside], t_us[inside]))
-        here, order, t_us = (np.concatenate(values) for values in zip(*found, strict=True))
+            result.append((here[inside], order[inside], t_us[inside]))
+        here, order, t_us = (np.concatenate(values) for values in zip(*result, strict=True))
         return which[here], t_us, self._mark(which[here], cell[here], order)
 
     def last_mark(self, which: NDArray[np.intp], t_us: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -92,11 +92,11 @@ class PoissonPoints:
         here, elapsed, block = np.arange(which.size), np.zeros(which.size), 0
         while here.size:
             draw = np.full(here.size, block, np.uint32)
-            found = words(self._seed, self._stream, self._pixel[which[here]], _counter(cell[here]), draw)
+            result = words(self._seed, self._stream, self._pixel[which[here]], _counter(cell[here]), draw)
             for k in range(_BLOCK):
-                elapsed = elapsed - np.log(uniform(found[k])) * self._mean_us[which[here]]
+                elapsed = elapsed - np.log(uniform(result[k])) * self._mean_us[which[here]]
                 inside = elapsed < self._cell_us[which[here]]
-                here, elapsed, found = here[inside], elapsed[inside], found[:, inside]
+                here, elapsed, result = here[inside], elapsed[inside], result[:, inside]
                 if here.size:
                     yield here, np.full(here.size, _BLOCK * block + k), elapsed
             block += 1

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import output_errors
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.sources.render.truth.poses import CameraModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
@@ -86,7 +87,7 @@ def write_kalibr_camchain(path: str | Path, truths: Sequence[SceneTruth], grids:
         topic, from_imu = f"/cam{number}/image_raw", np.linalg.inv(pose) @ poses[0]
         chain[f"cam{number}"] = _kalibr_camera(truth.camera(grid), topic, from_imu, before)
     with output_errors(target):
-        write_yaml(target, chain)
+        write_kalibr(target, chain)
     return target
 
 
@@ -117,16 +118,11 @@ def write_kalibr_aprilgrid(
             raise RangeError(name, value, "a number above 0")
     target = Path(path)
     with output_errors(target):
-        write_yaml(target, {"target_type": "aprilgrid", **values})
+        write_kalibr(target, {"target_type": "aprilgrid", **values})
     return target
 
 
-def write_yaml(path: Path, content: dict[str, Any]) -> None:
-    """Write plain values as YAML."""
-    from ruamel.yaml import YAML
-
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 200
+def write_kalibr(path: Path, content: dict[str, Any]) -> None:
+    """Write plain values as YAML, each list on one line."""
     with path.open("w", encoding="utf-8") as stream:
-        yaml.dump(json.loads(json.dumps(content)), stream)
+        write_yaml(json.loads(json.dumps(content)), stream, width=200)

@@ -201,10 +201,10 @@ def number(value: NDArray, name: str, file: Path, *, whole: bool = False, least:
     wrong = SpecError(f"{name} must be one {kind} of {least:g} or more, up to {_MOST:g}", file=file)
     if value.size != 1 or value.dtype.kind not in "uif":
         raise wrong
-    found = float(value.item())
-    if not least <= found <= _MOST or (whole and found != int(found)):
+    result = float(value.item())
+    if not least <= result <= _MOST or (whole and result != int(result)):
         raise wrong
-    return found
+    return result
 
 
 def count_maps(captures: CaptureSet, name: str, member: str) -> Iterator[NDArray]:

@@ -85,6 +85,13 @@ def export(recording: Recorded, format: str, path: str | Path, overwrite: bool =
     return _write_frames(recording, format, path, overwrite)
 
 
+def every_format() -> tuple[str, ...]:
+    """Names of all formats: of events, of frames, of both, of geometric truth."""
+    from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
+
+    return (*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS, *TRUTH_FORMATS)
+
+
 def check_format(format: str, has_events: bool, has_frames: bool) -> None:
     """Refuse a format that does not exist, or of what a recording does not have.
 
@@ -93,9 +100,7 @@ def check_format(format: str, has_events: bool, has_frames: bool) -> None:
     RangeError
         With the formats that can be used.
     """
-    from hesim_render.recording.truth_export import FORMATS as TRUTH_FORMATS
-
-    known = (*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS, *TRUTH_FORMATS)
+    known = every_format()
     if format not in known:
         raise RangeError("format", format, f"one of {', '.join(known)}{did_you_mean(format, known)}")
     if format in (*EVENT_FORMATS, "mp4-events") and not has_events:
@@ -192,23 +197,17 @@ def _write_ticks(recording: Recorded, path: str | Path, overwrite: bool) -> Path
     tick_us = (recording.manifest["sensor"]["spec"].get("evs") or {}).get("tick_us")
     if tick_us is None and not len(recording.frames):
         raise RangeError("format", "raw-npz", "a format of events: there are no frames, and no ticks")
-    folder = OutputFolder(path, FRAMES_NAME, overwrite)
-    try:
-        with output_errors(folder.target):
-            write_tick_files(recording, folder.path, tick_us)
-            facts = {"format": "raw-npz", "tick_us": tick_us, "frames": [frame.times for frame in recording.frames]}
-            (folder.path / FRAMES_NAME).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        return folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
+    with OutputFolder(path, FRAMES_NAME, overwrite) as folder, output_errors(folder.target):
+        write_tick_files(recording, folder.path, tick_us)
+        facts = {"format": "raw-npz", "tick_us": tick_us, "frames": [frame.times for frame in recording.frames]}
+        (folder.path / FRAMES_NAME).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    return folder.target
 
 
 def _write_frames(recording: Recorded, format: str, path: str | Path, overwrite: bool) -> Path:
     """Write all frames as files of one folder, with `FRAMES_NAME` beside them."""
     kind, mosaic = FRAME_FORMATS[format], recording.mosaic
-    folder = OutputFolder(path, FRAMES_NAME, overwrite)
-    try:
+    with OutputFolder(path, FRAMES_NAME, overwrite) as folder:
         entries = []
         for frame in recording.frames:
             name = f"{frame.index:06d}{kind.suffix}"
@@ -226,7 +225,4 @@ def _write_frames(recording: Recorded, format: str, path: str | Path, overwrite:
         }
         with output_errors(folder.target):
             (folder.path / FRAMES_NAME).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-        return folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
+    return folder.target

@@ -13,11 +13,10 @@ from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.exchange import EventStream, mcap_file, open_events
 from hesim_render.exchange.triggers import exposures
 from hesim_render.mosaic.description import describe
-from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw
+from hesim_render.recording.camera_raw import CAMERA_SUFFIXES, read_camera_raw, read_raw
 from hesim_render.recording.dng import is_packed
 from hesim_render.recording.exports import mosaic_encoding
 from hesim_render.recording.frame import Frame
-from hesim_render.recording.raw_file import read_raw
 from hesim_render.recording.writer import RecordingWriter
 
 if TYPE_CHECKING:

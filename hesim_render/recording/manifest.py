@@ -15,13 +15,13 @@ from pydantic import BaseModel, ValidationError
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import inside, read_text, reading
 from hesim_render.mosaic import description as mosaic
+from hesim_render.recording.dng import noise_profile
 from hesim_render.recording.manifest_spec import RecordingSpec
-from hesim_render.recording.noise_profile import noise_profile
 from hesim_render.specs.files import content_hash, validate
 from hesim_render.specs.lens import LENS_TERMS
 from hesim_render.specs.light import mixed_light
+from hesim_render.specs.reflectance import TextureSpec, leaves_of
 from hesim_render.specs.sensor import SensorSpec
-from hesim_render.specs.surface import TextureSpec, leaves_of
 
 if TYPE_CHECKING:
     from hesim_render.sensor.sensor import Sensor
@@ -124,13 +124,13 @@ def _file_hashes(scene: BaseModel) -> dict[str, str]:
 
 def software_versions() -> dict[str, str]:
     """Versions of all software whose change may change the bits of a recording."""
-    found = {"python": platform.python_version()}
+    result = {"python": platform.python_version()}
     for name in ("hesim_render", "mitsuba", "drjit", "numpy"):
         try:
-            found[name] = version(name)
+            result[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+            result[name] = "unknown"
+    return result
 
 
 def to_text(value: Any, indent: str = "") -> str:
@@ -161,9 +161,9 @@ def read(folder: Path) -> dict[str, Any]:
     text = read_text(inside(folder, MANIFEST_NAME))
     with reading(file):
         manifest = json.loads(text)
-    found = manifest.get("schema_version") if isinstance(manifest, dict) else None
-    if found != SCHEMA_VERSION or isinstance(found, bool):
-        raise SpecError(f"schema_version is {found!r}; this version reads {SCHEMA_VERSION}", file=file)
+    result = manifest.get("schema_version") if isinstance(manifest, dict) else None
+    if result != SCHEMA_VERSION or isinstance(result, bool):
+        raise SpecError(f"schema_version is {result!r}; this version reads {SCHEMA_VERSION}", file=file)
     return validate(RecordingSpec, manifest, file, {}).model_dump(mode="json", exclude_unset=True)
 
 

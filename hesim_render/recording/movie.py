@@ -11,8 +11,7 @@ import numpy as np
 
 from hesim_render.core.errors import RangeError
 from hesim_render.pixels.evs.events import no_events
-from hesim_render.recording.colour_view import Picture, colour_picture
-from hesim_render.recording.event_view import black_picture, events_picture
+from hesim_render.recording.colour_view import Picture, black_picture, colour_picture, events_picture
 from hesim_render.recording.preview import magnified
 
 if TYPE_CHECKING:

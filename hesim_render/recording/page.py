@@ -1,4 +1,7 @@
-"""A recording as a web page: ``recording.html`` beside its files, and short tables for notebooks."""
+"""A recording as a web page: ``recording.html`` beside its files, and short tables for notebooks.
+
+Plots of a recording: its pictures, events over time, and the distribution of RAW values.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +10,99 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ruamel.yaml import YAML
 
-from hesim_render.core.drawing import new_figure, report_style, svg
+from hesim_render.core.drawing import COLOURS, new_figure, report_style, svg
 from hesim_render.core.guard import printable
-from hesim_render.core.html import filled, inline_picture, table
+from hesim_render.core.html import filled, inline_picture, table, tick_text
 from hesim_render.core.output import replacing
+from hesim_render.core.units import US_PER_S
+from hesim_render.core.yaml_file import write_yaml
+from hesim_render.events import event_rate
 from hesim_render.recording.outline import parameters, scene_name
-from hesim_render.recording.plots import draw_histogram, draw_rates
 from hesim_render.recording.quality import render_lines
-from hesim_render.recording.showcase import contact_sheet
+from hesim_render.recording.showcase import contact_sheet, middle_views
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from hesim_render.recording.recorded import Recorded
+
+#: Intervals of the curve of event rates.
+_INTERVALS = 200
+_PANEL_PX = (460, 320)
+_TINTS = {"red": "#d62728", "green": "#2ca02c", "blue": "#1f77b4"}
+
+
+def figure_of(recording: Recorded) -> Figure:
+    """`Recording.plot`."""
+    draws: list[Callable[[Recorded, Axes], None]] = []
+    pictures = middle_views(recording)
+    if min(recording.event_shape) > 0:
+        draws.append(draw_rates)
+    if len(recording.frames):
+        draws.append(draw_histogram)
+    number = max(1, len(pictures) + len(draws))
+    columns = min(2, number)
+    rows = -(-number // columns)
+    with report_style():
+        figure = new_figure((columns * _PANEL_PX[0], rows * _PANEL_PX[1]))
+        every = list(np.atleast_1d(figure.subplots(rows, columns)).ravel())
+        for panel in pictures:
+            axes = every.pop(0)
+            axes.imshow(panel.picture)
+            axes.set_axis_off()
+            axes.set_title(panel.caption, fontsize=9)
+        for draw in draws:
+            draw(recording, every.pop(0))
+        for axes in every:
+            axes.set_axis_off()
+        figure.suptitle(repr(recording)[1:-1], fontsize=10)
+    return figure
+
+
+def draw_rates(recording: Recorded, axes: Axes) -> None:
+    """ON and OFF events per second over the recording; from disk, one interval at a time is read."""
+    time = recording.manifest["time"]
+    evs = recording.manifest["sensor"]["spec"].get("evs") or {}
+    tick_us = evs.get("tick_us") or 1  # whole ticks: otherwise intervals with one more would stand out
+    step_us = tick_us * max(1, -(-(time["end_us"] - time["begin_us"]) // (_INTERVALS * tick_us)))
+    # a time stamp is the end of a window: an event at the end belongs to what is before
+    edges = np.append(np.arange(time["begin_us"] + 1, time["end_us"], step_us), time["end_us"] + 1)
+    rates = [
+        event_rate(recording.event_slice(int(a), int(b)), float(b - a), float(a), float(b))
+        for a, b in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    on, off = (np.array([getattr(rate, name)[0] for rate in rates]) for name in ("on_per_s", "off_per_s"))
+    axes.stairs(on, edges / US_PER_S, color=COLOURS[1], label="ON")
+    axes.stairs(off, edges / US_PER_S, color=COLOURS[0], label="OFF")
+    axes.set(title="Events", xlabel="time, s", ylabel="events per s, all pixels")
+    axes.set_ylim(bottom=0)
+    axes.legend(frameon=False)
+
+
+def draw_histogram(recording: Recorded, axes: Axes) -> None:
+    """RAW values of the middle frame, of each filter."""
+    frame, mosaic = recording.frames[len(recording.frames) // 2], recording.mosaic
+    tile = mosaic.tile_channel
+    rows, cols = frame.raw.shape
+    channel = np.tile(tile, (-(-rows // tile.shape[0]), -(-cols // tile.shape[1])))[:rows, :cols]
+    largest = 2**mosaic.bit_depth - 1
+    values = frame.raw[frame.valid]
+    low, high = (float(v) for v in np.quantile(values, [0.0, 1.0])) if values.size else (0.0, float(largest))
+    step = max(1.0, np.ceil((high - low + 1) / 120))
+    edges = low - 0.5 + step * np.arange(np.ceil((high - low + 1) / step) + 1)
+    for number, name in enumerate(mosaic.channels):
+        counts, _ = np.histogram(frame.raw[frame.valid & (channel == number)], edges)
+        axes.stairs(counts, edges, color=_TINTS.get(str(name), COLOURS[number % len(COLOURS)]),
+                    label=str(name))  # fmt: skip
+    axes.axvline(mosaic.black_level_dn, color=COLOURS[6], linestyle="--", linewidth=1, label="black level")
+    axes.set(title=f"RAW values of frame {frame.index}", xlabel="DN", ylabel="pixels", yscale="symlog")
+    axes.yaxis.set_major_formatter(tick_text)
+    axes.legend(frameon=False)
+
 
 PAGE = "recording.html"
 #: Longest lists of numbers that the page shows in full.
@@ -90,7 +173,6 @@ def _short(node: Any) -> Any:
 
 
 def _as_yaml(node: Any) -> str:
-    stream, yaml = io.StringIO(), YAML(typ="safe", pure=True)
-    yaml.default_flow_style, yaml.allow_unicode, yaml.width = None, True, 110
-    yaml.dump(node, stream)
+    stream = io.StringIO()
+    write_yaml(node, stream, is_sorted=True)
     return "" if not node else stream.getvalue()

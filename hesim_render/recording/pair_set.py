@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import MOST_PIXELS, leads_out, printable, read_text, reading
 from hesim_render.core.units import S_PER_US
-from hesim_render.recording.raw_file import RAW_SUFFIXES, read_raw
+from hesim_render.recording.camera_raw import RAW_SUFFIXES, read_raw
 from hesim_render.specs.capture import CaptureSpec
 from hesim_render.specs.files import load_yaml, validate
 
@@ -27,7 +27,7 @@ DATA_FILE = "EMVA1288_Data.txt"
 _S_PER_NS = 1e-9
 #: Names of a plain folder: light, exposure in µs, photons per pixel if known, number of the frame.
 _NAME = re.compile(r"(dark|lit)_([0-9.]+)us(?:_([0-9.]+)ph)?_([0-9]+)(\.[A-Za-z]+)")
-_NAME_TOLD = "lit_<exposure>us_<photons>ph_<number>.png or dark_<exposure>us_<number>.png"
+_NAME_STATED = "lit_<exposure>us_<photons>ph_<number>.png or dark_<exposure>us_<number>.png"
 #: Most frames of a set: a hundred times those of the standard.
 _MOST_FRAMES = 30_000
 #: Exposures at which a variance is known, below which no line is fitted.
@@ -225,23 +225,23 @@ def _picture(folder: Path, file: Path, line: int, name: str) -> Path:
 
 def _named(folder: Path) -> tuple[CaptureSpec, tuple[int, int], list[Series]]:
     """Frames of a plain folder, by their names."""
-    found: dict[tuple[bool, float, float | None], list[tuple[int, Path]]] = {}
+    result: dict[tuple[bool, float, float | None], list[tuple[int, Path]]] = {}
     for path in sorted(folder.iterdir()):
         match = _NAME.fullmatch(path.name)
         if match is None:
             if path.suffix.lower() in RAW_SUFFIXES:
-                raise SpecError(f"the name states no light and exposure; expected {_NAME_TOLD}", file=path)
+                raise SpecError(f"the name states no light and exposure; expected {_NAME_STATED}", file=path)
             continue
         light, exposure, photons, number, _ = match.groups()
         texts = exposure if photons is None else f"{exposure} {photons}"
-        stated = _numbers(path, 1, texts, 1 if photons is None else 2, _NAME_TOLD)
+        stated = _numbers(path, 1, texts, 1 if photons is None else 2, _NAME_STATED)
         if leads_out(folder, path.name):
             raise SpecError("leads out of its folder", file=path)
-        found.setdefault((light == "lit", stated[0] * S_PER_US, None if photons is None else stated[1]), []).append(
+        result.setdefault((light == "lit", stated[0] * S_PER_US, None if photons is None else stated[1]), []).append(
             (int(number), path)
         )
     spec = _capture_spec(folder, None)
-    series = [Series(*key, tuple(p for _, p in sorted(files)), folder, None) for key, files in found.items()]
+    series = [Series(*key, tuple(p for _, p in sorted(files)), folder, None) for key, files in result.items()]
     return spec, _size(series[0].files[0]), series
 
 
@@ -277,14 +277,14 @@ def _arranged(file: Path, spec: CaptureSpec, shape: tuple[int, int], series: lis
         raise SpecError(problem, file=file)
     spatial = {}
     for lit, name in ((True, "lit"), (False, "dark")):
-        found = [entry for entry in series if entry.lit == lit and len(entry.files) > 2]
-        if len(found) != 1:
-            where = f", at {' and '.join(s.label for s in found)}" if found else ""
+        result = [entry for entry in series if entry.lit == lit and len(entry.files) > 2]
+        if len(result) != 1:
+            where = f", at {' and '.join(s.label for s in result)}" if result else ""
             raise SpecError(
-                f"{len(found)} {name} series of more than two frames{where}; one is needed, for DSNU and PRNU",
+                f"{len(result)} {name} series of more than two frames{where}; one is needed, for DSNU and PRNU",
                 file=file,
             )
-        spatial[lit] = found[0]
+        spatial[lit] = result[0]
     if spatial[True].exposure_s != spatial[False].exposure_s:
         raise spatial[True].error(
             f"the dark series is of {spatial[False].exposure_s * 1e6:g} µs; both need one exposure"

@@ -72,15 +72,15 @@ def verdict_lines(audits: Mapping[str, dict[str, Any] | None], noun: str) -> lis
 
 def _events(part: dict[str, Any]) -> str:
     """Text about missed and extra events, where any were seen. Bounds that say nothing are not stated as such."""
-    true, found = part.get("true_events"), part.get("found_events")
-    if not (true or found):
+    true, result = part.get("true_events"), part.get("found_events")
+    if not (true or result):
         return ""
     if _saw_too_little(part):
         none = part["missed"] == part["extra"] == 0
         verdict = "none was missed and none is too many" if none else (
             f"{_percent(part['missed'])} are missed, {_percent(part['extra'])} too many"
         )  # fmt: skip
-        return f"; of {max(true or 0, found or 0):.0f} signal events that were seen {verdict}, too few for a bound"
+        return f"; of {max(true or 0, result or 0):.0f} signal events that were seen {verdict}, too few for a bound"
     return (
         f"; missed {_percent(part['missed'])} of signal events, at most {_percent(part['missed_at_most'])}; "
         f"too many {_percent(part['extra'])}, at most {_percent(part['extra_at_most'])}"

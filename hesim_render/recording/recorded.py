@@ -28,9 +28,8 @@ from hesim_render.exchange.dsec import read_events
 from hesim_render.mosaic.description import Mosaic
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import manifest as manifests
-from hesim_render.recording.frame import EventTruth, Frame
+from hesim_render.recording.frame import EventTruth, Frame, StoredFrames, read_maps
 from hesim_render.recording.label_file import LABEL_FILE, OBJECT_FILE, read_labels, read_objects
-from hesim_render.recording.stored_frames import StoredFrames, read_maps
 
 if TYPE_CHECKING:
     from hesim_render.pixels.evs.events import EventLabels

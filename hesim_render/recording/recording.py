@@ -57,7 +57,7 @@ class Recording(Recorded):
         -------
         A matplotlib figure, which notebooks show; `savefig` writes it.
         """
-        from hesim_render.recording.plots import figure_of
+        from hesim_render.recording.page import figure_of
 
         return figure_of(self)
 

@@ -19,8 +19,7 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.extras import how_to_install
 from hesim_render.core.progress import Progress
 from hesim_render.core.units import S_PER_US
-from hesim_render.recording.colour_view import colour_picture
-from hesim_render.recording.event_view import OFF_COLOUR, ON_COLOUR
+from hesim_render.recording.colour_view import OFF_COLOUR, ON_COLOUR, colour_picture
 
 if TYPE_CHECKING:
     from hesim_render.recording.recorded import Recorded

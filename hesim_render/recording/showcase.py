@@ -12,8 +12,7 @@ from hesim_render.core.guard import printable
 from hesim_render.core.output import replacing
 from hesim_render.pixels.evs.events import no_events
 from hesim_render.recording import preview
-from hesim_render.recording.colour_view import Picture, colour_picture
-from hesim_render.recording.event_view import black_picture, events_picture
+from hesim_render.recording.colour_view import Picture, black_picture, colour_picture, events_picture
 from hesim_render.recording.preview import Panel
 from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
 

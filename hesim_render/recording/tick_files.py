@@ -32,9 +32,9 @@ def write_tick_files(recording: Recorded, folder: Path, tick_us: int | None) -> 
     if tick_us is None:
         return len(recording.frames)
     for tick in range(tick_us, recording.duration_us + 1, tick_us):
-        found = recording.event_slice(tick - tick_us + 1, tick + 1)
+        result = recording.event_slice(tick - tick_us + 1, tick + 1)
         signs = np.zeros(recording.event_shape, np.int8)
-        signs[found["y"], found["x"]] = found["polarity"]
+        signs[result["y"], result["x"]] = result["polarity"]
         codes = np.select([signs > 0, signs < 0], [2, 1], 0).astype(np.uint8)
         np.savez_compressed(folder / f"{tick:09d}_evs.npz", events=signs, event_raw=codes)
     return len(recording.frames)

@@ -20,9 +20,8 @@ from hesim_render.core.errors import RangeError, did_you_mean
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.units import S_PER_US
 from hesim_render.recording.box_export import write_coco, write_dsec_det, write_prophesee_boxes
-from hesim_render.recording.camera_files import write_kalibr_camchain, write_opencv_camera, write_yaml
-from hesim_render.recording.truth_file import POSE_STEP_US, images_at
-from hesim_render.recording.truth_kinds import IMAGES
+from hesim_render.recording.camera_files import write_kalibr, write_kalibr_camchain, write_opencv_camera
+from hesim_render.recording.truth_file import IMAGES, POSE_STEP_US, images_at
 from hesim_render.sources.render.truth.imu import ImuModel
 from hesim_render.sources.render.truth.raster import Grid
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
@@ -71,16 +70,11 @@ def export_truth(
     if every_us is not None and not 1 <= every_us <= recording.duration_us:
         raise RangeError("every_us", every_us, f"1 to {recording.duration_us} µs, the length of the recording")
     truth = recording.truth
-    folder = OutputFolder(out, MARKER, overwrite)
-    try:
-        with output_errors(folder.target):
-            facts = write(recording, truth, folder.path, every_us)
-            text = json.dumps({"format": format_, **facts}, indent=2, ensure_ascii=False)
-            (folder.path / MARKER).write_text(text + "\n", encoding="utf-8")
-        return folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
+    with OutputFolder(out, MARKER, overwrite) as folder, output_errors(folder.target):
+        facts = write(recording, truth, folder.path, every_us)
+        text = json.dumps({"format": format_, **facts}, indent=2, ensure_ascii=False)
+        (folder.path / MARKER).write_text(text + "\n", encoding="utf-8")
+    return folder.target
 
 
 # ---- EXR -----------------------------------------------------------------------------------------------------------
@@ -235,7 +229,7 @@ def _kalibr(recording: Recorded, truth: SceneTruth, folder: Path, every_us: int 
         "gyroscope_noise_density": model.gyro_noise_density,
         "gyroscope_random_walk": model.gyro_random_walk,
     }
-    write_yaml(folder / "imu.yaml", unit)
+    write_kalibr(folder / "imu.yaml", unit)
     return {"cameras": {f"cam{number}": grid for number, grid in enumerate(grids)}}
 
 

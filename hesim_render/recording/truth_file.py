@@ -1,11 +1,13 @@
 """Geometric truth of a recording in one HDF5 file, written frame by frame.
 
 docs/ground-truth.md lists the data sets with their units. Images are chunked by frame and packed with Blosc LZ4.
+
+Kinds of ground truth that a run can be asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +19,40 @@ from numpy.typing import NDArray
 from hesim_render.core.errors import RangeError, SpecError, did_you_mean
 from hesim_render.core.guard import reading
 from hesim_render.core.hdf5 import COMPRESSION, new_file, read_dataset
-from hesim_render.recording.truth_kinds import EVENTS, truth_kinds
 
 if TYPE_CHECKING:
     from hesim_render.sources.render.truth.scene_truth import SceneTruth
+
+#: Kinds with one image for each frame or time; all are those of the chief ray through each pixel's centre.
+IMAGES = ("depth", "normals", "position", "ids", "flow", "mixed")
+#: Kinds that are not images.
+SERIES = ("poses", "boxes", "imu", "light")
+#: Label of each event, events that were lost, and the events without noise.
+EVENTS = "events"
+TRUTH_KINDS = (*IMAGES, *SERIES, EVENTS)
+
+
+def truth_kinds(names: str | Iterable[str]) -> tuple[str, ...]:
+    """The kinds that names ask for, in the order of `TRUTH_KINDS`; ``all`` asks for all.
+
+    One text holds names with commas between them, as on the command line.
+
+    Raises
+    ------
+    RangeError
+        For a name that is not a kind.
+    """
+    wanted: set[str] = set()
+    for name in names.replace(" ", "").split(",") if isinstance(names, str) else names:
+        if name == "all":
+            wanted.update(TRUTH_KINDS)
+        elif name in TRUTH_KINDS:
+            wanted.add(name)
+        else:
+            known = (*TRUTH_KINDS, "all")
+            raise RangeError("truth", name, f"one of {', '.join(known)}{did_you_mean(name, known)}")
+    return tuple(kind for kind in TRUTH_KINDS if kind in wanted)
+
 
 #: Place of the file in a recording.
 TRUTH_FILE = "truth/geometry.h5"

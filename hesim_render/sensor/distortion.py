@@ -134,8 +134,8 @@ class Distortion:
     @cached_property
     def _fold(self) -> float:
         """Tangent at which the model folds first, in any direction around the axis; the largest one if it does not."""
-        radius, found = self._radii
-        _, _, xx, xy, yy = np.moveaxis(found, -1, 0)
+        radius, result = self._radii
+        _, _, xx, xy, yy = np.moveaxis(result, -1, 0)
         with np.errstate(all="ignore"):
             # beyond a pole of the rational model, the first is below 0 as well
             fair = (xx * yy - xy * xy > 0) & (xx + yy > 0)
@@ -144,15 +144,15 @@ class Distortion:
 
     def _at_radius(self, tangent: float) -> float:
         """Least distance from the axis, over all directions around it, of the places at a tangent."""
-        radius, found = self._radii
-        around = np.hypot(found[..., 0], found[..., 1]).min(axis=1)
+        radius, result = self._radii
+        around = np.hypot(result[..., 0], result[..., 1]).min(axis=1)
         return float(np.interp(tangent, radius, around))
 
     @cached_property
     def limit(self) -> float:
         """Tangent up to which the model is used: beyond the image, but before it folds."""
-        radius, found = self._radii
-        least = np.hypot(found[..., 0], found[..., 1]).min(axis=1)
+        radius, result = self._radii
+        least = np.hypot(result[..., 0], result[..., 1]).min(axis=1)
         good = radius <= self._fold
         seen = float(np.interp(self.farthest, least[good], radius[good]))
         return float(min(_BEYOND * seen, seen + _TO_FOLD * (self._fold - seen)))
@@ -160,10 +160,10 @@ class Distortion:
     @cached_property
     def starts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Mean distance from the axis of places, increasing, and the tangents there: where the inverse starts."""
-        radius, found = self._radii
+        radius, result = self._radii
         inside = radius < self.limit
         tangent = np.append(radius[inside], self.limit)
-        mean = np.hypot(found[..., 0], found[..., 1]).mean(axis=1)
+        mean = np.hypot(result[..., 0], result[..., 1]).mean(axis=1)
         return np.maximum.accumulate(np.interp(tangent, radius, mean)), tangent
 
     @cached_property
@@ -171,9 +171,9 @@ class Distortion:
         """Largest factors, over all directions that are used, by which an image place moves: for a change of the
         tangent, for a shift of the camera over the depth of what it sees, and for a turn of the camera, rad.
         """
-        radius, found = self._radii
+        radius, result = self._radii
         inside = radius <= self.limit
-        _, _, xx, xy, yy = np.moveaxis(found[inside], -1, 0)
+        _, _, xx, xy, yy = np.moveaxis(result[inside], -1, 0)
         norm = (np.abs(xx + yy) + np.sqrt((xx - yy) ** 2 + 4 * xy**2)).max(axis=1) / 2
         stretch = np.sqrt(1 + radius[inside] ** 2)
         return float(norm.max()), float((norm * stretch).max()), float((norm * stretch**2).max())

@@ -264,8 +264,8 @@ class FlickerFlux:
         total = np.zeros((2, pixel.size))
         for source, weight in zip(self._auditable, self._weights(begin_us, end_us), strict=True):
             lit = np.flatnonzero(weight)
-            found = source.reference_flux(pixel[lit], begin_us[lit], end_us[lit], quality, events)
-            total[:, lit] += weight[lit] * found
+            result = source.reference_flux(pixel[lit], begin_us[lit], end_us[lit], quality, events)
+            total[:, lit] += weight[lit] * result
         return total
 
 

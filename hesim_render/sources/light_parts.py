@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from hesim_render.sources.scene import Scene
+from hesim_render.specs.light import WaveformSpec
 from hesim_render.specs.target import lamps_of
-from hesim_render.specs.waveform import WaveformSpec
 from hesim_render.spectral.waveform import Waveform
 
 
@@ -43,11 +43,11 @@ def _flicker(spec: WaveformSpec | None) -> WaveformSpec | None:
 
 def _different(kinds: Sequence[WaveformSpec | None]) -> list[WaveformSpec | None]:
     """Each waveform once, None first."""
-    found: list[WaveformSpec | None] = [None] if None in kinds else []
+    result: list[WaveformSpec | None] = [None] if None in kinds else []
     for kind in kinds:
-        if kind not in found:
-            found.append(kind)
-    return found
+        if kind not in result:
+            result.append(kind)
+    return result
 
 
 def _with_lights(scene: Scene, lit: Sequence[Any]) -> Scene:

@@ -1,16 +1,131 @@
-"""The ``evs`` section of a sensor file: event pixels, their thresholds and their noise."""
+"""The ``evs`` section of a sensor file: event pixels, their thresholds and their noise.
+
+Pixels that misbehave, as a sensor file describes them: events that are not the scene's, values of two levels.
+
+The leak of event pixels, as a sensor file describes it.
+
+The photoreceptor of event pixels, as a sensor file describes it.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from pydantic import Field, model_validator
 
 from hesim_render.specs.data_sheet import DataSheetSpec, V2eSpec
-from hesim_render.specs.defects import EventDefectSpec
 from hesim_render.specs.files import Strict
-from hesim_render.specs.leak import LeakSpec
-from hesim_render.specs.photoreceptor import PhotoreceptorSpec
+
+#: Largest part of the pixels that may have a defect: beyond, it is what pixels do.
+_MOST = 0.5
+
+
+class EventDefectSpec(Strict):
+    """Event pixels that are stuck, hot or flickering; the device seed says which, and a pixel has one defect."""
+
+    stuck_share: float = Field(0.0, ge=0, le=_MOST, description="part of the pixels that never give an event")
+    hot_share: float = Field(
+        0.0, ge=0, le=_MOST, description="part that gives ON events of its own, whatever the light"
+    )
+    hot_rate_hz: float | None = Field(None, ge=1e-6, le=1e5, description="of those events, median over hot pixels")
+    hot_rate_spread_decades: float = Field(0.0, ge=0, le=2, description="std over hot pixels of log10 of that rate")
+    flickering_share: float = Field(0.0, ge=0, le=_MOST, description="part that does so now and then")
+    flickering_rate_hz: float | None = Field(None, ge=1e-6, le=1e5, description="of ON events while it fires")
+    flickering_firing_s: float | None = Field(None, ge=1e-5, le=1e6, description="mean time for which it fires")
+    flickering_quiet_s: float | None = Field(None, ge=1e-5, le=1e6, description="mean time for which it does not")
+
+    @model_validator(mode="after")
+    def _check(self) -> EventDefectSpec:
+        if self.hot_share > 0 and self.hot_rate_hz is None:
+            raise ValueError("hot_share needs hot_rate_hz")
+        timing = (self.flickering_rate_hz, self.flickering_firing_s, self.flickering_quiet_s)
+        if self.flickering_share > 0 and None in timing:
+            raise ValueError("flickering_share needs flickering_rate_hz, flickering_firing_s and flickering_quiet_s")
+        if self.stuck_share + self.hot_share + self.flickering_share > _MOST:
+            raise ValueError(f"the shares add up to more than {_MOST:g}")
+        return self
+
+
+class TelegraphSpec(Strict):
+    """Frame pixels with random telegraph noise: two levels `amplitude` apart, about the pixel's own mean."""
+
+    share: float = Field(ge=0, le=_MOST, description="part of the pixels; which ones follows from the device seed")
+    amplitude_e: float = Field(ge=0, le=1e6, description="high level less low one, mean over these pixels")
+    amplitude_law: Literal["exponential", "equal"] = Field("exponential", description="over these pixels")
+    high_s: float = Field(ge=1e-5, le=1e6, description="mean time at the high level")
+    low_s: float = Field(ge=1e-5, le=1e6, description="mean time at the low level")
+
+
+class PhotoreceptorSpec(Strict):
+    """Second-order low-pass of ln x before it is compared: two equal poles, −3 dB together at the corner."""
+
+    cutoff_hz: float = Field(
+        ge=1e-3, le=1e6, description="corner at signal_dn and above, where the bias current limits it"
+    )
+    follows_light: bool = Field(True, description="below signal_dn the corner falls with the signal")
+    signal_dn: float | None = Field(None, ge=1e-9, le=1e9, description="signal of which the corner is cutoff_hz")
+    min_cutoff_hz: float | None = Field(
+        None, ge=1e-3, le=1e6, description="corner in the dark; up to signal_dn it rises on a straight line"
+    )
+    filters_noise: bool = Field(
+        False, description="the noise (last_event) passes it too: below photoreceptor_cutoff_hz its bandwidth is the "
+        "corner, and its variance falls with it"
+    )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _check(self) -> PhotoreceptorSpec:
+        if self.follows_light:
+            if self.signal_dn is None or self.min_cutoff_hz is None:
+                raise ValueError("a corner that follows the light needs signal_dn and min_cutoff_hz")
+            if self.min_cutoff_hz > self.cutoff_hz:
+                raise ValueError(f"min_cutoff_hz {self.min_cutoff_hz:g} is above cutoff_hz {self.cutoff_hz:g}")
+        elif self.signal_dn is not None or self.min_cutoff_hz is not None:
+            raise ValueError("without follows_light the corner is cutoff_hz: leave signal_dn and min_cutoff_hz out")
+        elif self.filters_noise:
+            raise ValueError("filters_noise needs follows_light; otherwise photoreceptor_cutoff_hz says the same")
+        return self
+
+
+#: Fastest leak of the pixels in the tail, Hz.
+MOST_TAIL_HZ = 1000.0
+
+
+class LeakSpec(Strict):
+    """ON events in still light: a Poisson process, or a reference level that drifts."""
+
+    process: Literal["drift", "poisson"] = Field(
+        description="drift: the reference drifts down, towards ON events; poisson: events at random times"
+    )
+    rate_hz: float = Field(ge=0, le=1e6, description="ON events of a pixel of nominal threshold, in the dark, 1/s")
+    rate_hz_per_dn: float = Field(0.0, ge=0, le=1e9, description="growth of that rate with the signal (drift)")
+    spread: float = Field(0.0, ge=0, lt=1, description="std over pixels of both together, relative (drift)")
+    tail_hz: float = Field(
+        0.0, ge=0, lt=MOST_TAIL_HZ, description="a share tail_hz/(tail_hz + r) of the pixels leaks faster by more than "
+        "r (drift)"
+    )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _check(self) -> LeakSpec:
+        if self.process == "poisson" and (self.rate_hz_per_dn or self.spread or self.tail_hz):
+            raise ValueError(
+                "rate_hz_per_dn, spread and tail_hz belong to process 'drift'; 'poisson' has rate_hz alone"
+            )
+        return self
+
+    def mean_rate_hz(self, signal_dn: float) -> float:
+        """Rate of the leak of pixels of nominal threshold, mean over pixels, Hz.
+
+        Parameters
+        ----------
+        signal_dn : signal, DN.
+        """
+        if self.tail_hz == 0:
+            return self.rate_hz + self.rate_hz_per_dn * signal_dn
+        most = MOST_TAIL_HZ / (self.tail_hz + MOST_TAIL_HZ)
+        tail_hz = self.tail_hz * (-math.log1p(-most) - most) / most
+        return self.rate_hz + self.rate_hz_per_dn * signal_dn + tail_hz
+
 
 #: Smallest threshold if a change gives one event per threshold that it contains.
 _LEAST_THRESHOLD = 1e-4

@@ -89,7 +89,7 @@ class FilterSetSpec(Strict):
         ValueError
             If neither the set nor the palette has a filter.
         """
-        found: dict[str, SpectrumSpec] = {}
+        result: dict[str, SpectrumSpec] = {}
         for letter, pixel in self.pixels.items():
             known = {**palette.filters, **self.filters}
             if pixel.filter not in known:
@@ -97,8 +97,8 @@ class FilterSetSpec(Strict):
                     f"pixels.{letter}.filter: the palette {palette.name!r} has no filter {pixel.filter!r}"
                     f"{did_you_mean(pixel.filter, known)}; it has {', '.join(palette.filters)}"
                 )
-            found[pixel.filter] = known[pixel.filter]
-        return found
+            result[pixel.filter] = known[pixel.filter]
+        return result
 
 
 def read_filter_set(name_or_path: str | Path) -> FilterSetSpec:

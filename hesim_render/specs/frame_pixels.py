@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, PositiveInt, model_validator
 
-from hesim_render.specs.defects import TelegraphSpec
+from hesim_render.specs.event_pixels import TelegraphSpec
 from hesim_render.specs.files import Strict
 
 #: Smallest slope of a bent signal up to full scale; the light would not follow from the signal below.

@@ -221,9 +221,9 @@ class LensSpec(Strict):
     def used_effects(self) -> dict[str, Any]:
         """Effects that are on, by name, as plain values; kernels are not listed."""
         given = self.model_dump(mode="json", include=set(EFFECTS), exclude_none=True)
-        found = {name: given[name] for name, neutral in EFFECTS.items() if name in given and given[name] != neutral}
+        result = {name: given[name] for name, neutral in EFFECTS.items() if name in given and given[name] != neutral}
         if self.psf_fwhm_um > 0:
-            found["psf"] = {"type": "gaussian", "image_height_mm": [0.0], "fwhm_um": [self.psf_fwhm_um]}
-        if isinstance(found.get("psf"), dict):
-            found["psf"].pop("kernels", None)
-        return found
+            result["psf"] = {"type": "gaussian", "image_height_mm": [0.0], "fwhm_um": [self.psf_fwhm_um]}
+        if isinstance(result.get("psf"), dict):
+            result["psf"].pop("kernels", None)
+        return result

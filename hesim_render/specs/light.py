@@ -1,8 +1,12 @@
-"""A light of a scene file: its place, its spectrum, its level and its waveform."""
+"""A light of a scene file: its place, its spectrum, its level and its waveform.
+
+The waveform of a flickering light in a scene file.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -11,8 +15,61 @@ from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.reflectance import InFolder
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.waveform import WaveformSpec
+from hesim_render.spectral import waveform
 from hesim_render.spectral.spectrum import Spectrum, scale_to_irradiance, scale_to_lux, summed
+
+#: Times are whole µs in the sensor, where a faster light would be steady.
+_Frequency = Annotated[float, Field(gt=0, le=100_000)]
+
+
+class MainsSpec(Strict):
+    """w(t) = 1 + depth · cos(2π · 2 · frequency_hz · t + phase): power at twice the mains frequency."""
+
+    type: Literal["mains"]
+    frequency_hz: _Frequency = Field(description="of the mains, 50 or 60; the light has twice that")
+    depth: float = Field(ge=0, le=1, description="(max − min)/(max + min) of the light")
+    phase_deg: float = 0.0
+
+    def load(self) -> waveform.Waveform:
+        return waveform.Mains(self.frequency_hz, self.depth, self.phase_deg)
+
+
+class PwmSpec(Strict):
+    """On (1/duty of the mean) while frac(frequency_hz · t + phase/360°) < duty, else off."""
+
+    type: Literal["pwm"]
+    frequency_hz: _Frequency
+    duty: float = Field(gt=0, le=1, description="part of each period in which the light is on")
+    phase_deg: float = Field(0.0, description="0: switched on at t = 0")
+
+    def load(self) -> waveform.Waveform:
+        return waveform.Pwm(self.frequency_hz, self.duty, self.phase_deg)
+
+
+class TableWaveformSpec(Strict):
+    """Measured power, linear between its samples; its unit does not matter."""
+
+    type: Literal["table"]
+    t_us: tuple[float, ...] = Field(min_length=2, description="times of `value`, µs, increasing")
+    value: tuple[Annotated[float, Field(ge=0)], ...] = Field(description="power, 0 or more")
+    repeat: bool = Field(False, description="start over after the last sample; else the end values hold")
+
+    @model_validator(mode="after")
+    def _check(self) -> TableWaveformSpec:
+        if len(self.value) != len(self.t_us):
+            raise ValueError(f"value: {len(self.value)} values for {len(self.t_us)} times")
+        for earlier, later in pairwise(self.t_us):
+            if later - earlier < 1e-3:
+                raise ValueError(f"t_us: times must increase by 0.001 µs or more: {later:g} µs follows {earlier:g} µs")
+        if not any(self.value):
+            raise ValueError("value: a light that is always off has no waveform; its level is given in lux or watts")
+        return self
+
+    def load(self) -> waveform.Waveform:
+        return waveform.TableWaveform(self.t_us, self.value, self.repeat)
+
+
+WaveformSpec = Annotated[MainsSpec | PwmSpec | TableWaveformSpec, Field(discriminator="type")]
 
 
 def _not_negative(spec: SpectrumSpec) -> SpectrumSpec:
@@ -117,5 +174,5 @@ def mixed_light(lights: Iterable[LightSpec]) -> Spectrum | None:
     given = list(lights)
     if len(given) == 1 and given[0].type != "none":
         return given[0].illuminant.load()
-    found = [level for level in map(irradiance, given) if level is not None]
-    return summed(*found) if found else None
+    result = [level for level in map(irradiance, given) if level is not None]
+    return summed(*result) if result else None

@@ -10,7 +10,7 @@ from pydantic import Field, field_serializer, model_validator
 
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, Vector
-from hesim_render.specs.waveform import WaveformSpec
+from hesim_render.specs.light import WaveformSpec
 
 
 class MitsubaSpec(Strict):

@@ -1,4 +1,7 @@
-"""How an object or the camera moves: keyframes of rigid motions."""
+"""How an object or the camera moves: keyframes of rigid motions.
+
+A mesh that changes its shape: positions of its vertices at some times, in files.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from hesim_render.core.errors import SpecError
 from hesim_render.specs.files import Strict
 from hesim_render.specs.geometry import Direction, RigidMatrix, Vector, rotation_about, rotation_vectors
+from hesim_render.specs.reflectance import InFolder
 from hesim_render.trajectories.pose_files import PoseFile, read_poses
 
 #: Keys of a track that say how its `file` is read, and the texts that they may be; without any, whole numbers.
@@ -95,7 +99,7 @@ class TrackSpec(Strict):
     @model_validator(mode="before")
     @classmethod
     def _from_file(cls, data: Any, info: ValidationInfo) -> Any:
-        """Read the keyframes of ``file``; a dump then holds the numbers. What only rides on its parent needs none."""
+        """Read the keyframes of ``file``; a dump then holds the numbers. A track with a parent needs none."""
         if isinstance(data, dict) and data.get("parent") is not None and not ({"file", "keyframes"} & set(data)):
             return {**data, "keyframes": [{"t_us": 0}, {"t_us": 1}]}
         if not isinstance(data, dict) or not ({"file", *_OF_FILE} & set(data)):
@@ -123,12 +127,14 @@ class TrackSpec(Strict):
     @field_validator("keyframes")
     @classmethod
     def _without_matrices(cls, frames: list[KeyframeSpec], info: ValidationInfo) -> list[KeyframeSpec]:
-        found: list[KeyframeSpec] = []
+        result: list[KeyframeSpec] = []
         turns = iter(rotation_vectors([frame.matrix for frame in frames if frame.matrix is not None]))
         for frame in frames:
             turn = None if frame.matrix is None else next(turns)
-            found.append(frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), found[-1] if found else None, turn))
-        return found
+            result.append(
+                frame.resolved(info.data.get("pivot_m", (0.0, 0.0, 0.0)), result[-1] if result else None, turn)
+            )
+        return result
 
     @model_validator(mode="after")
     def _check(self) -> TrackSpec:
@@ -136,4 +142,41 @@ class TrackSpec(Strict):
         for earlier, later in zip(times[:-1], times[1:], strict=True):
             if later <= earlier:
                 raise ValueError(f"keyframes must be in order of time: {later} µs follows {earlier} µs")
+        return self
+
+
+class DeformationSpec(InFolder):
+    """Positions of the vertices of a mesh, linear in time between those of the file.
+
+    `file` is an NPZ file with ``t_us`` [time] and ``vertices`` [time, vertex, 3], or a folder of meshes with the same
+    faces, in the order of their names, one every `every_us`. Positions are in the coordinates of the mesh file, and are
+    stretched and placed with it. Before the first and after the last time the shape is held, or the sequence repeats.
+    """
+
+    file: str = Field(min_length=1, description="NPZ file, or folder of PLY or OBJ files, relative to this file")
+    every_us: int | None = Field(None, ge=1, le=10**12, description="time from file to file of a folder, µs")
+    begin_us: int = Field(0, ge=-(10**12), le=10**12, description="time of the first file of a folder, µs")
+    repeat: bool = False
+
+    @property
+    def path(self) -> Path:
+        """The file or the folder."""
+        return self.folder / self.file
+
+    @property
+    def files(self) -> list[str]:
+        """Names of all its files, relative to the folder of the scene file, in the order of time."""
+        if not self.path.is_dir():
+            return [self.file]
+        result = (path for path in self.path.iterdir() if path.suffix.lower() in (".ply", ".obj"))
+        return [str(Path(self.file) / path.name) for path in sorted(result)]
+
+    @model_validator(mode="after")
+    def _check(self) -> DeformationSpec:
+        if not self.path.exists():
+            raise ValueError(f"no such file or folder: {self.path}")
+        if self.path.is_dir() != (self.every_us is not None):
+            raise ValueError("every_us goes with a folder of meshes; an NPZ file has its own times (t_us)")
+        if not self.path.is_dir() and ("begin_us" in self.model_fields_set or self.path.suffix.lower() != ".npz"):
+            raise ValueError("expected an NPZ file, or a folder; begin_us goes with a folder")
         return self

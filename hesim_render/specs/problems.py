@@ -39,8 +39,8 @@ def spec_error(
     -------
     One error with all problems.
     """
-    found: dict[tuple[int, str, str], SpecError] = {}
-    problems = _told_once(error.errors(include_url=False), data)
+    result: dict[tuple[int, str, str], SpecError] = {}
+    problems = _once(error.errors(include_url=False), data)
     places = [_keys_of(problem, data) for problem in problems]
     short_lists = [place for problem, place in zip(problems, places, strict=True) if _is_short_list(problem)]
     meant: set[tuple[Any, ...]] = set()
@@ -57,11 +57,11 @@ def spec_error(
             continue  # rows of a matrix: the matrix as a whole was reported already
         for message in problem["msg"].removeprefix("Value error, ").splitlines():
             own = _one(problem, message, model, data, file, overrides)
-            found.setdefault((own.line or 0, own.key or "", str(own)), own)
-    return SpecError.together([found[place] for place in sorted(found)])
+            result.setdefault((own.line or 0, own.key or "", str(own)), own)
+    return SpecError.together([result[place] for place in sorted(result)])
 
 
-def _told_once(problems: Iterable[Any], data: Any) -> list[Any]:
+def _once(problems: Iterable[Any], data: Any) -> list[Any]:
     """Each problem once. If a value may be written in several ways, only the problems of the intended way are kept.
 
     Pydantic reports such a value once for each alternative. An unknown key is the best sign of the intended
@@ -75,11 +75,11 @@ def _told_once(problems: Iterable[Any], data: Any) -> list[Any]:
             groups[number] = {None: [problem]}
         else:
             groups.setdefault(("alternatives", *keys[:split]), {}).setdefault(problem["loc"][split], []).append(problem)
-    found: list[Any] = []
+    result: list[Any] = []
     for branches in groups.values():
-        found += max(branches.values(), key=lambda branch: max(map(_telling, branch)))
+        result += max(branches.values(), key=lambda branch: max(map(_telling, branch)))
     once: dict[tuple[Any, ...], Any] = {}
-    for problem in sorted(found, key=_telling):  # keep one problem per value, the most informative one
+    for problem in sorted(result, key=_telling):  # keep one problem per value, the most informative one
         once[tuple(_keys_of(problem, data))] = problem
     return list(once.values())
 

@@ -20,16 +20,14 @@ from pydantic import (
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import leads_out, reading
-from hesim_render.specs.deformation import DeformationSpec
 from hesim_render.specs.files import Strict, apply_overrides, load_yaml, locate, validate
 from hesim_render.specs.geometry import Direction, Size, Vector
 from hesim_render.specs.light import LampSpec, LightSpec
 from hesim_render.specs.mitsuba_scene import MitsubaSpec
-from hesim_render.specs.motion import TrackSpec
+from hesim_render.specs.motion import DeformationSpec, TrackSpec
 from hesim_render.specs.problems import line_of
-from hesim_render.specs.reflectance import ReflectanceSpec
+from hesim_render.specs.reflectance import Count, MaterialSpec, ReflectanceSpec, TextureSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.surface import Count, MaterialSpec, TextureSpec
 from hesim_render.specs.target import TargetSpec, lamps_of
 
 #: Path of a file that a scene names.

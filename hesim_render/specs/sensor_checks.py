@@ -20,12 +20,12 @@ _LOST = 1e-3
 
 def sensor_problems(spec: SensorSpec) -> Iterator[str]:
     """All inconsistencies; each begins with its dotted key."""
-    found = list(_tile(spec))
-    if not found:  # otherwise the roles are not known
-        found += _roles(spec)
-    found += _filters(spec)
-    if found:  # a missing section is reported once, not again for each reference to it
-        yield from found
+    result = list(_tile(spec))
+    if not result:  # otherwise the roles are not known
+        result += _roles(spec)
+    result += _filters(spec)
+    if result:  # a missing section is reported once, not again for each reference to it
+        yield from result
         return
     for group in ("sources", "assumptions"):
         for key in getattr(spec, group):

@@ -160,8 +160,8 @@ class SpectrumSpec(Strict):
             return spectra.constant(self.flat, *(self.band_nm or (300.0, 1100.0)))
         if self.csv is not None:
             if self._table is None:
-                found = spectra.read_csv(self.folder / self.csv, self.column)
-                self._table = tuple(found.wavelength_nm.tolist()), tuple(found.values.tolist())
+                result = spectra.read_csv(self.folder / self.csv, self.column)
+                self._table = tuple(result.wavelength_nm.tolist()), tuple(result.values.tolist())
             return Spectrum(np.array(self._table[0]), np.array(self._table[1]))
         if self.illuminant is not None:
             return spectra.illuminant(self.illuminant)

@@ -69,7 +69,7 @@ class SweepSpec(NamesFiles):
     def _values(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             return value
-        found = {}
+        result = {}
         for key, values in value.items():
             if isinstance(values, dict):
                 try:
@@ -80,8 +80,8 @@ class SweepSpec(NamesFiles):
                     raise ValueError(f"{place}: {problem['msg'].removeprefix('Value error, ')}") from None
             elif isinstance(values, list) and not values:
                 raise ValueError(f"{key}: a list of values is empty")
-            found[key] = values
-        return found
+            result[key] = values
+        return result
 
     @field_validator("options")
     @classmethod

@@ -17,21 +17,19 @@ from hesim_render.specs.boards import (
 from hesim_render.specs.charts import (
     ColorCheckerTarget,
     DeadLeavesTarget,
+    EdgeFieldTarget,
     FlatTarget,
     GreyRampTarget,
     ImageTarget,
     IntegratingSphereTarget,
     PatchChartTarget,
-    StepWedgeTarget,
-)
-from hesim_render.specs.light import LampSpec
-from hesim_render.specs.resolution import (
-    EdgeFieldTarget,
     ResolutionWedgesTarget,
     SiemensStarTarget,
     SlantedEdgeTarget,
+    StepWedgeTarget,
     ZonePlateTarget,
 )
+from hesim_render.specs.light import LampSpec
 
 TargetSpec = Annotated[
     FlatTarget

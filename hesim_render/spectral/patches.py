@@ -42,12 +42,12 @@ def read_patches(file: Path) -> dict[str, Spectrum]:
     (first, header), rows = lines[0], lines[1:]
     is_lab = tuple(cell.lower().rstrip("*") for cell in header[1:]) == _LAB
     wavelengths = None if is_lab else _wavelengths(header, file, first)
-    found: dict[str, Spectrum] = {}
+    result: dict[str, Spectrum] = {}
     for number, cells in rows:
         if len(cells) != len(header):
             raise SpecError(f"expected {len(header)} cells, found {len(cells)}", file=file, line=number)
         name = cells[0]
-        if not name or name in found:
+        if not name or name in result:
             raise SpecError(f"the name {name!r} is {'empty' if not name else 'there twice'}", file=file, line=number)
         try:
             values = np.array([float(cell) for cell in cells[1:]])
@@ -58,7 +58,7 @@ def read_patches(file: Path) -> dict[str, Spectrum]:
         if not np.isfinite(values).all():
             raise SpecError("a value is not finite", file=file, line=number)
         if wavelengths is None:
-            found[name] = _of_lab(tuple(values.tolist()), file, number)
+            result[name] = _of_lab(tuple(values.tolist()), file, number)
             continue
         if values.min() < 0 or values.max() > 1:
             hint = "; divide percent by 100" if values.max() > 1.5 else ""
@@ -67,8 +67,8 @@ def read_patches(file: Path) -> dict[str, Spectrum]:
                 file=file,
                 line=number,
             )
-        found[name] = Spectrum(wavelengths, values)
-    return found
+        result[name] = Spectrum(wavelengths, values)
+    return result
 
 
 def _wavelengths(header: list[str], file: Path, line: int) -> np.ndarray:

@@ -12,14 +12,11 @@ from numpy.typing import NDArray
 from hesim_render.core.progress import Progress
 from hesim_render.specs.study import Equal, NamedLight, StudySpec, SurfacesSpec
 from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.studies.candidate import candidates
-from hesim_render.studies.colour_matrix import to_srgb
-from hesim_render.studies.colour_samples import reflectance_set
+from hesim_render.studies.candidate import Seen, candidates, seen_by
+from hesim_render.studies.colour_error import to_srgb
+from hesim_render.studies.colour_samples import reflectance_set, reflectances_of
 from hesim_render.studies.event_figures import event_figures
-from hesim_render.studies.exposure import electrons, exposure_for, light_throughput, white_rate
-from hesim_render.studies.noise_figures import noise_figures
-from hesim_render.studies.seen import Seen, seen_by
-from hesim_render.studies.surfaces import reflectances_of
+from hesim_render.studies.noise_figures import electrons, exposure_for, light_throughput, noise_figures, white_rate
 from hesim_render.studies.table import Cell, Table
 from hesim_render.targets.opened_cube import CubeFile
 
@@ -89,8 +86,8 @@ def run_study(spec: StudySpec, progress: Progress | None = None) -> StudyResult:
 
 def _chart(item: SurfacesSpec) -> list[Spectrum]:
     """The reflectances that matrices are fitted to; of a cube, the ColorChecker."""
-    found = reflectance_set("colorchecker") if item.reflectances is None else reflectances_of(item)
-    return list(found.values())
+    result = reflectance_set("colorchecker") if item.reflectances is None else reflectances_of(item)
+    return list(result.values())
 
 
 def _cube(item: SurfacesSpec, spec: StudySpec) -> CubeFile | None:
@@ -141,8 +138,8 @@ def _rows(
             if aps is not None and "noise" in spec.figures:
                 row |= noise_figures(spec, seen, spectrum, chart, rate, lux, exposure_us)
             if aps is not None and "demosaic" in spec.figures:
-                found, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
-                row |= found
+                result, picture = _detail(spec, seen, spectrum, rate, lux, exposure_us)
+                row |= result
                 if len(pictures) < MOST_PICTURES:
                     text = f"{candidate.set_name}, {seen.light_name}, {lux:g} lx, equal {equal}"
                     pictures.append((text, picture))

@@ -2,6 +2,8 @@
 
 A matrix maps the channels of a camera (white at 1) to CIE XYZ (white at Y = 1). Errors are colour differences in CIELAB
 under the white of the light itself, so no chromatic adaptation is needed.
+
+Matrices that a study uses besides the best one: to sRGB, and against noise.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import RangeError, SpecError
+from hesim_render.spectral.colorimetry import xyz_to_linear_srgb
 from hesim_render.spectral.colour_difference import delta_e_2000, delta_e_ab, lab
+from hesim_render.studies.colour_noise import ChannelNoise
 from hesim_render.studies.colour_samples import ColourSamples
 from hesim_render.studies.subspace import rank
 
@@ -120,19 +124,19 @@ def fit_matrix(
     if expansion not in get_args(Expansion):
         raise RangeError("expansion", expansion, f"one of {', '.join(get_args(Expansion))}")
     terms = expanded(samples.camera, expansion)
-    found_rank = rank(samples.camera)
-    if found_rank < 3:
+    seen_rank = rank(samples.camera)
+    if seen_rank < 3:
         raise SpecError(
-            f"the channels see these surfaces in {found_rank} of the 3 dimensions that colour needs; add a filter, or "
+            f"the channels see these surfaces in {seen_rank} of the 3 dimensions that colour needs; add a filter, or "
             "other surfaces"
         )
     if len(terms) < terms.shape[1]:
         raise RangeError("surfaces", len(terms), f"at least {terms.shape[1]}, the number of terms of the matrix")
     start, *_ = np.linalg.lstsq(terms, samples.xyz, rcond=1e-9)
-    found: NDArray[np.float64] = np.asarray(start.T, dtype=np.float64)
+    result: NDArray[np.float64] = np.asarray(start.T, dtype=np.float64)
     if method != "least_squares_xyz":
-        found = _least_difference(terms, samples, found, method)
-    return ColourError(found, method, expansion, colour_differences(samples, found, expansion, _measure_of(method)))
+        result = _least_difference(terms, samples, result, method)
+    return ColourError(result, method, expansion, colour_differences(samples, result, expansion, _measure_of(method)))
 
 
 def colour_differences(
@@ -234,5 +238,38 @@ def _least_difference(
         around = loss(np.concatenate([values[None], values + steps, values - steps]))
         return float(around[0]), (around[1 : 1 + start.size] - around[1 + start.size :]) / (2 * steps[0, 0])
 
-    found = minimize(loss_and_slope, start.ravel(), jac=True, method="BFGS", options={"maxiter": 200, "gtol": 1e-4})
-    return found.x.reshape(start.shape) if found.fun < loss(start.ravel()) else start
+    result = minimize(loss_and_slope, start.ravel(), jac=True, method="BFGS", options={"maxiter": 200, "gtol": 1e-4})
+    return result.x.reshape(start.shape) if result.fun < loss(start.ravel()) else start
+
+
+def to_srgb(matrix: ArrayLike, white_xyz: ArrayLike) -> NDArray[np.float64]:
+    """A matrix to linear sRGB in place of XYZ; the white of the light becomes (1, 1, 1) (Bradford).
+
+    Parameters
+    ----------
+    matrix : [3, channel], to XYZ.
+    white_xyz : [3].
+    """
+    return xyz_to_linear_srgb(np.asarray(matrix).T, white_xyz).T
+
+
+def noise_aware_matrix(samples: ColourSamples, white_e: ArrayLike, noise: ChannelNoise) -> NDArray[np.float64]:
+    """The matrix to XYZ with the least squared error over surfaces, noise included (Wiener's filter).
+
+    M = (Σ x cᵀ)(Σ c cᵀ + Σ diag Var c)⁻¹ over the surfaces: it gives up colour where noise would cost more. Its second
+    row is the best estimate of the luminance, also of cameras that see no colour.
+
+    Parameters
+    ----------
+    samples : the surfaces.
+    white_e : [channel], electrons of one pixel on a perfect white.
+    noise : of the channels.
+
+    Returns
+    -------
+    [3, channel].
+    """
+    white = np.asarray(white_e, dtype=np.float64)
+    variance = noise.variance_e2(np.maximum(samples.camera, 0) * white) / white**2
+    normal = samples.camera.T @ samples.camera + np.diag(variance.sum(axis=0))
+    return np.asarray(np.linalg.solve(normal, samples.camera.T @ samples.xyz).T, dtype=np.float64)

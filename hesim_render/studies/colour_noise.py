@@ -40,19 +40,6 @@ class ChannelNoise:
     quadratic: NDArray[np.float64]
     count: NDArray[np.float64]
 
-    @classmethod
-    def of_photons(cls, channels: int, read_noise_e: float = 0.0, count: ArrayLike = 1.0) -> ChannelNoise:
-        """Shot noise and read noise alone.
-
-        Parameters
-        ----------
-        channels : number of channels.
-        read_noise_e : of one pixel, e⁻.
-        count : pixels of each channel.
-        """
-        ones = np.ones(channels)
-        return cls(read_noise_e**2 * ones, ones, 0 * ones, np.broadcast_to(np.asarray(count, float), channels).copy())
-
     def variance_e2(self, signal_e: ArrayLike) -> NDArray[np.float64]:
         """Variance of the mean of a channel's pixels, e⁻², at signals [..., channel]."""
         s = np.asarray(signal_e, dtype=np.float64)
@@ -146,8 +133,9 @@ def output_noise(
 
     >>> import numpy as np
     >>> from hesim_render.studies import ChannelNoise, output_noise
-    >>> found = output_noise(np.eye(3), [1e4] * 3, ChannelNoise.of_photons(3), weights=(1, 0, 0))
-    >>> round(found.ysnr**2, 6), found.amplification
+    >>> shot_noise = ChannelNoise(np.zeros(3), np.ones(3), np.zeros(3), np.ones(3))
+    >>> outcome = output_noise(np.eye(3), [1e4] * 3, shot_noise, weights=(1, 0, 0))
+    >>> round(outcome.ysnr**2, 6), outcome.amplification
     (1800.0, 1.0)
 
     Returns
@@ -190,7 +178,7 @@ def light_for_snr(
     A single pixel with 20 e⁻/lux of white and 2 e⁻ of read noise: N²= 100 (N + 4) gives N = 103.85 e⁻ at 28.85 lx.
 
     >>> from hesim_render.studies import ChannelNoise, light_for_snr
-    >>> round(light_for_snr(10, [1.0], [20.0], ChannelNoise.of_photons(1, 2.0)), 2)
+    >>> round(light_for_snr(10, [1.0], [20.0], ChannelNoise(*(np.array([x]) for x in (4.0, 1.0, 0.0, 1.0)))), 2)
     28.85
 
     Returns

@@ -1,16 +1,22 @@
-"""Surfaces under a light as a camera and as the CIE observer see them."""
+"""Surfaces under a light as a camera and as the CIE observer see them.
+
+Surfaces of a study: sets of reflectances and hyperspectral cubes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hesim_render.core.errors import SpecError, did_you_mean
+from hesim_render.specs.study import SurfacesSpec
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colorimetry import responses_to, tristimulus
+from hesim_render.spectral.patches import read_patches
 from hesim_render.spectral.spectrum import REQUIRED_COVERAGE, Spectrum, constant, coverage
 
 
@@ -28,29 +34,6 @@ class ColourSamples:
     camera: NDArray[np.float64]
     xyz: NDArray[np.float64]
     white_xyz: NDArray[np.float64]
-
-    @classmethod
-    def of_tables(
-        cls, curves: ArrayLike, light: ArrayLike, reflectances: ArrayLike, observer: ArrayLike
-    ) -> ColourSamples:
-        """Samples from tables on one even grid, as sums of products.
-
-        Parameters
-        ----------
-        curves : [wavelength, channel], responses per watt.
-        light : [wavelength], relative spectral power.
-        reflectances : [wavelength, surface].
-        observer : [wavelength, 3], colour-matching functions.
-
-        Returns
-        -------
-        The samples.
-        """
-        power = np.asarray(light, dtype=np.float64)[:, None]
-        seen, observed = power * np.asarray(curves), power * np.asarray(observer)
-        surfaces = np.asarray(reflectances, dtype=np.float64).T
-        white, white_xyz = seen.sum(axis=0), observed.sum(axis=0)
-        return cls(surfaces @ seen / white, surfaces @ observed / white_xyz[1], white_xyz / white_xyz[1])
 
 
 def colour_samples(
@@ -161,12 +144,12 @@ def reflectance_set(name: str) -> dict[str, Spectrum]:
     if name in ("rawtoaces", "rawtoaces-even", "rawtoaces-odd"):
         table = colour.characterisation.read_training_data_rawtoaces_v1()
         grid, values = np.asarray(table.wavelengths), np.asarray(table.values)
-        found = {
+        result = {
             str(label): held(Spectrum(grid, np.maximum(column, 0.0)))
             for label, column in zip(table.labels, values.T, strict=True)
         }
         first, step = {"rawtoaces": (0, 1), "rawtoaces-even": (0, 2), "rawtoaces-odd": (1, 2)}[name]
-        return dict(list(found.items())[first::step])
+        return dict(list(result.items())[first::step])
     if name == "cie-tcs":
         samples = colour.quality.datasets.SDS_TCS["CIE 1995"]
         return {
@@ -186,3 +169,25 @@ def held(reflectance: Spectrum, low_nm: float = 360.0, high_nm: float = 830.0) -
     if grid[-1] < high_nm:
         grid, values = np.append(grid, high_nm), np.append(values, values[-1])
     return Spectrum(grid, values)
+
+
+def reflectances_of(item: SurfacesSpec) -> dict[str, Spectrum]:
+    """Reflectances by name, of a shipped set or of a CSV file of patches.
+
+    Raises
+    ------
+    SpecError
+        If there is no such set or file, or the file is not valid.
+    """
+    assert item.reflectances is not None
+    if item.reflectances in REFLECTANCE_SETS:
+        return reflectance_set(item.reflectances)
+    if Path(item.reflectances).suffix == "":
+        return reflectance_set(item.reflectances)  # raises, with what there is
+    file = Path(item.beside(item.reflectances))
+    if not file.is_file():
+        raise SpecError("no such file", file=file)
+    patches = read_patches(file)
+    if not patches:
+        raise SpecError("has no patches", file=file)
+    return {name: held(each) for name, each in patches.items()}

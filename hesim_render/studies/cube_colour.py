@@ -103,11 +103,11 @@ def cube_figures(
         texels = values.reshape(-1, values.shape[2]).T
         true = _lab_on_device(to_ratios[0].T @ texels)
         for k, own in enumerate(to_ratios[1:]):
-            found = _differences(true, own.T @ texels)
-            number = np.minimum((found * (1 / _BIN)).astype(np.int32), counts.shape[1] - 1)
+            result = _differences(true, own.T @ texels)
+            number = np.minimum((result * (1 / _BIN)).astype(np.int32), counts.shape[1] - 1)
             counts[k] += np.bincount(number, minlength=counts.shape[1])
-            total[k] += found.sum(dtype=np.float64)
-            largest[k] = max(largest[k], float(found.max()))
+            total[k] += result.sum(dtype=np.float64)
+            largest[k] = max(largest[k], float(result.max()))
     pixels = cube.shape[0] * cube.shape[1]
     for k in range(len(sets)):
         place = int(np.searchsorted(np.cumsum(counts[k]), 0.95 * pixels))
@@ -122,9 +122,9 @@ def _lab_on_device(ratios: NDArray[np.float32]) -> Triple:
     import drjit as dr
 
     x, y, z = (table(jit().Float, row) for row in ratios)
-    found = lab_of((x, y, z), device_namespace())
-    dr.eval(*found)
-    return found
+    result = lab_of((x, y, z), device_namespace())
+    dr.eval(*result)
+    return result
 
 
 def _differences(true: Triple, ratios: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,7 +1,11 @@
-"""What a mosaic costs in detail: resolution, false colour and zipper after the demosaicing of the real ISP."""
+"""What a mosaic costs in detail: resolution, false colour and zipper after the demosaicing of the real ISP.
+
+Test patterns as a pixel grid sees them: slanted edge, star and zone plate, each pixel the mean over its area.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -17,9 +21,57 @@ from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.crosstalk import mixed
 from hesim_render.spectral.colour_difference import lab
 from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.studies import patterns
 from hesim_render.studies.chart_noise import Measured
 from hesim_render.studies.table import Cell
+
+#: Side of a pattern, px; a multiple of the tiles of 2, 3, 4 and 6 pixels.
+SIDE_PX = 192
+#: Rows and columns of all patterns side by side.
+CHART_PX = SIDE_PX, 3 * SIDE_PX
+#: Angle of the edge from the vertical, degrees; spokes of the star; highest frequency of the zone plate, cycles per px.
+EDGE_DEG, SPOKES, ZONE_TOP = 5.0, 36, 0.5
+#: Points across a pixel.
+_FINE = 8
+
+
+def _sampled(value: Callable[[NDArray, NDArray], NDArray]) -> NDArray[np.float64]:
+    """Mean over the area of each pixel of a function of the place from the centre, px."""
+    fine = (np.arange(SIDE_PX * _FINE) + 0.5) / _FINE - SIDE_PX / 2
+    result = np.empty((SIDE_PX, SIDE_PX))
+    for row in range(SIDE_PX):
+        y = fine[row * _FINE : (row + 1) * _FINE, None]
+        part = value(fine[None, :], y)
+        result[row] = part.reshape(_FINE, SIDE_PX, _FINE).mean(axis=(0, 2))
+    return result
+
+
+def slanted_edge() -> NDArray[np.float64]:
+    """0 on the left of an edge through the centre, 1 on the right, [row, col]."""
+    slope = np.tan(np.radians(EDGE_DEG))
+    return _sampled(lambda x, y: (x + slope * y > 0).astype(float))
+
+
+def star() -> NDArray[np.float64]:
+    """A star of sectors, 0 and 1 in turn, [row, col]."""
+    return _sampled(lambda x, y: (np.sin(SPOKES * np.arctan2(y, x)) > 0).astype(float))
+
+
+def zone_plate() -> NDArray[np.float64]:
+    """½ (1 + cos) of a phase whose frequency rises with the distance, to `ZONE_TOP` at the sides, [row, col]."""
+    rate = np.pi * ZONE_TOP / (SIDE_PX / 2)
+    return _sampled(lambda x, y: 0.5 * (1 + np.cos(rate * (x**2 + y**2))))
+
+
+def chart() -> NDArray[np.float64]:
+    """Edge, star and zone plate side by side, [row, col]."""
+    return np.concatenate([slanted_edge(), star(), zone_plate()], axis=1)
+
+
+def distance_px() -> NDArray[np.float64]:
+    """Distance of each pixel of a pattern from its centre, [row, col]."""
+    place = np.arange(SIDE_PX) + 0.5 - SIDE_PX / 2
+    return np.hypot(place[:, None], place[None, :])
+
 
 #: Reflectances of the dark and the light parts of all patterns, grey.
 DARK, LIGHT = 0.05, 0.8
@@ -41,7 +93,7 @@ _STEPS = Pipeline.of("black_level", {"step": "white_balance", "clip": False}, "d
 
 @cache
 def _chart() -> NDArray[np.float64]:
-    return patterns.chart()
+    return chart()
 
 
 def demosaic_figures(
@@ -112,19 +164,19 @@ def demosaic_figures(
     for repeat in range(repeats):
         dn = part.aps.without(*_FIXED).sample(image, exposure_us, seed, repeat)
         picture = developed(dn.astype(np.float64) - spec.black_level_dn - dark_dn)
-        off = (picture - reflectance[..., None])[:, patterns.SIDE_PX : 2 * patterns.SIDE_PX][_ring()]
+        off = (picture - reflectance[..., None])[:, SIDE_PX : 2 * SIDE_PX][_ring()]
         errors.append(np.sqrt(np.mean(off**2)))
     if errors:
-        found = Measured.of(np.array(errors))
+        result = Measured.of(np.array(errors))
         figures |= {
-            "picture_error_simulated": found.value, "picture_error_low": found.low, "picture_error_high": found.high,
+            "picture_error_simulated": result.value, "picture_error_low": result.low, "picture_error_high": result.high,
         }  # fmt: skip
     return figures, picture.astype(np.float32)
 
 
 def _figures(rgb: NDArray[np.float64], reflectance: NDArray[np.float64]) -> dict[str, float | None]:
     """Figures of a picture without noise, [row, col, 3], white at 1."""
-    side = patterns.SIDE_PX
+    side = SIDE_PX
     edge, star, zone = (np.s_[:, k * side : (k + 1) * side] for k in range(3))
     colours = lab(rgb @ _SRGB_TO_XYZ.T, _SRGB_TO_XYZ.sum(axis=1))
     chroma = np.hypot(colours[..., 1], colours[..., 2])
@@ -132,11 +184,11 @@ def _figures(rgb: NDArray[np.float64], reflectance: NDArray[np.float64]) -> dict
     inner = np.s_[8:-8, 8:-8]  # the demosaicing meets its own border, or the next pattern
     mtf50 = edge_response(luminance[edge][inner]).frequency_at(0.5)
     place = np.arange(side) + 0.5 - side / 2
-    slope = np.tan(np.radians(patterns.EDGE_DEG))
-    distance = np.abs(place[None, :] + slope * place[:, None]) * np.cos(np.radians(patterns.EDGE_DEG))
+    slope = np.tan(np.radians(EDGE_DEG))
+    distance = np.abs(place[None, :] + slope * place[:, None]) * np.cos(np.radians(EDGE_DEG))
     near, away = distance[inner] < _NEAR_PX, distance[inner] > _AWAY_PX
     own = chroma[edge][inner]
-    radius = patterns.distance_px()
+    radius = distance_px()
     ring = _ring()
     off = (luminance[star] - reflectance[star])[ring]
     return {
@@ -151,7 +203,7 @@ def _figures(rgb: NDArray[np.float64], reflectance: NDArray[np.float64]) -> dict
 @cache
 def _ring() -> NDArray[np.bool_]:
     """The judged part of the star, [row, col]."""
-    frequency = patterns.SPOKES / (2 * np.pi * np.maximum(patterns.distance_px(), 1e-9))
+    frequency = SPOKES / (2 * np.pi * np.maximum(distance_px(), 1e-9))
     return (frequency > _STAR_BAND[0]) & (frequency < _STAR_BAND[1])
 
 

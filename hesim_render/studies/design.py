@@ -20,11 +20,11 @@ from hesim_render.specs.filter_set import FilterSetSpec, PaletteSpec, read_filte
 from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.spectral.physical import silicon_quantum_efficiency
 from hesim_render.studies.colour_noise import channel_noise
+from hesim_render.studies.colour_samples import reflectances_of
 from hesim_render.studies.design_cost import Condition, DesignCost, Weights
 from hesim_render.studies.design_filters import Dyes, Family, FreeCurves, ThinFilms
 from hesim_render.studies.design_tile import repeated
 from hesim_render.studies.filter_sets import filters_of, with_filter_set
-from hesim_render.studies.surfaces import reflectances_of
 
 #: Bands of all spectra of a design, nm.
 BANDS_NM = np.arange(360.0, 831.0, 5.0)

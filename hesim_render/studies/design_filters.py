@@ -75,11 +75,11 @@ class Dyes:
         """See `Family.start`: bands where the wanted filter is dark."""
         dark = np.clip(-np.log10(np.maximum(wanted / self.most, 1e-3)), 0, 2)
         weight = dark + 1e-3
-        found: list[float] = []
+        result: list[float] = []
         for quantile in (np.arange(self.bands) + rng.uniform(0.2, 0.8, self.bands)) / self.bands:
             place = self.wavelength_nm[int(np.searchsorted(np.cumsum(weight) / weight.sum(), quantile))]
-            found += [float(place), float(rng.uniform(60, 160)), float(rng.uniform(0.8, 1.8))]
-        return np.array(found)
+            result += [float(place), float(rng.uniform(60, 160)), float(rng.uniform(0.8, 1.8))]
+        return np.array(result)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,7 @@
-"""Run a design from its file, judge the result by full simulation, and write all of it."""
+"""Run a design from its file, judge the result by full simulation, and write all of it.
+
+The files of a design: its filters as a palette, its tile as a filter set.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from hesim_render.core.output import OutputFolder, output_errors
 from hesim_render.core.progress import Progress, shown
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.specs.design import DesignSpec, read_design
 from hesim_render.specs.files import validate
-from hesim_render.specs.filter_set import read_palette
+from hesim_render.specs.filter_set import FilterSetSpec, read_palette
+from hesim_render.specs.spectrum import SpectrumSpec
 from hesim_render.specs.study import StudySpec
 from hesim_render.studies.cfa import run_study
-from hesim_render.studies.design import DesignResult, Problem, optimise
-from hesim_render.studies.design_result import designed_palette, designed_set
+from hesim_render.studies.demosaic_figures import CHART_PX
+from hesim_render.studies.design import BANDS_NM, DesignResult, Problem, optimise
+from hesim_render.studies.design_tile import counts_of, spread_tile
 from hesim_render.studies.filter_sets import with_filter_set
-from hesim_render.studies.patterns import CHART_PX
 from hesim_render.studies.report import report_page, verdict_table
 from hesim_render.studies.table import Table
 
@@ -79,8 +83,7 @@ def design(
         read: DesignSpec = validate(DesignSpec, dict(spec), None, {})
     else:
         read = spec if isinstance(spec, DesignSpec) else read_design(spec)
-    folder = OutputFolder(out, MARKER, overwrite)
-    try:
+    with OutputFolder(out, MARKER, overwrite) as folder:
         with shown(progress, read.name) as report:
             problem = Problem(read)
             result = optimise(problem, report)
@@ -92,10 +95,10 @@ def design(
             sensor |= {"description": palette.description, "sources": {}, "assumptions": palette.assumptions}
             _write_yaml(folder.path / "sensor.yaml", sensor)
             judged = _judgement(read, problem, folder.path)
-            found = run_study(judged, report)
-        verdicts = _verdicts(read, found.table)
+            outcome = run_study(judged, report)
+        verdicts = _verdicts(read, outcome.table)
         with output_errors(folder.target):
-            found.table.write(folder.path / "results.csv")
+            outcome.table.write(folder.path / "results.csv")
             content = {
                 "design": json.loads(read.model_dump_json()), "cost": result.cost, "costs": result.costs.tolist(),
                 "evaluations": result.evaluations, "shares": result.shares,
@@ -103,12 +106,8 @@ def design(
             }  # fmt: skip
             (folder.path / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
             summary = verdict_table(verdicts, result.costs, None if result.shares is None else filters.tile)
-            (folder.path / "report.html").write_text(report_page(judged, found, summary), encoding="utf-8")
-        folder.commit()
-    except BaseException:
-        folder.discard()
-        raise
-    return Design(result, found.table, verdicts)
+            (folder.path / "report.html").write_text(report_page(judged, outcome, summary), encoding="utf-8")
+    return Design(result, outcome.table, verdicts)
 
 
 def _judgement(spec: DesignSpec, problem: Problem, folder: Path) -> StudySpec:
@@ -148,7 +147,7 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
     """
     weights = spec.cost
     own = table.where(filter_set=DESIGNED)
-    found = []
+    result = []
     for name in dict.fromkeys(table["filter_set"]):
         if name == DESIGNED:
             continue
@@ -183,13 +182,59 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
                 verdict[figure], verdict[f"{figure}_against"] = (
                     float(np.nanmean(each[figure])) for each in (own, other)
                 )
-        found.append(verdict)
-    return found
+        result.append(verdict)
+    return result
 
 
 def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
-    writer = YAML()  # keeps the order
-    writer.default_flow_style = None
-    writer.width = 120
     with output_errors(path), path.open("w", encoding="utf-8") as file:
-        writer.dump(dict(content), file)
+        write_yaml(dict(content), file, width=120)
+
+
+def designed_set(problem: Problem, result: DesignResult) -> FilterSetSpec:
+    """The filter set with the tile of a result, as whole pixels; the set itself where shares are not varied."""
+    own = problem.filter_set
+    if problem.spec.tile_px is None or result.shares is None:
+        return own
+    tile, free = problem.tile(*problem.spec.tile_px)
+    letters = {
+        name: next(letter for letter, pixel in own.pixels.items() if pixel.filter == name and "aps" in pixel.roles)
+        for name in problem.frames
+    }
+    counts = counts_of(np.array([result.shares[name] for name in problem.frames]), int(free.sum()))
+    wanted = {letters[name]: int(count) for name, count in zip(problem.frames, counts, strict=True)}
+    outcome = spread_tile(tile, free, wanted)
+    drawn = set(outcome.ravel().tolist())
+    return own.model_copy(update={
+        "name": f"{own.name}-designed", "tile": "\n".join("".join(row) for row in outcome),
+        "description": f"{own.description} Shares of the frame filters designed by gradients.",
+        "pixels": {letter: pixel for letter, pixel in own.pixels.items() if letter in drawn},
+    })  # fmt: skip
+
+
+def designed_palette(problem: Problem, result: DesignResult) -> dict[str, object]:
+    """The content of a palette file with the filters of a result, in place of those of the palette."""
+    palette = problem.palette.model_dump(mode="json", exclude_none=True)
+    filters = {}
+    for name in problem.names:
+        values = result.filters.get(name, problem.start_transmittance[name])
+        filters[name] = {"wavelength_nm": BANDS_NM.tolist(), "value": np.round(values, 6).tolist()}
+    if result.silicon_depth_um is not None:
+        efficiency = with_silicon_depth(problem.sensor.spec.quantum_efficiency, round(result.silicon_depth_um, 4))
+        palette["quantum_efficiency"] = efficiency.model_dump(mode="json", exclude_none=True)
+    return {
+        **palette, "name": problem.spec.name, "filters": filters, "sources": {},
+        "description": f"{', '.join(problem.vary)} designed as {problem.spec.family}; start {problem.palette.name}",
+        "assumptions": {"filters": "designed by gradients; no filter of these curves has been made"},
+    }  # fmt: skip
+
+
+def with_silicon_depth(efficiency: SpectrumSpec, depth_um: float) -> SpectrumSpec:
+    """The same quantum efficiency with another depth of the silicon."""
+    if efficiency.silicon_depth_um is not None:
+        return efficiency.model_copy(update={"silicon_depth_um": depth_um})
+    parts = [
+        part if part.silicon_depth_um is None else part.model_copy(update={"silicon_depth_um": depth_um})
+        for part in efficiency.product or []
+    ]
+    return efficiency.model_copy(update={"product": parts})

@@ -31,10 +31,10 @@ def counts_of(shares: NDArray[np.float64], pixels: int) -> NDArray[np.int64]:
         if not few.any():
             break
         is_free &= ~few
-    found = np.floor(wanted + 1e-9).astype(np.int64)
-    rest = np.argsort(found - wanted, kind="stable")
-    found[rest[: pixels - int(found.sum())]] += 1
-    return found
+    result = np.floor(wanted + 1e-9).astype(np.int64)
+    rest = np.argsort(result - wanted, kind="stable")
+    result[rest[: pixels - int(result.sum())]] += 1
+    return result
 
 
 def repeated(filters: FilterSetSpec, rows: int, cols: int) -> NDArray[np.str_]:
@@ -105,6 +105,6 @@ def spread_tile(letters: NDArray[np.str_], places: NDArray[np.bool_], wanted: di
         if energy < least - 1e-12:
             best, least = kind.copy(), energy
     assert best is not None
-    found = letters.copy()
-    found[places] = np.array(names)[best]
-    return found
+    result = letters.copy()
+    result[places] = np.array(names)[best]
+    return result

@@ -141,12 +141,12 @@ def effective_responses(sensor: Sensor, filters: Sequence[str], role: Role, cros
     """
     if crosstalk == 0:
         return [sensor.responses[name] for name in filters]
-    found = []
+    result = []
     for shares in mixing(sensor, filters, role, crosstalk):
         parts = [
             sensor.responses[name].scaled(float(share))
             for name, share in zip(sensor.spec.filters, shares, strict=True)
             if share > 0
         ]
-        found.append(summed(*parts))
-    return found
+        result.append(summed(*parts))
+    return result

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, svg
 from hesim_render.spectral.colorimetry import encode_srgb, xyz_to_linear_srgb
-from hesim_render.studies.seen import Seen
+from hesim_render.studies.candidate import Seen
 from hesim_render.studies.table import Table
 
 _MARKERS = "osD^vP*X<>hp"

@@ -14,11 +14,10 @@ from hesim_render.core.drawing import report_style
 from hesim_render.core.html import filled, inline_picture, number
 from hesim_render.specs.study import StudySpec
 from hesim_render.spectral.colorimetry import encode_srgb
+from hesim_render.studies.candidate import Seen
 from hesim_render.studies.cfa import StudyResult
-from hesim_render.studies.headings import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, level_text
 from hesim_render.studies.plots import PARETO, chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
-from hesim_render.studies.seen import Seen
-from hesim_render.studies.table import Cell, Table
+from hesim_render.studies.table import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, Cell, Table, level_text
 
 #: Columns that say which row it is; all but the first are left out if they say the same in every row.
 _NAMES = {"filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, ms"}
@@ -89,7 +88,7 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
     costs : of each start before and after, [start, 2].
     tile : the designed tile, where shares were varied.
     """
-    found = []
+    result = []
     named = {"delta_e_mean": "mean ΔE2000 without noise", "mtf50_cy_per_px": "MTF50, cy/px",
              "false_colour": "false colour, C*ab", "zone_plate_colour": "zone plate, C*ab",
              "picture_error_simulated": "rms error with noise"}  # fmt: skip
@@ -108,16 +107,16 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
             for key, title in named.items()
             if key in verdict
         ]
-        found.append((str(verdict["against"]), rows))
+        result.append((str(verdict["against"]), rows))
     changes = [f"{number(before)} to {number(after)}" for before, after in costs]
-    return filled("studies/verdict.html", verdicts=found, tile=tile, costs=changes)
+    return filled("studies/verdict.html", verdicts=result, tile=tile, costs=changes)
 
 
 def _first_of_each_set(seen: Sequence[Seen]) -> list[Seen]:
-    found: dict[tuple[str, str], Seen] = {}
+    result: dict[tuple[str, str], Seen] = {}
     for each in seen:
-        found.setdefault((each.candidate.sensor_name, each.candidate.set_name), each)
-    return list(found.values())
+        result.setdefault((each.candidate.sensor_name, each.candidate.set_name), each)
+    return list(result.values())
 
 
 def _levels(rows: Table) -> list[str]:
@@ -138,7 +137,10 @@ def _group(named: tuple[Cell, ...], group: Table, levels: Sequence[str]) -> dict
         if any(row.get(PARETO[0]) is not None and row.get(PARETO[1]) is not None for row in some)
     ]
     tables = [
-        (_level(levels, values), [(title, *found) for title, columns in _OF_LEVEL if (found := _table(some, columns))])
+        (
+            _level(levels, values),
+            [(title, *result) for title, columns in _OF_LEVEL if (result := _table(some, columns))],
+        )
         for values, some in inner
     ]
     own = [name for name in _NAMES if name != "exposure_us" and name in group.columns]
@@ -151,10 +153,10 @@ def _group(named: tuple[Cell, ...], group: Table, levels: Sequence[str]) -> dict
 
 def _grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
     """The rows by the values of some columns, in the order in which these first occur."""
-    found: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    result: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
     for row in rows:
-        found.setdefault(tuple(row[name] for name in keys), []).append(row)
-    return [(values, Table(group)) for values, group in found.items()]
+        result.setdefault(tuple(row[name] for name in keys), []).append(row)
+    return [(values, Table(group)) for values, group in result.items()]
 
 
 def _level(keys: Sequence[str], values: Sequence[Cell]) -> str:
@@ -202,10 +204,10 @@ def _cell(value: object) -> str:
 def _patches(seen: Sequence[Seen]) -> list[tuple[str, list[tuple[str, Markup]]]]:
     """Of all that share surfaces and light: a drawing of their patches, and each chart with its caption."""
     coloured = [each for each in seen if each.colour is not None]
-    found = []
+    result = []
     for _, group in groupby(coloured, key=lambda each: (each.surfaces, each.light_name)):
         some = list(group)
         named = zip(some, seen_labels(some), strict=True)
         charts = [(text, inline_picture(chart_picture(each), text)) for each, text in named]
-        found.append((patch_plot(some), charts))
-    return found
+        result.append((patch_plot(some), charts))
+    return result

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -61,8 +62,7 @@ def study(
         read: StudySpec = validate(StudySpec, dict(spec), None, {})
     else:
         read = spec if isinstance(spec, StudySpec) else read_study(spec)
-    folder = None if out is None else OutputFolder(out, MARKER, overwrite)
-    try:
+    with nullcontext() if out is None else OutputFolder(out, MARKER, overwrite) as folder:
         with shown(progress, read.name) as report:
             result = run_study(read, report)
         if folder is not None:
@@ -74,9 +74,4 @@ def study(
                 text = result.table.to_json(study=content, schema_version=1)
                 (folder.path / MARKER).write_text(text, encoding="utf-8")
                 (folder.path / "report.html").write_text(report_page(read, result), encoding="utf-8")
-            folder.commit()
-    except BaseException:
-        if folder is not None:
-            folder.discard()
-        raise
     return result.table

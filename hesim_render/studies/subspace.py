@@ -43,10 +43,10 @@ def require_colour(curves: ArrayLike, what: str) -> None:
     SpecError
         If fewer than three columns are independent.
     """
-    found = rank(curves)
-    if found < 3:
+    result = rank(curves)
+    if result < 3:
         raise SpecError(
-            f"{what}: its filters span {found} of the 3 dimensions that colour needs; add a filter, or leave the "
+            f"{what}: its filters span {result} of the 3 dimensions that colour needs; add a filter, or leave the "
             "colour figures out"
         )
 

@@ -124,13 +124,13 @@ def sweep(
     # runs that differ in the ISP alone come one after the other, so that they share a recording
     first = _first_of_each(runs)
     order = sorted(range(len(runs)), key=lambda k: (first[runs[k].simulation], k))
-    found: dict[int, list[dict[str, Cell]]] = {}
+    result: dict[int, list[dict[str, Cell]]] = {}
     with shown(progress, read.name) as report:
         for done, k in enumerate(order):
             if report is not None:
                 report(done, len(runs), f"run {done + 1} of {len(runs)}")
-            found[k] = _rows(made, runs[k], folder)
-    table = Table(run.cells | row for k, run in enumerate(runs) for row in found[k])
+            result[k] = _rows(made, runs[k], folder)
+    table = Table(run.cells | row for k, run in enumerate(runs) for row in result[k])
     table.write(folder / "results.csv", overwrite=True)
     table.write(folder / "results.json", overwrite=True)
     return table
@@ -164,10 +164,10 @@ def _file_of(folder: Path, made: _Studies | _Recordings, run: Run) -> Path:
 
 
 def _first_of_each(runs: Sequence[Run]) -> dict[str, int]:
-    found: dict[str, int] = {}
+    result: dict[str, int] = {}
     for k, run in enumerate(runs):
-        found.setdefault(run.simulation, k)
-    return found
+        result.setdefault(run.simulation, k)
+    return result
 
 
 def _rows(made: _Studies | _Recordings, run: Run, folder: Path) -> list[dict[str, Cell]]:

@@ -74,8 +74,8 @@ class RunFigures:
     def __call__(self, metric: str) -> dict[str, Cell]:
         """One metric by its name in `specs.sweep.METRICS`: columns with values, None where it has no meaning."""
         name, of = _METRICS[metric]
-        found = of(self)
-        return found if isinstance(found, dict) else {name: found}
+        result = of(self)
+        return result if isinstance(result, dict) else {name: result}
 
     @cached_property
     def seconds(self) -> float:
@@ -211,8 +211,8 @@ class RunFigures:
     @property
     def isp_report(self) -> dict[str, Cell]:
         """Numbers that the steps of the ISP report."""
-        found = {} if self.picture is None else self.picture.report or {}
-        return {f"isp_{key}": float(value) for key, value in found.items() if isinstance(value, int | float)}
+        result = {} if self.picture is None else self.picture.report or {}
+        return {f"isp_{key}": float(value) for key, value in result.items() if isinstance(value, int | float)}
 
 
 def _with_white_at_1(picture: NDArray) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 from hesim_render.core.errors import SpecError
 from hesim_render.specs import boards as board_specs
 from hesim_render.specs import charts as chart_specs
-from hesim_render.specs import resolution as resolution_specs
+from hesim_render.specs import charts as resolution_specs
 from hesim_render.specs.target import TargetSpec
 from hesim_render.targets import boards, charts, leaves, resolution
 from hesim_render.targets.image import image

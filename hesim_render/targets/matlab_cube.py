@@ -39,9 +39,9 @@ def _of_variables(file: Path, data: dict[str, Any], layout: str) -> CubeFile:
     """Arrays in MATLAB's order: [row, col, band]."""
     name = next((key for key in _CUBES if getattr(data.get(key), "ndim", 0) == 3), None)
     if name is None:
-        found = ", ".join(key for key in data if not key.startswith("__"))
+        result = ", ".join(key for key in data if not key.startswith("__"))
         raise SpecError(
-            f"expected one of {', '.join(_CUBES)} with three dimensions; found {found or 'nothing'}", file=file
+            f"expected one of {', '.join(_CUBES)} with three dimensions; found {result or 'nothing'}", file=file
         )
     if name == "mcCOEF":
         return _isetcam_basis(file, data)
@@ -130,9 +130,9 @@ def read_hdf5(file: Path) -> CubeFile:
 
 def _whole(group: Any, name: str, file: Path) -> NDArray:
     """A small data set."""
-    found = dataset_of(group, name, file, "fui")
-    require_memory(found.size * found.dtype.itemsize, name, file, _MOST_SMALL_BYTES)
-    return np.asarray(found)
+    result = dataset_of(group, name, file, "fui")
+    require_memory(result.size * result.dtype.itemsize, name, file, _MOST_SMALL_BYTES)
+    return np.asarray(result)
 
 
 def _bands_in(data: dict[str, Any]) -> NDArray[np.float64] | None:

@@ -178,12 +178,12 @@ def cells(dark: NDArray[np.bool_], x: NDArray[np.float64], y: NDArray[np.float64
     dark : [row, col], row 0 at the top.
     x, y : limits of the columns, increasing, [cols + 1], and of the rows, decreasing, [rows + 1], m.
     """
-    found: tuple[list, list] = ([], [])
+    result: tuple[list, list] = ([], [])
     for row, values in enumerate(dark):
         ends = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
         for first, last in zip(ends[:-1], ends[1:], strict=True):
-            found[int(values[first])].append(box(x[first], x[last], y[row + 1], y[row]))
-    return found
+            result[int(values[first])].append(box(x[first], x[last], y[row + 1], y[row]))
+    return result
 
 
 def bent(piece: TargetPiece, radius_m: float, step_m: float) -> TargetPiece:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hesim_render.core.errors import SpecError
-from hesim_render.specs.resolution import (
+from hesim_render.specs.charts import (
     EdgeFieldTarget,
     ResolutionWedgesTarget,
     SiemensStarTarget,

@@ -91,10 +91,10 @@ def read_poses(file: Path, how: PoseFile = AS_IN_THE_FILE, of_camera: bool = Fal
     return [{"t_us": t + shift, "matrix": pose.tolist()} for t, pose in zip(times, poses, strict=True)]
 
 
-_Found = tuple[list[int | None], list[int], NDArray[np.float64]]
+_PoseRows = tuple[list[int | None], list[int], NDArray[np.float64]]
 
 
-def _rows(file: Path, quaternion: str) -> _Found:
+def _rows(file: Path, quaternion: str) -> _PoseRows:
     """Lines, times in µs and poses [n, 4, 4] of a file with one pose in a line."""
     every = [(number, line.strip()) for number, line in enumerate(read_text(file).splitlines(), 1)]
     is_csv = file.suffix.lower() == ".csv"
@@ -147,7 +147,7 @@ def _numbers(cells: list[str], file: Path, line: int, is_euroc: bool) -> list[fl
     return values
 
 
-def _opencv(file: Path, how: PoseFile, of_camera: bool) -> _Found:
+def _opencv(file: Path, how: PoseFile, of_camera: bool) -> _PoseRows:
     """Poses of a file of OpenCV's `FileStorage`: ``rvecs`` and ``tvecs`` [n, 3] of `cv2.calibrateCamera`, or
     ``extrinsic_parameters`` [n, 6], and perhaps ``t_us`` [n].
 
@@ -204,8 +204,8 @@ def _matrix(content: Mapping[str, Any], key: str, width: int, file: Path) -> NDA
         return [numbers(item) for item in node] if isinstance(node, list) else node
 
     try:
-        found = np.array(numbers(content[key]), dtype=np.float64)
-        rows = found.reshape(-1, width)
+        result = np.array(numbers(content[key]), dtype=np.float64)
+        rows = result.reshape(-1, width)
     except (TypeError, ValueError):
         rows = np.full((1, width), np.nan)
     if not np.isfinite(rows).all():

@@ -206,9 +206,9 @@ def _spatial(result: PairCalibration, real: Half, twin: Half) -> list[Check]:
             Check(f"defects, histogram, {name}", "pixels", "deviation, " + ("DN" if name == "dark" else "relative"),
                   edges[:-1], counts[0], counts[1], np.sqrt(np.maximum(counts[0] + counts[1], 1.0)))
         )  # fmt: skip
-        found = [spectra(s, f) for s, f in zip(series, scale, strict=True)]
+        outcome = [spectra(s, f) for s, f in zip(series, scale, strict=True)]
         for direction in ("rows", "columns"):
-            here = [f[direction] for f in found]
+            here = [f[direction] for f in outcome]
             error = np.sqrt(sum(s.error**2 for s in here))
             checks.append(
                 Check(f"spectrum of {direction}, {name}", unit, "periods per pixel", here[0].cycles, here[0].power,

@@ -75,29 +75,24 @@ def make_twin(
     if min(len(pairs.spatial_lit.files), len(pairs.spatial_dark.files)) < 8:
         raise pairs.spatial_lit.error("a series of fewer than 8 frames has no two halves")
     fitted, held = pairs.half(0), pairs.half(1)
-    folder = OutputFolder(out, RESULT_NAME, overwrite)
-    try:
-        with output_errors(folder.target):
-            calibration = folder.path / "calibration.yaml"
-            result = calibrate_pairs(fitted, calibration, progress=progress)
-            sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
-            bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_rel"], seed)
-            real = Half(
-                pair_levels(held, held.lit, progress), pair_levels(held, held.dark, progress),
-                long_series(held, False, progress), long_series(held, True, progress),
-            )  # fmt: skip
-            twin = Half(
-                bench.pairs(held, True, progress), bench.pairs(held, False, progress), bench.long(held, False),
-                bench.long(held, True),
-            )  # fmt: skip
-            checks = compare(result, held, real, twin)
-            texts = [finding.text for finding in findings(result)]
-            (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
-            (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
-        return Twin(folder.commit(), checks)
-    except BaseException:
-        folder.discard()
-        raise
+    with OutputFolder(out, RESULT_NAME, overwrite) as folder, output_errors(folder.target):
+        calibration = folder.path / "calibration.yaml"
+        result = calibrate_pairs(fitted, calibration, progress=progress)
+        sensor_file = write_sensor(folder.path / "sensor.yaml", calibration, result)
+        bench = TwinBench(load_sensor(sensor_file), result, read_maps(calibration, "aps")["light_rel"], seed)
+        real = Half(
+            pair_levels(held, held.lit, progress), pair_levels(held, held.dark, progress),
+            long_series(held, False, progress), long_series(held, True, progress),
+        )  # fmt: skip
+        twin = Half(
+            bench.pairs(held, True, progress), bench.pairs(held, False, progress), bench.long(held, False),
+            bench.long(held, True),
+        )  # fmt: skip
+        checks = compare(result, held, real, twin)
+        texts = [finding.text for finding in findings(result)]
+        (folder.path / RESULT_NAME).write_text(_json(checks, seed), encoding="utf-8")
+        (folder.path / "twin.html").write_text(page(checks, texts), encoding="utf-8")
+    return Twin(folder.target, checks)
 
 
 def _json(checks: list[Check], seed: int) -> str:

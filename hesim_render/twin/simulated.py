@@ -51,14 +51,14 @@ class TwinBench:
         """Pairs like those of a set."""
         series = like.lit if lit else like.dark
         different = list(dict.fromkeys(series))
-        found = {}
+        result = {}
         for number, entry in enumerate(different):
             first, second = self.frames(_light(like, entry), entry.exposure_s, 2)
-            found[entry] = pair_statistics(first, second, like.spec.full_scale_dn)
+            result[entry] = pair_statistics(first, second, like.spec.full_scale_dn)
             if progress is not None:
                 progress("simulating pairs", (number + 1) / len(different))
         photons = [entry.photons or 0.0 for entry in series]
-        return levels([entry.exposure_s for entry in series], photons, [found[entry] for entry in series])
+        return levels([entry.exposure_s for entry in series], photons, [result[entry] for entry in series])
 
     def long(self, like: PairSet, lit: bool) -> Long:
         """A long series like that of a set."""

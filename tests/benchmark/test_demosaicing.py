@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark, evaluate_benchmark
-from hesim_render.benchmark.bilinear import bilinear
-from hesim_render.benchmark.pictures import ClipDevelopment
+from hesim_render.benchmark.pictures import ClipDevelopment, bilinear
 
 BAYER = np.array([[0, 1], [1, 2]])
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hesim_render.benchmark import devices
-from hesim_render.benchmark.devices import VISIBLE, claim_device, devices_of
+from hesim_render.benchmark import worker
+from hesim_render.benchmark.worker import VISIBLE, claim_device, devices_of
 
 CODE = """
 import importlib.util, sys
@@ -38,7 +38,7 @@ def test_workers_take_different_gpus_and_a_dead_one_gives_its_own_back(tmp_path)
 
     def start():
         process = subprocess.Popen(
-            [sys.executable, "-c", CODE, str(tmp_path), devices.__file__],
+            [sys.executable, "-c", CODE, str(tmp_path), worker.__file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

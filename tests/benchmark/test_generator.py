@@ -11,9 +11,9 @@ from PIL import Image
 from benchmarks import generated, small
 from hesim_render.benchmark.draws import draws, shares
 from hesim_render.benchmark.generator import Generator
+from hesim_render.benchmark.materials import KINDS, texture
 from hesim_render.benchmark.meshes import mesh
 from hesim_render.benchmark.plan import BenchmarkPlan, shared_parts
-from hesim_render.benchmark.textures import KINDS, texture
 from hesim_render.core.errors import HesimError, SpecError
 from hesim_render.specs.benchmark import SharpSpec, read_benchmark
 from hesim_render.specs.scene import SceneSpec, read_scene

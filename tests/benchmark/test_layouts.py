@@ -8,8 +8,7 @@ from PIL import Image
 import hesim_render as hr
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark
-from hesim_render.benchmark.cumulative import cumulative_grid
-from hesim_render.benchmark.layouts import export_benchmark
+from hesim_render.benchmark.layouts import cumulative_grid, export_benchmark
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 

@@ -1,16 +1,19 @@
 """The learned filter: what it sees, how it is measured, and that calibrated noise helps on a sensor unlike it."""
 
 import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hesim_render.benchmark import learned_filter
 from hesim_render.benchmark.event_filters import last_before
-from hesim_render.benchmark.learned_filter import LearnedFilter, area_under_curve, features, uniform_noise
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.pixels.evs.events import EVENT_DTYPE
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+import learned_filter
+from learned_filter import LearnedFilter, area_under_curve, features, uniform_noise
 
 SHAPE = (9, 11)
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from hesim_render.benchmark.double_integral import sharp_over_blurred
 from hesim_render.benchmark.event_filters import background_activity, nearest_neighbour
+from hesim_render.benchmark.intensity import sharp_over_blurred
 from hesim_render.benchmark.metrics import chamfer, count_error, denoising_scores, rate_error, rate_maps
 from hesim_render.core.errors import RangeError
 from hesim_render.measure.pictures import delta_e, psnr, ssim

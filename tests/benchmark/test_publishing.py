@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 import hesim_render as hr
 from benchmarks import small
 from hesim_render.benchmark import build_benchmark
-from hesim_render.benchmark.croissant import card_header, tasks
+from hesim_render.benchmark.card import card_header, tasks
 from hesim_render.benchmark.shards import pack_benchmark
 from hesim_render.benchmark.tonic_dataset import EventDataset
 from hesim_render.core.errors import RangeError, SpecError

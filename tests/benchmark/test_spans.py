@@ -22,8 +22,7 @@ from hesim_render.benchmark.build import UnfinishedError
 from hesim_render.benchmark.clip import build_clip, clip_folder, render_span
 from hesim_render.benchmark.local import LocalWorkers
 from hesim_render.benchmark.plan import BenchmarkPlan
-from hesim_render.benchmark.spans import journals_in, spans_folder, spans_of
-from hesim_render.benchmark.units import Unit, Waiting
+from hesim_render.benchmark.spans import Unit, Waiting, journals_in, spans_folder, spans_of
 from hesim_render.benchmark.verify import digest_of
 from hesim_render.benchmark.worker import attempt
 from hesim_render.core.errors import OutputError, RangeError
@@ -139,7 +138,7 @@ def test_journals_of_others_are_read_and_never_written(tmp_path):
         with one.path.open("ab") as file:
             file.write(begun)
         with Journal(tmp_path / "two", run, others=[one.path, tmp_path / "none"]) as two:
-            assert two.found == 1 and two.recall(key, [found]) and np.array_equal(found, data)
+            assert two.count == 1 and two.recall(key, [found]) and np.array_equal(found, data)
             two.keep(b"l" * 16, [data])
         assert not two.path.exists()
         with Journal(tmp_path / "two", {"clip": 2}, others=[one.path]) as of_another_run:

@@ -13,10 +13,12 @@ import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibrate.evs.cells import PixelThresholds, pool_events
 from hesim_render.calibrate.evs.counts import read_static
-from hesim_render.calibrate.evs.model import mean_probability, probability_variance
+from hesim_render.calibrate.evs.model import probability_variance
 from hesim_render.calibrate.evs.steps import GROUPS, Steps, pixel_groups
 from hesim_render.calibrate.evs.thresholds import fit_thresholds
 from hesim_render.capture.lab import write_captures
+from hesim_render.core.namespace import NUMPY
+from hesim_render.pixels.evs.formulas import exceedance, over_thresholds
 from hesim_render.recording.capture_set import read_captures
 
 
@@ -193,7 +195,7 @@ def test_closed_form_of_the_mean_over_thresholds():
     z = np.linspace(-9, 9, 20001)
     weight = np.exp(-z * z / 2) / np.exp(-z * z / 2).sum()
     p = ndtr(-u[:, None] * (1 + m * z))
-    np.testing.assert_allclose(mean_probability(u, m), p @ weight, rtol=1e-9)
+    np.testing.assert_allclose(exceedance(over_thresholds(u, 1.0, m, NUMPY), 1.0), p @ weight, rtol=1e-9)
     np.testing.assert_allclose(probability_variance(u, m), (p * p) @ weight - (p @ weight) ** 2, rtol=1e-6)
 
 

@@ -71,7 +71,7 @@ def test_variance_polynomial_is_exact_however_noisy_the_signals_are(tau):
     """Errors in variables: noise of the signals inflates Σ I² by τ², and Σ I³ and Σ I⁴ accordingly."""
     found = fit_variance(join([pooled(seconds, tau) for seconds in (0.01, 0.05, 0.2)]))
     np.testing.assert_allclose(found.beta, BETA, rtol=1e-6, atol=1e-12)
-    assert found.identified.all() and found.hidden_pixels == 0
+    assert found.identified.all() and found.quantised_pixels == 0
 
 
 @pytest.mark.parametrize("more", [0.99, 1.0, 1.01])

@@ -9,7 +9,7 @@ from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import RangeError
 from hesim_render.mosaic.schedule import exposures, tick_blocks
-from hesim_render.sources.window_by_window import WindowByWindow
+from hesim_render.sources.still import WindowByWindow
 
 
 class RampFlux(WindowByWindow):

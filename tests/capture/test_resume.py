@@ -81,7 +81,7 @@ def test_another_command_does_not_go_on(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         record("exact static", tmp_path / "out", stop_after=1, monkeypatch=monkeypatch, overwrite=True, samples=8192)
     (journal,) = tmp_path.iterdir()
-    with pytest.raises(OutputError, match=r"interrupted run.*another seed;"):
+    with pytest.raises(OutputError, match=r"interrupted run.*differs in seed;"):
         record("exact static", tmp_path / "out", monkeypatch=monkeypatch, seed=6, samples=8192)
     assert list(tmp_path.iterdir()) == [journal]
     record("exact static", tmp_path / "out", monkeypatch=monkeypatch, seed=6, samples=4, overwrite=True)
@@ -106,7 +106,7 @@ def test_entries_are_told_apart_by_all_that_they_depend_on(exact, tmp_path):
     assert len({values.tobytes() for values in expected}) == (4 if exact else 6)  # two windows in one slice of time
     for again in (False, True):
         with pytest.raises(KeyboardInterrupt), Journal(tmp_path / "out", {}) as journal:
-            assert (journal.found > 0) == again
+            assert (journal.count > 0) == again
             made = sources()
             for number, source in enumerate(made):
                 source.go_on(journal, number)

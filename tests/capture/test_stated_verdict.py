@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from hesim_render.capture.error_meter import ErrorMeter
+from hesim_render.capture.error_meter import ErrorMeter, stated_verdict
 from hesim_render.capture.event_flux import EventFlux
 from hesim_render.capture.scene_run import require_short
-from hesim_render.capture.stated_verdict import stated_verdict
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import TooLongError
 from hesim_render.sources.demand import Estimate
@@ -42,7 +41,7 @@ def test_event_truth_is_the_mean_of_both_halves_and_half_of_their_difference():
 def test_a_run_is_too_long_beyond_its_limit_in_minutes():
     estimate = Estimate(seconds=150.0, peak_bytes=2e8, rays=3e6)
     require_short(estimate, 2.5, "less")
-    with pytest.raises(TooLongError, match=r"more than 2.49 min has to be wanted: .*, or ask for less: fewer pixels"):
+    with pytest.raises(TooLongError, match=r"more than 2.49 min must be allowed: .*, or ask for less: fewer pixels"):
         require_short(estimate, 2.49, "fewer pixels")
 
 

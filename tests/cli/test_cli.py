@@ -20,6 +20,7 @@ from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core import backend, progress
 from hesim_render.core.backend import BackendCandidate
 from hesim_render.core.errors import RangeError
+from hesim_render.core.extras import how_to_install
 from hesim_render.core.region import parse_roi
 from hesim_render.core.shipped import data_folder, list_names
 
@@ -180,7 +181,7 @@ def test_a_long_run_says_what_to_do_in_one_reading(capsys, tmp_path):
         "--quality", "0.4", "--roi", "64x64",
     )  # fmt: skip
     assert status == 2 and out.startswith("estimate: about ") and line.count("\n") == 1
-    assert "this run takes about " in line and "has to be wanted: add --yes (max_minutes=None), or ask for less" in line
+    assert "this run takes about " in line and "must be allowed: add --yes (max_minutes=None), or ask for less" in line
     assert "--duration, a smaller --roi, or a larger error, such as --quality 0.8" in line
     assert list(tmp_path.iterdir()) == []
 
@@ -199,7 +200,7 @@ def test_doctor_says_what_to_install_where_nothing_runs(capsys, monkeypatch):
     monkeypatch.setattr(backend, "candidates", lambda: [broken])
     status, out, err = call(capsys, "info")
     assert status == 2 and "does not work: no such file" in out
-    assert err.count("\n") == 1 and "libllvm19" in err and "pip install 'tadashi" in err
+    assert err.count("\n") == 1 and "libllvm19" in err and how_to_install("llvm") in err
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import pytest
 
 from hesim_render.cli.commands import program
-from hesim_render.cli.option_names import in_options
+from hesim_render.cli.options import in_options
 from hesim_render.core.errors import ConflictError, RangeError, SpecError
 
 

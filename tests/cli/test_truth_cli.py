@@ -8,7 +8,7 @@ import hesim_render as hr
 from hesim_render.cli.cube import parse_bands
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.core.errors import RangeError
-from hesim_render.recording.truth_kinds import TRUTH_KINDS
+from hesim_render.recording.truth_file import TRUTH_KINDS
 from hesim_render.specs.files import data_folder
 
 RUN = ("simulate", "rotating-star", "--sensor", "gen2", "--roi", "32x24", "--duration", "0.02", "--samples", "2")

@@ -9,6 +9,7 @@ import pytest
 from hesim_render.core import backend
 from hesim_render.core.backend import BackendCandidate
 from hesim_render.core.errors import BackendError
+from hesim_render.core.extras import how_to_install
 
 
 @pytest.fixture
@@ -76,6 +77,31 @@ def test_system_libraries_are_17_or_newer_and_newest_first(fresh, tmp_path):
     assert not [name for name in names if any(old in name for old in ("14", "15", "16"))]
 
 
+def test_the_extra_s_library_comes_with_those_it_needs_by_their_own_paths(fresh, tmp_path):
+    """Its links may be missing: they are made at Python's first start, where that may write."""
+    site, lib = tmp_path / "site", tmp_path / "lib"
+    info = site / "karellen_llvm_core-17.0.6.0.dist-info"
+    info.mkdir(parents=True)
+    (lib / "of-the-machine").mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: karellen-llvm-core\nVersion: 17.0.6.0\n")
+    real = ["libLTO.so.17", "libLLVM-17.so", "of-the-machine/libc++.so.1.0", "of-the-machine/libc++abi.so.1.0",
+            "of-the-machine/libc++.modules.json", "of-the-machine/libunwind.so.1.0"]  # fmt: skip
+    links = ["libLLVM.so", "libLLVM-17.0.6.so", "of-the-machine/libc++.so.1"]
+    for name in real:
+        (lib / name).write_bytes(b"")
+    (info / "RECORD").write_text("".join(f"../lib/{name},,\n" for name in real + links))
+    fresh.setattr(sys, "path", [str(site)])
+    beside = tuple(str(lib / "of-the-machine" / f"{name}.so.1.0") for name in ("libunwind", "libc++abi", "libc++"))
+    assert backend._extra_library() == (str(lib / "libLLVM-17.so"), beside)
+    (lib / "libLLVM-17.0.6.so").symlink_to("libLLVM-17.so")
+    (lib / "of-the-machine" / "libc++.so.1").symlink_to("libc++.so.1.0")
+    assert backend._extra_library() == (str(lib / "libLLVM-17.so"), beside)
+    (lib / "libLLVM-17.so").rename(lib / "gone")
+    assert backend._extra_library() is None
+    fresh.setattr(sys, "path", [str(lib)])
+    assert backend._extra_library() is None
+
+
 def test_nonsense_in_the_environment_falls_through(fresh, tmp_path):
     nonsense = tmp_path / "libLLVM-19.so"
     nonsense.write_bytes(b"not a library")
@@ -113,7 +139,7 @@ def test_without_candidates_the_message_says_what_to_install(fresh):
         select_anew()
     text = str(caught.value)
     assert "\n" not in text
-    for part in ("no Dr.Jit backend works", "LLVM >= 17", "libllvm19", "pip install 'tadashi"):
+    for part in ("no Dr.Jit backend works", "LLVM >= 17", "libllvm19", how_to_install("llvm")):
         assert part in text
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from hesim_render.cli.exit_status import ExitStatus
 from hesim_render.cli.interrupts import Interrupts
-from hesim_render.core.interrupts import interrupts_held
+from hesim_render.core.child import interrupts_held
 
 #: A lock that is taken twice: native code that never comes back, and that no signal wakes.
 _NEVER = """

@@ -28,7 +28,7 @@ def test_results_outlive_an_interrupt_and_not_a_success(tmp_path):
     path = interrupted(tmp_path / "out")
     assert path.name == ".out.unfinished" and path.is_file()
     with Journal(tmp_path / "out", RUN) as journal:
-        assert journal.found == 2
+        assert journal.count == 2
         values, marks = first_of(journal)
         np.testing.assert_array_equal(values, np.arange(5))
         assert marks.all()
@@ -46,7 +46,7 @@ def test_a_second_interrupt_adds_to_the_first(tmp_path):
         raise KeyboardInterrupt
     with Journal(tmp_path / "out", RUN) as journal:
         found = np.zeros(4)
-        assert journal.found == 3 and journal.recall(key_of("c"), [found]) and found[3] == 3
+        assert journal.count == 3 and journal.recall(key_of("c"), [found]) and found[3] == 3
 
 
 def test_keys_tell_types_shapes_and_places_apart():
@@ -64,7 +64,7 @@ def test_a_file_cut_anywhere_keeps_its_whole_entries(cut, tmp_path):
     path.write_bytes(data[:-cut])
     entry = 28 + 16  # the second one; before it lies the first one of 28 + 23 bytes
     with Journal(tmp_path / "out", RUN) as journal:
-        assert journal.found == (1 if cut <= entry else 0)
+        assert journal.count == (1 if cut <= entry else 0)
         assert (first_of(journal) is not None) == (cut <= entry)
         journal.keep(SECOND, [np.arange(2.0)])
         found = np.zeros(2)
@@ -86,15 +86,15 @@ def test_another_run_is_refused_by_what_differs_or_begun_anew(tmp_path):
     path = interrupted(tmp_path / "out")
     before = path.read_bytes()
     other = {"seed": 4, "scene": {"name": "b", "sha256": "1"}}
-    with pytest.raises(OutputError, match=r"another seed, scene; .*--overwrite"):
+    with pytest.raises(OutputError, match=r"differs in seed, scene; .*--overwrite"):
         Journal(tmp_path / "out", other)
     assert path.read_bytes() == before
     with Journal(tmp_path / "out", other, overwrite=True) as journal:
-        assert journal.found == 0
+        assert journal.count == 0
     assert not path.exists()
     path.write_bytes(b"something else")  # not a journal: nothing to go on from
     with Journal(tmp_path / "out", RUN) as journal:
-        assert journal.found == 0
+        assert journal.count == 0
 
 
 def test_two_runs_at_a_time_do_not_share_a_journal(tmp_path):

@@ -320,13 +320,14 @@ def test_the_commands(capsys, tmp_path):
     assert not (tmp_path / "f.h5").exists()
 
 
-def test_the_commands_offer_the_formats_that_exist():
+def test_the_commands_complete_the_formats_that_exist():
     from hesim_render.cli import exchange
     from hesim_render.exchange import FRAME_FORMATS, formats
     from hesim_render.recording.exports import WHOLE_FORMATS
+    from hesim_render.recording.truth_export import FORMATS
 
-    assert (*EVENT_FORMATS, *FRAME_FORMATS) == exchange._EXPORTS
-    assert exchange._IMPORTS == formats.READABLE == tuple(formats._OPENERS)
-    assert exchange._WHOLE == WHOLE_FORMATS
-    for name in (*exchange._EXPORTS, *WHOLE_FORMATS):
+    assert exchange._complete_export("") == [*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS, *FORMATS]
+    assert exchange._complete_export("mp4-") == ["mp4-colour", "mp4-events"]
+    assert exchange._complete_import("") == [*formats.READABLE] == [*formats._OPENERS]
+    for name in (*EVENT_FORMATS, *FRAME_FORMATS, *WHOLE_FORMATS):
         assert f"``{name}``" in hr.Recording.export.__doc__

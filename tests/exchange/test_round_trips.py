@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange import aedat4, open_events, stream
+from hesim_render.exchange.aedat4 import FlatTable
 from hesim_render.exchange.dsec import read_events as read_dsec
-from hesim_render.exchange.flatbuffer import FlatTable
 
 READABLE = ("evt2", "evt3", "dat", "aedat4", "dsec", "dsec-gzip", "npz")
 QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

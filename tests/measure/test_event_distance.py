@@ -8,8 +8,7 @@ import pytest
 from hesim_render.core.errors import SpecError
 from hesim_render.exchange import EventStream
 from hesim_render.measure import event_distance
-from hesim_render.measure.event_distance import event_distances
-from hesim_render.measure.event_statistics import event_statistics
+from hesim_render.measure.event_distance import event_distances, event_statistics
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 
 SHAPE, SECONDS, RATE_HZ = (31, 37), 2.6, 21.0

@@ -194,7 +194,7 @@ def test_the_content_of_a_recording_does_not_know_its_pictures():
         if name in MODULES and name not in reached:
             reached.add(name)
             waiting += modules_imported(name)
-    assert "hesim_render.recording.stored_frames" in reached
+    assert "hesim_render.recording.frame" in reached
     drawn = {"preview", "showcase", "page", "plots", "movie", "exports", "save"}
     assert not reached & {f"hesim_render.recording.{name}" for name in drawn}
 
@@ -245,3 +245,16 @@ def test_imports_point_down_when_they_run():
         if other in MODULES and package_of(here) and package_of(other):
             assert LEVEL[package_of(other)] <= LEVEL[package_of(here)], f"{here} asks for {other}, which is above it"
             assert other in modules_imported(here) | {here}, f"{here} asks for {other}, which its text does not say"
+
+
+def test_the_capture_knows_the_types_of_what_it_handles():
+    for name in EVERY:
+        if package_of(name) == "capture":
+            used = {node.id for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8")))
+                    if isinstance(node, ast.Name)}  # fmt: skip
+            assert not used & {"getattr", "isinstance", "Any"}, name
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if not name.startswith("hesim_render.sources.render")])
+def test_a_module_has_a_size_that_one_reads(name):
+    assert len(MODULES[name].read_text(encoding="utf-8").splitlines()) <= 350

@@ -1,5 +1,6 @@
 """What is given away is whole: wheel and source archive, citation, the container's steps, installation by uv."""
 
+import importlib.metadata
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 from ruamel.yaml import YAML
 from source_trees import source_tree
 
@@ -17,6 +19,7 @@ from hesim_render.core.shipped import FOLDERS, list_names
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+INSTALLED = {found.metadata["Name"] for found in importlib.metadata.distributions()}
 #: Steps of the Dockerfile that need root.
 NEEDS_ROOT = ("useradd",)
 
@@ -32,6 +35,20 @@ def test_one_version_stands_everywhere():
     assert {"cff-version", "message", "title", "authors"} <= set(citation)
     headings = re.findall(r"^## \[([\d.]+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert headings[0] == PROJECT["version"] and len(headings) == len(set(headings))
+
+
+def test_every_package_of_a_run_has_an_upper_bound():
+    """Another release may change bytes; the viewer and PyTorch only read what is there."""
+    extras = PROJECT["optional-dependencies"]
+    for name in ("view", "torch", "docs", "test", "dev"):
+        assert name in extras
+    of_a_run = [*PROJECT["dependencies"], *(package for name, packages in extras.items() for package in packages
+                                            if name not in ("view", "torch", "docs", "test", "dev"))]  # fmt: skip
+    assert len(of_a_run) > 25
+    for package in map(Requirement, of_a_run):
+        assert any(part.operator in ("<", "==", "~=") for part in package.specifier), package.name
+        installed = importlib.metadata.version(package.name) if package.name in INSTALLED else None
+        assert installed is None or package.specifier.contains(installed), (package.name, installed)
 
 
 def test_the_container_has_extras_that_exist_and_runs_the_program():

@@ -17,8 +17,9 @@ def run(name, *arguments):
 
 
 @pytest.mark.slow
-def test_opencv_finds_the_camera():
-    found = re.findall(r"^([fc][xy]).* (-?[\d.]+)%$", run("calibrate_with_opencv.py", 8), re.MULTILINE)
+@pytest.mark.parametrize("board", ["checkerboard", "charuco"])
+def test_opencv_finds_the_camera(board):
+    found = re.findall(r"^([fc][xy]).* (-?[\d.]+)%$", run("calibrate_with_opencv.py", 8, board), re.MULTILINE)
     assert [name for name, _ in found] == ["fx", "fy", "cx", "cy"]
     assert all(abs(float(percent)) < 0.3 for _, percent in found)
 

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import run_page
@@ -13,6 +14,7 @@ from source_trees import source_tree
 
 import hesim_render as hr
 from hesim_render.cli.commands import program
+from tests import claim
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -164,7 +166,31 @@ def test_every_claim_has_an_oracle_a_figure_and_a_command():
     assert len(rows) > 35
     for row in rows:
         assert len(row) in (4, 5) and all(row), row
-        assert NAMED_TEST.search(row[-1]) or NAMED_SCRIPT.search(row[-1]), row
+        command, _, fold = row[-1].partition("<details><summary>tests</summary>")
+        assert command.startswith("`python ") and not NAMED_TEST.search(command), row
+        assert bool(NAMED_TEST.search(fold)) == ("tests.claim" in command), row
+    named = claim.claims()
+    assert len(named) > 70 and all(tests for _, tests in named.values())
+    assert named["grey-card"] == (
+        "a grey card can be checked by hand",
+        ["tests/capture/test_simulation.py::test_grey_card_electrons_by_hand"],
+    )
+
+
+def test_the_tests_of_a_claim_are_run_with_the_slow_ones(monkeypatch, capsys):
+    asked = []
+    monkeypatch.setattr(
+        claim.subprocess, "run", lambda command, cwd: asked.append(command) or SimpleNamespace(returncode=5)
+    )
+    assert claim.main(["crop", "grey-card"]) == 5
+    (command,) = asked
+    assert command[1:3] == ["-m", "pytest"] and "slow or not slow" in command
+    assert [part.rpartition("::")[2] for part in command[-2:]] == [
+        "test_a_crop_is_the_full_sensor",
+        "test_grey_card_electrons_by_hand",
+    ]
+    assert claim.main([]) == 0 and claim.main(["crop", "wolf"]) == 2 and len(asked) == 1
+    assert "crop" in capsys.readouterr().out
 
 
 def test_the_readme_is_short_and_begins_with_two_commands_and_a_picture():

@@ -10,12 +10,11 @@ import hesim_render as hr
 from hesim_render.core.backend import jit
 from hesim_render.core.shipped import list_names
 from hesim_render.mosaic.layout import Layout
-from hesim_render.pixels.evs import reference_law
+from hesim_render.pixels.evs import start
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.noise_rates import events_per_period
-from hesim_render.pixels.evs.reference_law import Pixels, law
 from hesim_render.pixels.evs.stage import EvsStage
-from hesim_render.pixels.evs.start import start_chances, start_of
+from hesim_render.pixels.evs.start import Pixels, law, start_chances, start_of
 from hesim_render.sensor.reading import read_sensor
 
 SIDE = 64
@@ -123,7 +122,7 @@ def test_levels_of_comparison_are_drawn_from_the_law():
     """At the thresholds of 3 and 3.5 σ the law of 4608 pixels; between nodes the median moves with the thresholds."""
     noise = pixels(evs__refractory_period_us=400, evs__contrast_threshold_on=0.21, evs__contrast_threshold_off=0.245)
     count = int(np.prod(noise.layout.evs_shape))
-    angle = reference_law.POLE / 16
+    angle = start.POLE / 16
     found = start_of(noise, 3, np.full(count, 0.07, np.float32), np.ones(count), angle).reference
     expected = law(Pixels(np.array([3.0]), np.array([3.5]), 400e-6 * 250, 1e-3 / 250, angle))
     below = np.append(0.0, np.cumsum(expected.share[0]))
@@ -146,7 +145,7 @@ def test_stationary_laws_of_chains():
     rng = np.random.default_rng(3)
     chances = 10.0 ** rng.uniform(-9, 0, (3, 7, 7))
     chances /= chances.sum(axis=2, keepdims=True)
-    found = reference_law._stationary(chances)
+    found = start._stationary(chances)
     for matrix, own in zip(chances, found, strict=True):
         value, vector = np.linalg.eig(matrix.T)
         expected = np.real(vector[:, np.argmax(np.real(value))])
@@ -154,27 +153,27 @@ def test_stationary_laws_of_chains():
 
 
 def test_a_normal_law_on_the_grid_has_its_mean_and_variance():
-    grid, step = reference_law._GRID, reference_law._STEP
+    grid, step = start._GRID, start._STEP
     mean = np.array([-1.234, 0.0, 0.05, 2.71])
     for deviation in (0.03, 0.1, 0.5):
-        weight = reference_law._weights(mean, deviation)
+        weight = start._weights(mean, deviation)
         np.testing.assert_allclose(weight.sum(axis=1), 1, rtol=1e-12)
         np.testing.assert_allclose(weight @ grid, mean, atol=1e-12)
         variance = weight @ grid**2 - mean**2
         assert np.all(np.abs(variance - deviation**2 - step**2 / 6) < step**2 / 5)
     # beyond the ends, at the ends
-    np.testing.assert_allclose(reference_law._weights(np.array([-9.0, 9.0]), 0.2)[[0, 1], [0, -1]], 1)
+    np.testing.assert_allclose(start._weights(np.array([-9.0, 9.0]), 0.2)[[0, 1], [0, -1]], 1)
 
 
 def test_crossings_are_those_of_a_gaussian_process():
     """With many nodes Rice's formula; with the 16 of the simulation those of two correlated normal numbers."""
     level = np.array([0.0, 0.7, 2.3, 4.1])
-    found = reference_law._crossings(level, 0.01)
-    np.testing.assert_allclose(found, reference_law.POLE / (2 * np.pi) * np.exp(-0.5 * level**2), rtol=4e-3)
-    angle = reference_law.POLE / 16
+    found = start._crossings(level, 0.01)
+    np.testing.assert_allclose(found, start.POLE / (2 * np.pi) * np.exp(-0.5 * level**2), rtol=4e-3)
+    angle = start.POLE / 16
     correlation = (1 + angle) * np.exp(-angle)
     amplitude = np.sqrt(3 / (2 + correlation))
-    for one, value in zip(level, reference_law._crossings(level, angle), strict=True):
+    for one, value in zip(level, start._crossings(level, angle), strict=True):
         both = stats.multivariate_normal([0, 0], [[1, correlation], [correlation, 1]]).cdf([one / amplitude] * 2)
         assert value == pytest.approx(16 * (stats.norm.cdf(one / amplitude) - both), rel=2e-3, abs=1e-7)
 
@@ -193,12 +192,12 @@ def test_the_law_agrees_with_simulated_rates():
     mean = np.array([2.5, 3.0, 3.5])
     for (dead, difference), known in SIMULATED.items():
         on, off = mean - difference / 2, mean + difference / 2
-        found = law(Pixels(on, off, dead, 1e-5, reference_law.POLE / 16)).events
+        found = law(Pixels(on, off, dead, 1e-5, start.POLE / 16)).events
         np.testing.assert_allclose(found, known, rtol=0.07)
 
 
 def test_the_law_is_symmetric_and_follows_the_leak():
-    angle = reference_law.POLE / 16
+    angle = start.POLE / 16
     one, other = law(Pixels(np.array([2.7, 3.9]), np.array([3.9, 2.7]), 0.05, 1e-4, angle)).share
     np.testing.assert_allclose(one, other[::-1], rtol=1e-6, atol=1e-12)
     # with frequent resets the level is that of the noise itself

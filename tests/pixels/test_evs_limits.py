@@ -20,7 +20,7 @@ from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.recording.recording import Recording
 from hesim_render.recording.writer import RecordingWriter
 from hesim_render.sensor.reading import read_sensor
-from hesim_render.sources.window_by_window import WindowByWindow
+from hesim_render.sources.still import WindowByWindow
 
 K, T_REF_US, WINDOW_US = 0.2, 10_000, 1000  # of reference-mono: I = 2 DN per electron of a window
 CUTOFF_HZ = 300.0

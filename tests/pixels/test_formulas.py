@@ -103,8 +103,8 @@ def test_variance_below_which_rounding_hides_the_noise():
         return abs(mean - centre), abs(law @ (dn - mean) ** 2 - variance - 1 / 12) / variance
 
     worst = {v: np.max([rounded(v, c) for c in np.linspace(0, 0.5, 51)], axis=0) for v in (0.24, 0.12, 0.03)}
-    assert worst[aps.HIDDEN_VARIANCE_DN2][1] < 0.05 < worst[0.12][1]
-    assert worst[aps.HIDDEN_VARIANCE_DN2][0] < 0.005 and worst[0.03][0] > 0.1
+    assert worst[aps.QUANTISED_VARIANCE_DN2][1] < 0.05 < worst[0.12][1]
+    assert worst[aps.QUANTISED_VARIANCE_DN2][0] < 0.005 and worst[0.03][0] > 0.1
 
 
 def level(signal, law):

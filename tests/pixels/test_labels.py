@@ -10,7 +10,7 @@ from hesim_render.pixels.evs.balance import Balance, PixelSteps
 from hesim_render.pixels.evs.events import EventLabels, Label, Lost
 from hesim_render.pixels.evs.labels import Labeller
 from hesim_render.pixels.evs.model import EvsNoise
-from hesim_render.pixels.evs.nominal import NominalSteps
+from hesim_render.pixels.evs.partners import NominalSteps
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.sensor.reading import read_sensor
 

@@ -16,7 +16,7 @@ from hesim_render.pixels.evs.leak_drift import LeakDrift
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.sensor.reading import read_sensor
-from hesim_render.specs.leak import LeakSpec
+from hesim_render.specs.event_pixels import LeakSpec
 
 SHAPE = (48, 56)
 PIXELS = SHAPE[0] * SHAPE[1]

@@ -12,9 +12,8 @@ import tifffile
 
 import hesim_render as hr
 from hesim_render.core.errors import HesimWarning, SpecError
-from hesim_render.recording.dng import write_dng
+from hesim_render.recording.dng import noise_profile, write_dng
 from hesim_render.recording.imports import import_recording
-from hesim_render.recording.noise_profile import noise_profile
 from hesim_render.recording.outline import scene_name
 from hesim_render.recording.preview_dng import needs_preview, write_preview_dng
 

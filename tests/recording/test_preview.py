@@ -9,7 +9,7 @@ from PIL import Image
 
 from hesim_render.mosaic import description as mosaic
 from hesim_render.pixels.evs.events import EVENT_DTYPE
-from hesim_render.recording import event_view, preview, showcase
+from hesim_render.recording import colour_view, preview, showcase
 from hesim_render.recording.colour_view import colour_picture, thumbnail
 from hesim_render.recording.recording import Recording
 from hesim_render.spectral import colorimetry
@@ -129,8 +129,8 @@ def test_events_land_where_they_are_and_none_is_lost(size):
     events = recordings.events_of(sensor, 1000, count=2)
     events["x"], events["y"], events["polarity"] = [3, 60], [5, 40], [1, -1]
     background = np.zeros((*size, 3), np.uint8)
-    picture = event_view.events_picture(background, events, sensor.layout.evs_shape).astype(int)
-    blank = event_view.events_picture(background, events[:0], sensor.layout.evs_shape).astype(int)
+    picture = colour_view.events_picture(background, events, sensor.layout.evs_shape).astype(int)
+    blank = colour_view.events_picture(background, events[:0], sensor.layout.evs_shape).astype(int)
     changed = np.abs(picture - blank).sum(axis=2) > 0
     rows, cols = np.nonzero(changed)
     for k, warm in ((0, True), (1, False)):
@@ -146,7 +146,7 @@ def test_events_lie_over_the_luminance_of_a_frame():
     """18 + 0.3 Y of Rec. 709, rounded down."""
     pure = np.zeros((2, 3, 3), np.uint8)
     pure[0, [0, 1, 2], [0, 1, 2]] = 200
-    found = event_view.events_picture(pure, np.zeros(0, EVENT_DTYPE), (4, 9))
+    found = colour_view.events_picture(pure, np.zeros(0, EVENT_DTYPE), (4, 9))
     assert found[0].tolist() == [[30] * 3, [60] * 3, [22] * 3] and (found[1] == 18).all()
 
 

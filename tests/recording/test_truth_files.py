@@ -20,7 +20,7 @@ from hesim_render.pixels.evs.events import EVENT_DTYPE, EventLabels, LabelBlock
 from hesim_render.recording.camera_files import write_kalibr_aprilgrid, write_kalibr_camchain, write_opencv_camera
 from hesim_render.recording.label_file import LabelFileWriter, read_labels
 from hesim_render.recording.truth_export import dsec_flow_image, export_truth, tum_lines
-from hesim_render.recording.truth_kinds import TRUTH_KINDS, truth_kinds
+from hesim_render.recording.truth_file import TRUTH_KINDS, truth_kinds
 from hesim_render.sources.render.truth.scene_truth import SceneTruth
 
 GEOMETRY = TRUTH_KINDS[:-1]

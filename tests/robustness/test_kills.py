@@ -270,7 +270,7 @@ def ended_twice(tmp_path, command, run, given, number, more_bytes, how=("-m", "h
         before = journal.stat().st_size
     kept = journal.read_bytes()
     refused = start(tmp_path, [*run, "--seed", "8", "--out", out])
-    assert "an interrupted run, which would go on there, had another seed" in refused.communicate(timeout=60)[1]
+    assert "the interrupted run at this place differs in seed" in refused.communicate(timeout=60)[1]
     assert refused.returncode == 2 and journal.read_bytes() == kept
     finish(tmp_path, given)
     assert files_in(out) == files_in(tmp_path / "whole") and not journal.exists()

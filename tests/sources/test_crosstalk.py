@@ -11,7 +11,7 @@ from hesim_render.capture.noise_terms import noise_models
 from hesim_render.core.backend import jit
 from hesim_render.recording.frame import Frame
 from hesim_render.sources.crosstalk import CrosstalkFlux, mixed, with_crosstalk
-from hesim_render.sources.window_by_window import WindowByWindow
+from hesim_render.sources.still import WindowByWindow
 
 PART = 0.12
 

@@ -18,7 +18,7 @@ from hesim_render.sources.render.exact import RenderedFlux
 from hesim_render.sources.render.renderer import flickering
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
 from hesim_render.sources.scene import Scene
-from hesim_render.sources.window_by_window import WindowByWindow
+from hesim_render.sources.still import WindowByWindow
 from hesim_render.spectral.waveform import Mains, Pwm
 
 CARD = {"type": "flat", "width_m": 0.4, "height_m": 0.3, "reflectance": {"flat": 0.5}}

@@ -4,7 +4,7 @@ import pytest
 
 from hesim_render.core.errors import SpecError
 from hesim_render.core.shipped import data_folder, list_names
-from hesim_render.specs.kinds import StudyKind, study_kind
+from hesim_render.specs.run import StudyKind, study_kind
 
 
 def test_each_shipped_study_is_of_its_kind():

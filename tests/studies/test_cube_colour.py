@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from test_colour_figures import samples_of_tables
 
 import hesim_render as hr
 from hesim_render.core.errors import SpecError
 from hesim_render.sources.cube import planes
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.spectrum import Spectrum
-from hesim_render.studies import ColourSamples, colour_differences, colour_samples, fit_matrix
+from hesim_render.studies import colour_differences, colour_samples, fit_matrix
 from hesim_render.studies.colour_samples import reflectance_set
 from hesim_render.targets.cube_file import open_cube
 
@@ -34,7 +35,7 @@ def expected(cube, light, level=1.0):
     surfaces = [np.interp(grid, BANDS, pixel) for pixel in cube.reshape(-1, BANDS.size)]
     curves = np.column_stack([each.at(grid) for each in responses()])
     functions = np.column_stack([each.at(grid) for each in spectra.colour_matching_functions()])
-    samples = ColourSamples.of_tables(curves, light.at(grid), np.array(surfaces).T / level, functions)
+    samples = samples_of_tables(curves, light.at(grid), np.array(surfaces).T / level, functions)
     return colour_differences(samples, matrix)
 
 

@@ -6,7 +6,7 @@ import pytest
 import hesim_render as hr
 from hesim_render.core.errors import RangeError
 from hesim_render.measure import edge_response
-from hesim_render.studies import patterns
+from hesim_render.studies import demosaic_figures
 from hesim_render.studies.demosaic_figures import DARK, LIGHT, _figures, zipper
 
 STUDY = {"schema_version": 1, "name": "detail", "sensors": ["reference-bayer"], "figures": ["demosaic"]}
@@ -14,24 +14,24 @@ STUDY = {"schema_version": 1, "name": "detail", "sensors": ["reference-bayer"], 
 
 def test_patterns_are_means_over_pixels():
     """The box of a pixel has the MTF sinc; half of the star is bright; a zone plate has its phase at each place."""
-    edge = edge_response(patterns.slanted_edge()[8:-8, 8:-8])
+    edge = edge_response(demosaic_figures.slanted_edge()[8:-8, 8:-8])
     assert edge.angle_deg == pytest.approx(-5, abs=0.05) or edge.angle_deg == pytest.approx(5, abs=0.05)
     # along the normal of an edge tilted by 5°, the pixel is nearly a box of 1 px
     np.testing.assert_allclose(edge.mtf[[10, 25, 50]], np.sinc([0.1, 0.25, 0.5]), atol=0.01)
-    star = patterns.star()
+    star = demosaic_figures.star()
     assert star.mean() == pytest.approx(0.5, abs=1e-6) and star.min() == 0 and star.max() == 1
-    zone = patterns.zone_plate()
-    side = patterns.SIDE_PX
+    zone = demosaic_figures.zone_plate()
+    side = demosaic_figures.SIDE_PX
     row = zone[side // 2, side // 2 :] - 0.5
     x = np.arange(side // 2) + 0.5
     # amplitude of the mean over a pixel of a cosine of frequency f: about sinc f
-    expected = 0.5 * np.cos(np.pi * patterns.ZONE_TOP / (side / 2) * x**2)
+    expected = 0.5 * np.cos(np.pi * demosaic_figures.ZONE_TOP / (side / 2) * x**2)
     np.testing.assert_allclose(row[:20], expected[:20], atol=0.03)
-    assert patterns.chart().shape == (side, 3 * side) and all(side % size == 0 for size in (2, 4, 6))
+    assert demosaic_figures.chart().shape == (side, 3 * side) and all(side % size == 0 for size in (2, 4, 6))
 
 
 def test_a_perfect_picture_has_perfect_figures():
-    reflectance = DARK + (LIGHT - DARK) * patterns.chart()
+    reflectance = DARK + (LIGHT - DARK) * demosaic_figures.chart()
     perfect = _figures(np.repeat(reflectance[..., None], 3, axis=2), reflectance)
     assert perfect["mtf50_cy_per_px"] == pytest.approx(0.603, abs=0.01)  # sinc f = 1/2
     assert perfect["zipper"] == 0 and perfect["star_error"] < 1e-12

@@ -14,10 +14,16 @@ from hesim_render.studies.colour_noise import saturation_e
 MATRIX = np.array([[1.7, -0.5, -0.2], [-0.3, 1.6, -0.3], [0.0, -0.7, 1.7]])
 
 
+def photon_noise(channels, read_noise_e=0.0, count=1.0):
+    """Shot noise and read noise alone."""
+    ones = np.ones(channels)
+    return ChannelNoise(read_noise_e**2 * ones, ones, 0 * ones, np.broadcast_to(np.asarray(count, float), channels))
+
+
 def test_amplification_and_snr_by_hand():
     """Shot noise of unequal channels: every variance written out."""
     white = np.array([5000.0, 10000.0, 4000.0])
-    noise = ChannelNoise.of_photons(3, read_noise_e=3.0, count=[1, 2, 1])
+    noise = photon_noise(3, read_noise_e=3.0, count=[1, 2, 1])
     found = output_noise(MATRIX, white, noise, 0.18)
     var = [(0.18 * 5000 + 9) / 5000**2, (0.18 * 10000 + 9) / 2 / 10000**2, (0.18 * 4000 + 9) / 4000**2]
     red = 1.7**2 * var[0] + 0.5**2 * var[1] + 0.2**2 * var[2]
@@ -61,7 +67,7 @@ def test_a_published_comparison_with_clear_pixels_is_reproduced(name):
     unit = 1e4  # electrons of a channel with gain 1
     white = unit / (np.array(gains) * sensitivity)
     luminance = (0.2126, 0.7152, 0.0722)
-    noise = ChannelNoise.of_photons(3)
+    noise = photon_noise(3)
     plain, corrected = (output_noise(each, white, noise, 1.0, luminance) for each in (np.eye(3), matrix))
     np.testing.assert_allclose(corrected.rgb, 1, atol=2e-3)
     published = np.zeros((3, 3))
@@ -78,7 +84,7 @@ def test_snr10_of_a_textbook_sensor():
     for read in (0.0, 2.0, 50.0):
         electrons = (100 + math.sqrt(100**2 + 400 * read**2)) / 2
         assert electrons**2 == pytest.approx(100 * (electrons + read**2))
-        lux = light_for_snr(10, [1.0], [3200.0], ChannelNoise.of_photons(1, read))
+        lux = light_for_snr(10, [1.0], [3200.0], photon_noise(1, read))
         assert lux == pytest.approx(electrons / (0.18 * 3200), rel=1e-12)
     # the light found gives the SNR asked for, also with a quadratic part and several pixels
     noise = ChannelNoise(np.array([9.0, 16.0]), np.ones(2), np.array([1e-4, 0.0]), np.array([2.0, 1.0]))
@@ -89,9 +95,9 @@ def test_snr10_of_a_textbook_sensor():
     assert weights @ signal / math.sqrt(variance) == pytest.approx(7, rel=1e-12)
     assert light_for_snr(300, [1, 0], per_lux, noise, 0.3) == math.inf  # 1 % of the signal in two pixels: never 300
     with pytest.raises(RangeError):
-        light_for_snr(0, [1], [1], ChannelNoise.of_photons(1))
+        light_for_snr(0, [1], [1], photon_noise(1))
     with pytest.raises(RangeError):
-        light_for_snr(10, [-1], [1], ChannelNoise.of_photons(1))
+        light_for_snr(10, [-1], [1], photon_noise(1))
 
 
 def test_noise_of_a_sensor_is_that_of_its_model_and_its_tile():
@@ -149,9 +155,9 @@ def test_dynamic_range_by_hand():
 
 def test_a_matrix_of_another_size_is_refused():
     with pytest.raises(RangeError, match=r"\(3, 2\)"):
-        output_noise(MATRIX, [1.0, 2.0], ChannelNoise.of_photons(2))
+        output_noise(MATRIX, [1.0, 2.0], photon_noise(2))
     with pytest.raises(RangeError, match="above 0"):
-        output_noise(MATRIX, [1.0, 2.0, 0.0], ChannelNoise.of_photons(3))
+        output_noise(MATRIX, [1.0, 2.0, 0.0], photon_noise(3))
 
 
 def test_colours_of_noisy_frames_are_those_of_the_matrix_to_xyz():

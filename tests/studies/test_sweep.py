@@ -13,7 +13,7 @@ from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.isp import Pipeline, process
 from hesim_render.sources.render.audit.audit import Audit
 from hesim_render.specs.files import data_folder
-from hesim_render.specs.kinds import StudyKind, study_kind
+from hesim_render.specs.run import StudyKind, study_kind
 from hesim_render.specs.sweep import RangeSpec, read_sweep
 from hesim_render.studies import sweep as sweeps
 from hesim_render.studies.sweep import sweep

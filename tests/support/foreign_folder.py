@@ -5,7 +5,7 @@ import os
 import sys
 
 #: Names that nobody has installed, but that are looked for.
-_OPTIONAL = ("tadashi", "torch", "rerun", "distributed", "cv2", "rawpy", "sitecustomize", "usercustomize")
+_OPTIONAL = ("torch", "rerun", "distributed", "cv2", "rawpy", "sitecustomize", "usercustomize")
 
 
 def names():

@@ -7,9 +7,34 @@ from scipy import integrate
 
 from hesim_render.specs.target import TargetSpec
 from hesim_render.targets.build import build_target
-from hesim_render.targets.leaves import leaves_autocovariance, leaves_picture
+from hesim_render.targets.leaves import leaves_picture
 
 GREYS = (0.1, 0.7)
+
+
+def leaves_autocovariance(distance, radius_min, radius_max, greys):
+    """Autocovariance of the dead-leaves texture, σ² γ(h)/(2 γ(0) − γ(h)) [cao2010].
+
+    γ(h) is the mean covariogram of a leaf: the area that a disc shares with itself moved by h, averaged over radii.
+    Two points have the same grey if the front-most leaf over either of them covers both.
+
+    Parameters
+    ----------
+    distance : h, in the unit of the radii.
+    radius_min, radius_max : limits of the radii, whose density is proportional to r⁻³.
+    greys : limits of the uniform law of the greys.
+    """
+    h = np.asarray(distance, dtype=np.float64)
+    # a Gauss rule in ln r, where the density is proportional to r⁻²
+    place, weight = np.polynomial.legendre.leggauss(200)
+    low, high = np.log(radius_min), np.log(radius_max)
+    radius = np.exp((low + high) / 2 + (high - low) / 2 * place)
+    share = weight * radius**-2.0
+    half = np.clip(h[..., None] / (2 * radius), 0.0, 1.0)
+    shared = 2 * radius**2 * (np.arccos(half) - half * np.sqrt(1 - half**2))
+    gamma = np.sum(share * shared, axis=-1) / share.sum()
+    whole = np.sum(share * np.pi * radius**2) / share.sum()
+    return (greys[1] - greys[0]) ** 2 / 12 * gamma / (2 * whole - gamma)
 
 
 def closed_form(h, low, high):

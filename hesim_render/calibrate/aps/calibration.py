@@ -144,13 +144,13 @@ def analyse(
         dark_moments, lit = (without_rows(m, used, spec.full_scale_dn, row_variance) for m in (dark_moments, lit))
     dark = fit_dark(dark_moments, used, spec.full_scale_dn, row_variance)
     signals = np.stack([light_signal(lit, dark, k) for k in range(lit.exposures_s.size)])
-    good = used & ~dark.bad & ~dark.hot & ~telegraph.found
+    good = used & ~dark.bad & ~dark.hot & ~telegraph.is_telegraph
     _check_light(dark, lit, signals, good, spec.full_scale_dn)
     saturation = saturation_dn(lit, signals, good, spec.full_scale_dn)
     dark_clear = (dark_moments.lowest > 0) & (dark_moments.highest < spec.full_scale_dn)
 
     beta: NDArray | None = None
-    bad = used & (dark.bad | telegraph.found)
+    bad = used & (dark.bad | telegraph.is_telegraph)
     for _ in range(2):
         usable = np.stack(
             [

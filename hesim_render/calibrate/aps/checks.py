@@ -70,7 +70,7 @@ def check_frames(result: ApsCalibration, dark: FrameMoments, lit: FrameMoments) 
     in_dark = [frame_drift(dark, k, rows, None) for k in range(dark.exposures_us.size)]
     in_light = [frame_drift(lit, k, rows, result.signals[k]) for k in range(lit.exposures_us.size)]
     proportions = _proportions(result, lit, rows)
-    found = [
+    outcome = [
         _rows(result),
         _black(result, in_dark, "black level, dark"),
         _line(result, dark, rows),
@@ -81,7 +81,7 @@ def check_frames(result: ApsCalibration, dark: FrameMoments, lit: FrameMoments) 
         _curvature(result),
         _scatter(result),
     ]
-    return FrameChecks(in_dark, in_light, proportions, [f for f in found if f is not None])
+    return FrameChecks(in_dark, in_light, proportions, [f for f in outcome if f is not None])
 
 
 def _dark_variance(result: ApsCalibration) -> float:
@@ -142,14 +142,14 @@ def _light(result: ApsCalibration, drifts: list[FrameDrift]) -> Finding | None:
 
 def _worst(drifts: list[tuple[FrameDrift, Shared]], least: float) -> tuple[FrameDrift, float] | None:
     """The exposure with the most significant variance above `least`, and its p-value among all exposures."""
-    found = [
+    result = [
         (shared.ratio, drift, min(1.0, shared.p_value * len(drifts)))
         for drift, shared in drifts
         if shared.variance > least and shared.p_value * len(drifts) < ALARM
     ]
-    if not found:
+    if not result:
         return None
-    _, drift, p_value = max(found, key=lambda item: item[0])
+    _, drift, p_value = max(result, key=lambda item: item[0])
     return drift, p_value
 
 
@@ -189,7 +189,7 @@ def _proportions(result: ApsCalibration, lit: FrameMoments, rows: float) -> list
     lit : moments of the lit frames.
     rows : variance of the temporal row noise, DN².
     """
-    found = []
+    outcome = []
     good = ~result.bad & ~result.dark.bad & ~result.dark.hot
     for k, t in enumerate(lit.exposures_s):
         use = result.usable[k] & good & np.isfinite(result.composite.rate_dn_per_s)
@@ -214,10 +214,10 @@ def _proportions(result: ApsCalibration, lit: FrameMoments, rows: float) -> list
         scores = np.stack([np.bincount(row, weight * x) for x in design])
         shared = rows / lit.frames + result.dark.mean_variance(t) * rows / (_dark_variance(result) + rows)
         error = np.sqrt(np.diag(inverse + shared * inverse @ (scores @ scores.T) @ inverse))
-        found.append(
+        outcome.append(
             Proportion(int(lit.exposures_us[k]), float(value[0]), float(error[0]), float(value[1]), float(error[1]))
         )
-    return found
+    return outcome
 
 
 def _shift(result: ApsCalibration, proportions: list[Proportion]) -> Finding | None:
@@ -250,12 +250,12 @@ def _largest(
     values: list[tuple[float, float, int]], least: float, check: str, text: str, scale: float
 ) -> Finding | None:
     """The largest of the values that are significant and above `least`."""
-    found = []
+    result = []
     for value, error, exposure_us in values:
         p_value = 2 * float(norm.sf(abs(value) / error)) * len(values)
         if p_value < ALARM and abs(value) > least:
-            found.append((abs(value), Finding(check, text.format(scale * value, exposure_us / 1000), p_value)))
-    return max(found, key=lambda item: item[0])[1] if found else None
+            result.append((abs(value), Finding(check, text.format(scale * value, exposure_us / 1000), p_value)))
+    return max(result, key=lambda item: item[0])[1] if result else None
 
 
 def _curvature(result: ApsCalibration) -> Finding | None:

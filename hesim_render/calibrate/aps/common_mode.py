@@ -69,12 +69,12 @@ def row_noise(dark: FrameMoments, used: NDArray[np.bool_]) -> Shared:
     exposures = range(dark.exposures_us.size)
     parts = [_row_changes(dark, k, used) for k in exposures]
     own = np.maximum([noise[rows] for _, noise in parts], _LEAST_NOISE_DN2)
-    found = np.stack([np.sum(change[:, rows] ** 2, axis=0) for change, _ in parts]) / (dark.frames - 1)
-    found *= count / (count - 1)
+    result = np.stack([np.sum(change[:, rows] ** 2, axis=0) for change, _ in parts]) / (dark.frames - 1)
+    result *= count / (count - 1)
     # a row with a flickering pixel has less information; weights from the rows' own samples would bias the sum
     weight = 1 / np.maximum(own, _BUSY * np.median(own, axis=1)[:, None]) ** 2
     level, total = weight * own, float(np.sum(weight * own))
-    ratio = float(np.sum(weight * found)) / total
+    ratio = float(np.sum(weight * result)) / total
     freedom = total**2 / float(np.sum(level**2)) * (dark.frames - 1) * (count - 1) / count
     behind = (dark.frames - 1) * float(used.sum()) * len(exposures)
     scale = total / float(weight.sum())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.moments import FrameMoments
 from hesim_render.core.errors import SpecError
-from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, QUANTISED_VARIANCE_DN2
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def fit_dark(
     Raises
     ------
     SpecError
-        If the dark frames are clipped, or their noise is hidden by rounding.
+        If the dark frames are clipped, or their noise is below the steps of the ADC.
     """
     t = moments.exposures_s
     valid = (moments.lowest > 0) & (moments.highest < full_scale_dn)
@@ -80,27 +80,27 @@ def fit_dark(
             for v, ok in zip(moments.variance, valid, strict=True)
         ]
     )
-    # The means of exposures whose noise is hidden are biased by up to half a step: they are not used.
-    hidden = ~(spread - ADC_VARIANCE_DN2 >= HIDDEN_VARIANCE_DN2)
-    if np.sum(~hidden) < 2:
+    # The means of exposures whose noise is lost in quantisation are biased by up to half a step: they are not used.
+    quantised = ~(spread - ADC_VARIANCE_DN2 >= QUANTISED_VARIANCE_DN2)
+    if np.sum(~quantised) < 2:
         measured = max(np.nanmax(spread) - ADC_VARIANCE_DN2, 0)
         raise SpecError(
             f"the temporal variance of the dark frames is {measured:.3f} DN² without the ADC's 1/12, below "
-            f"{HIDDEN_VARIANCE_DN2} DN²: rounding hides the noise and biases the means; capture RAW with more bits "
+            f"{QUANTISED_VARIANCE_DN2} DN²: rounding hides the noise and biases the means; capture RAW with more bits "
             "(10 or more) or a higher analog gain"
         )
-    spread[hidden] = np.nan
-    valid &= ~hidden[:, None, None]
+    spread[quantised] = np.nan
+    valid &= ~quantised[:, None, None]
     weight = np.where(np.isfinite(spread), moments.frames / np.maximum(spread, ADC_VARIANCE_DN2), 0.0)
     n_fp, n_dp, covariance = _all_pixels(moments.mean, t, weight)
-    broken = used & ~valid[~hidden].all(axis=0)
+    broken = used & ~valid[~quantised].all(axis=0)
     bad = used & (valid.sum(axis=0) < 2)
     n_fp[broken], n_dp[broken] = _masked(moments.mean[:, broken], t, weight, valid[:, broken])
     n_dp[bad | ~used] = 0.0
     good = used & ~bad
     black, n_row, n_blc = split_fixed_pattern(n_fp, good)
-    whole = used & valid[~hidden].all(axis=0)
-    freedom = int(np.sum(~hidden)) - 2
+    whole = used & valid[~quantised].all(axis=0)
+    freedom = int(np.sum(~quantised)) - 2
     chi2 = None
     if freedom > 0 and np.any(whole):
         chi2 = sum(

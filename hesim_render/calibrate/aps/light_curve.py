@@ -95,16 +95,16 @@ def straight(x: NDArray, y: NDArray, error: NDArray) -> Intercept:
     design = np.stack([np.ones_like(x), x] if np.ptp(x) > 0 else [np.ones_like(x)])
     weight = 1 / error**2
     inverse = np.linalg.inv((design * weight) @ design.T)
-    found = inverse @ (design * weight) @ y
-    residual = y - found @ design
+    result = inverse @ (design * weight) @ y
+    residual = y - result @ design
     dof = max(x.size - design.shape[0], 1)
     scale = _scale(float(np.sum(weight * residual**2)) / dof, dof)
     errors = np.sqrt(np.diag(inverse) * scale)
     rms = float(np.sqrt(np.sum(residual**2) / dof))
-    if found.size == 1:
-        return Intercept(float(found[0]), float(errors[0]), 0.0, float("nan"), rms, dof + 1, inverse * scale)
+    if result.size == 1:
+        return Intercept(float(result[0]), float(errors[0]), 0.0, float("nan"), rms, dof + 1, inverse * scale)
     return Intercept(
-        float(found[0]), float(errors[0]), float(found[1]), float(errors[1]), rms, dof + 1, inverse * scale
+        float(result[0]), float(errors[0]), float(result[1]), float(errors[1]), rms, dof + 1, inverse * scale
     )
 
 
@@ -192,10 +192,10 @@ def mean_curve(light: NDArray, signal: NDArray, error_dn: NDArray) -> MeanCurve:
             dof = h.size - int(trial.sum())
             if added == 0 or dof < 2:
                 continue
-            found, less = _fit(h, signal, weight, trial)
+            result, less = _fit(h, signal, weight, trial)
             ratio = (squares - less) / added / max(less / dof, 1e-300)
             if f_law.sf(ratio, added, dof) < ALARM:
-                free, best, squares = trial, found, less
+                free, best, squares = trial, result, less
         dof = h.size - int(free.sum())
         residual = signal - _value(best, h)
         excess = float(np.sum(residual**2 / signal**2) - np.sum(error_dn**2 / signal**2)) / dof

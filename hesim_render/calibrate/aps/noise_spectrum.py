@@ -79,7 +79,7 @@ def noise_spectrum(stack: Frames, mean: NDArray) -> NoiseSpectrum:
     inside = power[1:, 1:]
     white = float(np.median(inside)) / float(gamma.median(frames - 1) / (frames - 1))
     limit = white * float(gamma.isf(ALARM / inside.size, frames - 1)) / (frames - 1)
-    found = []
+    result = []
     for row, col in np.argwhere(power > limit):
         mirrored = (rows - row) % rows
         edge = col == 0 or 2 * col == cols
@@ -88,8 +88,8 @@ def noise_spectrum(stack: Frames, mean: NDArray) -> NoiseSpectrum:
         parts = 1 if edge and mirrored == row else 2
         variance = parts * float(power[row, col] - white) / (rows * cols)
         cycles = row / rows - (1 if 2 * row > rows else 0)
-        found.append(InterferenceLine(float(cycles), float(col / cols), float(np.sqrt(variance))))
-    lines = sorted(found, key=lambda line: -line.rms_dn)[:_MOST_LINES]
+        result.append(InterferenceLine(float(cycles), float(col / cols), float(np.sqrt(variance))))
+    lines = sorted(result, key=lambda line: -line.rms_dn)[:_MOST_LINES]
     # the transform of the power is the correlation; all but the last frequency of an even size stands for two
     weight = np.where(inside > limit, 0.0, 2.0)
     if cols % 2 == 0:

@@ -42,8 +42,10 @@ def content(
         missing = [TERMS[k] for k in range(6) if not fit.identified[k]]
         if missing:
             notes.append(f"position ({i}, {j}): the data do not identify the terms {', '.join(missing)}")
-        if fit.hidden_pixels:
-            notes.append(f"position ({i}, {j}): {fit.hidden_pixels} values left out, their noise is hidden by rounding")
+        if fit.quantised_pixels:
+            notes.append(
+                f"position ({i}, {j}): {fit.quantised_pixels} values left out, their noise is hidden by rounding"
+            )
     dark, checks = result.dark, check_frames(result, dark_moments, lit)
     stated = {} if captures.frame_rate_hz is None else {"frame_rate_hz": captures.frame_rate_hz}
     return {
@@ -74,7 +76,7 @@ def content(
         "hot_limit_dn_per_s": dark.hot_limit_dn_per_s,
         "hot_pixels": int(dark.hot.sum()),
         "bad_pixels": int(result.bad.sum()),
-        "telegraph_pixels": int(result.telegraph.found.sum()),
+        "telegraph_pixels": int(result.telegraph.is_telegraph.sum()),
         "drift": {
             "black_dn_rms": {
                 name: max((d.black.rms if d.black.significant else 0.0 for d in drifts), default=0.0)

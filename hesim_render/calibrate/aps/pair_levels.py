@@ -76,9 +76,9 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
 
     def one(entry: Series) -> tuple[float, ...]:
         first, second = pairs.frames(entry)
-        found = pair_statistics(first, second, full)
-        _check(entry, found, first, second, full)
-        return found
+        result = pair_statistics(first, second, full)
+        _check(entry, result, first, second, full)
+        return result
 
     with ThreadPoolExecutor(2) as two:
         results = []
@@ -86,14 +86,14 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
             results.append(measured)
             if progress is not None:
                 progress("reading pairs", (number + 1) / len(different))
-    found = dict(zip(different, results, strict=True))
+    result = dict(zip(different, results, strict=True))
     photons = [0.0 if not s.lit else np.nan if s.photons is None else s.photons for s in series]
-    return levels([s.exposure_s for s in series], photons, [found[s] for s in series])
+    return levels([s.exposure_s for s in series], photons, [result[s] for s in series])
 
 
-def levels(exposure_s: Iterable[float], photons: Iterable[float], found: list[tuple[float, ...]]) -> Levels:
+def levels(exposure_s: Iterable[float], photons: Iterable[float], result: list[tuple[float, ...]]) -> Levels:
     """`pair_statistics` of several pairs as one table."""
-    table = np.array(found, np.float64).T
+    table = np.array(result, np.float64).T
     return Levels(np.array(list(exposure_s)), np.array(list(photons)), *table)
 
 
@@ -126,14 +126,14 @@ def pair_statistics(first: NDArray, second: NDArray, full_scale_dn: int) -> tupl
     return mean, change, variance, float(per_row.std(ddof=1)) / np.sqrt(rows), *shared, squares, *ends
 
 
-def _check(entry: Series, found: tuple[float, ...], first: NDArray, second: NDArray, full: int) -> None:
-    mean, change, variance = found[:3]
-    low, high = found[-2:]
+def _check(entry: Series, result: tuple[float, ...], first: NDArray, second: NDArray, full: int) -> None:
+    mean, change, variance = result[:3]
+    low, high = result[-2:]
     if max(low, high) > 0.5:
         return
     if np.array_equal(first, second):
         raise entry.error("both frames are the same; a pair has two exposures")
-    noise = np.sqrt(2 * variance / first.size + 2 * max(found[4], 0.0) / first.shape[0])
+    noise = np.sqrt(2 * variance / first.size + 2 * max(result[4], 0.0) / first.shape[0])
     if entry.lit and abs(change) > MOST_CHANGE * mean and abs(change) > _SIGMAS * noise:
         raise entry.error(
             f"the light drifts: the second frame is {100 * abs(change) / mean:.2g} % "

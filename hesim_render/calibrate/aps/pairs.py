@@ -34,7 +34,7 @@ from hesim_render.calibrate.aps.variance import Pooled, VarianceFit, fit_varianc
 from hesim_render.calibrate.moments import Progress
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import require_memory
-from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, HIDDEN_VARIANCE_DN2, polynomial
+from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, QUANTISED_VARIANCE_DN2, polynomial
 from hesim_render.recording.pair_set import PairSet
 
 #: EMVA 1288 fits from 0 to this part of saturation.
@@ -186,9 +186,10 @@ def _check_dark(pairs: PairSet, dark: Levels, long_dark: Long) -> None:
                 f"{100 * dark.low[k]:.3g} % of the dark pixels are 0 DN, which hides a part of the noise; raise the "
                 "black level (offset)"
             )
-        if dark.variance[k] - ADC_VARIANCE_DN2 < HIDDEN_VARIANCE_DN2:
+        if dark.variance[k] - ADC_VARIANCE_DN2 < QUANTISED_VARIANCE_DN2:
             raise entry.error(
-                f"the dark variance is {dark.variance[k]:.3f} DN², below {HIDDEN_VARIANCE_DN2 + ADC_VARIANCE_DN2:.2f}: "
+                f"the dark variance is {dark.variance[k]:.3f} DN², below "
+                f"{QUANTISED_VARIANCE_DN2 + ADC_VARIANCE_DN2:.2f}: "
                 "rounding hides the noise; capture with more bits or a higher gain"
             )
     if long_dark.temporal.pixel <= 0:
@@ -219,15 +220,15 @@ def _shared(dark: Levels, long_dark: Long) -> tuple[tuple[float, float], tuple[f
     Lit frames are not used: a lamp that flickers changes rows of a rolling shutter.
     """
     of_pairs = np.unique(dark.exposure_s, return_index=True)[1]
-    found = []
+    result = []
     for values, errors in ((dark.row, dark.row_error), (dark.col, dark.col_error)):
         error = float(np.sqrt(np.mean(errors[of_pairs] ** 2) / of_pairs.size))
-        found.append((float(values[of_pairs].mean()), error))
-    row, row_error = found[0]
+        result.append((float(values[of_pairs].mean()), error))
+    row, row_error = result[0]
     series, series_error = long_dark.temporal.row, max(long_dark.temporal.row_error, 1e-30)
     weight = np.array([1 / max(row_error, 1e-30) ** 2, 1 / series_error**2])
     pooled = float(weight @ (row, series) / weight.sum())
-    return (pooled, float(1 / np.sqrt(weight.sum()))), found[1]
+    return (pooled, float(1 / np.sqrt(weight.sum()))), result[1]
 
 
 def _difference_covariance(pairs: PairSet, lit: Levels, dark: Levels, use: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ SIGNIFICANT = 3.9
 
 def findings(result: PairCalibration) -> list[Finding]:
     """What the sensor, or the bench, has beyond the standard's linear model, with its size."""
-    found = []
+    outcome = []
     curve, k = result.curve, result.gain.slope
     top = float(result.light[result.clear].max())
     bend = float(curve.at(np.array([top]))[0] / (curve.terms[0] * (top + curve.offset)) - 1)
@@ -24,42 +24,44 @@ def findings(result: PairCalibration) -> list[Finding]:
             f"the mean bends: {100 * bend:+.2g} % at the brightest clear level. The sensor file has the curve "
             "(aps.nonlinearity); K and the quantum efficiency are means over 0 to 70 % of saturation"
         )
-        found.append(("linearity", text))
+        outcome.append(("linearity", text))
     if abs(curve.offset) > 4 * curve.offset_error > 0:
         unit = "photons" if result.pairs.has_photons else "s of exposure"
         text = (
             f"every lit frame has {curve.offset:.3g} {unit} more than stated: an exposure that is longer than stated "
             "by a constant, or light during the read-out (smear)"
         )
-        found.append(("light offset", text))
+        outcome.append(("light offset", text))
     if curve.light_rms > _LEAST_SCATTER / 4:
-        found.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
+        outcome.append(("light", f"the light scatters by {100 * curve.light_rms:.2g} % from exposure to exposure"))
     if result.level_rms > _LEAST_SCATTER and result.level_chance < ALARM:
         text = (
             f"the variances of single levels scatter by {100 * result.level_rms:.2g} % about the polynomial, more than "
             f"chance (χ²/dof {result.level_chi2:.1f}): steps of the ADC that are not even, or noise that comes and goes"
         )
-        found.append(("variance", text))
+        outcome.append(("variance", text))
     for name, (variance, error) in (("row noise", result.row), ("column noise", result.col)):
         if variance > SIGNIFICANT * error:
             rms = float(np.sqrt(variance))
             text = f"{name[:-6]}s change together from frame to frame by {rms:.3g} DN ({rms / k:.2g} e-)"
-            found.append((name, text))
+            outcome.append((name, text))
     for line in result.noise_spectrum.lines[:3]:
         text = (
             f"a pattern with {line.cycles_per_row:.3g} periods a row and {line.cycles_per_col:.3g} a column has a new "
             f"phase in each frame, {line.rms_dn:.2g} DN rms"
         )
-        found.append(("interference", text))
+        outcome.append(("interference", text))
     if result.noise_spectrum.correlated:
         text = (
             f"the dark noise of neighbours in a row has a correlation of {result.noise_spectrum.correlation:+.3f}: a "
             "filter of the read-out"
         )
-        found.append(("read noise", text))
+        outcome.append(("read noise", text))
     columns = result.long_dark.spatial.col
     if columns > SIGNIFICANT * result.long_dark.spatial.errors(fixed=True)[1]:
-        found.append(("column pattern", f"columns have offsets of their own, {np.sqrt(columns):.2g} DN rms"))
+        outcome.append(("column pattern", f"columns have offsets of their own, {np.sqrt(columns):.2g} DN rms"))
     if result.black.rms > 3 * np.sqrt(max(result.row[0], 0.0) / (2 * result.pairs.shape[0])) + 0.01:
-        found.append(("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure"))
-    return [Finding(check, text, None) for check, text in found]
+        outcome.append(
+            ("black level", f"the dark level changes by {result.black.rms:.2g} DN from exposure to exposure")
+        )
+    return [Finding(check, text, None) for check, text in outcome]

@@ -171,12 +171,12 @@ def _dark_current(result: PairCalibration, k: float, relative: float) -> dict[st
     if not np.isfinite(result.black.slope_error):
         return not_identifiable("one exposure tells no dark current; capture dark pairs at several exposures")
     value = result.black.slope / k
-    found = estimated(
+    outcome = estimated(
         value, float(np.hypot(result.black.slope_error / k, value * relative)), "e-/s", result.black.groups
     )
-    found["from_variance"] = result.noise.slope / k**2
-    found["value_dn_per_s"] = result.black.slope
-    return found
+    outcome["from_variance"] = result.noise.slope / k**2
+    outcome["value_dn_per_s"] = result.black.slope
+    return outcome
 
 
 def _full_well(result: PairCalibration, k: float, relative: float) -> dict[str, Any]:

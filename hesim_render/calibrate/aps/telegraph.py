@@ -45,7 +45,7 @@ class TelegraphMaps:
     correlation: NDArray[np.float32]
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def is_telegraph(self) -> NDArray[np.bool_]:
         return self.amplitude_dn > 0
 
 
@@ -71,10 +71,10 @@ def find_telegraph(
         values[divmod(number, stack.shape[1])] = frame.ravel()[place]
     for first in range(0, place.size, _TOGETHER):
         part = slice(first, first + _TOGETHER)
-        found = fit_two_levels(values[..., part], stack.exposures_us.astype(np.float64) * S_PER_US)
-        good = found.is_telegraph
+        result = fit_two_levels(values[..., part], stack.exposures_us.astype(np.float64) * S_PER_US)
+        good = result.is_telegraph
         for name in ("amplitude_dn", "high_share", "correlation"):
-            getattr(maps, name).ravel()[place[part][good]] = getattr(found, name)[good]
+            getattr(maps, name).ravel()[place[part][good]] = getattr(result, name)[good]
     return maps
 
 
@@ -223,9 +223,9 @@ def _line(y: NDArray, t: NDArray, high: NDArray | None) -> tuple[NDArray[np.floa
             product = terms[i] if high is not None and i == j == 2 else terms[i] * terms[j]
             normal[:, i, j] = np.sum(product, axis=axes)
     normal += 1e-9 * np.eye(size) * y.shape[0] * y.shape[1]
-    found: NDArray = np.linalg.solve(normal, right[..., None])[..., 0].T
-    squares = np.sum(y * y, axis=axes) - np.sum(found * right.T, axis=0)
-    return found, np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2)).astype(np.float64)
+    result: NDArray = np.linalg.solve(normal, right[..., None])[..., 0].T
+    squares = np.sum(y * y, axis=axes) - np.sum(result * right.T, axis=0)
+    return result, np.sqrt(np.maximum(squares / (y.shape[0] * y.shape[1]), ADC_VARIANCE_DN2)).astype(np.float64)
 
 
 def _chain(
@@ -239,10 +239,12 @@ def _chain(
     occurs in two successive frames [pixel].
     """
     exposures, frames, pixels = y.shape
+    # how likely each value is in either state, over the larger of the two
     rest = (y - level[0] - level[1] * t) / width
     emission = np.stack([-0.5 * rest**2, -0.5 * (rest - level[2] / width) ** 2])
     top = emission.max(axis=0)
     emission = np.exp(emission - top)
+    # forward: probability of the state from all frames up to this one
     stationary = np.stack([1 - share, share])[:, None]  # [state, 1, pixel]
     forward = np.empty((2, exposures, frames, pixels))
     scale = np.empty((exposures, frames, pixels))
@@ -253,6 +255,7 @@ def _chain(
         now = now / scale[:, k]
         forward[:, :, k] = now
         before = correlation * now + (1 - correlation) * stationary
+    # backward: the same from all later frames; together they are the probability from all frames
     high = np.empty_like(y)
     both = np.zeros(pixels)
     backward = np.ones((2, exposures, pixels))

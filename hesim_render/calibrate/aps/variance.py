@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from hesim_render.pixels.aps.formulas import (
     ADC_VARIANCE_DN2,
-    HIDDEN_VARIANCE_DN2,
+    QUANTISED_VARIANCE_DN2,
     fourth_cumulant_dn4,
     polynomial,
 )
@@ -166,7 +166,7 @@ class VarianceFit:
     chi2_per_dof, dof : goodness of fit over all pixels and exposures. p_value : chance of a larger χ².
     expected_chi2 : per dof; above 1 where the variance is of few electrons, whose Poisson law has longer tails.
     cubic : coefficient of I³ where it is fitted besides, DN⁻¹, and its standard error; None where none is identifiable.
-    hidden_pixels : pixel-exposures left out because rounding hides their noise.
+    quantised_pixels : pixel-exposures left out because rounding hides their noise.
     """
 
     beta: NDArray[np.float64]
@@ -177,7 +177,7 @@ class VarianceFit:
     p_value: float
     expected_chi2: float
     cubic: tuple[float, float] | None
-    hidden_pixels: int
+    quantised_pixels: int
 
 
 def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
@@ -193,7 +193,7 @@ def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
     without : numbers of terms that are not fitted.
     """
     everything = bins.pixels.sum()
-    seen = bins.variance_dn2 >= HIDDEN_VARIANCE_DN2
+    seen = bins.variance_dn2 >= QUANTISED_VARIANCE_DN2
     bins = Pooled(*(getattr(bins, name)[seen] for name in Pooled.__dataclass_fields__))
     if bins.pixels.size == 0:
         nothing = np.zeros(6)
@@ -214,13 +214,13 @@ def fit_variance(bins: Pooled, without: Sequence[int] = ()) -> VarianceFit:
             break
         dropped.append(useless[0])
     cubic = _cubic(bins, units, equations, solved)
-    hidden = int(everything - bins.pixels.sum())
+    quantised = int(everything - bins.pixels.sum())
     units = units[:6]
     covariance = covariance / np.outer(units, units)
     beta = beta / units
     expected = _expected_chi2(bins, beta)
     p_value = _p_value(bins, chi2 / expected, dof)
-    return VarianceFit(beta, keep, covariance, chi2, dof, p_value, expected, cubic, hidden)
+    return VarianceFit(beta, keep, covariance, chi2, dof, p_value, expected, cubic, quantised)
 
 
 def _p_value(bins: Pooled, chi2: float, dof: int) -> float:
@@ -265,18 +265,21 @@ def _solve(
     predicted = np.maximum(bins.variance_dn2, _FLOOR_DN2)
     beta, dropped = np.zeros(6), list(dropped)
     for turn in range(30):
+        # weights from the variance that the last round predicts
         weight = bins.weight(predicted + ADC_VARIANCE_DN2)
         matrix = np.tensordot(weight, exact, 1)
         keep = _identifiable(matrix, dropped)
         if turn >= _SETTLED:
             # a term identified with the weights of one round and not of the next would alternate without end
             dropped = list(np.flatnonzero(~keep))
+        # normal equations of the terms that the captures tell apart
         previous, beta = beta, np.zeros(6)
         beta[keep] = np.linalg.solve(matrix[np.ix_(keep, keep)], np.tensordot(weight, products, 1)[keep])
         predicted = np.maximum(polynomial(beta / units, bins.signal_dn, bins.exposure_s), _FLOOR_DN2)
         if np.allclose(beta, previous, rtol=1e-10, atol=1e-12):
             break
     inverse = np.linalg.inv(matrix[np.ix_(keep, keep)])
+    # covariance by the sandwich, as regressors have noise of their own; wider where χ² shows misfit
     scatter = np.tensordot(weight, noisy, 1)
     squares = float(weight @ bins.squares - 2 * beta @ np.tensordot(weight, products, 1) + beta @ scatter @ beta)
     dof = max(int(bins.pixels.sum()) - int(keep.sum()), 1)
@@ -304,12 +307,12 @@ def _normal_equations(bins: Pooled, scale: NDArray) -> tuple[NDArray, NDArray, N
 
 def _without_noise(sums: NDArray, tau: NDArray) -> NDArray[np.float64]:
     """Σ of a factor times Hermite polynomials of Î, from Σ of it times powers of Î: [bin, power]; `tau` is τ²."""
-    found = sums.astype(np.float64).copy()
+    result = sums.astype(np.float64).copy()
     for n in range(2, sums.shape[1]):
         for j in range(1, n // 2 + 1):
             count = factorial(n) / (factorial(j) * factorial(n - 2 * j) * 2**j)
-            found[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]
-    return found
+            result[:, n] += (-1) ** j * count * tau**j * sums[:, n - 2 * j]
+    return result
 
 
 def _identifiable(matrix: NDArray, dropped: list[int]) -> NDArray[np.bool_]:

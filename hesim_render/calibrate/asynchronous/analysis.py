@@ -89,7 +89,7 @@ def analyse_trials(
     laws = {one: fit_trials(sets, one, rough_start(steady, steps, ~bad, one), _GLANCE) for one in _LAWS}
     advantage = laws["sqrt"].log_likelihood - laws["linear"].log_likelihood
     if abs(advantage) < _BEYOND_DOUBT:
-        laws = {one: fit_trials(sets, one, found.values) for one, found in laws.items()}
+        laws = {one: fit_trials(sets, one, result.values) for one, result in laws.items()}
         advantage = laws["sqrt"].log_likelihood - laws["linear"].log_likelihood
     law: Law = "sqrt" if advantage > DECISIVE else "linear"
     fit = laws[law]

@@ -60,9 +60,9 @@ def check_trials(fit: Fit, sets: tuple[Trials, Trials]) -> tuple[list[Finding], 
     columns = _columns(fit)
     goodness = {name: _judge(columns, np.flatnonzero(columns.family == k), fit) for k, name in enumerate(_FAMILIES)}
     goodness["all"] = _judge(columns, np.arange(columns.family.size), fit)
-    found = [_family(name, goodness[name]) for name in _FAMILIES]
-    found += [_ended(fit), _ceiling(sets[1]), _floor(fit, sets[1])]
-    return [f for f in found if f is not None], goodness
+    result = [_family(name, goodness[name]) for name in _FAMILIES]
+    result += [_ended(fit), _ceiling(sets[1]), _floor(fit, sets[1])]
+    return [f for f in result if f is not None], goodness
 
 
 def _columns(fit: Fit) -> Columns:
@@ -206,7 +206,7 @@ def _ceiling(steps: Trials) -> Finding | None:
 def _floor(fit: Fit, steps: Trials) -> Finding | None:
     """Finding of events with the polarity opposite to the step, beyond leak."""
     step = step_of(fit.values, steps)
-    found = []
+    result = []
     for name, polarity, leak in (("ON", 1, fit.values[LEAK]), ("OFF", -1, 0.0)):
         theta = fit.values[THETA[0 if polarity > 0 else 1]]
         away = (np.sign(steps.contrast) == -polarity) & (np.abs(step) > 0.5 * theta)
@@ -216,13 +216,13 @@ def _floor(fit: Fit, steps: Trials) -> Finding | None:
         usual = trials * leak * steps.edges_s[-1]
         p_value = float(poisson.sf(events - 1, usual + 0.5))
         if trials and p_value < ALARM / 2 and (events - usual) / trials > _LEAST_FLOOR:
-            found.append((name, events / trials, p_value))
-    if not found:
+            result.append((name, events / trials, p_value))
+    if not result:
         return None
-    rates = " and ".join(f"{r:.2g} ({n})" for n, r, _ in found)
+    rates = " and ".join(f"{r:.2g} ({n})" for n, r, _ in result)
     return Finding(
         "S-curve floor",
         f"steps away from the threshold give events, in {rates} of the trials, beyond leak. Noise and leak are off. "
         "Look for events that come by themselves, or a reset that is not over when the trial begins.",
-        min(2 * p for _, _, p in found),
+        min(2 * p for _, _, p in result),
     )

@@ -69,13 +69,13 @@ def unlike(fit: Fit, steady: Trials, steps: Trials, good: NDArray[np.bool_]) -> 
     Three tests of each polarity: too many events in steady light, events missing at steps that certainly give one, and
     events at steps that certainly give none.
     """
-    found = np.zeros((6, good.size), bool)
+    result = np.zeros((6, good.size), bool)
     pixels = np.flatnonzero(good)
     for begin in range(0, pixels.size, _CHUNK):
         some = pixels[begin : begin + _CHUNK]
         for k, polarity in enumerate((1, -1)):
-            found[3 * k : 3 * k + 3, some] = _tests(fit, steady.of(some), steps.of(some), polarity)
-    wrong = found[found.sum(axis=1) <= _MOST_BAD * pixels.size]
+            result[3 * k : 3 * k + 3, some] = _tests(fit, steady.of(some), steps.of(some), polarity)
+    wrong = result[result.sum(axis=1) <= _MOST_BAD * pixels.size]
     return np.any(wrong, axis=0) if wrong.size else np.zeros(good.size, bool)
 
 
@@ -113,33 +113,36 @@ def classify(steady: Trials, steps: Trials, bad: NDArray[np.bool_]) -> TrialDefe
     chance below 1e-6 at a constant rate.
     """
     nothing = np.zeros(bad.size, np.float32)
-    found = TrialDefects(
+    result = TrialDefects(
         bad, np.zeros(bad.size, np.uint8), nothing, nothing.copy(), np.ones(bad.size, np.float32), nothing.copy()
     )
     some = np.flatnonzero(bad)
     if some.size == 0:
-        return found
+        return result
     ours, light = steady.of(some), int(np.argmax(steady.signal_dn))
     seconds = max(float(steady.calm[light, ~bad].sum(dtype=np.float64) * steady.edges_s[-1]), 1e-12)
     duration = np.maximum(ours.calm[light] * steady.edges_s[-1], 1e-12)
+    # hot: hardly ever calm, or more events in the brightest light than usual pixels would give by chance
     never_calm = ours.calm[light] < _CALM * steady.calm[light].max()
     rates = [np.where(never_calm, 0, n[light].sum(axis=0, dtype=np.float64)) / duration for n in (ours.on, ours.off)]
     usual = [float(n[light][:, ~bad].sum(dtype=np.float64)) / seconds for n in (steady.on, steady.off)]
     excess = [poisson.sf(r * duration - 1, max(u, 1e-9) * duration) < 1e-3 for r, u in zip(rates, usual, strict=True)]
     hot = never_calm | excess[0] | excess[1]
+    # stuck: no event from any step
     silent = (steps.on[..., some].sum(axis=(0, 1)) == 0) & (steps.off[..., some].sum(axis=(0, 1)) == 0) & ~never_calm
-    found.kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
+    result.kind[some] = np.where(silent, Defect.STUCK, np.where(hot, Defect.HOT, Defect.OTHER))
     own = _own_rates(ours, light, never_calm, float(steady.calm[light].max()))
+    # flickering: a hot pixel whose events come in some parts of the time and not in others
     if steady.parts is not None:
         flickers = hot & ~silent & unsteady(steady.parts.disturbed[:, some], steady.parts.trials)
-        found.kind[some[flickers]] = Defect.FLICKERING
-        _flicker(found, some[flickers], steady.parts, own[:, flickers])
-    is_hot = found.kind[some] == Defect.HOT
-    found.on_hz[some[is_hot]], found.off_hz[some[is_hot]] = own[:, is_hot]
-    return found
+        result.kind[some[flickers]] = Defect.FLICKERING
+        _flicker(result, some[flickers], steady.parts, own[:, flickers])
+    is_hot = result.kind[some] == Defect.HOT
+    result.on_hz[some[is_hot]], result.off_hz[some[is_hot]] = own[:, is_hot]
+    return result
 
 
-def _flicker(found: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: NDArray[np.float64]) -> None:
+def _flicker(result: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: NDArray[np.float64]) -> None:
     """Enter the times and rates of flickering pixels.
 
     The state of a pixel is taken to be constant during a trial: the share of trials with an event while it fires is
@@ -147,12 +150,12 @@ def _flicker(found: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: N
 
     Parameters
     ----------
-    found : where they are entered.
+    result : where they are entered.
     pixels : the flickering pixels.
     own : [polarity, flickering pixel], mean rates of ON and OFF events, Hz, for the share of ON events.
     """
     counts = parts.disturbed[:, pixels]
-    good = parts.disturbed[:, ~found.bad]
+    good = parts.disturbed[:, ~result.bad]
     usual = float(good.mean(dtype=np.float64)) / parts.trials if good.size else 0.0
     share, correlation = dynamics(counts, parts.trials, usual)
     chance = np.maximum(counts.mean(axis=0, dtype=np.float64) / parts.trials - usual, 0.0) / share
@@ -160,11 +163,11 @@ def _flicker(found: TrialDefects, pixels: NDArray[np.intp], parts: Parts, own: N
     most = 1 - 0.5 / np.maximum(counts.shape[0] * parts.trials * share, 1.0)
     rate = rate_hz(np.minimum(chance, most), parts.trial_s)
     on_share = own[0] / np.maximum(own.sum(axis=0), 1e-300)
-    found.on_hz[pixels], found.off_hz[pixels] = on_share * rate, (1 - on_share) * rate
+    result.on_hz[pixels], result.off_hz[pixels] = on_share * rate, (1 - on_share) * rate
     switching = (correlation > 0) & (share < 1)
     with np.errstate(divide="ignore"):
         change = -np.log(np.where(switching, correlation, 1.0)) / parts.trial_s
-    found.firing_share[pixels], found.change_hz[pixels] = np.where(switching, share, 1.0), change
+    result.firing_share[pixels], result.change_hz[pixels] = np.where(switching, share, 1.0), change
 
 
 def _own_rates(steady: Trials, light: int, never_calm: NDArray[np.bool_], most: float) -> NDArray[np.float64]:

@@ -100,9 +100,11 @@ def first_event(
     fresh = math.sqrt(max(1.0 - rho * rho, 1e-12))
     settling = max(settle_s - _REMEMBERED / cutoff_hz, 0.0)
     for z, weight in zip(_Z, _Z_WEIGHTS, strict=True):
+        # chance of no event while settling, for noise that was z standard deviations high at the reset
         high, low = theta / before + z, theta_other / before - z
         lost = cutoff_hz * (passage_rate(high) + passage_rate(low)) + sum(leak_hz)
         kept = weight * np.exp(-np.minimum(lost * settling, 500.0))
+        # distances to both thresholds after the step
         up, down = theta - step + before * z, theta_other + step - before * z
         # at the step a calm pixel's noise lies within both thresholds and still correlates with that at the reset
         within, below = ndtr((high - rho * z) / fresh), ndtr((low + rho * z) / fresh)

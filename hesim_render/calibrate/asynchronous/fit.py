@@ -135,21 +135,21 @@ def _along(
     likelihood: Likelihood, values: NDArray, change: NDArray, least: NDArray, best: float
 ) -> NDArray[np.float64] | None:
     """The best point in the direction `change` of ln of the parameters; None where none is better."""
-    found, scale = None, 1.0
+    result, scale = None, 1.0
     for _ in range(_TRIES):
         there = values * np.exp(scale * change)
         there[list(_MAY_VANISH)] = np.maximum(there, least)[list(_MAY_VANISH)]
         total = float(likelihood.of_pixels(there).sum())
         if total > best:
-            found, best = there, total
+            result, best = there, total
             if scale < 1:
                 break
             scale *= 2.0
-        elif found is not None:
+        elif result is not None:
             break
         else:
             scale *= 0.4
-    return found
+    return result
 
 
 def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law) -> NDArray[np.float64]:
@@ -164,21 +164,26 @@ def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law
     light = np.array([c[1] for c in curves])
     if light.size == 0:
         raise SpecError("no S-curve rises from below ½ to above it; take steps of up to twice the threshold")
+    # the response with which all lights agree on the threshold
     tried = np.geomspace(0.3, 3000.0, 200) / light.max()
     response = float(tried[np.argmin([_disagreement(curves, r) for r in tried])])
     polarity, _, centre, variance = np.array(curves).T
+    # each curve's centre as a threshold; of all curves of a polarity, the median
     x0, x1 = 1 + response * light, 1 + response * light * np.exp(polarity * centre)
     theta_of = polarity * np.log(x1 / x0)
     theta = [float(np.median(theta_of[polarity == p])) if np.any(polarity == p) else 0.0 for p in (1, -1)]
     theta = [t or max(theta) for t in theta]
+    # width² is linear in mismatch², shot noise and read noise: least squares with none below 0
     power, power_1 = ((v if law == "sqrt" else v * v) for v in (light, light * np.exp(polarity * centre)))
     width = variance * ((x1 - 1) / x1) ** 2
     columns = np.stack([theta_of**2, power / x0**2 + power_1 / x1**2, 1 / x0**2 + 1 / x1**2], axis=1)
-    found, _ = nnls(columns / width[:, None], np.ones(width.size))
+    result, _ = nnls(columns / width[:, None], np.ones(width.size))
+    # no noise term starts at 0, where its slope vanishes
     least = (0.02 * theta[0]) ** 2
-    mismatch = [float(np.clip(np.sqrt(found[0]), 0.02, max(s, 0.02))) for s in spread]
-    shot = max(found[1], 0.05 * least * (1 + response * light.max()) ** 2 / power.max())
-    values = np.array([*theta, *mismatch, response, shot, max(found[2], least), 0.0, _leak_start(steady)])
+    mismatch = [float(np.clip(np.sqrt(result[0]), 0.02, max(s, 0.02))) for s in spread]
+    shot = max(result[1], 0.05 * least * (1 + response * light.max()) ** 2 / power.max())
+    values = np.array([*theta, *mismatch, response, shot, max(result[2], least), 0.0, _leak_start(steady)])
+    # the bandwidth has no closed form: the likeliest of sixteen, on some of the pixels
     few = np.random.default_rng(0).permutation(np.flatnonzero(good))[:_FEW]
     sets = steady.of(few), steps.of(few)
     grids = tuple(threshold_grid(t, m)[::4] for t, m in zip(theta, mismatch, strict=True))
@@ -192,7 +197,7 @@ def rough_start(steady: Trials, steps: Trials, good: NDArray[np.bool_], law: Law
 
 def _pooled_curves(steps: Trials, polarity: int) -> list[tuple[int, float, float, float]]:
     """Polarity, light, and mean and variance of |ln I₁/I₀| of the S-curve right after the step, of each light."""
-    found = []
+    result = []
     for light in np.unique(steps.signal_dn):
         kinds = np.flatnonzero((np.sign(steps.contrast) == polarity) & (steps.signal_dn == light))
         kinds = kinds[np.argsort(np.abs(steps.contrast[kinds]))]
@@ -203,8 +208,8 @@ def _pooled_curves(steps: Trials, polarity: int) -> list[tuple[int, float, float
         contrast, missing = np.abs(steps.contrast[kinds]), 1 - rate / rate[-1]
         first = np.trapezoid(missing, contrast)
         second = 2 * np.trapezoid(missing * (contrast - contrast[0]), contrast)
-        found.append((polarity, float(light), float(contrast[0] + first), float(max(second - first**2, 1e-8))))
-    return found
+        result.append((polarity, float(light), float(contrast[0] + first), float(max(second - first**2, 1e-8))))
+    return result
 
 
 def _disagreement(curves: list[tuple[int, float, float, float]], response: float) -> float:

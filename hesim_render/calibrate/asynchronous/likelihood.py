@@ -101,9 +101,9 @@ class TrialCounts:
 
     def log_likelihood(self, values: NDArray, grid: NDArray, law: Law) -> NDArray[np.float64]:
         """ln L [pixel, threshold]."""
-        found = [chances(values, t, self.polarity, grid, law) for t in self.sets]
-        events = np.concatenate([np.log(np.maximum(c, _LEAST_CHANCE)).reshape(-1, grid.size) for c in found])
-        none = np.concatenate([np.log(np.maximum(1.0 - c.sum(axis=1), _LEAST_CHANCE)) for c in found])
+        result = [chances(values, t, self.polarity, grid, law) for t in self.sets]
+        events = np.concatenate([np.log(np.maximum(c, _LEAST_CHANCE)).reshape(-1, grid.size) for c in result])
+        none = np.concatenate([np.log(np.maximum(1.0 - c.sum(axis=1), _LEAST_CHANCE)) for c in result])
         return self.events @ events + self.silent @ none
 
 

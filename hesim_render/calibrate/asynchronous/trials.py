@@ -9,6 +9,7 @@ tell flickering pixels from steady ones.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,22 +100,22 @@ def is_asynchronous(captures: CaptureSet) -> bool:
     SpecError
         If the captures do not suit the sensor.
     """
-    found = captures.has(S_CURVE) or captures.has(NOISE_RATE)
+    result = captures.has(S_CURVE) or captures.has(NOISE_RATE)
     evs = captures.sensor.evs if captures.sensor is not None else None
-    if evs is not None and evs.reference == "previous_sample" and found:
+    if evs is not None and evs.reference == "previous_sample" and result:
         raise SpecError(
             "its sensor compares at fixed ticks: capture evs_static.npz and evs_steps.npz, not trials after a reset",
             file=captures.folder / "capture.yaml",
             key="sensor",
         )
-    if evs is not None and evs.reference == "last_event" and not found and captures.has("evs_static"):
+    if evs is not None and evs.reference == "last_event" and not result and captures.has("evs_static"):
         raise SpecError(
             "its sensor has reference 'last_event', without comparisons at fixed ticks: capture trials after a reset, "
             f"{NOISE_RATE}.npz and {S_CURVE}.npz",
             file=captures.folder / "capture.yaml",
             key="sensor",
         )
-    return found or (evs is not None and evs.reference == "last_event")
+    return result or (evs is not None and evs.reference == "last_event")
 
 
 def read_trials(captures: CaptureSet) -> tuple[Trials, Trials]:
@@ -147,18 +148,7 @@ def _read(file: Path, has_steps: bool) -> Trials:
     if not np.all((signal >= 0) & (signal <= BRIGHTEST_DN)):
         raise SpecError(SIGNAL_RANGE, file=file)
     contrast = _list(arrays.get("contrast", np.zeros(signal.size)), "contrast", file)
-    if contrast.shape != signal.shape:
-        raise SpecError(f"contrast has {contrast.size} values, signal_dn {signal.size}; each kind needs one", file=file)
-    if np.abs(contrast).max() > _LARGEST_CONTRAST:
-        raise SpecError(f"contrast, ln I₁/I₀, must lie within ±{_LARGEST_CONTRAST:g}", file=file)
-    if has_steps and not (np.any(contrast > 0) and np.any(contrast < 0)):
-        raise SpecError("contrast must hold steps up, which tell θ₊, and down, which tell θ₋", file=file)
-    if has_steps and (np.any(contrast == 0) or np.any(signal == 0)):
-        raise SpecError(
-            f"a step needs light before it and a contrast; steady light goes into {NOISE_RATE}.npz", file=file
-        )
-    if not has_steps and np.any(contrast != 0):
-        raise SpecError(f"contrast must be 0 in steady light; steps go into {S_CURVE}.npz", file=file)
+    _require_contrast(contrast, signal, has_steps, file)
     settle_s = number(arrays["settle_us"], "settle_us", file) * S_PER_US
     edges = _list(arrays["edges_us"], "edges_us", file)
     if edges.size < 2 or edges[0] != 0 or np.any(np.diff(edges) <= 0):
@@ -169,15 +159,7 @@ def _read(file: Path, has_steps: bool) -> Trials:
     if calm.ndim != 3 or calm.size == 0 or len(calm) != signal.size:
         raise SpecError(f"n_calm has shape {calm.shape}; expected [{signal.size} kinds of trials, row, col]", file=file)
     wanted = (signal.size, edges.size - 1, *calm.shape[1:])
-    for name, values in (("n_calm", calm), ("n_on", on), ("n_off", off)):
-        if values.dtype.kind not in "ui":
-            raise SpecError(f"{name} holds {values.dtype.name}; save whole numbers of trials", file=file)
-        if values is not calm and values.shape != wanted:
-            raise SpecError(
-                f"{name} has shape {values.shape}; expected {wanted}: [kind, time bin, row, col]", file=file
-            )
-        if values.min() < 0 or values.max() >= 2**31:
-            raise SpecError(f"{name} holds numbers below 0, or beyond 2^31", file=file)
+    _require_counts({"n_calm": calm, "n_on": on, "n_off": off}, wanted, file)
     events = on.sum(axis=1, dtype=np.int64) + off.sum(axis=1, dtype=np.int64)
     if np.any(events > calm):
         raise SpecError("n_on and n_off hold more trials together than n_calm: count first events only", file=file)
@@ -195,6 +177,35 @@ def _read(file: Path, has_steps: bool) -> Trials:
         off.reshape(*wanted[:2], -1), (calm.shape[1], calm.shape[2]),
         _parts(arrays, signal, calm, events, file) if has_parts else None,
     )  # fmt: skip
+
+
+def _require_contrast(contrast: NDArray[np.float64], signal: NDArray[np.float64], has_steps: bool, file: Path) -> None:
+    """Refuse contrasts [kind] that do not belong to trials with steps, or to trials without."""
+    if contrast.shape != signal.shape:
+        raise SpecError(f"contrast has {contrast.size} values, signal_dn {signal.size}; each kind needs one", file=file)
+    if np.abs(contrast).max() > _LARGEST_CONTRAST:
+        raise SpecError(f"contrast, ln I₁/I₀, must lie within ±{_LARGEST_CONTRAST:g}", file=file)
+    if has_steps and not (np.any(contrast > 0) and np.any(contrast < 0)):
+        raise SpecError("contrast must hold steps up, which tell θ₊, and down, which tell θ₋", file=file)
+    if has_steps and (np.any(contrast == 0) or np.any(signal == 0)):
+        raise SpecError(
+            f"a step needs light before it and a contrast; steady light goes into {NOISE_RATE}.npz", file=file
+        )
+    if not has_steps and np.any(contrast != 0):
+        raise SpecError(f"contrast must be 0 in steady light; steps go into {S_CURVE}.npz", file=file)
+
+
+def _require_counts(counts: Mapping[str, NDArray], wanted: tuple[int, ...], file: Path) -> None:
+    """Refuse counts of trials that are no whole numbers, or not of the shape of those of events."""
+    for name, values in counts.items():
+        if values.dtype.kind not in "ui":
+            raise SpecError(f"{name} holds {values.dtype.name}; save whole numbers of trials", file=file)
+        if name != "n_calm" and values.shape != wanted:
+            raise SpecError(
+                f"{name} has shape {values.shape}; expected {wanted}: [kind, time bin, row, col]", file=file
+            )
+        if values.min() < 0 or values.max() >= 2**31:
+            raise SpecError(f"{name} holds numbers below 0, or beyond 2^31", file=file)
 
 
 def _parts(
@@ -225,7 +236,7 @@ def _parts(
 
 
 def _list(values: NDArray, name: str, file: Path) -> NDArray[np.float64]:
-    found = values.astype(np.float64)
-    if found.ndim != 1 or found.size == 0 or not np.all(np.isfinite(found)):
+    result = values.astype(np.float64)
+    if result.ndim != 1 or result.size == 0 or not np.all(np.isfinite(result)):
         raise SpecError(f"{name} must be a list of finite numbers", file=file)
-    return found
+    return result

@@ -104,8 +104,8 @@ def analyse(
     if captures.has("evs_steps"):
         tell("contrast steps", 0.3)
         steps = read_steps(captures, good)
-        found, _ = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
-        more = np.zeros(good.shape, bool) if found is None else bad_in_steps(steps, found, good)
+        result, _ = _measured_thresholds(captures, steps, laws[_likelier(laws)], good)
+        more = np.zeros(good.shape, bool) if result is None else bad_in_steps(steps, result, good)
         if more.any():
             bad, good = bad | more, good & ~more
             steps = read_steps(captures, good)

@@ -25,12 +25,12 @@ _APART = 0.3
 
 def check_events(result: EvsCalibration, contrast_of: str) -> tuple[list[Finding], CurveLevels | None]:
     """Every check of the events, and the levels of the S-curves where they were captured."""
-    found = [_counts(result), _starts(result)]
+    outcome = [_counts(result), _starts(result)]
     levels = None
     if result.thresholds is not None and result.steps is not None:
         levels = curve_levels(result.steps, result.thresholds)
-        found += [_ceiling(levels), _floor(result, levels), _width(result, contrast_of)]
-    return [f for f in found if f is not None], levels
+        outcome += [_ceiling(levels), _floor(result, levels), _width(result, contrast_of)]
+    return [f for f in outcome if f is not None], levels
 
 
 def _counts(result: EvsCalibration) -> Finding | None:
@@ -87,22 +87,22 @@ def _floor(result: EvsCalibration, levels: CurveLevels) -> Finding | None:
     """Finding of events of steps in the other direction, and of ON events beyond leak."""
     fit = result.together
     leak, leak_error = (fit.values[5], np.sqrt(max(fit.covariance[5, 5], 0.0))) if fit.free[5] else (0.0, 0.0)
-    found = []
+    outcome = []
     for name, (value, error), own, own_error in (
         ("ON", levels.floor_on, leak, leak_error), ("OFF", levels.floor_off, 0.0, 0.0),
     ):  # fmt: skip
         p_value = 4 * float(norm.sf(abs(value - own) / max(float(np.hypot(error, own_error)), 1e-12)))
         if p_value < ALARM and abs(value - own) > _LEAST_FLOOR and value > 0:
-            found.append((name, value, p_value))
-    if not found:
+            outcome.append((name, value, p_value))
+    if not outcome:
         return None
-    rates = " and ".join(f"{value:.2g} ({name})" for name, value, _ in found)
+    rates = " and ".join(f"{value:.2g} ({name})" for name, value, _ in outcome)
     return Finding(
         "S-curve floor",
         f"steps away from the threshold still give events, in {rates} of the trials, beyond leak. A … D, which take "
         "the rarest counts for noise, are off. Look for events that come by themselves (hot neighbours, crosstalk, "
         "read-out noise, moving objects) or noise with longer tails than a normal law.",
-        min(p for _, _, p in found),
+        min(p for _, _, p in outcome),
     )
 
 
@@ -135,8 +135,8 @@ def _width(result: EvsCalibration, contrast_of: str) -> Finding | None:
         return None
     return Finding(
         "S-curve width",
-        f"the width of the S-curve asks for noise of {measured:.3g} (ln), the static counts for {expected:.3g}: they "
-        "are not of one normal law. A … D hold for the static counts at best, and θ/σ does not. Look for noise with "
-        "longer tails than a normal law, events that come by themselves, or steps captured at another light or bias.",
+        f"the width of the S-curve belongs to a noise of {measured:.3g} (ln), the static counts for {expected:.3g}: "
+        "they are not of one normal law. A … D hold for the static counts at best, and θ/σ does not. Look for noise "
+        "with longer tails than a normal law, events without a change, or steps captured at another light or bias.",
         p_value,
     )

@@ -34,11 +34,11 @@ class CurveLevels:
 def curve_levels(steps: Steps, thresholds: Thresholds) -> CurveLevels:
     """Fit floors and ceiling to the pooled S-curves."""
     start = np.array([*thresholds.values, 0.0, 0.0, 1.0])
-    found = _fit(steps, thresholds.step, np.ones(GROUPS, bool), start)
+    result = _fit(steps, thresholds.step, np.ones(GROUPS, bool), start)
     groups = np.flatnonzero(steps.pixels)
-    left_out = np.array([_fit(steps, thresholds.step, np.arange(GROUPS) != k, found) for k in groups])
+    left_out = np.array([_fit(steps, thresholds.step, np.arange(GROUPS) != k, result) for k in groups])
     error = np.sqrt((groups.size - 1) * left_out.var(axis=0))
-    return CurveLevels(*((float(found[k]), float(error[k])) for k in (4, 5, 6)))
+    return CurveLevels(*((float(result[k]), float(error[k])) for k in (4, 5, 6)))
 
 
 def _fit(steps: Steps, step: NDArray, groups: NDArray[np.bool_], start: NDArray) -> NDArray[np.float64]:
@@ -50,14 +50,17 @@ def _fit(steps: Steps, step: NDArray, groups: NDArray[np.bool_], start: NDArray)
     for _ in range(_ROUNDS):
         score, fisher = np.zeros(7), np.zeros((7, 7))
         for rate, polarity, floor in zip(rates, (1.0, -1.0), (4, 5), strict=True):
+            # rate = floor + (ceiling − floor) · S-curve, and its slopes by all seven parameters
             shape = curve(values[:4], polarity, step)
             p = values[floor] + (values[6] - values[floor]) * shape
             jacobian = np.zeros((step.size, 7))
             jacobian[:, :4] = (values[6] - values[floor]) * curve_slopes(values[:4], polarity, step)
             jacobian[:, floor], jacobian[:, 6] = 1 - shape, shape
+            # a binomial weighs each rate by 1/(p (1 − p))
             weight = 1 / (np.clip(p * (1 - p), 0.0, None) + _LEAST_VARIANCE)
             score += (weight * (rate - p)) @ jacobian
             fisher += (jacobian * weight[:, None]).T @ jacobian
+        # a step at most 0.3 of the scale, back into the range of a curve
         change = np.linalg.lstsq(fisher, score, rcond=None)[0]
         values = values + np.clip(change, -0.3 * scale, 0.3 * scale)
         values[:3] = np.maximum(values[:3], 1e-3 * scale[:3])

@@ -83,16 +83,16 @@ def _out_of_reach(counts: NDArray, group: NDArray, trials: int, u: NDArray, reac
     # Only counts far off need the exact tail.
     margin = 4.0
     h, w = (trials * high)[group], (trials * low)[group]
-    found = np.zeros(counts.shape, bool)
+    result = np.zeros(counts.shape, bool)
     over, under = counts > h + margin * np.sqrt(h), counts < w - margin * np.sqrt(w)
-    found[over] = binom.sf(counts[over] - 1, trials, high[group[over]]) < _CHANCE
-    found[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE
-    return found
+    result[over] = binom.sf(counts[over] - 1, trials, high[group[over]]) < _CHANCE
+    result[under] = binom.cdf(counts[under], trials, low[group[under]]) < _CHANCE
+    return result
 
 
 def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArray]) -> NDArray[np.bool_]:
     """Pixels whose ON and OFF thresholds differ by more than those of the other pixels."""
-    found = np.zeros(group.shape, bool)
+    result = np.zeros(group.shape, bool)
     enough = np.all([counts >= LEAST_EVENTS for counts in both], axis=0)
     rate = [(counts[enough] + 0.5) / (trials + 1) for counts in both]
     t = [-ndtri(r) for r in rate]
@@ -100,31 +100,31 @@ def _apart(both: list[NDArray], group: NDArray, trials: int, middle: list[NDArra
     u = (middle[0] + middle[1])[group[enough]] / 2
     usable = u > 0.3
     if usable.sum() < _FEWEST:
-        return found
+        return result
     difference = (t[0] - t[1] - (middle[0] - middle[1])[group[enough]])[usable] / u[usable]
     own = np.sqrt(noise[usable]) / u[usable]
     low, centre, high = np.quantile(difference, [0.16, 0.5, 0.84])
     spread = np.sqrt(max(((high - low) / 2) ** 2 - float(np.median(own**2)), 0.0))
     limit = max(_LEAST_REACH, _SPREADS * spread) + _SIGMAS * own
-    found[np.flatnonzero(enough)[usable]] = np.abs(difference - centre) > limit
-    return found
+    result[np.flatnonzero(enough)[usable]] = np.abs(difference - centre) > limit
+    return result
 
 
 def bad_in_steps(steps: Steps, thresholds: Thresholds, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Good pixels [row, col] whose events over all steps no threshold within the spread explains."""
-    found = np.zeros(good.shape, bool)
+    result = np.zeros(good.shape, bool)
     for polarity, total, mismatch in (
         (1.0, steps.on_total, thresholds.mismatch_on), (-1.0, steps.off_total, thresholds.mismatch_off),
     ):  # fmt: skip
         reach = max(_LEAST_REACH, _SPREADS * mismatch)
         # the sum of binomial counts scatters less than a Poisson count with the same mean
         most, least = totals_of(thresholds, polarity, np.array([1 - reach, 1 + reach]), steps.trials)
-        found |= good & ((poisson.sf(total - 1, most) < _CHANCE) | (poisson.cdf(total, least) < _CHANCE))
+        result |= good & ((poisson.sf(total - 1, most) < _CHANCE) | (poisson.cdf(total, least) < _CHANCE))
     apart = (thresholds.pixel_on - thresholds.pixel_off).astype(np.float64)
     noise = np.hypot(thresholds.noise_on, thresholds.noise_off).astype(np.float64)
     low, centre, high = np.quantile(apart[good], [0.16, 0.5, 0.84])
     spread = np.sqrt(max(((high - low) / 2) ** 2 - float(np.median(noise[good] ** 2)), 0.0))
-    return found | (good & (np.abs(apart - centre) > max(_LEAST_REACH, _SPREADS * spread) + _SIGMAS * noise))
+    return result | (good & (np.abs(apart - centre) > max(_LEAST_REACH, _SPREADS * spread) + _SIGMAS * noise))
 
 
 def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None) -> EventDefects:
@@ -134,13 +134,13 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     of the good pixels of its brightness. A hot pixel gives equal numbers of its own events per trial in the dark and in
     the light and, where counts of parts of a capture are known, in each part.
     """
-    found = EventDefects(
+    result = EventDefects(
         bad=bad, kind=np.where(bad, np.uint8(Defect.OTHER), np.uint8(Defect.NONE)),
         on=np.zeros(bad.shape, np.float32), off=np.zeros(bad.shape, np.float32),
         firing_share=np.ones(bad.shape, np.float32), correlation=np.zeros(bad.shape, np.float32),
     )  # fmt: skip
     if not bad.any():
-        return found
+        return result
     silent = np.ones(int(bad.sum()), bool)
     own, excess, significant = [], [], []
     for signal, on, off in static.sessions:
@@ -165,7 +165,7 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
     named = np.full(silent.shape, np.uint8(Defect.OTHER))
     named[over] = np.where(steady[over], np.uint8(Defect.HOT), np.uint8(Defect.FLICKERING))
     named[silent] = Defect.STUCK
-    found.kind[bad] = named
+    result.kind[bad] = named
     # a polarity with no more events than good pixels have does not count: its threshold may be low
     chance = np.where(np.any(significant, axis=0), rates.mean(axis=0), 0.0)
     flickers = np.flatnonzero(named == Defect.FLICKERING)
@@ -173,11 +173,11 @@ def classify(static: StaticCapture, bad: NDArray[np.bool_], steps: Steps | None)
         share, correlation = dynamics(
             static.parts[:, bad][:, flickers], static.part_trials, (usual[0] + usual[1])[flickers]
         )
-        for values, all_of_them in ((share, found.firing_share), (correlation, found.correlation)):
+        for values, all_of_them in ((share, result.firing_share), (correlation, result.correlation)):
             all_of_them[tuple(axis[flickers] for axis in np.nonzero(bad))] = values
         chance[:, flickers] = np.minimum(chance[:, flickers] / share, 1.0)
-    found.on[bad], found.off[bad] = chance
-    return found
+    result.on[bad], result.off[bad] = chance
+    return result
 
 
 def _of_like(
@@ -195,8 +195,8 @@ def _of_like(
     # a pixel of unknown brightness is compared with the pixels that have the most events
     here = np.where(np.isfinite(signal[bad]), signal[bad], np.inf)
     place = np.minimum(np.searchsorted(light, here), light.size - 1)
-    found = []
+    result = []
     for reduce in (lambda part: part.mean() / trials, lambda part: np.quantile(part, 0.999)):
         usual = np.array([[reduce(part) for part in by_group(counts[good], group)] for counts in both])
-        found.append(np.where(np.isfinite(here), usual[:, place], usual.max(axis=1)[:, None]))
-    return found[0], found[1]
+        result.append(np.where(np.isfinite(here), usual[:, place], usual.max(axis=1)[:, None]))
+    return result[0], result[1]

@@ -138,10 +138,12 @@ class _Mixture:
         Nodes at fixed thresholds would be too far apart: the count of a low threshold determines it far more precisely.
         """
         u, k, n = self.u * scale[self.group], self.events, self.trials
+        # a first guess of the pixel's threshold, z, from its own rate of events
         own = (k + 0.5) / (n + 1)
         middle = -ndtri(own)
         information = (u * m) ** 2 * n * np.exp(-middle * middle) / (2 * np.pi * own * (1 - own))
         z, width = np.clip((middle / u - 1) / m * information / (1 + information), -12, 12), np.ones_like(u)
+        # Newton steps to the likeliest z, and the width of the peak there
         for _ in range(4):
             t = u * (1 + m * np.clip(z, -12, 12))
             q = np.clip(ndtr(-t), 1e-300, 1 - 1e-15)
@@ -149,6 +151,7 @@ class _Mixture:
             information = (u * m) ** 2 * n * slope**2 / (q * (1 - q)) + 1
             step = u * m * slope * (n * q - k) / (q * (1 - q)) - z
             z, width = np.clip(z + np.clip(step / information, -2, 2), -12, 12), 1 / np.sqrt(information)
+        # Gauss–Hermite over the peak, in logarithms, as counts of thousands underflow
         terms = np.empty((_NODES.size, u.size))
         for row, node in zip(terms, _NODES, strict=True):
             at = z + np.sqrt(2) * width * node
@@ -172,8 +175,8 @@ class _Mixture:
 
         bounds = [(np.log(_NO_MISMATCH), np.log(_LARGEST_MISMATCH)), *[(-1.0, 1.0)] * size]
         start = np.concatenate([[np.log(m)], np.zeros(size)])
-        found = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
-        return -float(found.fun), float(np.exp(found.x[0])), np.exp(found.x[1:])
+        result = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+        return -float(result.fun), float(np.exp(result.x[0])), np.exp(result.x[1:])
 
     def information(self, m: float, scale: NDArray) -> tuple[float, float]:
         """Information of m with the groups' thresholds fitted, and the standard error of m."""

@@ -107,11 +107,13 @@ def maximise(
     """
     eta = np.array(start, dtype=np.float64)
     mask = np.asarray(free, bool)
+    # how far the brightest light reaches, which scales the steps of the shot noise
     bright = max(float(cells.signal_dn.max()), 1e-9)
     reach = bright if law == "linear" else np.sqrt(bright)
     converged = np.zeros(len(eta), bool)
     active = np.arange(len(eta))
     damping = np.full(len(eta), 1e-3)
+    # scoring with a damping of its own for each fit; fits that have converged leave `active`
     value, score, information = _evaluate(cells, eta, theta_v, law, mask, variance, True)
     before = value
     for round_ in range(_ROUNDS):
@@ -120,6 +122,7 @@ def maximise(
                 break  # far out in a valley without end, where only a combination of parameters is identifiable
             before = value
         now = eta[active]
+        # converged: the undamped step would gain next to nothing of the likelihood
         plain = _solve(now, score, information, 0.0)
         done = np.sum(plain * score, axis=1) < 1e-8
         if np.any(done):
@@ -131,12 +134,14 @@ def maximise(
             if active.size == 0:
                 break
             now = eta[active]
+        # the damped step, at most as long as each parameter may change in one round
         step = _solve(now, score, information, damping[:, None])
         limit = np.tile([0.0, 1.0, 0.0, 0.0, 0.3, 0.1], (len(now), 1))
         limit[:, 0] = np.maximum(np.exp(now[:, 1]) / bright, now[:, 0]) * 0.7
         strength = np.maximum(1 / reach, np.sqrt(now[:, 2] + now[:, 3] ** 2))
         limit[:, 2], limit[:, 3] = 0.7 * strength**2, 0.7 * strength
         step /= np.maximum(1, np.max(np.abs(step) / limit, axis=1))[:, None]
+        # take it where the likelihood rises and trust the model more; elsewhere stay and trust it less
         trial = np.where(mask, np.clip(now + step, _LEAST, _LARGEST), now)
         new_value, new_score, new_information = _evaluate(cells, trial, theta_v, law, mask, variance, True)
         better = new_value >= value - 1e-12 * np.abs(value)
@@ -144,6 +149,7 @@ def maximise(
         value, score = np.where(better, new_value, value), np.where(better[:, None], new_score, score)
         information = np.where(better[:, None, None], new_information, information)
         damping = np.where(better, damping / 5, damping * 5).clip(1e-9, 1e9)
+    # the information at the end, with the weights of the end
     _, _, fisher = _evaluate(cells, eta, theta_v, law, mask, variance)
     return eta, fisher, converged
 

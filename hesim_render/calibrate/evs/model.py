@@ -120,11 +120,6 @@ def both_probabilities(
     return results[0], results[1]
 
 
-def mean_probability(u: NDArray, mismatch: NDArray | float) -> NDArray:
-    """Mean of Q over the pixels' thresholds."""
-    return exceedance(over_thresholds(u, 1.0, mismatch, NUMPY), 1.0)
-
-
 def probability_variance(u: NDArray, mismatch: NDArray | float, relative: NDArray | float = 1.0) -> NDArray:
     """Variance over pixels of Q(u (r + m z)), z standard normal (Gauss–Hermite, 40 points)."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(40)

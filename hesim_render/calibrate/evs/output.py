@@ -82,9 +82,9 @@ def content(captures: CaptureSet, result: EvsCalibration, bootstrap: NDArray | N
         rate = float(rate_hz(leak, interval_s)), error[5] / (1 - leak) / interval_s
         section["tick_us"] = interval_s * US_PER_S
         section["leak_rate_hz"] = estimated(*rate, "Hz") if leaks else {"value": 0.0, "note": absent}
-    hidden = "hidden behind the mismatch of thresholds, or too few events"
+    reason = "hidden behind the mismatch of thresholds, or too few events"
     section["dispersion"] = {
-        name: estimated(value, error) if np.isfinite(value) else not_identifiable(hidden)
+        name: estimated(value, error) if np.isfinite(value) else not_identifiable(reason)
         for name, value, error in (
             ("temporal", spread.total, spread.total_error),
             ("temporal_difference", spread.difference, spread.difference_error),

@@ -76,14 +76,14 @@ class Thresholds:
 
     def of_pixels(self) -> PixelThresholds:
         """Known thresholds of each pixel: its estimate, shrunk towards the mean by the noise of the estimate."""
-        found = []
+        result = []
         for estimate, noise, mismatch in (
             (self.pixel_on, self.noise_on, self.mismatch_on), (self.pixel_off, self.noise_off, self.mismatch_off),
         ):  # fmt: skip
             variance, own = mismatch**2, noise.astype(np.float64) ** 2
             trust = variance / np.maximum(variance + own, 1e-30)
-            found.append((1 + trust * (estimate.astype(np.float64) - 1), np.sqrt(trust * own)))
-        (on, on_spread), (off, off_spread) = found
+            result.append((1 + trust * (estimate.astype(np.float64) - 1), np.sqrt(trust * own)))
+        (on, on_spread), (off, off_spread) = result
         return PixelThresholds(on, off, on_spread, off_spread)
 
 
@@ -108,8 +108,8 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
     step : [step], S = ln x₁/x₀ of each contrast.
     """
     sums = _Sums.of(steps, good)
-    found = sums.fit(step, steps.trials)
-    values, squares = found[:4], found[4:6]
+    result = sums.fit(step, steps.trials)
+    values, squares = result[:4], result[4:6]
     left_out = np.array([sums.without(k).fit(step, steps.trials, values) for k in range(GROUPS) if sums.pixels[k]])
     covariance = (len(left_out) - 1) * np.cov(left_out.T, bias=True)
     error = np.sqrt(np.diag(covariance))
@@ -118,7 +118,7 @@ def fit_thresholds(steps: Steps, step: NDArray[np.float64], good: NDArray[np.boo
     each = [
         float(np.sqrt(v)) if mismatch and v > _SIGMAS * e else 0.0 for v, e in zip(squares, error[4:6], strict=True)
     ]
-    noise = found[6]
+    noise = result[6]
     pixel = [
         _of_pixel(values, sign, sign * step, total, steps.trials, m)
         for sign, total, m in ((1.0, steps.on_total, each[0]), (-1.0, steps.off_total, each[1]))
@@ -255,11 +255,11 @@ def _totals(
     return trials * p.sum(axis=1), trials * (p * (1 - p)).sum(axis=1)
 
 
-def totals_of(found: Thresholds, polarity: float, relative: NDArray, trials: int) -> NDArray[np.float64]:
+def totals_of(result: Thresholds, polarity: float, relative: NDArray, trials: int) -> NDArray[np.float64]:
     """Mean events over all steps of pixels whose threshold of one polarity is `relative` to the mean."""
-    theta, m = (found.theta_on, found.mismatch_on) if polarity > 0 else (found.theta_off, found.mismatch_off)
-    signed = polarity * found.step
-    return _totals(theta * relative, theta, found.width, found.slope * polarity, signed, trials, m * m)[0]
+    theta, m = (result.theta_on, result.mismatch_on) if polarity > 0 else (result.theta_off, result.mismatch_off)
+    signed = polarity * result.step
+    return _totals(theta * relative, theta, result.width, result.slope * polarity, signed, trials, m * m)[0]
 
 
 def _mismatch_square(theta: float, width: float, slope: float, signed: NDArray, variance: float, trials: int) -> float:

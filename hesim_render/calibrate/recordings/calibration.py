@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from hesim_render.calibrate.recordings import still, target
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
@@ -15,6 +14,7 @@ from hesim_render.calibrate.recordings.tally import EventTally, tally
 from hesim_render.calibrate.result import plain
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.output import free_place, replacing
+from hesim_render.core.yaml_file import write_yaml
 from hesim_render.exchange import open_events
 
 #: Thresholds follow from the leak, and the leak from the thresholds.
@@ -75,27 +75,25 @@ def calibrate_recordings(
     if target_hz is not None and (target_file is None or not target_hz > 0):
         raise RangeError("target_hz", target_hz, "cycles per second of a moving target, above 0")
     path = None if out is None else free_place(out, overwrite, (".yaml", ".yml"))
-    told = progress or (lambda what, part: None)
+    report = progress or (lambda what, part: None)
     tallies: list[EventTally] = []
     every = [*names, *([str(target_file)] if target_file is not None else [])]
     for k, name in enumerate(every):
-        told(f"read {Path(name).name}", k / (len(every) + 1))
+        report(f"read {Path(name).name}", k / (len(every) + 1))
         stream = open_events(name, shape=shape, keep_stated=True)
         if tallies and stream.shape != tallies[0].shape:
             (rows, cols), (first_rows, first_cols) = stream.shape, tallies[0].shape
             raise SpecError(f"is of {cols}x{rows} px; expected {first_cols}x{first_rows}, as {names[0]}", file=name)
         tallies.append(tally(stream))
-    told("fit", len(every) / (len(every) + 1))
+    report("fit", len(every) / (len(every) + 1))
     moving = tallies.pop() if target_file is not None else None
-    found = figures(
+    result = figures(
         tallies, moving, None if lux is None else [float(level) for level in lux], target_contrast, target_hz
     )
     if path is not None:
-        yaml = YAML()
-        yaml.width, yaml.default_flow_style = 120, None
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8") as file:
-            yaml.dump(plain(found), file)
-    return found
+            write_yaml(plain(result), file, width=120)
+    return result
 
 
 def figures(
@@ -115,17 +113,17 @@ def figures(
             file=one.source,
         )
     of_target = target.unknown("it takes a recording of a moving target (--target)")
-    found = still.balance(tallies, lux)
+    result = still.balance(tallies, lux)
     if moving is not None and contrast is not None:
         leak_hz = 0.0
         for _ in range(_ROUNDS):
             of_target = target.thresholds(moving, contrast, cycles_hz, leak_hz)
             if of_target.ratio["value"] is None:
                 break
-            found = still.balance_with_target(tallies, lux, moving, of_target.ratio, leak_hz)
-            leak_hz = float(np.mean([leak["value"] for leak in found.leaks]))
+            result = still.balance_with_target(tallies, lux, moving, of_target.ratio, leak_hz)
+            leak_hz = float(np.mean([leak["value"] for leak in result.leaks]))
     entries, findings = [], []
-    for k, (one, leak) in enumerate(zip(tallies, found.leaks, strict=True)):
+    for k, (one, leak) in enumerate(zip(tallies, result.leaks, strict=True)):
         rates = still.group_rates(one)
         entries.append({
             "file": Path(one.source).name, "lux": None if lux is None else lux[k], "seconds": one.seconds,
@@ -137,8 +135,8 @@ def figures(
             findings.append({"file": Path(one.source).name, "text": problem})
     return {
         "sensor": {"rows": tallies[0].shape[0], "cols": tallies[0].shape[1]},
-        "recordings": entries, "threshold_ratio": found.ratio, **of_target.entries, "leak_dark_hz": found.dark,
-        "leak_growth_hz_per_lux": found.growth,
+        "recordings": entries, "threshold_ratio": result.ratio, **of_target.entries, "leak_dark_hz": result.dark,
+        "leak_growth_hz_per_lux": result.growth,
         "hot_share": still.hot_share(tallies), "silent_share": still.silent_share(tallies),
         "dead_time_us": dead_time(every), "readout_limit_events_per_s": limit, "findings": findings,
     }  # fmt: skip

@@ -32,8 +32,8 @@ def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
     """
     counts = np.sum([one.intervals for one in tallies], axis=0)[:LONG_US].astype(np.float64)
     if counts.sum() < _LEAST_INTERVALS:
-        told = f"{int(counts.sum())} intervals are shorter than {LONG_US / 1000:g} ms; {_LEAST_INTERVALS} are needed"
-        return not_identifiable(told)
+        reason = f"{int(counts.sum())} intervals are shorter than {LONG_US / 1000:g} ms; {_LEAST_INTERVALS} are needed"
+        return not_identifiable(reason)
     place, chance = _step(counts)
     end = int(place[np.argmax(chance)])
     after = counts[end : 2 * end + 2]

@@ -126,9 +126,9 @@ class EventTally:
         first = np.diff(pixel, prepend=-1) != 0
         before_us = np.where(first, self._turn_us[pixel], np.append(0, t_us[:-1]))
         self._turn_us[pixel[np.append(first[1:], True)]] = t_us[np.append(first[1:], True)]
-        found = (t_us - before_us)[before_us >= 0]
-        self.turns_us.append(found)
-        self._turns += found.size
+        result = (t_us - before_us)[before_us >= 0]
+        self.turns_us.append(result)
+        self._turns += result.size
 
     def period_s(self) -> float | None:
         """Time between two turns of a pixel from OFF to ON events, s; those that noise splits or joins are left out."""
@@ -175,10 +175,10 @@ def tally(stream: EventStream) -> EventTally:
     """
     begin_us, end_us = stream.span_us()
     if end_us - begin_us < _LEAST_US:
-        told = "has no events" if end_us == begin_us == 0 else f"lasts {end_us - begin_us} µs"
-        raise SpecError(f"{told}; expected a recording of at least {_LEAST_US} µs", file=stream.source)
-    found = EventTally(str(stream.source), stream.shape, begin_us, end_us)
+        problem = "has no events" if end_us == begin_us == 0 else f"lasts {end_us - begin_us} µs"
+        raise SpecError(f"{problem}; expected a recording of at least {_LEAST_US} µs", file=stream.source)
+    result = EventTally(str(stream.source), stream.shape, begin_us, end_us)
     for block in stream:
-        found.add(block)
-    found.finish()
-    return found
+        result.add(block)
+    result.finish()
+    return result

@@ -15,7 +15,7 @@ def findings(section: Mapping[str, Any]) -> list[tuple[str, str, str]] | None:
     """The findings of a section: check, chance and text of each; None for a calibration without checks."""
     if "findings" not in section:
         return None
-    return [(found["check"], _chance(found["p_value"]), found["text"]) for found in section["findings"]]
+    return [(result["check"], _chance(result["p_value"]), result["text"]) for result in section["findings"]]
 
 
 def _chance(p_value: float | None) -> str:

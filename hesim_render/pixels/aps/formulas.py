@@ -35,7 +35,7 @@ ADC_VARIANCE_DN2 = 1.0 / 12.0
 
 #: Below this temporal variance (without that of the ADC) rounding hides the noise and biases the means: Sheppard's
 #: correction q²/12 fails.
-HIDDEN_VARIANCE_DN2 = 0.24
+QUANTISED_VARIANCE_DN2 = 0.24
 
 #: The noise term of each of β0 … β5. A coefficient is 0 where its term is switched off.
 BETA_TERMS = ("read", "shot", "dark_current", "shot", "shot", "dark_current")

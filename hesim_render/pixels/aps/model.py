@@ -23,7 +23,7 @@ from hesim_render.pixels.aps.fixed_pattern import FixedPattern
 from hesim_render.pixels.aps.formulas import ADC_VARIANCE_DN2, BETA_TERMS, PixelProperties, PixelValue
 from hesim_render.pixels.aps.sampler import DeviceMaps, draw_dn
 from hesim_render.pixels.aps.telegraph import TelegraphPixels, telegraph_pixels
-from hesim_render.pixels.terms import switched_off
+from hesim_render.pixels.arrays import switched_off
 from hesim_render.specs.frame_pixels import ApsSpec, InterferenceSpec
 
 APS_TERMS = (
@@ -150,11 +150,8 @@ class ApsNoise(PlainState):
         if chosen not in known:
             raise RangeError("position", position, "(tile_row, tile_col) of a frame pixel of the tile")
         dark = 0.0 if "dark_current" in self.off else self.spec.dark_current_now_e_per_s
-        return PixelProperties(
-            1.0, dark, self.spec.black_level_dn, None if self.beta is None else tuple(self.beta[chosen])
-        )
-
-    # ---- the model --------------------------------------------------------------------------------
+        beta = None if self.beta is None else tuple(self.beta[chosen])
+        return PixelProperties(1.0, dark, self.spec.black_level_dn, beta)
 
     def _refused(self, exposure_us: float) -> str:
         """The reason why the polynomial cannot be a variance at this exposure, µs; empty where it can."""
@@ -305,8 +302,6 @@ class ApsNoise(PlainState):
         cell = [0.0 if term in self.off else b for term, b in zip(BETA_TERMS, physical, strict=True)]
         tile_rows, tile_cols = self.layout.tile_shape
         return [[list(cell) for _ in range(tile_cols)] for _ in range(tile_rows)]
-
-    # ---- the sampler ------------------------------------------------------------------------------
 
     def sample(self, electrons: ArrayLike | Float, exposure_us: float, seed: int, frame: int = 0) -> NDArray[np.uint16]:
         """One noisy frame.

@@ -87,7 +87,7 @@ def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> Telegra
         every = measured.amplitude_dn, measured.high_share, measured.change_hz
         amplitude, share, change_hz = (values.ravel().astype(np.float64) for values in every)
         place = np.flatnonzero(amplitude > 0)
-        found = amplitude[place], share[place], change_hz[place]
+        result = amplitude[place], share[place], change_hz[place]
     elif spec.telegraph is not None:
         given = spec.telegraph
         key = layout.full_index.ravel()
@@ -97,7 +97,7 @@ def telegraph_pixels(spec: ApsSpec, layout: Layout, device_seed: int) -> Telegra
             amplitude *= -np.log(device_uniform(device_seed, Stream.TELEGRAPH_AMPLITUDE, key[place]))
         share = np.full(place.size, given.high_s / (given.high_s + given.low_s))
         change_hz = np.full(place.size, 1.0 / given.high_s + 1.0 / given.low_s)
-        found = amplitude, share, change_hz
+        result = amplitude, share, change_hz
     else:
         return None
-    return TelegraphPixels(place, layout.full_index.ravel()[place], *found, frame_us) if place.size else None
+    return TelegraphPixels(place, layout.full_index.ravel()[place], *result, frame_us) if place.size else None

@@ -100,8 +100,8 @@ class Balance:
             released = self._ready_us[pixel] < t_us
             self._count[EFFECT, pixel[released & (self._count[EFFECT, pixel] != 0)]] = 0
         match = self._count[other, pixel] * sign > 0
-        found = self._pop(other, pixel[match])
-        pairs.append((found, number[match]) if own == EFFECT else (number[match], found))
+        result = self._pop(other, pixel[match])
+        pairs.append((result, number[match]) if own == EFFECT else (number[match], result))
         rest = ~match
         if self._dead_us is not None and own == CAUSE:
             asleep = rest & (t_us <= self._ready_us[pixel])
@@ -117,9 +117,9 @@ class Balance:
     def _pop(self, side: int, pixel: NDArray[np.int64]) -> NDArray[np.int64]:
         """Numbers of the latest waiting steps, which wait no longer."""
         count = self._count[side, pixel]
-        found = self._waiting[side, pixel, np.abs(count) - 1]
+        result = self._waiting[side, pixel, np.abs(count) - 1]
         self._count[side, pixel] = count - np.sign(count)
-        return found
+        return result
 
     def _push(self, side: int, pixel: NDArray[np.int64], sign: NDArray[np.int64], number: NDArray[np.int64]) -> None:
         place = np.abs(self._count[side, pixel])
@@ -162,8 +162,8 @@ class LastSteps:
         pairs: list[tuple[NDArray, NDArray]] = [(np.empty(0, np.int64), np.empty(0, np.int64))]
         for own, (t_us, pixel, sign, number) in _rounds(causes, effects):
             match = self._sign[1 - own, pixel] == sign
-            found = self._number[1 - own, pixel[match]]
-            pairs.append((found, number[match]) if own == EFFECT else (number[match], found))
+            result = self._number[1 - own, pixel[match]]
+            pairs.append((result, number[match]) if own == EFFECT else (number[match], result))
             self._sign[1 - own, pixel[match]] = 0
             self._sign[own, pixel] = np.where(match, 0, sign)
             self._number[own, pixel] = number

@@ -82,11 +82,11 @@ class PreviousSample:
         begin_us = self._t_us
         dr.schedule(polarity)
         self._keep(level, variance, t_us)
-        found = polarity.numpy()
+        result = polarity.numpy()
         if self._defects is not None:
-            found = self._defects.at_tick(found, begin_us, t_us)
-        pixel = np.flatnonzero(found != 0)  # in row-major order
-        return _events(t_us, pixel, found[pixel], self._cols)
+            result = self._defects.at_tick(result, begin_us, t_us)
+        pixel = np.flatnonzero(result != 0)  # in row-major order
+        return _events(t_us, pixel, result[pixel], self._cols)
 
     def _keep(self, level: Float, variance: Float, t_us: int) -> None:
         import drjit as dr
@@ -232,10 +232,10 @@ class LastEvent:
         dr.eval(level, reference, crossed)
         before = self.reference, self.level
         self.reference, self.level = reference, level
-        found = np.flatnonzero(crossed.numpy())
-        if len(found) == 0:
+        result = np.flatnonzero(crossed.numpy())
+        if len(result) == 0:
             return no_events()
-        pixel = types.UInt32(found.astype(np.uint32))
+        pixel = types.UInt32(result.astype(np.uint32))
         gathered = [dr.gather(types.Float, value, pixel) for value in (crossed, *before, level)]
         gathered.append(dr.select(gathered[0] > 0, take(theta_on, pixel), -take(theta_off, pixel)))
         dr.eval(gathered)
@@ -247,7 +247,7 @@ class LastEvent:
         # a crossing that rounding moved out of the previous segment is due at once
         part = (reference_0 + number * theta_signed - level_0) / np.where(travel == 0, np.inf, travel)
         t_us = begin_us + np.clip(part, 0.0, 1.0) * (end_us - begin_us)
-        return _events(self._stamp(t_us), np.repeat(found, repeats), np.sign(theta_signed), self._cols)
+        return _events(self._stamp(t_us), np.repeat(result, repeats), np.sign(theta_signed), self._cols)
 
     def _crossings_with_dead_time(
         self, refractory: Refractory, level: Float, begin_us: float, end_us: float

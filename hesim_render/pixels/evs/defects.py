@@ -21,8 +21,7 @@ from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.measured import event_defect_rates
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
-from hesim_render.specs.defects import EventDefectSpec
-from hesim_render.specs.event_pixels import EvsSpec
+from hesim_render.specs.event_pixels import EventDefectSpec, EvsSpec
 
 #: Events of a defect per comparison above which more change nothing: the chance of no event is e⁻³⁰.
 _MOST_PER_TICK = 30.0
@@ -84,8 +83,10 @@ def _drawn(spec: EventDefectSpec, key: NDArray[np.uint32], device_seed: int) -> 
         number = np.ones(key.size)
     else:
         number = device_uniform(device_seed, Stream.EVENT_DEFECT, key)
+    # one number per pixel decides its kind, so that no pixel has two defects
     edges = np.cumsum([spec.stuck_share, spec.hot_share, spec.flickering_share])
     stuck, hot, flickering = (np.flatnonzero(np.searchsorted(edges, number, "right") == k) for k in range(3))
+    # hot pixels always fire, at log-normal rates; flickering ones during part of the time
     decades = spec.hot_rate_spread_decades
     spread = 10.0 ** (decades * device_normal(device_seed, Stream.EVENT_DEFECT_RATE, key[hot])) if decades else 1.0
     firing, quiet = spec.flickering_firing_s or 1.0, spec.flickering_quiet_s or 1.0

@@ -80,27 +80,30 @@ class Labeller:
         assert stage.t_us is not None
         clean = self._clean_pixels.step(electrons, stage.t_us)
         through = np.ones(events.size, np.bool_) if kept is None else kept
+        # number of each event in the recording; −1 for those that are not in it
         counted = through & self._of_run(events)
         before = self._events
         number = np.where(counted, before + np.cumsum(counted) - 1, -1)
         self._events += int(np.count_nonzero(counted))
-        found = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK]).astype(np.uint8)
+        # first by what made it; then by whether pixels without noise give it as well
+        result = np.choose(origin - 1, [Label.NOISE, Label.LEAK, Label.HOT, Label.LEAK]).astype(np.uint8)
         step = StepLabels(no_events(), np.empty(0, np.int64), np.empty(0, np.uint8))
         if self._partners is not None:
             step = self._partners.take(stage, electrons, events, origin, number)
         else:
             own = clean if self._own is None else self._own.step(electrons, stage.t_us)
             place = self._key(events)
-            found[np.isin(place, self._key(own))] = Label.MISMATCH
-            found[np.isin(place, self._key(clean))] = Label.SIGNAL
-        found, new = found[counted], step.changed >= before
-        found[step.changed[new] - before] = step.changed_to[new]
+            result[np.isin(place, self._key(own))] = Label.MISMATCH
+            result[np.isin(place, self._key(clean))] = Label.SIGNAL
+        result, new = result[counted], step.changed >= before
+        result[step.changed[new] - before] = step.changed_to[new]
+        # events that the sensor lost: by the read-out, or because a pixel was in its dead time
         unread, asleep = self._in_run(events[~through]), self._in_run(step.asleep)
         lost = np.concatenate([unread, asleep])
         where = np.repeat(np.array([Lost.READOUT, Lost.REFRACTORY], np.uint8), [unread.size, asleep.size])
         order = np.argsort(lost["t_us"], kind="stable")
         changes = step.changed[~new], step.changed_to[~new]
-        self._block.append(LabelBlock(found, *changes, lost[order], where[order], self._in_run(clean)))
+        self._block.append(LabelBlock(result, *changes, lost[order], where[order], self._in_run(clean)))
 
     def taken(self) -> LabelBlock:
         """The labels since the last call, which are no longer held."""

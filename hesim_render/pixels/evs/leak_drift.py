@@ -24,7 +24,7 @@ from hesim_render.core.units import US_PER_S
 from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.evs.model import EvsNoise
 from hesim_render.pixels.evs.noise_rates import LEAST_THRESHOLD_REL
-from hesim_render.specs.leak import MOST_TAIL_HZ
+from hesim_render.specs.event_pixels import MOST_TAIL_HZ
 
 #: Way of the drift, ln units, after which levels and reference are moved back together.
 _FAR = 4.0

@@ -21,16 +21,14 @@ from hesim_render.core.plain import PlainState
 from hesim_render.core.rng import Stream, device_normal
 from hesim_render.core.units import S_PER_US
 from hesim_render.mosaic.layout import Layout
+from hesim_render.pixels.arrays import switched_off
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.defects import PixelDefects, defects_of
 from hesim_render.pixels.evs.formulas import Coefficients
 from hesim_render.pixels.evs.noise_rates import LEAST_THRESHOLD_REL
 from hesim_render.pixels.evs.on_device import EventPixels, Map
 from hesim_render.pixels.measured import relative_threshold
-from hesim_render.pixels.terms import switched_off
-from hesim_render.specs.event_pixels import EvsCoefficients, EvsSpec
-from hesim_render.specs.leak import LeakSpec
-from hesim_render.specs.photoreceptor import PhotoreceptorSpec
+from hesim_render.specs.event_pixels import EvsCoefficients, EvsSpec, LeakSpec, PhotoreceptorSpec
 
 #: Kinds of defects, each a term.
 _DEFECTS = ("stuck", "hot", "flickering")

@@ -184,8 +184,8 @@ def noise_sigma(
 
     def excess(log_sigma: float) -> float:
         sigma = math.exp(log_sigma)
-        found = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s, leak_hz))
-        return math.log(max(found, 1e-300) / rate_hz)
+        result = sum(noise_rates_hz(thresholds, mismatch, sigma, bandwidth_hz, dead_s, leak_hz))
+        return math.log(max(result, 1e-300) / rate_hz)
 
     lowest, highest = math.log(mean / _LARGEST_MEAN), math.log(mean / rate_table().lower[0])
     if excess(highest) < 0:

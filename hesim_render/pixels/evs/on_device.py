@@ -14,7 +14,7 @@ from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.arrays import to_device
 from hesim_render.pixels.evs import formulas
 from hesim_render.pixels.evs.formulas import Coefficients, ShotLaw
-from hesim_render.specs.photoreceptor import PhotoreceptorSpec
+from hesim_render.specs.event_pixels import PhotoreceptorSpec
 
 Map = float | NDArray[np.float32]
 

@@ -71,6 +71,7 @@ class Refractory:
         theta_on, theta_off = thresholds
         level_0, level_1 = levels
         rest = types.Float(self._ready_us - dr.opaque(types.Float64, begin_us))
+        # pixels whose dead time ends within the segment take the level of that moment as their reference
         rest /= dr.opaque(types.Float, end_us - begin_us)  # part of the segment that is dead
         awake = rest <= 1.0
         released = awake & (rest > 0.0)
@@ -78,16 +79,17 @@ class Refractory:
         distance = level_1 - reference
         hit = awake & ((distance >= theta_on) | (distance <= -theta_off))
         dr.eval(reference, hit)
-        found = np.union1d(np.flatnonzero(hit.numpy()), leak[1]).astype(np.uint32)
-        if found.size == 0:
+        # only pixels that cross, or leak, go to the host, where each may have several events
+        result = np.union1d(np.flatnonzero(hit.numpy()), leak[1]).astype(np.uint32)
+        if result.size == 0:
             return reference, *(np.empty(0, kind) for kind in (np.float64, np.uint32, np.float64))
-        pixel = types.UInt32(found)
+        pixel = types.UInt32(result)
         gathered = [dr.gather(types.Float, value, pixel) for value in (reference, level_0, level_1)]
-        gathered += [take(theta_on, pixel) + dr.zeros(types.Float, found.size), take(theta_off, pixel)]
+        gathered += [take(theta_on, pixel) + dr.zeros(types.Float, result.size), take(theta_off, pixel)]
         ready = np.array(dr.gather(types.Float64, self._ready_us, pixel))
         own, low, high, on, off = (np.array(value).astype(np.float64) for value in gathered)
-        off = np.broadcast_to(off, found.shape)
-        own, ready, *events = self._rounds(found, own, ready, low, high, (on, off), begin_us, end_us, leak)
+        off = np.broadcast_to(off, result.shape)
+        own, ready, *events = self._rounds(result, own, ready, low, high, (on, off), begin_us, end_us, leak)
         dr.scatter(reference, types.Float(own.astype(np.float32)), pixel)
         dr.scatter(self._ready_us, types.Float64(ready), pixel)
         dr.eval(reference, self._ready_us)
@@ -112,7 +114,7 @@ class Refractory:
         leak_us, leak_origin = np.append(leak[0][order], np.inf), np.append(leak[2][order], 0.0)
         turn, last = (np.searchsorted(leak[1][order], pixel, side=side) for side in ("left", "right"))
         travel, length = high - low, end_us - begin_us
-        found: list[tuple[NDArray, NDArray, NDArray]] = []
+        result: list[tuple[NDArray, NDArray, NDArray]] = []
         here = np.arange(pixel.size)
         while here.size:
             distance = high[here] - own[here]
@@ -128,10 +130,10 @@ class Refractory:
             fires = np.isfinite(t_us) & ~(leaks & (due_us < ready[here]))
             turn[here[leaks]] += 1
             firing = here[fires]
-            found.append((t_us[fires], pixel[firing], np.where(leaks, leak_origin[due], sign)[fires]))
+            result.append((t_us[fires], pixel[firing], np.where(leaks, leak_origin[due], sign)[fires]))
             ready[firing] = t_us[fires] + self._period_us
             released = firing[ready[firing] <= end_us]
             own[released] = low[released] + (ready[released] - begin_us) / length * travel[released]
             here = here[np.isfinite(t_us)]
-        t_us, fired, polarity = (np.concatenate(values) for values in zip(*found, strict=True))
+        t_us, fired, polarity = (np.concatenate(values) for values in zip(*result, strict=True))
         return own, ready, t_us, fired, polarity

@@ -17,7 +17,7 @@ from hesim_render.core.units import LUMINOUS_EFFICACY_LM_PER_W, US_PER_S
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.cube.options import CubeOptions
 from hesim_render.sources.cube.planes import integrated, integration_weights
-from hesim_render.sources.window_by_window import WindowByWindow
+from hesim_render.sources.still import WindowByWindow
 from hesim_render.spectral.spectrum import photopic, product, scale_to_lux
 from hesim_render.targets.cube_file import CubeFile, open_cube
 

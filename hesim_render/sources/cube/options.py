@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from hesim_render.core.errors import RangeError
 from hesim_render.specs.files import Strict
 from hesim_render.specs.spectrum import SpectrumSpec
 
@@ -53,6 +55,24 @@ class CubeOptions(Strict):
         if any(abs(speed) > 1e7 for speed in self.pan_px_per_s):
             raise ValueError("pan_px_per_s: expected at most 1e7 px/s")
         return self
+
+    @classmethod
+    def of(cls, given: Mapping[str, object]) -> CubeOptions:
+        """Options from keywords.
+
+        Raises
+        ------
+        RangeError
+            For an unknown name or a value out of range; the message has the name.
+        """
+        try:
+            return cls.model_validate(given)
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            name = ".".join(map(str, problem["loc"])) or "options"
+            value = problem.get("input")
+            shown = "…" if isinstance(value, dict) else value
+            raise RangeError(name, shown, problem["msg"].removeprefix("Value error, ")) from None
 
     @property
     def is_moving(self) -> bool:

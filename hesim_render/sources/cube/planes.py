@@ -36,7 +36,7 @@ def integration_weights(spectra: Sequence[Spectrum], cube: CubeFile, hold: bool)
     assert bands is not None
     ends = [min(_HELD_NM[0], bands[0] - 1)], [max(_HELD_NM[1], bands[-1] + 1)]
     wide = np.concatenate([ends[0], bands, ends[1]]) if hold else bands
-    found = []
+    result = []
     for spectrum in spectra:
         try:
             weights = band_weights(spectrum, wide)
@@ -46,8 +46,8 @@ def integration_weights(spectra: Sequence[Spectrum], cube: CubeFile, hold: bool)
             weights[1] += weights[0]
             weights[-2] += weights[-1]
             weights = weights[1:-1]
-        found.append(weights)
-    return np.stack(found, axis=1)
+        result.append(weights)
+    return np.stack(result, axis=1)
 
 
 def blocks(cube: CubeFile) -> Iterator[NDArray[np.float32]]:

@@ -22,7 +22,7 @@ from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.timeline import Timeline
 from hesim_render.sources.render.tracer import BLOCK_RAYS, PixelTracer
 from hesim_render.sources.scene import Scene
-from hesim_render.sources.window_by_window import WindowByWindow
+from hesim_render.sources.still import WindowByWindow
 from hesim_render.spectral.spectrum import Spectrum
 
 #: Largest motion of an object within a slice, pixels.

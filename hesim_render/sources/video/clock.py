@@ -57,3 +57,47 @@ class Clock:
         """The sorted `times_us` that lie strictly between two times, µs."""
         first, last = np.searchsorted(times_us, begin_us, side="right"), np.searchsorted(times_us, end_us, side="left")
         return times_us[first:last]
+
+
+def picture_weights(
+    edges_us: NDArray[np.float64], is_held: bool, begin_us: NDArray[np.float64], end_us: NDArray[np.float64]
+) -> dict[int, NDArray[np.float64]]:
+    """Weight of each picture in the means over intervals, in order of time.
+
+    Parameters
+    ----------
+    edges_us : times at which the next picture takes over; with interpolation, the middles of the exposures.
+    is_held : a picture stands still until the next one; otherwise the scene changes linearly between the middles.
+    begin_us, end_us : the intervals: numbers, or one of each per pixel, [n].
+
+    Returns
+    -------
+    Weights by the number of the picture: one, or one per pixel, [n].
+    """
+    # the stretches between edges that any interval reaches into
+    first, last = float(begin_us.min()), float(end_us.max())
+    cells = range(
+        int(np.searchsorted(edges_us, first, side="right")), int(np.searchsorted(edges_us, last, side="left")) + 1
+    )
+    if len(cells) <= 1:  # a point in time on an edge belongs to the picture that begins there
+        cells = range(cells.start, cells.start + 1)
+    bounds = np.concatenate([[-np.inf], edges_us, [np.inf]])
+    length = end_us - begin_us
+    weights: dict[int, NDArray[np.float64]] = {}
+    for cell in cells:
+        # the part of each interval that lies in this stretch
+        low, high = (np.clip(times, bounds[cell], bounds[cell + 1]) for times in (begin_us, end_us))
+        share = np.where(length > 0, (high - low) / np.where(length > 0, length, 1.0), 1.0)
+        if is_held:
+            weights[cell] = share
+            continue
+        # stretch k extends from the middle of picture k - 1 to that of picture k; the mean of a straight line is its
+        # value half-way
+        before, after = max(cell - 1, 0), min(cell, edges_us.size - 1)
+        part = np.zeros(())
+        if after > before:
+            part = ((low + high) / 2 - edges_us[before]) / (edges_us[after] - edges_us[before])
+        weights[before] = weights.get(before, 0.0) + share * (1 - part)
+        if after > before:
+            weights[after] = weights.get(after, 0.0) + share * part
+    return weights

@@ -212,13 +212,13 @@ def _checksum_errors() -> Iterator[list[str]]:
     """Errors of checksums that decoders only log: some (FFV1) return the damaged picture anyway."""
     import av.logging
 
-    found: list[str] = []
+    result: list[str] = []
     before = av.logging.get_level()
     av.logging.set_level(av.logging.ERROR)
     try:
         with av.logging.Capture(local=False) as logs:
-            yield found
-            found += [text for *_, text in logs if "CRC mismatch" in text]
+            yield result
+            result += [text for *_, text in logs if "CRC mismatch" in text]
     finally:
         av.logging.set_level(before)
 

@@ -16,11 +16,11 @@ from hesim_render.core.progress import Progress
 from hesim_render.sensor.sensor import Sensor
 from hesim_render.sources.demand import Demand
 from hesim_render.sources.renderer import Renderer, Untraced
+from hesim_render.sources.still import WindowByWindow
 from hesim_render.sources.video.arrays import ArrayVideo
-from hesim_render.sources.video.clock import Clock
+from hesim_render.sources.video.clock import Clock, picture_weights
 from hesim_render.sources.video.colours import to_linear_srgb
-from hesim_render.sources.video.estimate import VideoEstimate, estimate_of_counts
-from hesim_render.sources.video.event_notes import event_notes
+from hesim_render.sources.video.estimate import VideoEstimate, estimate_of_counts, event_notes
 from hesim_render.sources.video.file import FileVideo
 from hesim_render.sources.video.folder import FolderVideo
 from hesim_render.sources.video.geometry import Resampler, mapping
@@ -29,7 +29,6 @@ from hesim_render.sources.video.linear import Lineariser
 from hesim_render.sources.video.motion import MotionVideo
 from hesim_render.sources.video.options import WHITE_LUX, VideoOptions
 from hesim_render.sources.video.picture import Reader
-from hesim_render.sources.window_by_window import WindowByWindow
 from hesim_render.spectral import spectrum as spectra
 
 Source = str | Path | NDArray
@@ -74,6 +73,7 @@ class VideoFlux(WindowByWindow, Untraced):
 
     Attributes
     ----------
+    name : of the source: its path, or ``array``.
     clock : times of the pictures.
     cut_short : evidence that the file once was longer, else empty.
 
@@ -93,7 +93,7 @@ class VideoFlux(WindowByWindow, Untraced):
         self.options = options = options or VideoOptions()
         self.sensor = sensor
         self._reader = open_video(source, options)
-        name = self._reader.name
+        self.name = name = self._reader.name
         self.tags = self._reader.tags.with_given(
             transfer=options.transfer, gamma=options.gamma, primaries=options.primaries, matrix=options.matrix,
             range=options.range,
@@ -200,39 +200,10 @@ class VideoFlux(WindowByWindow, Untraced):
         begin, end = _intervals(begin_us, end_us)
         index = types.UInt32(pixels)
         total: Float = 0.0
-        for number, share in self._shares(begin, end).items():
+        for number, share in picture_weights(self._edges, self._is_held, begin, end).items():
             total = dr.fma(dr.gather(types.Float, self._flux_of(number), index), _device(share), total)
             dr.eval(total)  # evaluate here, so that the pictures of a long interval are freed one by one
         return total, total
-
-    def _shares(self, begin: NDArray, end: NDArray) -> dict[int, NDArray[np.float64]]:
-        """Weight of each picture in the means over intervals (one weight, or one per pixel), in order of time."""
-        edges = self._edges
-        first, last = float(begin.min()), float(end.max())
-        cells = range(
-            int(np.searchsorted(edges, first, side="right")), int(np.searchsorted(edges, last, side="left")) + 1
-        )
-        if len(cells) <= 1:  # a point in time on an edge belongs to the picture that begins there
-            cells = range(cells.start, cells.start + 1)
-        bounds = np.concatenate([[-np.inf], edges, [np.inf]])
-        weights: dict[int, NDArray[np.float64]] = {}
-        for cell in cells:
-            low, high = np.clip(begin, bounds[cell], bounds[cell + 1]), np.clip(end, bounds[cell], bounds[cell + 1])
-            length = end - begin
-            share = np.where(length > 0, (high - low) / np.where(length > 0, length, 1.0), 1.0)
-            if self._is_held:
-                weights[cell] = share
-                continue
-            # cell k extends from the middle of picture k - 1 to that of picture k; the mean of a straight line is
-            # its value half-way
-            before, after = max(cell - 1, 0), min(cell, edges.size - 1)
-            part = np.zeros(())
-            if after > before:
-                part = ((low + high) / 2 - edges[before]) / (edges[after] - edges[before])
-            weights[before] = weights.get(before, 0.0) + share * (1 - part)
-            if after > before:
-                weights[after] = weights.get(after, 0.0) + share * part
-        return weights
 
     def _flux_of(self, number: int) -> Float:
         """Φ of all mosaic pixels in one picture, Dr.Jit Float [row · cols + col], e⁻/s."""

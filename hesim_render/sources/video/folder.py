@@ -38,7 +38,7 @@ def numbered_pictures(folder: Path) -> list[Path]:
     )
     if not files:
         raise SpecError(f"has no pictures ({', '.join(SUFFIXES)})", file=folder)
-    found: dict[int, Path] = {}
+    result: dict[int, Path] = {}
     series: tuple[str, str] | None = None
     for path in files:
         match = _NUMBERED.fullmatch(path.stem)
@@ -49,16 +49,16 @@ def numbered_pictures(folder: Path) -> list[Path]:
         if own != series:
             raise SpecError(f"is not of the same series as {files[0].name}; give one folder per series", file=path)
         number = int(match[2])
-        if number in found:
-            raise SpecError(f"has the same number as {found[number].name}", file=path)
-        found[number] = path
-    numbers = sorted(found)
-    gap = next((k for k in range(numbers[0], numbers[-1]) if k not in found), None)
+        if number in result:
+            raise SpecError(f"has the same number as {result[number].name}", file=path)
+        result[number] = path
+    numbers = sorted(result)
+    gap = next((k for k in range(numbers[0], numbers[-1]) if k not in result), None)
     if gap is not None:
         raise SpecError(
             f"picture number {gap} is missing ({len(numbers)} pictures, {numbers[0]} to {numbers[-1]})", file=folder
         )
-    return [found[number] for number in numbers]
+    return [result[number] for number in numbers]
 
 
 class FolderVideo(Hashed):

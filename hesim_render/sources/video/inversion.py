@@ -98,10 +98,10 @@ def camera_matrix(
         If the camera's matrix cannot be inverted, its channels are not filters of the sensor, or the luma sums to 0.
     """
     white = white_flux(sensor, filters, light, lux)
-    found = spectral_matrix(sensor, filters, light, lux) if others == "spectral" else white[:, None] * _unit(luma)
+    result = spectral_matrix(sensor, filters, light, lux) if others == "spectral" else white[:, None] * _unit(luma)
     used = camera or _own_camera(sensor, light)
     if used is None:
-        return found
+        return result
     unknown = [name for name in used.channels if name not in sensor.responses]
     if unknown:
         raise RangeError("channels of the camera", unknown, f"filters of the sensor: {', '.join(sensor.responses)}")
@@ -115,8 +115,8 @@ def camera_matrix(
     colours *= own_white[strongest] / colours[strongest].sum()
     for number, name in enumerate(filters):
         if name in used.channels:
-            found[number] = colours[used.channels.index(name)]
-    return found
+            result[number] = colours[used.channels.index(name)]
+    return result
 
 
 def _own_camera(sensor: Sensor, light: Spectrum) -> Camera | None:

@@ -144,15 +144,15 @@ class Lineariser:
         row = self._index // shape.width
         across = self._between(self._index - row * shape.width, shape.chroma_shift[0], width, shape.chroma_left)
         down = self._between(row, shape.chroma_shift[1], height, False)
-        found = []
+        result = []
         for plane in planes:
             pick = self._samples(plane)
             lines = []
             for line in dict.fromkeys((down[0], down[1])) if down[2] is None else down[:2]:
                 left = pick(line * width + across[0])
                 lines.append(left if across[2] is None else left + (pick(line * width + across[1]) - left) * across[2])
-            found.append(lines[0] if down[2] is None else lines[0] + (lines[1] - lines[0]) * down[2])
-        return found
+            result.append(lines[0] if down[2] is None else lines[0] + (lines[1] - lines[0]) * down[2])
+        return result
 
     def _between(self, place: UInt32, shift: int, count: int, aligned: bool) -> tuple[UInt32, UInt32, Float | None]:
         """Chroma samples before and after a luma position along one axis, and the fraction of the way between them."""

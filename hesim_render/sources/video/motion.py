@@ -93,10 +93,10 @@ class MotionVideo:
         self._given += 1
         while True:
             try:
-                found = self._sink.pull()
+                result = self._sink.pull()
             except (av.error.BlockingIOError, av.error.EOFError):
                 return
-            self._made.append(self._planes(found))
+            self._made.append(self._planes(result))
 
     def _frame(self, planes: Planes) -> Any:
         import av
@@ -113,11 +113,11 @@ class MotionVideo:
         return frame
 
     def _planes(self, frame: Any) -> Planes:
-        found: list[NDArray] = [
+        result: list[NDArray] = [
             np.ascontiguousarray(np.frombuffer(p, np.uint8).reshape(p.height, p.line_size)[:, : p.width])
             for p in frame.planes
         ]
-        return (found[1], found[0], found[2]) if self.format.layout == "planar" else tuple(found)
+        return (result[1], result[0], result[2]) if self.format.layout == "planar" else tuple(result)
 
     def start_digest(self) -> None:
         self._reader.start_digest()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -78,7 +78,7 @@ class VideoOptions(Strict):
         return self
 
     @classmethod
-    def of(cls, **given: Any) -> VideoOptions:
+    def of(cls, **given: object) -> VideoOptions:
         """Options from keywords; those that are None count as not given.
 
         Raises
@@ -88,6 +88,6 @@ class VideoOptions(Strict):
         """
         wanted = {name: value for name, value in given.items() if value is not None}
         try:
-            return cls(**wanted)
+            return cls.model_validate(wanted)
         except ValidationError as error:
             raise spec_error(error, cls, wanted) from None

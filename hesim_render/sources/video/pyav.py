@@ -75,13 +75,13 @@ def planes_of(frame: Any, shape: PictureFormat, target: str, where: str) -> Plan
     """The planes of a decoded frame, R before G before B; an alpha plane must be opaque."""
     if frame.format.name != target:
         frame = frame.reformat(format=target)
-    found = [_plane(plane, shape.bits) for plane in frame.planes]
+    result = [_plane(plane, shape.bits) for plane in frame.planes]
     colours = {"grey": 1, "planar": 3, "yuv": 3}[shape.layout]
-    if len(found) > colours:
-        without_alpha(np.dstack([found[0], found[-1]]), shape.bits, where)
+    if len(result) > colours:
+        without_alpha(np.dstack([result[0], result[-1]]), shape.bits, where)
     if shape.layout == "planar":
-        return found[2], found[0], found[1]  # PyAV has G, B, R
-    return tuple(found[:colours])
+        return result[2], result[0], result[1]  # PyAV has G, B, R
+    return tuple(result[:colours])
 
 
 def _plane(plane: Any, bits: int) -> NDArray:

@@ -20,6 +20,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
     Movable,
     as_spec_error,
     box_corners,
+    can_move,
     files_readable,
     make_mesh,
     settle_normals,
@@ -33,9 +34,9 @@ from hesim_render.sources.render.scene.surfaces import area_emitter, is_matt, pa
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
+from hesim_render.specs.reflectance import leaves_of
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.surface import leaves_of
 from hesim_render.specs.target import lamps_of
 from hesim_render.spectral.spectrum import Spectrum, constant, require_coverage
 from hesim_render.targets.build import placed_pieces
@@ -168,7 +169,7 @@ def build(mi: MitsubaModule, spec: SceneSpec, responses: Mapping[str, Spectrum] 
             if prefix not in shapes:
                 known = ", ".join(sorted(shapes))
                 raise SpecError(f"motion: no shape {name!r} in the Mitsuba scene; there are {known}", file=spec.file)
-            if f"{prefix}.vertex_positions" not in parameters and f"{prefix}.to_world" not in parameters:
+            if not can_move(parameters, prefix):
                 kind = shapes[prefix].class_name()
                 raise SpecError(
                     f"motion: shape {name!r} is a {kind}, which cannot move; use a mesh (PLY, OBJ)", file=spec.file

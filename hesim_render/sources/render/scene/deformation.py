@@ -11,9 +11,9 @@ from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
 from hesim_render.core.guard import require_memory
 from hesim_render.core.npz import read_arrays
-from hesim_render.sources.render.scene.mitsuba_version import as_spec_error
+from hesim_render.sources.render.scene.mitsuba_version import as_spec_error, mesh_faces, mesh_vertices
 from hesim_render.sources.render.scene.sizes import require_fits
-from hesim_render.specs.deformation import DeformationSpec
+from hesim_render.specs.motion import DeformationSpec
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def read_deformation(
     SpecError
         If a file is damaged or does not fit the mesh, or times do not increase.
     """
-    count, faces = int(mesh.vertex_count()), _faces(mi, mesh)
+    count, faces = int(mesh.vertex_count()), mesh_faces(mesh)
     if spec.path.is_dir():
         times, found = _from_folder(mi, spec, count, faces, key)
     else:
@@ -105,13 +105,9 @@ def _from_folder(
         require_fits(path)
         with as_spec_error(path, key):
             mesh = mi.load_dict({"type": path.suffix.lower().lstrip("."), "filename": str(path)})
-        if mesh.vertex_count() != count or not np.array_equal(_faces(mi, mesh), faces):
+        if mesh.vertex_count() != count or not np.array_equal(mesh_faces(mesh), faces):
             raise SpecError(f"its faces are not those of the mesh, which has {count} vertices and {len(faces)} faces",
                             file=path, key=key)  # fmt: skip
-        found[number] = np.array(mi.traverse(mesh)["vertex_positions"]).reshape(-1, 3)
+        found[number] = mesh_vertices(mesh)
     assert spec.every_us is not None
     return spec.begin_us + spec.every_us * np.arange(len(names), dtype=np.float64), found
-
-
-def _faces(mi: MitsubaModule, mesh: MitsubaObject) -> NDArray:
-    return np.array(mi.traverse(mesh)["faces"]).reshape(-1, 3)

@@ -1,7 +1,7 @@
 """Everything that depends on Mitsuba's version or its global state, in one place.
 
-Mitsuba 3.10 renames mesh parameters and brings animated transforms: this module and `builder` contain all code that
-these changes affect.
+Mitsuba 3.10 renames the data of meshes: this module contains all code that this affects, and
+``tests/sources/render/test_mitsuba_names.py`` lists the names.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core import backend
+from hesim_render.core.child import interrupts_held
 from hesim_render.core.device_types import MitsubaModule, MitsubaObject
 from hesim_render.core.errors import SpecError
-from hesim_render.core.interrupts import interrupts_held
 from hesim_render.sources.render.scene.files import SceneFiles
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals, ordered_normals
 from hesim_render.spectral.spectrum import Spectrum
@@ -297,6 +297,21 @@ def make_mesh(
 def transform(mi: MitsubaModule, matrix: NDArray[np.float64] | Sequence[Sequence[float]]) -> MitsubaObject:
     """A 4×4 matrix as Mitsuba's scalar transform."""
     return mi.ScalarTransform4f(np.asarray(matrix, dtype=np.float64))
+
+
+def mesh_vertices(mesh: MitsubaObject) -> NDArray[np.float64]:
+    """Places of a mesh's vertices, [vertex, 3]."""
+    return np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+
+
+def mesh_faces(mesh: MitsubaObject) -> NDArray[np.int64]:
+    """Numbers of the vertices of a mesh's triangles, [face, 3]."""
+    return np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+
+
+def can_move(parameters: MitsubaObject, prefix: str) -> bool:
+    """Whether a shape of a loaded scene has a pose that can be set."""
+    return f"{prefix}.vertex_positions" in parameters or f"{prefix}.to_world" in parameters
 
 
 class Movable:

@@ -15,9 +15,9 @@ from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.pictures import picture_texture
 from hesim_render.sources.render.scene.plugins import HONOURED, REFUSED
 from hesim_render.sources.render.scene.sizes import require_fits
+from hesim_render.specs.reflectance import TextureSpec
 from hesim_render.specs.scene import ObjectSpec, SceneSpec
 from hesim_render.specs.spectrum import SpectrumSpec
-from hesim_render.specs.surface import TextureSpec
 from hesim_render.spectral.spectrum import Spectrum
 from hesim_render.targets.image import read_picture
 

@@ -28,6 +28,7 @@ from hesim_render.core.device_types import (
     UInt32,
     Vector3,
 )
+from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.intersections import meets_ball, to_ball, to_face
 
 #: Largest number of faces and balls that are tested one by one: paths of four segments among 3, 6, 12, 24, 48 faces
@@ -65,8 +66,8 @@ def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
     """
     if not shape.is_mesh() or shape.face_count() > 2 * _MOST or shape.face_count() % 2:
         return []
-    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    triangles = np.array(shape.faces_buffer(), np.int64).reshape(-1, 2, 3)
+    vertices = mesh_vertices(shape)
+    triangles = mesh_faces(shape).reshape(-1, 2, 3)
     known = _at_corners(mi, shape)
     found = []
     for number, (first, second) in enumerate(triangles):

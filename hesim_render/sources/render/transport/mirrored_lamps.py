@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hesim_render.core.device_types import Float, Mask, MitsubaModule, MitsubaObject, Point2, Point3, Vector3
+from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 
 #: Part of the directions that is drawn from all images together. In a scene with floor, mirror and three other objects
 #: 0.03 to 0.1 had the same noise within a tenth, 0.3 had more.
@@ -156,13 +157,11 @@ def _mirror(mi: MitsubaModule, shape: MitsubaObject) -> tuple[NDArray[np.float64
     others = (mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null)
     if any(mi.has_flag(bsdf.flags(), flag) for flag in others):
         return None
-    parameters = mi.traverse(shape)
-    if "vertex_positions" in parameters:
-        points = np.array(parameters["vertex_positions"], np.float64).reshape(-1, 3)
-        faces = np.array(parameters["faces"], np.int64).reshape(-1, 3)
+    if shape.is_mesh():
+        points, faces = mesh_vertices(shape), mesh_faces(shape)
         normal = np.cross(points[faces[0, 1]] - points[faces[0, 0]], points[faces[0, 2]] - points[faces[0, 0]])
     elif shape.class_name() in ("Rectangle", "Disk"):
-        matrix = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
+        matrix = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
         points, normal = matrix[None, :3, 3], np.cross(matrix[:3, 0], matrix[:3, 1])
     else:
         return None

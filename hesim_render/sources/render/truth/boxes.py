@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from hesim_render.core.device_types import MitsubaObject
-from hesim_render.sources.render.scene.mitsuba_version import box_corners
+from hesim_render.sources.render.scene.mitsuba_version import box_corners, mesh_vertices
 from hesim_render.sources.render.truth.chief_rays import ChiefRays
 from hesim_render.sources.render.truth.poses import PoseTable, inverse
 from hesim_render.sources.render.truth.raster import Raster
@@ -108,7 +108,7 @@ def _points_of(shape: MitsubaObject, low: NDArray[np.float64], high: NDArray[np.
     """Points whose hull is that of a shape, [n, 3]: vertices of a mesh, else corners of its box."""
     if not shape.is_mesh():
         return box_corners(low, high)
-    return np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return mesh_vertices(shape)
 
 
 def _outline(middle: NDArray[np.float64], radius: float) -> NDArray[np.float64]:

@@ -1,0 +1,61 @@
+"""Identifiers have the words of the field: those below have a better one (`docs/glossary.md`)."""
+
+import io
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "hesim_render"
+#: Words of everyday speech, and of what the literature calls diffuse, occluded or illuminated.
+FORBIDDEN = re.compile(r"(?:^|_)(told|found|great|huge|closer|lit|unlit|hidden|matt)(?:_|$)")
+#: Names that are not ours to choose, or that files have.
+ALLOWED = {
+    "found_events": "key of recording.json",
+    "hidden": "argument of typer: an option that only --help-all shows",
+    **dict.fromkeys(("PackageNotFoundError", "FileNotFoundError"), "of Python"),
+    **dict.fromkeys(
+        ("lit", "is_lit", "lit_", "unlit", "long_lit", "spatial_lit", "darkest_lit", "lit_freedom", "lit_exposures_us",
+         "lit_ms", "lit_us", "LIT_EXPOSURES_US"),
+        "captures with light: aps_lit.npz, and keys of sets of pairs and of Mitsuba scenes",
+    ),
+}  # fmt: skip
+#: Packages and modules in which the words are still to be replaced; this list only becomes shorter.
+LEFT = (
+    "sources/render", "calibrate/recordings/still.py", "calibrate/recordings/target.py", "benchmark/tonic_dataset.py",
+    "recording/box_export.py", "recording/label_file.py", "recording/writer.py", "cli/simulate.py",
+    "pixels/evs/model.py", "pixels/evs/events.py",
+)  # fmt: skip
+FILES = [
+    path.relative_to(PACKAGE).as_posix()
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if not path.relative_to(PACKAGE).as_posix().startswith(LEFT)
+]
+
+
+def parts(identifier):
+    """``LastFound`` and ``last_found`` alike, in lower case."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", identifier).lower()
+
+
+@pytest.mark.parametrize(("name", "is_forbidden"), [
+    ("found", True), ("_found_pixels", True), ("LastFound", True), ("foundation", False), ("matte", False),
+    ("split", False), ("told_once", True),
+])  # fmt: skip
+def test_a_word_is_a_whole_part_of_a_name(name, is_forbidden):
+    assert bool(FORBIDDEN.search(parts(name))) == is_forbidden
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_identifiers_have_the_words_of_the_field(name):
+    text = (PACKAGE / name).read_text(encoding="utf-8")
+    names = {
+        token.string for token in tokenize.generate_tokens(io.StringIO(text).readline) if token.type == tokenize.NAME
+    }
+    assert {each for each in names if FORBIDDEN.search(parts(each))} <= set(ALLOWED)
+
+
+def test_what_is_left_is_there():
+    for name in LEFT:
+        assert (PACKAGE / name).exists(), name
