@@ -24,7 +24,8 @@ from hesim_render.recording.capture_set import read_captures
 
 def findings(section):
     """What the report says of the checks of a section, HTML."""
-    return str(_environment().get_template("calibrate/report/parts.html").module.told(findings_of(section))).strip()
+    parts = _environment().get_template("calibrate/report/parts.html").module
+    return str(parts.findings_list(findings_of(section))).strip()
 
 
 def frames_of(folder, report=None, **keys):

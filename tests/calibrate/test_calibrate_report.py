@@ -36,7 +36,7 @@ def test_sections_stand_side_by_side(both):
         maps = read_maps(folder / "c.yaml", section)
         for name, key in data[section]["maps"].items():
             assert name in ("file", "sha256") or key in maps
-    assert read_maps(folder / "c.yaml", "aps")["n_dp"].shape == (64, 64)
+    assert read_maps(folder / "c.yaml", "aps")["n_dp"].shape == (56, 72)
     assert {what for what, _ in told} >= {"reading aps_dark.npz", "reading aps_lit.npz", "fitting", "done"}
     assert all(0 <= done <= 1 for _, done in told)
     calibrate_aps(folder / "set", folder / "c.yaml")

@@ -217,6 +217,8 @@ def test_the_sensor_file_simulates_what_was_captured(written, tmp_path):
     assert (sensor.rows, sensor.cols, spec.bit_depth) == (36, 52, 12)
     assert spec.system_gain_dn_per_e == pytest.approx(result.gain.slope, rel=1e-6)
     assert spec.row_noise_dn == pytest.approx(CAMERA.row_noise, rel=0.2)
+    percent = read_calibration(calibration)["aps"]["prnu_percent"]["value"]
+    assert spec.prnu_rel == pytest.approx(percent / 100, rel=1e-6)
     maps = read_maps(calibration, "aps")
     offset = sensor.aps.fixed_pattern.offset_dn
     expected = spec.black_level_dn + maps["n_row"][:, None] + maps["n_blc"]

@@ -41,7 +41,7 @@ def test_event_truth_is_the_mean_of_both_halves_and_half_of_their_difference():
 def test_a_run_is_too_long_beyond_its_limit_in_minutes():
     estimate = Estimate(seconds=150.0, peak_bytes=2e8, rays=3e6)
     require_short(estimate, 2.5, "less")
-    with pytest.raises(TooLongError, match=r"more than 2.49 min has to be wanted: .*, or ask for less: fewer pixels"):
+    with pytest.raises(TooLongError, match=r"more than 2.49 min must be allowed: .*, or ask for less: fewer pixels"):
         require_short(estimate, 2.49, "fewer pixels")
 
 

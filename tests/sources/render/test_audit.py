@@ -307,6 +307,8 @@ def test_crossings_start_anew_at_each_event_of_the_reference():
     # one step late is alike; not rising at all is not
     late = [0, 0, 0.1, 0.21, 0.3, 0.41, 0.5]
     assert crossings(late, rising)["missed"] == 0
+    early = crossings([0, 0.21, 0.1, 0.1, 0.1, 0.1, 0.1], [0, 0.1, 0.21, 0.21, 0.21, 0.21, 0.21])
+    assert (early["missed"], early["extra"]) == (0, 0)
     assert crossings([0] * 7, rising)["missed"] == 2
     assert crossings([0, 0.3, 0, 0, 0, 0, 0], [0] * 7)["extra"] == 1
 
