@@ -199,11 +199,11 @@ def _distances(truth: EventStatistics | str, made: EventStatistics | str) -> dic
         if isinstance(one, str):
             return {"distances": {}, "loses": None, "no_distances": f"{whose}: {one}"}
     assert not isinstance(truth, str) and not isinstance(made, str)
-    found = event_distances(truth, made)
+    result = event_distances(truth, made)
     return {
         "distances": {one.name: {"value": one.value, "interval_95": list(one.interval_95), "within": one.within,
-                                 "differs": one.differs} for one in found},
-        "loses": [one.name for one in found if one.differs],
+                                 "differs": one.differs} for one in result},
+        "loses": [one.name for one in result if one.differs],
     }  # fmt: skip
 
 
@@ -256,9 +256,9 @@ def _distance_lines(rows: list[dict[str, Any]]) -> list[str]:
         return []
     lines = ["| distance from the true events | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for row in rows:
-        found = row.get("distances") or {}
+        result = row.get("distances") or {}
         cells = [
-            f"{found[name]['value']:.3g}{'*' if found[name]['differs'] else ''}" if found else "–" for name in names
+            f"{result[name]['value']:.3g}{'*' if result[name]['differs'] else ''}" if result else "–" for name in names
         ]
         lines.append(f"| {row['peer']} | {' | '.join(cells)} |")
     lines += ["", "*: more than parts of the true events differ from one another", ""]

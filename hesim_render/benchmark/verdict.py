@@ -43,7 +43,7 @@ def verdicts(scores: Sequence[Score], ticked: Collection[str] = ()) -> list[str]
     scores : of clips and their items.
     ticked : clips whose event pixels compare at fixed ticks.
     """
-    found = []
+    result = []
     for task, (nothing, measure, way) in NOTHING.items():
         own = [score for score in scores if score.task == task]
         idle = _values(own, nothing, measure)
@@ -68,8 +68,8 @@ def verdicts(scores: Sequence[Score], ticked: Collection[str] = ()) -> list[str]
                     f"; {of_ticks} of the items are of pixels with a fixed tick, whose events do not say by how much "
                     "the light changed"
                 )
-            found.append(text)
-    return found
+            result.append(text)
+    return result
 
 
 def _values(scores: Sequence[Score], method: str, measure: str) -> dict[tuple[str, int], float]:

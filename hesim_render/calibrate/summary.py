@@ -38,7 +38,7 @@ def summary_lines(calibration: Mapping[str, Any], section: str) -> list[str]:
     """
     content = calibration[section]
     names = _APS if section == "aps" else _EVS
-    truth = (calibration["capture"].get("truth") or {}).get(section, {})
+    truth = (calibration.get("capture", {}).get("truth") or {}).get(section, {})
     lines = [_line(text, content[key]) + _beside(content[key], truth.get(key)) for key, text in names.items()
              if key in content]  # fmt: skip
     lines += [_line(f"noise at {item['signal_dn']:.4g} DN", item) for item in content.get("noise", [])]

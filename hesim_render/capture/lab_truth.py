@@ -27,12 +27,12 @@ def truth_of(bench: Bench, longest_us: float) -> dict[str, dict[str, float]]:
     bench : of the session, whose noise terms may be off.
     longest_us : longest exposure of the lit frames, µs.
     """
-    found = {}
+    result = {}
     if bench.aps is not None:
-        found["aps"] = _frames(bench.aps, longest_us)
+        result["aps"] = _frames(bench.aps, longest_us)
     if bench.evs is not None:
-        found["evs"] = _events(bench.evs)
-    return found
+        result["evs"] = _events(bench.evs)
+    return result
 
 
 def _frames(aps: ApsNoise, longest_us: float) -> dict[str, float]:
@@ -42,7 +42,7 @@ def _frames(aps: ApsNoise, longest_us: float) -> dict[str, float]:
         return {"K": gain}
     span_e = (aps.full_scale_dn - spec.black_level_dn) / gain
     dark_e_per_s = 0.0 if "dark_current" in off else spec.dark_current_now_e_per_s
-    found = {
+    result = {
         "K": gain,
         "dark_current_e_per_s": dark_e_per_s,
         "dsnu_e": 0.0 if "dsnu" in off else spec.dsnu_e,
@@ -52,33 +52,33 @@ def _frames(aps: ApsNoise, longest_us: float) -> dict[str, float]:
     # the capacity that is found is that for light: dark current takes a part of it
     full_e = min(spec.full_well_e, span_e)
     if spec.nonlinearity is None and dark_e_per_s * longest_us * S_PER_US < _DARK_PART * full_e:
-        found["full_well_e"] = full_e
+        result["full_well_e"] = full_e
     if not (aps.interference or aps.column_noise_dn or aps.row_noise_dn):
         read = 0.0 if "read" in off else spec.read_noise_e
-        found["read_noise_e"] = math.hypot(read, 0.0 if "residual" in off else spec.residual_noise_dn / gain)
-    return found
+        result["read_noise_e"] = math.hypot(read, 0.0 if "residual" in off else spec.residual_noise_dn / gain)
+    return result
 
 
 def _events(evs: EvsNoise) -> dict[str, float]:
     spec, off = evs.spec, evs.off
     theta_on, theta_off = spec.contrast_threshold_on, spec.contrast_threshold_off
-    found = {
+    result = {
         "theta_on": theta_on, "theta_off": theta_off,
         "threshold_mismatch": 0.0 if "mismatch" in off else spec.threshold_mismatch_std,
     }  # fmt: skip
     if spec.leak is None:
         rate_hz = 0.0 if "leak" in off else spec.leak_rate_hz
-        found["leak_rate_hz"] = rate_hz
+        result["leak_rate_hz"] = rate_hz
         if spec.tick_us is not None:
-            found["leak_per_trial"] = -math.expm1(-rate_hz * spec.tick_us * S_PER_US)
+            result["leak_per_trial"] = -math.expm1(-rate_hz * spec.tick_us * S_PER_US)
     if spec.reference == "last_event":
         if spec.photoreceptor is None or not spec.photoreceptor.filters_noise:
-            found["photoreceptor_cutoff_hz"] = float(spec.photoreceptor_cutoff_hz or 0.0)
-        return found
+            result["photoreceptor_cutoff_hz"] = float(spec.photoreceptor_cutoff_hz or 0.0)
+        return result
     every = {(c.beta1, c.beta2, c.beta3, c.beta4, c.beta5) for c in spec.coefficients}
     if len(every) == 1 and not off & {"shot", "dark_current"}:
         beta1, beta2, beta3, beta4, beta5 = every.pop()
         if beta4 > 0:
             beta0 = float(np.mean([theta_on, theta_off])) / (spec.threshold_hardware_v or 1.0)
-            found |= {"A": beta0 * beta1 / beta4, "B": beta0 * beta2 / beta4, "C": beta3 / beta4, "D": beta5}
-    return found
+            result |= {"A": beta0 * beta1 / beta4, "B": beta0 * beta2 / beta4, "C": beta3 / beta4, "D": beta5}
+    return result

@@ -39,14 +39,16 @@ def report(
     shape = parse_size(size)
     console = Console(json_, quiet)
     with console.progress("report") as move:
-        found = make_report(
+        result = make_report(
             captures, out, size=shape, seed=seed, overwrite=overwrite,
             progress=lambda what, part: move(part, 1.0, what),
         )  # fmt: skip
     lines = []
-    tables = [] if found.events is None else event_tables(found.events)[:1]
-    for table in [*tables, *([] if found.frames is None else frame_tables(found.frames)[:1])]:
+    tables = [] if result.events is None else event_tables(result.events)[:1]
+    for table in [*tables, *([] if result.frames is None else frame_tables(result.frames)[:1])]:
         lines += [f"{name:<34} {value:>10}  {between:<24} {unit}" for name, value, between, unit, *_ in table.rows]
-    files = {kind: found.folder / f"report.{kind}" for kind in ("html", "pdf", "json")}
+    files = {kind: result.folder / f"report.{kind}" for kind in ("html", "pdf", "json")}
     lines.append(f"in {out}: {', '.join(file.name for file in files.values())}")
-    console.result("\n".join(line.rstrip() for line in lines), {"report": found.folder, "pages": found.pages, **files})
+    console.result(
+        "\n".join(line.rstrip() for line in lines), {"report": result.folder, "pages": result.pages, **files}
+    )

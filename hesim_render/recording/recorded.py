@@ -168,20 +168,20 @@ class Recorded:
         else:
             first = int(np.searchsorted(self.events["t_us"], begin_us, side="left"))
             events = self.event_slice(begin_us, end_us)
-        part, found = slice(first, first + events.size), np.empty(events.size, LABELLED_DTYPE)
+        part, result = slice(first, first + events.size), np.empty(events.size, LABELLED_DTYPE)
         for name in EVENT_DTYPE.names or ():
-            found[name] = events[name]
+            result[name] = events[name]
         if path is not None and (path / LABEL_FILE).is_file():
-            found["cause"] = read_causes(path, count, part)
+            result["cause"] = read_causes(path, count, part)
         elif self._labels is not None:
-            found["cause"] = self._labels.label[part]
+            result["cause"] = self._labels.label[part]
         else:
             raise SpecError("events have no labels; simulate with --truth events (truth='events')", file=path)
         if path is not None and self.has_event_objects:
-            found["object"] = read_objects(path, count, part)
+            result["object"] = read_objects(path, count, part)
         else:
-            found["object"] = self.truth.objects_at(events["t_us"], events["x"], events["y"])
-        return found
+            result["object"] = self.truth.objects_at(events["t_us"], events["x"], events["y"])
+        return result
 
     @cached_property
     def truth(self) -> SceneTruth:

@@ -128,7 +128,7 @@ class EventBench:
         jumps_us, rises = self._jumps(steps, stream)
         window_us = int(np.diff(jumps_us).min())
         require_memory(_BYTES_PER_RESPONSE * rises.size * self.pixels, f"{rises.size} jumps", self.path(steps.file))
-        found = np.zeros((rises.size, self.pixels), np.int32)
+        outcome = np.zeros((rises.size, self.pixels), np.int32)
         for events in stream:
             number = np.searchsorted(jumps_us, events["t_us"], side="left") - 1
             after_us = events["t_us"] - jumps_us[np.maximum(number, 0)]
@@ -136,9 +136,9 @@ class EventBench:
             kept = np.flatnonzero((number >= 0) & (after_us <= window_us) & right)
             pixel = events["y"][kept].astype(np.int64) * self.shape[1] + events["x"][kept]
             place, first = np.unique(number[kept] * self.pixels + pixel, return_index=True)
-            new = found.flat[place] == 0
-            found.flat[place[new]] = after_us[kept][first][new]
-        return Responses(steps, rises, found, window_us)
+            new = outcome.flat[place] == 0
+            outcome.flat[place[new]] = after_us[kept][first][new]
+        return Responses(steps, rises, outcome, window_us)
 
     def _jumps(self, steps: LightSteps, stream: EventStream) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Times of the jumps, and whether the light rises; only those that a whole window follows."""

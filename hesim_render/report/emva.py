@@ -64,27 +64,27 @@ def _of_both(entries: dict[str, dict[str, Any]], result: PairCalibration) -> dic
     well, noise, efficiency, k = (
         entries[name] for name in ("full_well_e", "temporal_dark_noise_e", "quantum_efficiency", "K")
     )
-    found: dict[str, dict[str, Any]] = {}
+    outcome: dict[str, dict[str, Any]] = {}
     if well["value"] is None:
-        found["snr_max"] = not_identifiable(well["reason"])
+        outcome["snr_max"] = not_identifiable(well["reason"])
     else:
         ratio = well["standard_error"] / well["value"]
-        found["snr_max"] = estimated(10 * np.log10(well["value"]), 10 / np.log(10) * ratio, "dB")
+        outcome["snr_max"] = estimated(10 * np.log10(well["value"]), 10 / np.log(10) * ratio, "dB")
     # σ_d of the standard has the ADC in it: σ_d² of ours and σ_q²/K²
     dark = float(np.hypot(noise["value"], np.sqrt(1 / 12) / k["value"]))
     error = noise["value"] / dark * noise["standard_error"]
-    found["threshold_e"] = estimated(dark + 0.5, error, "e-")
+    outcome["threshold_e"] = estimated(dark + 0.5, error, "e-")
     if efficiency["value"] is None:
-        found["threshold_photons"] = not_identifiable(efficiency["reason"])
+        outcome["threshold_photons"] = not_identifiable(efficiency["reason"])
     else:
         photons = (dark + 0.5) / efficiency["value"]
         relative = float(np.hypot(error / (dark + 0.5), efficiency["standard_error"] / efficiency["value"]))
-        found["threshold_photons"] = estimated(photons, photons * relative, "photons")
+        outcome["threshold_photons"] = estimated(photons, photons * relative, "photons")
     if well["value"] is None:
-        found["dynamic_range"] = not_identifiable(well["reason"])
+        outcome["dynamic_range"] = not_identifiable(well["reason"])
     else:
         relative = float(np.hypot(error / (dark + 0.5), ratio))
-        found["dynamic_range"] = estimated(
+        outcome["dynamic_range"] = estimated(
             20 * np.log10(well["value"] / (dark + 0.5)), 20 / np.log(10) * relative, "dB"
         )
-    return found
+    return outcome

@@ -91,40 +91,40 @@ def event_figures(bench: EventBench, progress: Callable[[str, float], None] | No
     SpecError
         If a recording cannot be read, or has no events.
     """
-    told = progress or (lambda what, part: None)
-    found = EventFigures(bench)
-    told("read recordings", 0.05)
+    stated = progress or (lambda what, part: None)
+    outcome = EventFigures(bench)
+    stated("read recordings", 0.05)
     hot, dead = _hot(bench), _dead(bench)
     good = ~(hot | dead[0] | dead[1])
-    told("S-curves", 0.3)
+    stated("S-curves", 0.3)
     for light in _lights(bench):
         pair = s_curve(light, 0, good), s_curve(light, 1, good)
-        found.curves.append(pair)
-        _add_curves(found, pair, light)
-    told("latency", 0.5)
-    _add_latencies(found, good)
-    told("dynamic range", 0.6)
-    _add_ranges(found, good)
-    told("background", 0.7)
-    _add_background(found)
-    told("bandwidth", 0.8)
-    found.band = bandwidth(bench, good)
-    if found.band is None:
+        outcome.curves.append(pair)
+        _add_curves(outcome, pair, light)
+    stated("latency", 0.5)
+    _add_latencies(outcome, good)
+    stated("dynamic range", 0.6)
+    _add_ranges(outcome, good)
+    stated("background", 0.7)
+    _add_background(outcome)
+    stated("bandwidth", 0.8)
+    outcome.band = bandwidth(bench, good)
+    if outcome.band is None:
         entry, lux = not_identifiable("no recordings of modulated light"), None
     else:
-        entry, lux = found.band.entry, found.band.lux
-    found.entries.append(
+        entry, lux = outcome.band.entry, outcome.band.lux
+    outcome.entries.append(
         Entry("bandwidth", "ON", entry, lux, None, bench.spec.temperature_c, int(np.count_nonzero(good)))
     )
-    told("short intervals", 0.9)
-    _add_times(found)
-    _add_defects(found, hot, dead)
+    stated("short intervals", 0.9)
+    _add_times(outcome)
+    _add_defects(outcome, hot, dead)
     if any(not one.reset for one in bench.spec.steps) and not _has_ticks(bench):
-        found.findings.append(
+        outcome.findings.append(
             "not all pixels were reset right before each jump: a pixel compares with the level of its last event, up "
             "to a threshold away, which widens S-curves and latencies"
         )
-    return found
+    return outcome
 
 
 def _hot(bench: EventBench) -> NDArray[np.bool_]:
@@ -157,11 +157,11 @@ def _temperature(bench: EventBench, every: list[Responses]) -> float | None:
     return stated.pop() if len(stated) == 1 else None
 
 
-def _add_curves(found: EventFigures, pair: tuple[SCurve, SCurve], light: list[Responses]) -> None:
+def _add_curves(outcome: EventFigures, pair: tuple[SCurve, SCurve], light: list[Responses]) -> None:
     for curve, name in zip(pair, POLARITIES, strict=True):
         for key, value in curve.entries.items():
-            found.entries.append(
-                Entry(key, name, value, curve.lux, None, _temperature(found.bench, light), curve.pixels)
+            outcome.entries.append(
+                Entry(key, name, value, curve.lux, None, _temperature(outcome.bench, light), curve.pixels)
             )
 
 
@@ -175,35 +175,35 @@ def _of_size(bench: EventBench, size: float) -> list[Responses]:
     return [nearest[lux] for lux in sorted(nearest)]
 
 
-def _add_latencies(found: EventFigures, good: NDArray[np.bool_]) -> None:
+def _add_latencies(outcome: EventFigures, good: NDArray[np.bool_]) -> None:
     """At the size of steps that the most lights have, the largest of them."""
-    bench = found.bench
+    bench = outcome.bench
     sizes = sorted({one.size for one in bench.responses})
     if not sizes:
         nothing = not_identifiable("no recordings of steps")
-        found.entries += [Entry(key, "ON", nothing, None, None, None, 0) for key in ("latency", "jitter")]
+        outcome.entries += [Entry(key, "ON", nothing, None, None, None, 0) for key in ("latency", "jitter")]
         return
     best = max(sizes, key=lambda size: (len(_of_size(bench, size)), size))
     for polarity, name in enumerate(POLARITIES):
         for one in _of_size(bench, best):
             answer = answers(one, polarity, good, bench.temperature_c(one.steps))
-            found.latencies[polarity].append(answer)
+            outcome.latencies[polarity].append(answer)
             for key, value in (("latency", answer.latency), ("jitter", answer.jitter)):
-                found.entries.append(
+                outcome.entries.append(
                     Entry(key, name, value, answer.lux, answer.contrast, answer.temperature_c, answer.pixels)
                 )
 
 
-def _add_ranges(found: EventFigures, good: NDArray[np.bool_]) -> None:
-    bench = found.bench
+def _add_ranges(outcome: EventFigures, good: NDArray[np.bool_]) -> None:
+    bench = outcome.bench
     ranges: list[DynamicRange | None] = []
     pixels = int(np.count_nonzero(good))
     keys = ("least_light", "most_light", "dynamic_range")
     for polarity, name in enumerate(POLARITIES):
-        theta = found.curves[0][polarity].theta if found.curves else float("nan")
+        theta = outcome.curves[0][polarity].theta if outcome.curves else float("nan")
         if not np.isfinite(theta):
             nothing = not_identifiable("the threshold is not known")
-            found.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
+            outcome.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
             ranges.append(None)
             continue
         every, false = [], []
@@ -214,7 +214,7 @@ def _add_ranges(found: EventFigures, good: NDArray[np.bool_]) -> None:
                 every.append(answers(one, polarity, good, bench.temperature_c(one.steps)))
                 false.append(float(chance))
             else:
-                found.findings.append(
+                outcome.findings.append(
                     f"{one.steps.file}: no steady recording of {one.steps.lux:g} lx that is at least as long as "
                     "the time between two jumps; what chance finds is not known, and this light is left out of the "
                     "dynamic range"
@@ -223,11 +223,11 @@ def _add_ranges(found: EventFigures, good: NDArray[np.bool_]) -> None:
         ranges.append(one_range)
         values = one_range.least_lux, one_range.most_lux, one_range.range_db
         contrast = float(np.expm1(2 * theta))
-        found.entries += [
+        outcome.entries += [
             Entry(key, name, value, None, contrast, bench.spec.temperature_c, pixels)
             for key, value in zip(keys, values, strict=True)
         ]
-    found.ranges = ranges[0], ranges[1]
+    outcome.ranges = ranges[0], ranges[1]
 
 
 def _steady(bench: EventBench, lux: float) -> Steady | None:
@@ -236,44 +236,44 @@ def _steady(bench: EventBench, lux: float) -> Steady | None:
     return min(near, key=lambda one: float(abs(np.log(one.lux / lux)))) if near else None
 
 
-def _add_background(found: EventFigures) -> None:
-    found.backgrounds = background(found.bench)
-    for one in found.backgrounds:
+def _add_background(outcome: EventFigures) -> None:
+    outcome.backgrounds = background(outcome.bench)
+    for one in outcome.backgrounds:
         for name, value in zip(POLARITIES, one.rates, strict=True):
-            found.entries.append(Entry("background", name, value, one.lux, None, one.temperature_c, one.pixels))
+            outcome.entries.append(Entry("background", name, value, one.lux, None, one.temperature_c, one.pixels))
         if one.finding:
-            found.findings.append(one.finding)
+            outcome.findings.append(one.finding)
     for polarity, name in enumerate(POLARITIES):
-        value = doubling(found.backgrounds, polarity)
-        found.entries.append(Entry("doubling", name, value, None, None, None, found.bench.pixels))
+        value = doubling(outcome.backgrounds, polarity)
+        outcome.entries.append(Entry("doubling", name, value, None, None, None, outcome.bench.pixels))
 
 
-def _add_times(found: EventFigures) -> None:
+def _add_times(outcome: EventFigures) -> None:
     """Dead time and read-out limit, from all recordings."""
-    bench = found.bench
+    bench = outcome.bench
     tallies = [bench.tally(name) for name in bench.names]
-    found.intervals = np.sum([one.intervals for one in tallies], axis=0)
+    outcome.intervals = np.sum([one.intervals for one in tallies], axis=0)
     limit, _ = readout_limit(tallies)
     for key, value in (("dead_time", dead_time(tallies)), ("readout_limit", limit)):
-        found.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
+        outcome.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
 
 
 def _add_defects(
-    found: EventFigures, hot: NDArray[np.bool_], dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+    outcome: EventFigures, hot: NDArray[np.bool_], dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 ) -> None:
-    bench = found.bench
+    bench = outcome.bench
     if len(bench.spec.steady) > 1:
         value = still.share(int(np.count_nonzero(hot)), bench.pixels)
     else:
         value = not_identifiable("it takes two steady recordings")
-    found.entries.append(Entry("hot", "", value, None, None, bench.spec.temperature_c, bench.pixels))
+    outcome.entries.append(Entry("hot", "", value, None, None, bench.spec.temperature_c, bench.pixels))
     for name, mask in zip(POLARITIES, dead, strict=True):
         value = (
             still.share(int(np.count_nonzero(mask)), bench.pixels)
             if bench.responses
             else not_identifiable("no recordings of steps")
         )
-        found.entries.append(Entry("dead", name, value, None, None, bench.spec.temperature_c, bench.pixels))
+        outcome.entries.append(Entry("dead", name, value, None, None, bench.spec.temperature_c, bench.pixels))
 
 
 def _has_ticks(bench: EventBench) -> bool:

@@ -17,7 +17,7 @@ from hesim_render.report.latency import Answers
 from hesim_render.specs.event_bench import Modulation, Steady
 
 #: Share of steps of 2θ that must be found.
-FOUND = 0.9
+DETECTED = 0.9
 #: Decibels of a factor e of light, 20·log₁₀.
 _DB = 20 / np.log(10)
 #: Windows of steady light that are looked at.
@@ -59,30 +59,30 @@ def false_share(bench: EventBench, steady: Steady, window_us: int, polarity: int
     return float(seen.reshape(windows, -1)[:, good].mean())
 
 
-def dynamic_range(found: list[Answers], false: list[float]) -> DynamicRange:
+def dynamic_range(outcome: list[Answers], false: list[float]) -> DynamicRange:
     """Lowest and highest light at which steps of two thresholds are found 90 of 100 times.
 
     Parameters
     ----------
-    found : answers to steps of two thresholds, in order of light.
+    outcome : answers to steps of two thresholds, in order of light.
     false : of each, the share that chance finds in the same time.
     """
-    lux = np.array([one.lux for one in found])
-    share = np.array([corrected(one.share, chance) for one, chance in zip(found, false, strict=True)])
-    error = np.array([one.error / max(1 - chance, 1e-9) for one, chance in zip(found, false, strict=True)])
+    lux = np.array([one.lux for one in outcome])
+    share = np.array([corrected(one.share, chance) for one, chance in zip(outcome, false, strict=True)])
+    error = np.array([one.error / max(1 - chance, 1e-9) for one, chance in zip(outcome, false, strict=True)])
     nothing = not_identifiable("no steps of two thresholds at two lights or more")
     if lux.size < 2:
         return DynamicRange(lux, share, error, nothing, nothing, nothing)
-    good = share >= FOUND
+    good = share >= DETECTED
     if not good.any():
-        nothing = not_identifiable(f"at no light are {100 * FOUND:g} % found; at most {100 * share.max():.3g} %")
+        nothing = not_identifiable(f"at no light are {100 * DETECTED:g} % found; at most {100 * share.max():.3g} %")
         return DynamicRange(lux, share, error, nothing, nothing, nothing)
     first, last = int(np.argmax(good)), int(lux.size - 1 - np.argmax(good[::-1]))
-    count = min(one.count * one.pixels for one in found)
+    count = min(one.count * one.pixels for one in outcome)
     log = np.log(lux)
-    low = crossing(log[: first + 1], share[: first + 1], error[: first + 1], FOUND, count)
+    low = crossing(log[: first + 1], share[: first + 1], error[: first + 1], DETECTED, count)
     back = slice(last, None)
-    high = crossing(-log[back][::-1], share[back][::-1], error[back][::-1], FOUND, count)
+    high = crossing(-log[back][::-1], share[back][::-1], error[back][::-1], DETECTED, count)
     least = _end(low, lux[first], 1, "at most")
     most = _end(high, lux[last], -1, "at least")
     if low is not None and high is not None:
@@ -177,8 +177,8 @@ def _half(part: list[tuple[float, NDArray[np.float64]]], k: int) -> float:
     x, share = np.log([swing for swing, _ in part]), np.array([values[k] for _, values in part])
     if not np.isfinite(share).all():
         return float("nan")
-    found = crossing(x, share, np.zeros(x.size), 0.5, 1e4)
-    return float("nan") if found is None else float(np.exp(found[0]))
+    outcome = crossing(x, share, np.zeros(x.size), 0.5, 1e4)
+    return float("nan") if outcome is None else float(np.exp(outcome[0]))
 
 
 def _corner(log_hz: NDArray[np.float64], log_swing: NDArray[np.float64]) -> float:

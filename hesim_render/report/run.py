@@ -80,7 +80,7 @@ def make_report(
     OutputError
         If `out` exists or cannot be written.
     """
-    told = progress or (lambda what, part: None)
+    stated = progress or (lambda what, part: None)
     if not captures:
         raise RangeError("captures", list(captures), "a sensor, or folders of captures")
     if not 0 <= seed < 2**63:
@@ -97,7 +97,7 @@ def make_report(
 
                 bench_folder, frame_folder, name = simulate_captures(
                     captures[0], folder.path / EVENT_CAPTURES, folder.path / FRAME_CAPTURES, size, seed,
-                    lambda what, part: told(what, 0.7 * part),
+                    lambda what, part: stated(what, 0.7 * part),
                 )  # fmt: skip
             begin = 0.7 if simulated else 0.0
             bench = None if bench_folder is None else EventBench(bench_folder)
@@ -107,8 +107,8 @@ def make_report(
                     frame_folder = bench.path(bench.spec.frames)
             events = None
             if bench is not None and bench.names:
-                events = event_figures(bench, lambda what, part: told(what, begin + (0.9 - begin) * part))
-            told("frames", 0.9)
+                events = event_figures(bench, lambda what, part: stated(what, begin + (0.9 - begin) * part))
+            stated("frames", 0.9)
             frames = None
             if frame_folder is not None:
                 try:
@@ -126,7 +126,7 @@ def make_report(
 
 def _sorted(folders: Sequence[Path]) -> tuple[Path | None, Path | None]:
     """The folder with recordings of events, and that with frames."""
-    found: dict[str, Path] = {}
+    outcome: dict[str, Path] = {}
     for folder in folders:
         if not folder.exists():
             raise SpecError("no such folder, and no sensor is to be given beside captures", file=folder)
@@ -136,10 +136,10 @@ def _sorted(folders: Sequence[Path]) -> tuple[Path | None, Path | None]:
                 f"holds neither {BENCH_NAME} (recordings of event pixels) nor captures of EMVA 1288 (frames)",
                 file=folder,
             )
-        if kind in found:
-            raise SpecError(f"is a second folder of {kind}, beside {found[kind]}", file=folder)
-        found[kind] = folder
-    return found.get("events"), found.get("frames")
+        if kind in outcome:
+            raise SpecError(f"is a second folder of {kind}, beside {outcome[kind]}", file=folder)
+        outcome[kind] = folder
+    return outcome.get("events"), outcome.get("frames")
 
 
 def _write(folder: Path, name: str, events: EventFigures | None, frames: FrameFigures | None) -> int:

@@ -219,9 +219,9 @@ class _Fit:
             def cost(moved: NDArray[np.float64], start: NDArray[np.float64] = start) -> float:
                 return -self.total(start + scale * moved) / float(pixels)
 
-            found = optimize.minimize(cost, np.zeros(4), method="L-BFGS-B", bounds=limits, options={"ftol": 1e-11})
-            if found.fun < least:
-                best, least = start + scale * found.x, found.fun
+            outcome = optimize.minimize(cost, np.zeros(4), method="L-BFGS-B", bounds=limits, options={"ftol": 1e-11})
+            if outcome.fun < least:
+                best, least = start + scale * outcome.x, outcome.fun
         return best, self._covariance(best, np.array([0.05 * width, 0.05, 0.1, 0.1]))
 
     def _covariance(self, values: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ from hesim_render.pixels.evs.events import no_events
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.report.bench import BENCH_NAME, EventBench
 from hesim_render.report.latency import answers
-from hesim_render.report.limits import FOUND
+from hesim_render.report.limits import DETECTED
 from hesim_render.report.s_curves import s_curve
 from hesim_render.sensor.from_data_sheet import electrons_per_s_lux
 from hesim_render.sensor.sensor import Sensor
@@ -63,7 +63,7 @@ class Instrument:
     """
 
     def __init__(self, sensor: Sensor, folder: Path, seed: int, progress: Callable[[str, float], None]) -> None:
-        self._noise, self._folder, self._seed, self._told = sensor.evs, folder, seed, progress
+        self._noise, self._folder, self._seed, self._stated = sensor.evs, folder, seed, progress
         spec, layout = sensor.spec, sensor.layout
         evs = self._noise.spec
         sheet = evs.data_sheet or evs.v2e
@@ -95,7 +95,7 @@ class Instrument:
         """Record everything, and write ``bench.yaml``."""
         evs = self._noise.spec
         theta = (evs.contrast_threshold_on + evs.contrast_threshold_off) / 2
-        self._told("S-curves", 0.02)
+        self._stated("S-curves", 0.02)
         for part in _COARSE:
             self._steps(REFERENCE_LUX, max(part, 0.02) * theta, _COARSE_PERIODS)
         for low, centre, high in self._coarse_curves():
@@ -109,9 +109,9 @@ class Instrument:
         if max(pairs) < 1.02 * min(pairs):
             pairs = [float(np.mean(pairs))]
         self._lights(pairs)
-        self._told("bandwidth", 0.8)
+        self._stated("bandwidth", 0.8)
         self._modulations(theta)
-        self._told("busy light", 0.95)
+        self._stated("busy light", 0.95)
         self._content["busy"] += [self._strobe(theta), self._rapid(theta)]
         self._write()
         return self._folder
@@ -119,30 +119,30 @@ class Instrument:
     def _lights(self, pairs: list[float]) -> None:
         """Steady light and steps of two thresholds, from the reference to both ends."""
         for k, lux in enumerate((REFERENCE_LUX, *_BRIGHTER)):
-            self._told(f"{lux:g} lx", 0.2 + 0.03 * k)
+            self._stated(f"{lux:g} lx", 0.2 + 0.03 * k)
             self._one_light(lux, pairs)
         for k, lux in enumerate(_DARKER):
             if self._half_us(lux) > _LONGEST_US:
                 break
-            self._told(f"{lux:g} lx", 0.3 + 0.05 * k)
-            if self._one_light(lux, pairs) < FOUND / 2:
+            self._stated(f"{lux:g} lx", 0.3 + 0.05 * k)
+            if self._one_light(lux, pairs) < DETECTED / 2:
                 break
 
     def _one_light(self, lux: float, pairs: list[float]) -> float:
         """The smallest share of steps that are found."""
         half_us = self._half_us(lux)
-        found = []
+        outcome = []
         for size in pairs:
             self._steps(lux, size, _PERIODS)
             bench = self._written()
             one = bench.answers_to(bench.spec.steps[-1])
             everything = np.ones(bench.pixels, np.bool_)
-            found += [answers(one, polarity, everything, None).share for polarity in (0, 1)]
+            outcome += [answers(one, polarity, everything, None).share for polarity in (0, 1)]
         length_us = max(_STEADY_US, _STEADY_PERIODS * half_us)
         events = self._run([(0, lux), (length_us, lux)])
         name = self._save(events, f"steady-{lux:g}lx")
         self._content["steady"].append({"file": name, "lux": lux, "interval_us": [0, length_us]})
-        return min(found)
+        return min(outcome)
 
     def _coarse_curves(self) -> list[tuple[float, ...]]:
         """Sizes at which 20, 50 and 80 % of the steps are answered so far, of rises and of falls."""

@@ -40,20 +40,20 @@ class Background:
 
 def background(bench: EventBench) -> list[Background]:
     """Background of each recording of steady light, in order of temperature and light."""
-    found = []
+    outcome = []
     for one in bench.spec.steady:
         tally = bench.tally(one.file)
         rates = still.group_rates(tally)
         seconds = tally.pixels * tally.seconds
         entries = _rate(still.rate(rates, 0), seconds), _rate(still.rate(rates, 1), seconds)
         problem = still.not_still(tally)
-        found.append(
+        outcome.append(
             Background(
                 one.lux, bench.temperature_c(one), tally.seconds, entries, tally.pixels,
                 None if problem is None else f"{one.file}: {problem}",
             )
         )  # fmt: skip
-    return sorted(found, key=lambda one: (one.temperature_c or 0.0, one.lux))
+    return sorted(outcome, key=lambda one: (one.temperature_c or 0.0, one.lux))
 
 
 def _rate(entry: dict[str, Any], seconds: float) -> dict[str, Any]:
@@ -64,21 +64,21 @@ def _rate(entry: dict[str, Any], seconds: float) -> dict[str, Any]:
     return entry | {"interval_95": [max(low, 0.0), high]}
 
 
-def doubling(found: list[Background], polarity: int) -> dict[str, Any]:
+def doubling(outcome: list[Background], polarity: int) -> dict[str, Any]:
     """Rise of temperature that doubles the background, °C, at the light with the largest range of temperatures.
 
     A line through the logarithms of the rates, weighted by their errors.
     """
     best: list[Background] = []
     widest = _SAME_C
-    for lux in sorted({one.lux for one in found}):
-        here = [one for one in found if one.lux == lux and one.temperature_c is not None]
+    for lux in sorted({one.lux for one in outcome}):
+        here = [one for one in outcome if one.lux == lux and one.temperature_c is not None]
         if here and (width := np.ptp([one.temperature_c or 0.0 for one in here])) > widest:
             best, widest = here, float(width)
     if not best:
-        stated = sorted({one.temperature_c for one in found if one.temperature_c is not None})
-        told = f"all recordings are at {stated[0]:g} °C" if stated else "no temperature is stated"
-        return not_identifiable(f"{told}; two at one light are needed")
+        known = sorted({one.temperature_c for one in outcome if one.temperature_c is not None})
+        stated = f"all recordings are at {known[0]:g} °C" if known else "no temperature is stated"
+        return not_identifiable(f"{stated}; two at one light are needed")
     rates = [one.rates[polarity] for one in best]
     if any(not rate.get("standard_error") or rate["value"] <= 0 for rate in rates):
         return not_identifiable("a recording has no event of this polarity")

@@ -17,10 +17,10 @@ _ALIKE = 0.05
 
 def grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
     """The rows by the values of some columns, in the order in which these first occur."""
-    found: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
+    result: dict[tuple[Cell, ...], list[dict[str, Cell]]] = {}
     for row in rows:
-        found.setdefault(tuple(row[name] for name in keys), []).append(row)
-    return [(values, Table(group)) for values, group in found.items()]
+        result.setdefault(tuple(row[name] for name in keys), []).append(row)
+    return [(values, Table(group)) for values, group in result.items()]
 
 
 def levels_of(rows: Table) -> list[str]:
@@ -73,13 +73,13 @@ def ranking(table: Table) -> list[str]:
         return []
     own = [name for name in _OWN if name in table.columns and len({row[name] for row in table}) > 1]
     levels = levels_of(table)
-    found = []
+    result = []
     for outer, group in grouped(table, ("surfaces", "illuminant")):
         for values, some in grouped(group, levels):
             sentence = _sentence(some, own)
             if sentence:
-                found.append(f"{', '.join(map(str, outer))}, {level_name(levels, values)}: {sentence}")
-    return found
+                result.append(f"{', '.join(map(str, outer))}, {level_name(levels, values)}: {sentence}")
+    return result
 
 
 def _sentence(rows: Table, own: Sequence[str]) -> str | None:

@@ -27,7 +27,9 @@ def flux(pixel):
 
 def fits(window, pixel, **changed):
     """Fits of the true lines, [k]."""
-    angle, offset = (np.array(v) for v in zip(*(line(CENTRE[w], p) for w, p in zip(window, pixel, strict=True)), strict=True))
+    angle, offset = (
+        np.array(v) for v in zip(*(line(CENTRE[w], p) for w, p in zip(window, pixel, strict=True)), strict=True)
+    )
     count = len(window)
     fit = EdgeFit(*(np.asarray(v, np.float32) for v in (
         np.cos(angle), np.sin(angle), offset, np.full(count, 0.004), LOW[pixel], HIGH[pixel], np.zeros(count),
