@@ -28,10 +28,9 @@ from hesim_render.cli.options import (
     listed,
     names_of,
 )
+from hesim_render.cli.pictures import write_framing, write_look
 from hesim_render.cli.terminal import split_overrides, summary
 from hesim_render.core.errors import ConflictError
-from hesim_render.core.guard import printable
-from hesim_render.core.output import free_place, replacing
 
 if TYPE_CHECKING:
     from hesim_render.recording.recording import Recording
@@ -147,9 +146,9 @@ def simulate(
         if sum((framing, look is not None, dry_run)) > 1:
             raise ConflictError("--framing", framing, "give one of --framing, --look and --dry-run")
         if look is not None:
-            _look(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite, look, duration)
+            write_look(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite, look, duration)
             return
-        _framing(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite)
+        write_framing(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite)
     elif kind is InputKind.scene:
         recording = _scene(
             console, given, sensor, out, scene_keys=keys, sensor_keys=sensor_keys, roi=roi,
@@ -281,82 +280,6 @@ def _again(
             loaded, out, given, progress=progress, on_estimate=console.estimated(progress), resume=True, **limits
         )
     show_recording(console, again)
-
-
-def _framing(
-    console: Console,
-    scene: str,
-    sensor: str,
-    out: Path,
-    scene_keys: dict[str, Any],
-    sensor_keys: dict[str, Any],
-    roi: str | None,
-    allow_outside: bool,
-    overwrite: bool,
-) -> None:
-    """Write the picture of ``--framing``."""
-    target = _picture_place(out, overwrite)
-    from PIL import Image
-
-    import hesim_render as hr
-    from hesim_render.sources.render.look import look
-
-    loaded = hr.load_scene(scene, scene_keys, allow_outside=allow_outside)
-    found = look(loaded, cropped(hr.load_sensor(sensor, sensor_keys), roi))
-    with replacing(target) as unfinished:
-        Image.fromarray(found.picture).save(unfinished, format="PNG")
-    for name, materials in found.materials.items():
-        console.text(f"materials of {name}:")
-        for material in materials:
-            console.text(f"  {printable(str(material))}")
-    console.result(
-        f"{found.target or 'the scene has no target'}\nframing in {target}",
-        {
-            "picture": target, "target": None if found.target is None else str(found.target),
-            "materials": {name: [str(one) for one in materials] for name, materials in found.materials.items()},
-        },
-    )  # fmt: skip
-
-
-def _look(
-    console: Console,
-    scene: str,
-    sensor: str,
-    out: Path,
-    scene_keys: dict[str, Any],
-    sensor_keys: dict[str, Any],
-    roi: str | None,
-    allow_outside: bool,
-    overwrite: bool,
-    look_s: float,
-    duration_s: float | None,
-) -> None:
-    """Write the picture of ``--look``, and print what moves."""
-    target = _picture_place(out, overwrite)
-    from hesim_render.capture.run_settings import RunSettings, whole_us
-    from hesim_render.core.units import US_PER_S
-    from hesim_render.describe import motion_figures, motion_lines, write_motion
-    from hesim_render.sensor.sensor import load_sensor
-    from hesim_render.sources.render.truth.motion_look import motion_look
-    from hesim_render.sources.scene import load_scene
-
-    duration_us = RunSettings().duration_us if duration_s is None else whole_us(duration_s)
-    with console.progress(f"look at {scene}"):
-        loaded = cropped(load_sensor(sensor, sensor_keys), roi)
-        found = motion_look(
-            load_scene(scene, scene_keys, allow_outside=allow_outside), loaded, look_s * US_PER_S, duration_us
-        )
-        write_motion(found, loaded, look_s * US_PER_S, target)
-    figures = motion_figures(found, loaded, duration_us)
-    text = "\n".join([*motion_lines(figures, loaded, duration_us), f"look in {target}"])
-    console.result(text, {"picture": target, **figures})
-
-
-def _picture_place(out: Path, overwrite: bool) -> Path:
-    """Place of a picture in place of a recording."""
-    target = out if out.suffix == ".png" else out.with_name(f"{out.name}.png")
-    free_place(target, overwrite)
-    return target
 
 
 def demo(

@@ -162,14 +162,27 @@ def test_a_plan_ends_at_the_first_window_after_the_run():
     """Two pixels; windows after the second are beyond the end."""
     rendered = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [1, 1]], bool)
     shape = rendered.shape
+    fitted = np.zeros(shape, bool)
     one = Plan(rendered, np.ones(shape, np.int16), rendered, *(np.ones(shape, np.float32) for _ in range(2)),
-               np.ones(shape, np.int16), Differences.none(*shape))  # fmt: skip
+               np.ones(shape, np.int16), Differences.none(*shape), fitted, ~rendered,
+               np.ones(shape, np.float32))  # fmt: skip
     cut = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [0, 0]], bool)
     np.testing.assert_array_equal(one.until(2).rendered, cut)
     np.testing.assert_array_equal(one.until(5).rendered, rendered)
     values = np.where(cut, [[2.0, 8.0], [0, 7], [0, 0], [8, 0], [0, 1], [0, 0]], 0).astype(np.float32)
     fill_in(values, cut, np.arange(6.0) * 3)
     np.testing.assert_allclose(values, [[2, 8], [4, 7], [6, 5], [8, 3], [0, 1], [0, 0]])
+    # the first window with a fit after the end is rendered as well
+    fitted[[3, 4, 5], [1, 1, 1]] = True
+    rendered[3, 1] = rendered[4, 0] = True
+    cut[[3, 4], [1, 1]] = True, False
+    np.testing.assert_array_equal(one.until(2).rendered, cut)
+    assert np.argwhere(one.until(2).fitted).tolist() == [[3, 1]]
+    fitted[3, 1] = False
+    cut[4, 1] = True
+    np.testing.assert_array_equal(one.until(2).rendered, cut)
+    without = one.without(np.array([3, 4]), np.array([0, 1])).rendered
+    assert not without[3, 0] and not without[4, 1] and without.sum() == rendered.sum() - 2
 
 
 def test_every_tuning_constant_says_its_unit_its_origin_and_what_it_is_for():

@@ -20,6 +20,7 @@ from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotF
 from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Closer, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
+from hesim_render.sources.render.transport import moving_scene
 
 UNIT, QUALITY = 40.0, 0.6
 WANTED = TUNING.difference_part * QUALITY * UNIT
@@ -178,6 +179,12 @@ def shadow_scene():
     )
 
 
+@pytest.fixture(autouse=True)
+def no_outlines(monkeypatch):
+    """Light whose noise differences are made for: nothing is known in closed form of what hides the sky."""
+    monkeypatch.setattr(moving_scene, "outlines_of", lambda scene: [])
+
+
 def test_differences_have_no_bias_and_the_error_that_is_stated():
     """Every pair as a difference that may be one, with few rays: nine seeds against the mean of 16 times 4096 rays.
 
@@ -211,8 +218,8 @@ def rays_without(scene, sensor):
     return source.counts.rays
 
 
-def test_a_look_at_every_fourth_instant_finds_what_all_looks_find():
-    """The same flux to the bit but at a few pairs, for fewer rays of the pilot."""
+def test_looks_that_halve_find_what_all_looks_find():
+    """The same flux to the bit but at a few pairs, which are no farther off than noise, for fewer rays of the pilot."""
     sensor = hr.load_sensor("davis346", {"evs.threshold_mismatch_std": 0.02}).crop(40, 24)
     found = []
     for stride in (1, TUNING.look_stride):
@@ -222,7 +229,9 @@ def test_a_look_at_every_fourth_instant_finds_what_all_looks_find():
         found.append((np.array([np.array(one.half_a) for one in samples]), source.counts.pilot_rays))
     (every, most), (some, fewer) = found
     assert np.ptp(every, axis=0).max() > 0.2 * every.max() and fewer < 0.7 * most
-    assert np.mean(every != some) < 4e-3
+    assert np.mean(every != some) < 0.05
+    unit = source.noise_unit(pixels, every, True)
+    assert np.sqrt(np.mean(((every - some) / unit) ** 2)) < 0.05
 
 
 class MadeUp:
@@ -264,7 +273,7 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces():
     row, col = np.indices((11, 11))
     busy = np.flatnonzero(((abs(row - 5) <= 2) & (abs(col - 5) <= 2)).ravel())
     looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]
-    assert sorted(tracer.traced) == sorted([*looks, *((window, site) for window in (5, 6, 7) for site in busy)])
+    assert sorted(tracer.traced) == sorted([*looks, *((window, site) for window in (5, 6) for site in busy)])
     # the ends are compared with the anchor, those between with the first window
     scatter, site = pilot.change.lit_scatter, np.arange(121)
     near_by = site != far

@@ -202,6 +202,7 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     gap = np.array([0.01, 0.02, -1, 0.03, -1, 0.01, 0.01, 0.01])
     fit = EdgeFit(*(v.astype(np.float32) for v in (
         np.ones(8), np.zeros(8), np.zeros(8), gap, np.full(8, 7.0), 7 + contrast, scatter, np.full(8, 20.0),
+        np.full(8, 128.0),
     )))  # fmt: skip
     tried = []
 

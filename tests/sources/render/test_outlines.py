@@ -133,7 +133,7 @@ def test_the_largest_outlines_count():
 
 
 def test_light_beside_a_moving_target_has_no_bias_and_little_noise():
-    """A turning plate hides a part of the sky from a wall: both estimators have one mean, and one has little scatter."""
+    """A turning plate hides a part of the sky from a wall: both estimators have one mean, one has little scatter."""
     sensor = hr.load_sensor("davis346").crop(90, 40, 190, 205)
     source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=3)
     tracer, index = source._tracer, source._index
