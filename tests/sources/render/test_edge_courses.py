@@ -132,3 +132,30 @@ def test_every_fourth_window_of_a_stretch_is_fitted(monkeypatch):
     assert np.flatnonzero(fitted[:, 0]).tolist() == [2, 8, 10, 17, 20]
     assert np.flatnonzero(fitted[:, 1]).tolist() == [0, 23]
     assert not fitted[:, 2].any()
+
+
+@pytest.mark.parametrize(("offsets", "is_followed"), [((-0.31, 0.27), True), ((-0.31, 0.56), False)])
+def test_wide_gaps_matter_where_the_share_bends(offsets, is_followed):
+    """A line along columns: its share is straight while it is inside of the pixel, and bends where it leaves."""
+    window, pixel = np.array([2, 7]), np.array([0, 0])
+    fit = fits(window, pixel, gap=0.03, normal_x=1, normal_y=0, offset=offsets)
+    pilot = np.full(PILOT.shape, np.nan, np.float32)
+    part = (CENTRE[2:8] - CENTRE[2]) / (CENTRE[7] - CENTRE[2])
+    share = np.minimum(0.5 + offsets[0] + part * (offsets[1] - offsets[0]), 1)
+    pilot[2:8, 0] = LOW[0] + (HIGH[0] - LOW[0]) * share
+    found = courses(window, pixel, fit, pilot, 1.0, WANTED[pixel], CENTRE, np.zeros(PILOT.shape, np.bool_))
+    assert found.window.tolist() == ([3, 4, 5, 6] if is_followed else [])
+
+
+def test_directions_are_joined_across_half_a_turn():
+    angle = np.array([np.pi - 0.03, np.pi + 0.04])
+    window, pixel = np.array([2, 7]), np.array([0, 0])
+    fit = fits(window, pixel, normal_x=np.cos(angle), normal_y=np.sin(angle), offset=[-0.2, 0.3])
+    part = (CENTRE - CENTRE[2]) / (CENTRE[7] - CENTRE[2])
+    middle = angle[0] + part * (angle[1] - angle[0])
+    share = coverage(np.cos(middle), np.sin(middle), -0.2 + 0.5 * part)
+    pilot = np.stack([LOW[0] + (HIGH[0] - LOW[0]) * share] * 2, axis=1).astype(np.float32)
+    found = courses(window, pixel, fit, pilot, 1.0, WANTED[pixel], CENTRE, np.zeros(PILOT.shape, np.bool_))
+    assert found.window.tolist() == [3, 4, 5, 6]
+    chord = pilot[2, 0] + part * (pilot[7, 0] - pilot[2, 0])
+    np.testing.assert_allclose(found.model, (pilot[:, 0] - chord)[3:7], atol=2.0)

@@ -110,7 +110,7 @@ def courses(
     order = np.lexsort((window, pixel))
     first, second = order[:-1], order[1:]
     both = (pixel[first] == pixel[second]) & (window[second] - window[first] <= _LONGEST)
-    both &= (window[second] - window[first] > 1) & fit.is_edge[first] & fit.is_edge[second]
+    both &= fit.is_edge[first] & fit.is_edge[second]
     first, second = first[both], second[both]
     # one edge: nearly the same direction and levels on both sides
     contrast = np.minimum(fit.high[first] - fit.low[first], fit.high[second] - fit.low[second])
