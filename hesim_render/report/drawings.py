@@ -27,28 +27,28 @@ _FEW_DECADES = 100.0
 _LONGEST_INTERVAL_US = 5000
 
 
-def event_drawings(outcome: EventFigures) -> list[Draw]:
+def event_drawings(figures: EventFigures) -> list[Draw]:
     """Drawings of event pixels, those that there are data for."""
     draws: list[Draw] = []
-    if outcome.curves:
-        draws.append(lambda axes: _s_curves(axes, outcome))
-    if outcome.latencies[0]:
-        draws += [lambda axes: _latency(axes, outcome), lambda axes: _outcome(axes, outcome)]
-    if outcome.backgrounds:
-        draws.append(lambda axes: _background(axes, outcome))
-    if outcome.band is not None:
-        draws.append(lambda axes: _band(axes, outcome))
-    if outcome.intervals.sum() > 0:
-        draws.append(lambda axes: _intervals(axes, outcome))
+    if figures.curves:
+        draws.append(lambda axes: _s_curves(axes, figures))
+    if figures.latencies[0]:
+        draws += [lambda axes: _latency(axes, figures), lambda axes: _detected(axes, figures)]
+    if figures.backgrounds:
+        draws.append(lambda axes: _background(axes, figures))
+    if figures.band is not None:
+        draws.append(lambda axes: _band(axes, figures))
+    if figures.intervals.sum() > 0:
+        draws.append(lambda axes: _intervals(axes, figures))
     return draws
 
 
-def frame_drawings(outcome: FrameFigures) -> list[Draw]:
+def frame_drawings(figures: FrameFigures) -> list[Draw]:
     """Drawings of frames: photon transfer, linearity, signal-to-noise ratio."""
     return [
-        lambda axes: _transfer(axes, outcome),
-        lambda axes: _linearity(axes, outcome),
-        lambda axes: _snr(axes, outcome),
+        lambda axes: _transfer(axes, figures),
+        lambda axes: _linearity(axes, figures),
+        lambda axes: _snr(axes, figures),
     ]
 
 
@@ -68,8 +68,8 @@ def _logarithmic(axes: Axes, *which: str) -> None:
             axis.set_minor_formatter("")
 
 
-def _s_curves(axes: Axes, outcome: EventFigures) -> None:
-    pair = outcome.curves[0]
+def _s_curves(axes: Axes, figures: EventFigures) -> None:
+    pair = figures.curves[0]
     axes.set(title=f"S-curves at {pair[0].lux:g} lx", xlabel="step, ln L₁/L₀", ylabel="share of steps answered")
     for curve, name, colour in zip(pair, POLARITIES, _ON_OFF, strict=True):
         points(axes, curve.size, curve.share, colour, name, 4.2)
@@ -100,10 +100,10 @@ def _bars(axes: Axes, lux: list[float], values: list[dict], colour: str, label: 
         )
 
 
-def _latency(axes: Axes, outcome: EventFigures) -> None:
-    contrast = outcome.latencies[0][0].contrast
+def _latency(axes: Axes, figures: EventFigures) -> None:
+    contrast = figures.latencies[0][0].contrast
     axes.set(title=f"Latency and jitter, contrast {100 * contrast:.3g} %", xlabel="illuminance, lx", ylabel="µs")
-    for every, name, colour in zip(outcome.latencies, POLARITIES, _ON_OFF, strict=True):
+    for every, name, colour in zip(figures.latencies, POLARITIES, _ON_OFF, strict=True):
         lux = [one.lux for one in every]
         _bars(axes, lux, [one.latency for one in every], colour, f"latency {name}")
         _bars(axes, lux, [one.jitter for one in every], colour, f"jitter {name}", "--")
@@ -116,11 +116,11 @@ def _legend(axes: Axes) -> None:
         axes.legend(frameon=False)
 
 
-def _outcome(axes: Axes, outcome: EventFigures) -> None:
+def _detected(axes: Axes, figures: EventFigures) -> None:
     axes.set(
         title="Steps of 2θ that are found", xlabel="illuminance, lx", ylabel="share, less chance", ylim=(-0.05, 1.05)
     )
-    for one, name, colour in zip(outcome.ranges, POLARITIES, _ON_OFF, strict=True):
+    for one, name, colour in zip(figures.ranges, POLARITIES, _ON_OFF, strict=True):
         if one is not None and one.lux.size:
             axes.errorbar(
                 one.lux, one.share, 1.96 * one.error, color=colour, marker="o", markersize=3.6, linewidth=1, label=name
@@ -130,12 +130,12 @@ def _outcome(axes: Axes, outcome: EventFigures) -> None:
     _legend(axes)
 
 
-def _background(axes: Axes, outcome: EventFigures) -> None:
+def _background(axes: Axes, figures: EventFigures) -> None:
     axes.set(title="Background", xlabel="illuminance, lx", ylabel="events per s and pixel")
-    stated = sorted({one.temperature_c for one in outcome.backgrounds if one.temperature_c is not None})
+    stated = sorted({one.temperature_c for one in figures.backgrounds if one.temperature_c is not None})
     each: list[float | None] = [*stated] or [None]
     for celsius in each:
-        every = [one for one in outcome.backgrounds if one.temperature_c == celsius]
+        every = [one for one in figures.backgrounds if one.temperature_c == celsius]
         about = "" if celsius is None or len(stated) == 1 else f", {celsius:g} °C"
         for k, (name, colour) in enumerate(zip(POLARITIES, _ON_OFF, strict=True)):
             _bars(axes, [one.lux for one in every], [one.rates[k] for one in every], colour, name + about)
@@ -143,8 +143,8 @@ def _background(axes: Axes, outcome: EventFigures) -> None:
     _legend(axes)
 
 
-def _band(axes: Axes, outcome: EventFigures) -> None:
-    band = outcome.band
+def _band(axes: Axes, figures: EventFigures) -> None:
+    band = figures.band
     assert band is not None
     axes.set(title="Swing for half of the cycles", xlabel="frequency, Hz", ylabel="ln L_max/L_min")
     there = np.isfinite(band.swing)
@@ -156,53 +156,53 @@ def _band(axes: Axes, outcome: EventFigures) -> None:
     _logarithmic(axes, "x", "y")
 
 
-def _intervals(axes: Axes, outcome: EventFigures) -> None:
+def _intervals(axes: Axes, figures: EventFigures) -> None:
     axes.set(title="Intervals of a pixel", xlabel="interval, µs", ylabel="number per µs")
-    counts = outcome.intervals[:-1]
+    counts = figures.intervals[:-1]
     edges = np.unique(np.round(np.geomspace(1, _LONGEST_INTERVAL_US, 60)).astype(int))
     edges = edges[edges < counts.size]
     total = np.append(0, np.cumsum(counts))
     density = np.diff(total[edges]) / np.diff(edges)
     axes.stairs(np.where(density > 0, density, np.nan), edges, fill=True, color=COLOURS[5], alpha=0.6)
-    dead = next(one.value for one in outcome.entries if one.key == "dead_time")
+    dead = next(one.value for one in figures.entries if one.key == "dead_time")
     if dead["value"] is not None:
         axes.axvline(dead["value"], color=COLOURS[1], linewidth=1)
     _logarithmic(axes, "x", "y")
 
 
-def _levels(outcome: FrameFigures) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], str]:
+def _levels(figures: FrameFigures) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], str]:
     """Light, signal and variance of the levels, and the name of the light."""
-    result = outcome.result
+    result = figures.result
     unit = "photons per pixel" if result.pairs.has_photons else "exposure, s"
     return light_of(result.pairs, result.lit), result.signal, result.lit.variance - result.dark.variance, unit
 
 
-def _transfer(axes: Axes, outcome: FrameFigures) -> None:
-    _, signal, variance, _ = _levels(outcome)
+def _transfer(axes: Axes, figures: FrameFigures) -> None:
+    _, signal, variance, _ = _levels(figures)
     axes.set(title="Photon transfer", xlabel="signal above the dark, DN", ylabel="variance above the dark, DN²")
     points(axes, signal, variance, COLOURS[0], "pairs", 4.2)
-    top = 0.7 * outcome.result.top_dn
-    axes.plot([0, top], [0, outcome.result.gain.slope * top], color=COLOURS[1], label="K, 0 to 70 % of saturation")
+    top = 0.7 * figures.result.top_dn
+    axes.plot([0, top], [0, figures.result.gain.slope * top], color=COLOURS[1], label="K, 0 to 70 % of saturation")
     axes.legend(frameon=False)
 
 
-def _linearity(axes: Axes, outcome: FrameFigures) -> None:
-    light, signal, _, unit = _levels(outcome)
+def _linearity(axes: Axes, figures: FrameFigures) -> None:
+    light, signal, _, unit = _levels(figures)
     axes.set(title="Signal", xlabel=unit, ylabel="signal above the dark, DN")
     points(axes, light, signal, COLOURS[0], "pairs", 4.2)
-    slope = outcome.result.responsivity.slope
+    slope = figures.result.responsivity.slope
     end = min(float(light.max()), float(signal.max()) / slope)
     axes.plot([0, end], [0, slope * end], color=COLOURS[1], label="responsivity")
     axes.legend(frameon=False)
 
 
-def _snr(axes: Axes, outcome: FrameFigures) -> None:
-    light, signal, _, unit = _levels(outcome)
-    snr = signal / np.sqrt(np.maximum(outcome.result.lit.variance, 1e-12))
-    some = (signal > 0) & outcome.result.clear
+def _snr(axes: Axes, figures: FrameFigures) -> None:
+    light, signal, _, unit = _levels(figures)
+    snr = signal / np.sqrt(np.maximum(figures.result.lit.variance, 1e-12))
+    some = (signal > 0) & figures.result.clear
     axes.set(title="Signal-to-noise ratio", xlabel=unit, ylabel="signal over temporal noise")
     points(axes, light[some], snr[some], COLOURS[0], "pairs", 4.2)
-    efficiency = outcome.entries["quantum_efficiency"]["value"]
+    efficiency = figures.entries["quantum_efficiency"]["value"]
     if efficiency is not None:
         line = np.geomspace(light[some].min(), light[some].max(), 60)
         axes.plot(line, np.sqrt(efficiency * line), color=COLOURS[6], linestyle="--", label="shot noise alone")

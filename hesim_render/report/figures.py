@@ -92,39 +92,39 @@ def event_figures(bench: EventBench, progress: Callable[[str, float], None] | No
         If a recording cannot be read, or has no events.
     """
     stated = progress or (lambda what, part: None)
-    outcome = EventFigures(bench)
+    figures = EventFigures(bench)
     stated("read recordings", 0.05)
     hot, dead = _hot(bench), _dead(bench)
     good = ~(hot | dead[0] | dead[1])
     stated("S-curves", 0.3)
     for light in _lights(bench):
         pair = s_curve(light, 0, good), s_curve(light, 1, good)
-        outcome.curves.append(pair)
-        _add_curves(outcome, pair, light)
+        figures.curves.append(pair)
+        _add_curves(figures, pair, light)
     stated("latency", 0.5)
-    _add_latencies(outcome, good)
+    _add_latencies(figures, good)
     stated("dynamic range", 0.6)
-    _add_ranges(outcome, good)
+    _add_ranges(figures, good)
     stated("background", 0.7)
-    _add_background(outcome)
+    _add_background(figures)
     stated("bandwidth", 0.8)
-    outcome.band = bandwidth(bench, good)
-    if outcome.band is None:
+    figures.band = bandwidth(bench, good)
+    if figures.band is None:
         entry, lux = not_identifiable("no recordings of modulated light"), None
     else:
-        entry, lux = outcome.band.entry, outcome.band.lux
-    outcome.entries.append(
+        entry, lux = figures.band.entry, figures.band.lux
+    figures.entries.append(
         Entry("bandwidth", "ON", entry, lux, None, bench.spec.temperature_c, int(np.count_nonzero(good)))
     )
     stated("short intervals", 0.9)
-    _add_times(outcome)
-    _add_defects(outcome, hot, dead)
+    _add_times(figures)
+    _add_defects(figures, hot, dead)
     if any(not one.reset for one in bench.spec.steps) and not _has_ticks(bench):
-        outcome.findings.append(
+        figures.findings.append(
             "not all pixels were reset right before each jump: a pixel compares with the level of its last event, up "
             "to a threshold away, which widens S-curves and latencies"
         )
-    return outcome
+    return figures
 
 
 def _hot(bench: EventBench) -> NDArray[np.bool_]:
@@ -157,11 +157,11 @@ def _temperature(bench: EventBench, every: list[Responses]) -> float | None:
     return stated.pop() if len(stated) == 1 else None
 
 
-def _add_curves(outcome: EventFigures, pair: tuple[SCurve, SCurve], light: list[Responses]) -> None:
+def _add_curves(figures: EventFigures, pair: tuple[SCurve, SCurve], light: list[Responses]) -> None:
     for curve, name in zip(pair, POLARITIES, strict=True):
         for key, value in curve.entries.items():
-            outcome.entries.append(
-                Entry(key, name, value, curve.lux, None, _temperature(outcome.bench, light), curve.pixels)
+            figures.entries.append(
+                Entry(key, name, value, curve.lux, None, _temperature(figures.bench, light), curve.pixels)
             )
 
 
@@ -175,35 +175,35 @@ def _of_size(bench: EventBench, size: float) -> list[Responses]:
     return [nearest[lux] for lux in sorted(nearest)]
 
 
-def _add_latencies(outcome: EventFigures, good: NDArray[np.bool_]) -> None:
+def _add_latencies(figures: EventFigures, good: NDArray[np.bool_]) -> None:
     """At the size of steps that the most lights have, the largest of them."""
-    bench = outcome.bench
+    bench = figures.bench
     sizes = sorted({one.size for one in bench.responses})
     if not sizes:
         nothing = not_identifiable("no recordings of steps")
-        outcome.entries += [Entry(key, "ON", nothing, None, None, None, 0) for key in ("latency", "jitter")]
+        figures.entries += [Entry(key, "ON", nothing, None, None, None, 0) for key in ("latency", "jitter")]
         return
     best = max(sizes, key=lambda size: (len(_of_size(bench, size)), size))
     for polarity, name in enumerate(POLARITIES):
         for one in _of_size(bench, best):
             answer = answers(one, polarity, good, bench.temperature_c(one.steps))
-            outcome.latencies[polarity].append(answer)
+            figures.latencies[polarity].append(answer)
             for key, value in (("latency", answer.latency), ("jitter", answer.jitter)):
-                outcome.entries.append(
+                figures.entries.append(
                     Entry(key, name, value, answer.lux, answer.contrast, answer.temperature_c, answer.pixels)
                 )
 
 
-def _add_ranges(outcome: EventFigures, good: NDArray[np.bool_]) -> None:
-    bench = outcome.bench
+def _add_ranges(figures: EventFigures, good: NDArray[np.bool_]) -> None:
+    bench = figures.bench
     ranges: list[DynamicRange | None] = []
     pixels = int(np.count_nonzero(good))
     keys = ("least_light", "most_light", "dynamic_range")
     for polarity, name in enumerate(POLARITIES):
-        theta = outcome.curves[0][polarity].theta if outcome.curves else float("nan")
+        theta = figures.curves[0][polarity].theta if figures.curves else float("nan")
         if not np.isfinite(theta):
             nothing = not_identifiable("the threshold is not known")
-            outcome.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
+            figures.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
             ranges.append(None)
             continue
         every, false = [], []
@@ -214,7 +214,7 @@ def _add_ranges(outcome: EventFigures, good: NDArray[np.bool_]) -> None:
                 every.append(answers(one, polarity, good, bench.temperature_c(one.steps)))
                 false.append(float(chance))
             else:
-                outcome.findings.append(
+                figures.findings.append(
                     f"{one.steps.file}: no steady recording of {one.steps.lux:g} lx that is at least as long as "
                     "the time between two jumps; what chance finds is not known, and this light is left out of the "
                     "dynamic range"
@@ -223,11 +223,11 @@ def _add_ranges(outcome: EventFigures, good: NDArray[np.bool_]) -> None:
         ranges.append(one_range)
         values = one_range.least_lux, one_range.most_lux, one_range.range_db
         contrast = float(np.expm1(2 * theta))
-        outcome.entries += [
+        figures.entries += [
             Entry(key, name, value, None, contrast, bench.spec.temperature_c, pixels)
             for key, value in zip(keys, values, strict=True)
         ]
-    outcome.ranges = ranges[0], ranges[1]
+    figures.ranges = ranges[0], ranges[1]
 
 
 def _steady(bench: EventBench, lux: float) -> Steady | None:
@@ -236,44 +236,44 @@ def _steady(bench: EventBench, lux: float) -> Steady | None:
     return min(near, key=lambda one: float(abs(np.log(one.lux / lux)))) if near else None
 
 
-def _add_background(outcome: EventFigures) -> None:
-    outcome.backgrounds = background(outcome.bench)
-    for one in outcome.backgrounds:
+def _add_background(figures: EventFigures) -> None:
+    figures.backgrounds = background(figures.bench)
+    for one in figures.backgrounds:
         for name, value in zip(POLARITIES, one.rates, strict=True):
-            outcome.entries.append(Entry("background", name, value, one.lux, None, one.temperature_c, one.pixels))
+            figures.entries.append(Entry("background", name, value, one.lux, None, one.temperature_c, one.pixels))
         if one.finding:
-            outcome.findings.append(one.finding)
+            figures.findings.append(one.finding)
     for polarity, name in enumerate(POLARITIES):
-        value = doubling(outcome.backgrounds, polarity)
-        outcome.entries.append(Entry("doubling", name, value, None, None, None, outcome.bench.pixels))
+        value = doubling(figures.backgrounds, polarity)
+        figures.entries.append(Entry("doubling", name, value, None, None, None, figures.bench.pixels))
 
 
-def _add_times(outcome: EventFigures) -> None:
+def _add_times(figures: EventFigures) -> None:
     """Dead time and read-out limit, from all recordings."""
-    bench = outcome.bench
+    bench = figures.bench
     tallies = [bench.tally(name) for name in bench.names]
-    outcome.intervals = np.sum([one.intervals for one in tallies], axis=0)
+    figures.intervals = np.sum([one.intervals for one in tallies], axis=0)
     limit, _ = readout_limit(tallies)
     for key, value in (("dead_time", dead_time(tallies)), ("readout_limit", limit)):
-        outcome.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
+        figures.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
 
 
 def _add_defects(
-    outcome: EventFigures, hot: NDArray[np.bool_], dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+    figures: EventFigures, hot: NDArray[np.bool_], dead: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 ) -> None:
-    bench = outcome.bench
+    bench = figures.bench
     if len(bench.spec.steady) > 1:
         value = still.share(int(np.count_nonzero(hot)), bench.pixels)
     else:
         value = not_identifiable("it takes two steady recordings")
-    outcome.entries.append(Entry("hot", "", value, None, None, bench.spec.temperature_c, bench.pixels))
+    figures.entries.append(Entry("hot", "", value, None, None, bench.spec.temperature_c, bench.pixels))
     for name, mask in zip(POLARITIES, dead, strict=True):
         value = (
             still.share(int(np.count_nonzero(mask)), bench.pixels)
             if bench.responses
             else not_identifiable("no recordings of steps")
         )
-        outcome.entries.append(Entry("dead", name, value, None, None, bench.spec.temperature_c, bench.pixels))
+        figures.entries.append(Entry("dead", name, value, None, None, bench.spec.temperature_c, bench.pixels))
 
 
 def _has_ticks(bench: EventBench) -> bool:

@@ -55,26 +55,26 @@ def answers(one: Responses, polarity: int, good: NDArray[np.bool_], temperature_
     temperature_c : of the sensor, if stated.
     """
     latency = one.of(polarity)[:, good].astype(np.float64)
-    outcome = latency > 0
-    everything = np.ones_like(outcome)
+    has_answer = latency > 0
+    everything = np.ones_like(has_answer)
     pixels = int(np.count_nonzero(good))
-    share = float(outcome.mean()) if outcome.size else 0.0
+    share = float(has_answer.mean()) if has_answer.size else 0.0
     about = one.steps.lux, one.steps.contrast, temperature_c, one.window_us
-    error = max(mean_error(outcome.astype(np.float64), everything), 1 / max(outcome.size, 1))
-    if np.count_nonzero(outcome) < _LEAST:
-        reason = not_identifiable(f"{np.count_nonzero(outcome)} answers; {_LEAST} are needed")
-        return Answers(*about, share, error, len(outcome), reason, reason, pixels)
-    median = whole_us(quantile(latency, outcome, 0.5))
-    return Answers(*about, share, error, len(outcome), median, _jitter(latency, outcome), pixels)
+    error = max(mean_error(has_answer.astype(np.float64), everything), 1 / max(has_answer.size, 1))
+    if np.count_nonzero(has_answer) < _LEAST:
+        reason = not_identifiable(f"{np.count_nonzero(has_answer)} answers; {_LEAST} are needed")
+        return Answers(*about, share, error, len(has_answer), reason, reason, pixels)
+    median = whole_us(quantile(latency, has_answer, 0.5))
+    return Answers(*about, share, error, len(has_answer), median, _jitter(latency, has_answer), pixels)
 
 
-def _jitter(latency: NDArray[np.float64], outcome: NDArray[np.bool_]) -> dict[str, Any]:
+def _jitter(latency: NDArray[np.float64], has_answer: NDArray[np.bool_]) -> dict[str, Any]:
     """Standard deviation of a normal law from the differences of successive latencies of a pixel."""
     pairs = len(latency) // 2
     if pairs == 0:
         return not_identifiable("one step; two are needed")
     first, second = latency[: 2 * pairs : 2], latency[1 : 2 * pairs : 2]
-    both = outcome[: 2 * pairs : 2] & outcome[1 : 2 * pairs : 2]
+    both = has_answer[: 2 * pairs : 2] & has_answer[1 : 2 * pairs : 2]
     if np.count_nonzero(both) < _LEAST:
         return not_identifiable(f"{np.count_nonzero(both)} pairs of answers; {_LEAST} are needed")
     return whole_us(quantile(np.abs(second - first), both, _ONE_SIGMA), np.sqrt(0.5))

@@ -59,17 +59,17 @@ def false_share(bench: EventBench, steady: Steady, window_us: int, polarity: int
     return float(seen.reshape(windows, -1)[:, good].mean())
 
 
-def dynamic_range(outcome: list[Answers], false: list[float]) -> DynamicRange:
+def dynamic_range(answers: list[Answers], false: list[float]) -> DynamicRange:
     """Lowest and highest light at which steps of two thresholds are found 90 of 100 times.
 
     Parameters
     ----------
-    outcome : answers to steps of two thresholds, in order of light.
+    answers : answers to steps of two thresholds, in order of light.
     false : of each, the share that chance finds in the same time.
     """
-    lux = np.array([one.lux for one in outcome])
-    share = np.array([corrected(one.share, chance) for one, chance in zip(outcome, false, strict=True)])
-    error = np.array([one.error / max(1 - chance, 1e-9) for one, chance in zip(outcome, false, strict=True)])
+    lux = np.array([one.lux for one in answers])
+    share = np.array([corrected(one.share, chance) for one, chance in zip(answers, false, strict=True)])
+    error = np.array([one.error / max(1 - chance, 1e-9) for one, chance in zip(answers, false, strict=True)])
     nothing = not_identifiable("no steps of two thresholds at two lights or more")
     if lux.size < 2:
         return DynamicRange(lux, share, error, nothing, nothing, nothing)
@@ -78,7 +78,7 @@ def dynamic_range(outcome: list[Answers], false: list[float]) -> DynamicRange:
         nothing = not_identifiable(f"at no light are {100 * DETECTED:g} % found; at most {100 * share.max():.3g} %")
         return DynamicRange(lux, share, error, nothing, nothing, nothing)
     first, last = int(np.argmax(good)), int(lux.size - 1 - np.argmax(good[::-1]))
-    count = min(one.count * one.pixels for one in outcome)
+    count = min(one.count * one.pixels for one in answers)
     log = np.log(lux)
     low = crossing(log[: first + 1], share[: first + 1], error[: first + 1], DETECTED, count)
     back = slice(last, None)
@@ -177,8 +177,8 @@ def _half(part: list[tuple[float, NDArray[np.float64]]], k: int) -> float:
     x, share = np.log([swing for swing, _ in part]), np.array([values[k] for _, values in part])
     if not np.isfinite(share).all():
         return float("nan")
-    outcome = crossing(x, share, np.zeros(x.size), 0.5, 1e4)
-    return float("nan") if outcome is None else float(np.exp(outcome[0]))
+    at = crossing(x, share, np.zeros(x.size), 0.5, 1e4)
+    return float("nan") if at is None else float(np.exp(at[0]))
 
 
 def _corner(log_hz: NDArray[np.float64], log_swing: NDArray[np.float64]) -> float:

@@ -63,7 +63,7 @@ class Instrument:
     """
 
     def __init__(self, sensor: Sensor, folder: Path, seed: int, progress: Callable[[str, float], None]) -> None:
-        self._noise, self._folder, self._seed, self._stated = sensor.evs, folder, seed, progress
+        self._noise, self._folder, self._seed, self._progress = sensor.evs, folder, seed, progress
         spec, layout = sensor.spec, sensor.layout
         evs = self._noise.spec
         sheet = evs.data_sheet or evs.v2e
@@ -95,7 +95,7 @@ class Instrument:
         """Record everything, and write ``bench.yaml``."""
         evs = self._noise.spec
         theta = (evs.contrast_threshold_on + evs.contrast_threshold_off) / 2
-        self._stated("S-curves", 0.02)
+        self._progress("S-curves", 0.02)
         for part in _COARSE:
             self._steps(REFERENCE_LUX, max(part, 0.02) * theta, _COARSE_PERIODS)
         for low, centre, high in self._coarse_curves():
@@ -109,9 +109,9 @@ class Instrument:
         if max(pairs) < 1.02 * min(pairs):
             pairs = [float(np.mean(pairs))]
         self._lights(pairs)
-        self._stated("bandwidth", 0.8)
+        self._progress("bandwidth", 0.8)
         self._modulations(theta)
-        self._stated("busy light", 0.95)
+        self._progress("busy light", 0.95)
         self._content["busy"] += [self._strobe(theta), self._rapid(theta)]
         self._write()
         return self._folder
@@ -119,12 +119,12 @@ class Instrument:
     def _lights(self, pairs: list[float]) -> None:
         """Steady light and steps of two thresholds, from the reference to both ends."""
         for k, lux in enumerate((REFERENCE_LUX, *_BRIGHTER)):
-            self._stated(f"{lux:g} lx", 0.2 + 0.03 * k)
+            self._progress(f"{lux:g} lx", 0.2 + 0.03 * k)
             self._one_light(lux, pairs)
         for k, lux in enumerate(_DARKER):
             if self._half_us(lux) > _LONGEST_US:
                 break
-            self._stated(f"{lux:g} lx", 0.3 + 0.05 * k)
+            self._progress(f"{lux:g} lx", 0.3 + 0.05 * k)
             if self._one_light(lux, pairs) < DETECTED / 2:
                 break
 

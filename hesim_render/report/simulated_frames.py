@@ -34,7 +34,7 @@ class FrameInstrument:
     """
 
     def __init__(self, sensor: Sensor, folder: Path, seed: int, progress: Callable[[str, float], None]) -> None:
-        self._sensor, self._folder, self._seed, self._stated = sensor, folder, seed, progress
+        self._sensor, self._folder, self._seed, self._progress = sensor, folder, seed, progress
         spec, self._noise = sensor.spec, sensor.aps
         efficiency = spec.quantum_efficiency.load()
         responses = {name: product(filter_.load(), efficiency) for name, filter_ in spec.filters.items()}
@@ -60,11 +60,11 @@ class FrameInstrument:
         per_us = _TOP * saturation_e / float(self._per_photon[row, col]) / _LONGEST_US
         exposures = [round(_LONGEST_US * (k + 1) / _LEVELS) for k in range(_LEVELS)]
         for k, exposure_us in enumerate(exposures):
-            self._stated("frames", k / (_LEVELS + 4))
+            self._progress("frames", k / (_LEVELS + 4))
             self._shoot(exposure_us, per_us * exposure_us, 2)
             self._shoot(exposure_us, 0.0, 2)
         middle_us = exposures[_LEVELS // 2 - 1] + 1
-        self._stated("series of frames", _LEVELS / (_LEVELS + 4))
+        self._progress("series of frames", _LEVELS / (_LEVELS + 4))
         self._shoot(middle_us, per_us * middle_us, _SERIES)
         self._shoot(middle_us, 0.0, _SERIES)
         notes = (

@@ -64,19 +64,19 @@ def _rate(entry: dict[str, Any], seconds: float) -> dict[str, Any]:
     return entry | {"interval_95": [max(low, 0.0), high]}
 
 
-def doubling(outcome: list[Background], polarity: int) -> dict[str, Any]:
+def doubling(backgrounds: list[Background], polarity: int) -> dict[str, Any]:
     """Rise of temperature that doubles the background, °C, at the light with the largest range of temperatures.
 
     A line through the logarithms of the rates, weighted by their errors.
     """
     best: list[Background] = []
     widest = _SAME_C
-    for lux in sorted({one.lux for one in outcome}):
-        here = [one for one in outcome if one.lux == lux and one.temperature_c is not None]
+    for lux in sorted({one.lux for one in backgrounds}):
+        here = [one for one in backgrounds if one.lux == lux and one.temperature_c is not None]
         if here and (width := np.ptp([one.temperature_c or 0.0 for one in here])) > widest:
             best, widest = here, float(width)
     if not best:
-        known = sorted({one.temperature_c for one in outcome if one.temperature_c is not None})
+        known = sorted({one.temperature_c for one in backgrounds if one.temperature_c is not None})
         stated = f"all recordings are at {known[0]:g} °C" if known else "no temperature is stated"
         return not_identifiable(f"{stated}; two at one light are needed")
     rates = [one.rates[polarity] for one in best]

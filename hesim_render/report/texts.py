@@ -59,35 +59,35 @@ def _light(lux: float | None, contrast: float | None, celsius: float | None) -> 
     return ", ".join(text for text in texts if text)
 
 
-def event_tables(outcome: EventFigures) -> list[ReportTable]:
+def event_tables(measured: EventFigures) -> list[ReportTable]:
     """Figures of event pixels, those against light, and definitions."""
     rows: list[tuple[str, ...]] = [
         (
             " ".join(text for text in (EVENTS[one.key].title, one.name) if text), *_value(one.value),
             _light(one.lux, one.contrast, one.temperature_c), str(one.pixels),
         )
-        for one in outcome.entries
+        for one in measured.entries
         if one.key not in _AGAINST_LIGHT or (one.value["value"] is None and one.lux is None)
     ]  # fmt: skip
     figures = ReportTable(
         "Event pixels", ("figure", "value", "95 % interval", "unit, or why not", "light", "pixels"), rows,
         (0.25, 0.1, 0.17, 0.25, 0.15, 0.08),
     )  # fmt: skip
-    return [figures, *_against_light(outcome), _definitions("What the figures of event pixels are", EVENTS)]
+    return [figures, *_against_light(measured), _definitions("What the figures of event pixels are", EVENTS)]
 
 
-def _against_light(outcome: EventFigures) -> list[ReportTable]:
+def _against_light(measured: EventFigures) -> list[ReportTable]:
     """One row a light (and temperature), with the interval of each value."""
     places = sorted(
-        {(one.temperature_c, one.lux) for one in outcome.latencies[0]}
-        | {(one.temperature_c, one.lux) for one in outcome.backgrounds},
+        {(one.temperature_c, one.lux) for one in measured.latencies[0]}
+        | {(one.temperature_c, one.lux) for one in measured.backgrounds},
         key=lambda place: (place[0] or 0.0, place[1]),
     )
     if not places:
         return []
     several = len({celsius for celsius, _ in places}) > 1
-    answers = [{(one.temperature_c, one.lux): one for one in every} for every in outcome.latencies]
-    steady = {(one.temperature_c, one.lux): one for one in outcome.backgrounds}
+    answers = [{(one.temperature_c, one.lux): one for one in every} for every in measured.latencies]
+    steady = {(one.temperature_c, one.lux): one for one in measured.backgrounds}
     rows = []
     for place in places:
         cells = [f"{place[1]:g}" + (f", {place[0]:g} °C" if several and place[0] is not None else "")]
@@ -96,9 +96,9 @@ def _against_light(outcome: EventFigures) -> list[ReportTable]:
         for k in (0, 1):
             one = answers[k].get(place)
             cells += ["", ""] if one is None else [_cell(one.latency), _cell(one.jitter)]
-        cells += [_share(one, place[1]) for one in outcome.ranges]
+        cells += [_share(one, place[1]) for one in measured.ranges]
         rows.append(tuple(cells))
-    contrast = f"{100 * outcome.latencies[0][0].contrast:.3g} %" if outcome.latencies[0] else ""
+    contrast = f"{100 * measured.latencies[0][0].contrast:.3g} %" if measured.latencies[0] else ""
     head = (
         "lx", *(f"background {name}, Hz" for name in POLARITIES),
         *(f"{what} {name}, µs" for name in POLARITIES for what in ("latency", "jitter")),
@@ -123,12 +123,12 @@ def _share(one: DynamicRange | None, lux: float) -> str:
     return f"{100 * one.share[k]:.4g} ± {196 * one.error[k]:.2g}"
 
 
-def frame_tables(outcome: FrameFigures) -> list[ReportTable]:
+def frame_tables(measured: FrameFigures) -> list[ReportTable]:
     """Figures of frames, and definitions."""
     rows: list[tuple[str, ...]] = [
-        (FRAMES[key].title, *_value(outcome.entries[key]), str(outcome.pixels))
+        (FRAMES[key].title, *_value(measured.entries[key]), str(measured.pixels))
         for key in FRAMES
-        if key in outcome.entries
+        if key in measured.entries
     ]
     figures = ReportTable(
         "Frames, by EMVA 1288 (Release 4.0 linear)", ("figure", "value", "95 % interval", "unit, or why not", "pixels"),

@@ -20,7 +20,7 @@ from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotF
 from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Closer, Pilot, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
-from hesim_render.sources.render.transport import moving_scene
+from hesim_render.sources.render.transport import outlines
 
 UNIT, QUALITY = 40.0, 0.6
 WANTED = TUNING.difference_part * QUALITY * UNIT
@@ -182,7 +182,7 @@ def shadow_scene():
 @pytest.fixture(autouse=True)
 def no_outlines(monkeypatch):
     """Light whose noise differences are made for: nothing is known in closed form of what hides the sky."""
-    monkeypatch.setattr(moving_scene, "outlines_of", lambda scene: [])
+    monkeypatch.setattr(outlines, "outlines_of", lambda scene: [])
 
 
 def test_differences_have_no_bias_and_the_error_that_is_stated():

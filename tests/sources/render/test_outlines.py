@@ -1,5 +1,7 @@
 """Flat outlines that hide a part of a uniform sky: closed forms against rays that are intersected in NumPy."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from hesim_render.core.rng import Stream
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba
+from hesim_render.sources.render.transport import outlines
 from hesim_render.sources.render.transport.outlines import Outline, Screen, largest, outlines_of
 
 #: A skew quadrilateral in a tilted plane.
@@ -65,21 +68,21 @@ def test_the_share_is_that_of_rays(point, normal):
 def test_a_closed_body_hides_its_silhouette_once():
     low, high = np.array([-0.4, -0.3, 0.2]), np.array([0.5, 0.1, 0.9])
     body = mitsuba().load_dict({"type": "cube", "to_world": box_transform(low, high)})
-    outlines = outlines_of(mitsuba().load_dict({"type": "scene", "body": body}))
-    assert len(outlines) == 6 and all(face.one_sided for face in outlines)
+    faces = outlines_of(mitsuba().load_dict({"type": "scene", "body": body}))
+    assert len(faces) == 6 and all(face.one_sided for face in faces)
     rng = np.random.default_rng(3)
     for point, normal in (((1.1, 0.4, -0.2), (-0.6, 0.2, 0.77)), ((0.1, -0.9, 0.6), (0.3, 0.9, 0.31))):
         point, normal = np.array(point), np.array(normal) / np.linalg.norm(normal)
         along = directions(normal, 40_000, rng)
         t = np.sort(np.stack([(low - point) / along, (high - point) / along]), axis=0)
         inside = (t[0].max(axis=1) <= t[1].min(axis=1)) & (t[1].min(axis=1) > 0)
-        share, count = hides(outlines, np.tile(point, (40_000, 1)), np.tile(normal, (40_000, 1)), along)
+        share, count = hides(faces, np.tile(point, (40_000, 1)), np.tile(normal, (40_000, 1)), along)
         assert np.mean(count != inside) < 3e-4
         assert inside.mean() > 0.02 and share[0] == pytest.approx(inside.mean(), abs=0.01)
     # from its own faces, and from within, it hides nothing
     own = np.array([[0.05, -0.1, 0.9], [0.5, 0.02, 0.44], [0.1, -0.1, 0.5]])
     up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    share, count = hides(outlines, own, up, up)
+    share, count = hides(faces, own, up, up)
     np.testing.assert_allclose(share, 0, atol=1e-5)
     np.testing.assert_array_equal(count, 0)
 
@@ -128,8 +131,29 @@ def test_only_flat_and_filled_shapes_have_an_outline():
 def test_the_largest_outlines_count():
     squares = [Outline(size * QUAD, one_sided=False) for size in np.linspace(0.5, 2.7, 12)]
     kept = largest([squares[::2], squares[1::2]])
-    assert sorted(each.area_m2 for part in kept for each in part) == [each.area_m2 for each in squares[4:]]
-    assert kept[0] == squares[4::2] and kept[1] == squares[5::2]
+    areas = [sorted(each.area_m2 for each in part) for part in kept]
+    assert areas == [[each.area_m2 for each in squares[4::2]], [each.area_m2 for each in squares[5::2]]]
+    # of equal ones there are no more
+    alike = [Outline(0.7 * QUAD + 0.1 * number, one_sided=False) for number in range(11)]
+    assert largest([alike[:3], alike[3:]]) == [alike[:3], alike[3:8]]
+
+
+def test_meshes_of_many_triangles_take_little_memory(monkeypatch):
+    """A bumpy surface of 20,000 vertices, whose square matrix would take 3 GB; and a limit for larger ones."""
+    x, y = np.meshgrid(np.linspace(-0.7, 1.3, 200), np.linspace(0.2, 1.1, 100))
+    corners = np.stack([x.ravel(), y.ravel(), 0.1 * np.sin(9 * x * y).ravel()], axis=1)
+    first = (np.arange(99)[:, None] * 200 + np.arange(199)).ravel()
+    faces = np.concatenate(
+        [np.stack([first, first + 1, first + 201], 1), np.stack([first, first + 201, first + 200], 1)]
+    )
+    tracemalloc.start()
+    assert outlines_of(mesh(corners, faces)) == []
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
+    flat = mesh(corners * [1, 1, 0], faces)
+    assert len(outlines_of(flat)) == 1
+    monkeypatch.setattr(outlines, "_MOST_TRIANGLES", len(faces) - 1)
+    assert outlines_of(flat) == []
 
 
 def test_light_beside_a_moving_target_has_no_bias_and_little_noise():

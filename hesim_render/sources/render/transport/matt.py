@@ -10,7 +10,7 @@ tabulated, e_k is a closed form, and rays estimate the visibility alone. A point
 irradiance (E[r] = e_k) and is visible or not (v = 1 or 0). This gives two unbiased estimators of e_k·V_k; `lit` uses
 e_k as a control variate:
 
-    lit     e_k − (1 − v)·r     no noise where the whole light is visible
+    lit     e_k − (1 − v)·r     no noise where the whole light is visible, or `outlines` hide the sky
     hidden  v·r                 no noise where the whole light is hidden
 
 Each pair of a pixel and a window uses the estimator that its pilot pass found less noisy.
@@ -42,6 +42,7 @@ from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
 from hesim_render.sources.render.transport.moving_scene import MovingScene
+from hesim_render.sources.render.transport.outlines import HiddenSky
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product, summed
@@ -99,6 +100,7 @@ class MattIntegrator:
             irradiances.append(sky)
             strengths.append(sky.scaled(1 / pi))
         self._has_sky = bool(skies)
+        self._outlines = HiddenSky(scene) if skies else None
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
@@ -201,9 +203,9 @@ class MattIntegrator:
                 asks,
             )
             known = open_
-            if isinstance(light, _Sky) and scene.outlines:
+            if self._outlines is not None and self._outlines.is_known and isinstance(light, _Sky):
                 # a share of the sky that is known to be hidden, and whether it hides this ray
-                part, hides = scene.hidden_sky(surface.world.p, normal, shadow.d, moment, asks)
+                part, hides = self._outlines.hides(surface.world.p, normal, shadow.d, moment)
                 known = open_ - part + hides
             lit = dr.fma(scale, dr.select(blocked, known - share, known), lit)
             hidden = dr.fma(scale, dr.select(blocked, 0.0, share), hidden)

@@ -25,7 +25,6 @@ from hesim_render.core.device_types import (
     Mask,
     MitsubaModule,
     MitsubaObject,
-    Point3,
     Ray,
     UInt32,
     Vector3,
@@ -38,7 +37,6 @@ from hesim_render.sources.render.transport.closed_form import Part, surface_of
 from hesim_render.sources.render.transport.many_objects import Fleet
 from hesim_render.sources.render.transport.motion_bounds import stays_in
 from hesim_render.sources.render.transport.needs_exact import NeedsExactMode, require_paths
-from hesim_render.sources.render.transport.outlines import Screen, largest, outlines_of
 from hesim_render.sources.render.transport.swept_boxes import Moment, box_rows, inverse_of, meets_box
 
 #: Largest number of objects in closed form that are tested one by one; more are tested in a loop of one kernel.
@@ -178,37 +176,6 @@ class MovingScene:
             self.groups.append(Group(name, own, part, built.trajectories[name], corners))
             faces += part.face_count
         self._sort_groups()
-        self._find_outlines()
-
-    def _find_outlines(self) -> None:
-        """Outlines of what may hide the sky, in the frames of the resting part and of each group."""
-        known = largest([outlines_of(self.static), *(outlines_of(group.scene) for group in self.groups)])
-        #: Frame of each screen: number of the group, None for the resting part.
-        self.outlines = [
-            (None if number == 0 else number - 1, Screen(self.mi, found)) for number, found in enumerate(known) if found
-        ]
-
-    def hidden_sky(
-        self, point: Point3, normal: Vector3, direction: Vector3, moment: Moment, active: Mask
-    ) -> tuple[Float, Float]:
-        """Share of a uniform sky that outlines hide from surface points, and how many of them hide a direction; see
-        `Screen.hides`.
-
-        Parameters
-        ----------
-        point, normal, direction : in world space.
-        moment : time of each ray.
-        active : lanes in which a result is needed.
-        """
-        share, count = self.mi.Float(0.0), self.mi.Float(0.0)
-        for number, screen in self.outlines:
-            own = point, normal, direction
-            if number is not None:
-                pose = self._tracks.pose(number, moment.local_us(number))
-                own = pose.to_rest(point), pose.turn_to_rest(normal), pose.turn_to_rest(direction)
-            part, hides = screen.hides(*own)
-            share, count = share + part, count + hides
-        return share, count
 
     def _sort_groups(self) -> None:
         """Sort groups into those tested one by one and those tested in a loop."""

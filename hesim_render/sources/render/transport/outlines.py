@@ -18,11 +18,14 @@ from scipy.spatial import ConvexHull, QhullError
 from hesim_render.core.device_types import Float, MitsubaModule, MitsubaObject, Point3, Vector3
 from hesim_render.sources.render.scene.mitsuba_version import mesh_faces, mesh_vertices
 from hesim_render.sources.render.transport.irradiance import outline_above_horizon
+from hesim_render.sources.render.transport.moving_scene import MovingScene
+from hesim_render.sources.render.transport.swept_boxes import Moment
 
 #: Largest number of outlines of a scene, the largest ones; each takes the time of a few dozen operations a ray.
 _MOST = 8
-#: Largest number of corners of an outline, and of shapes of a part that are searched for outlines.
-_MOST_CORNERS, _MOST_SHAPES = 8, 64
+#: Largest number of corners of an outline, of shapes of a part that are searched for outlines, and of their triangles:
+#: a mesh of millions takes seconds, and is hardly ever flat.
+_MOST_CORNERS, _MOST_SHAPES, _MOST_TRIANGLES = 8, 64, 100_000
 #: Distance from a plane, over the size of what lies in it, up to which a point lies in the plane.
 _IN_PLANE = 1e-5
 #: Least part of an outline that the surface must fill.
@@ -61,6 +64,8 @@ def outlines_of(scene: MitsubaObject) -> list[Outline]:
     shapes = scene.shapes()
     if not shapes or len(shapes) > _MOST_SHAPES or not all(shape.is_mesh() for shape in shapes):
         return []
+    if sum(shape.face_count() for shape in shapes) > _MOST_TRIANGLES:
+        return []
     triangles = [mesh_vertices(shape)[mesh_faces(shape)] for shape in shapes]
     together = _flat(np.concatenate(triangles))
     if together is not None:
@@ -79,8 +84,9 @@ def _flat(triangles: NDArray[np.float64]) -> Outline | None:
     """Outline of triangles [n, 3, 3] that lie in one plane and fill their convex hull; None of others."""
     points = np.unique(triangles.reshape(-1, 3), axis=0)
     middle = points.mean(axis=0)
-    _, sizes, axes = np.linalg.svd(points - middle, full_matrices=True)
-    if len(points) < 3 or sizes[1] <= _IN_PLANE * sizes[0] or (len(sizes) > 2 and sizes[2] > _IN_PLANE * sizes[0]):
+    # axes of the points, the one along which they extend least last
+    _, sizes, axes = np.linalg.svd(points - middle, full_matrices=False)
+    if len(points) < 3 or sizes[1] <= _IN_PLANE * sizes[0] or sizes[2] > _IN_PLANE * sizes[0]:
         return None
     try:
         hull = ConvexHull((points - middle) @ axes[:2].T)
@@ -195,7 +201,42 @@ def _margin(outline: Outline) -> float:
 
 
 def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
-    """The largest outlines of several parts, at most `_MOST` in all."""
-    every = sorted(((outline.area_m2, -number) for number, part in enumerate(parts) for outline in part), reverse=True)
-    least = every[_MOST - 1][0] if len(every) > _MOST else 0.0
-    return [[outline for outline in part if outline.area_m2 >= least] for part in parts]
+    """The largest outlines of several parts, at most `_MOST` in all; of equal ones the first."""
+    every = [(number, outline) for number, part in enumerate(parts) for outline in part]
+    kept = sorted(every, key=lambda one: -one[1].area_m2)[:_MOST]
+    return [[outline for number, outline in kept if number == own] for own in range(len(parts))]
+
+
+class HiddenSky:
+    """What the outlines of a moving scene hide of a uniform sky.
+
+    Parameters
+    ----------
+    scene : the scene.
+
+    Attributes
+    ----------
+    is_known : True if there are any outlines.
+    """
+
+    def __init__(self, scene: MovingScene) -> None:
+        self._scene = scene
+        parts = largest([outlines_of(part) for part in (scene.static, *(group.scene for group in scene.groups))])
+        #: Number of the group in whose frame a screen rests, None for the resting part.
+        self._screens = [
+            (None if number == 0 else number - 1, Screen(scene.mi, part)) for number, part in enumerate(parts) if part
+        ]
+        self.is_known = bool(self._screens)
+
+    def hides(self, point: Point3, normal: Vector3, direction: Vector3, moment: Moment) -> tuple[Float, Float]:
+        """As `Screen.hides`, of all outlines; in world space, at the time of each ray."""
+        mi = self._scene.mi
+        share, count = mi.Float(0.0), mi.Float(0.0)
+        for number, screen in self._screens:
+            own = point, normal, direction
+            if number is not None:
+                pose = self._scene.pose(number, moment)
+                own = pose.to_rest(point), pose.turn_to_rest(normal), pose.turn_to_rest(direction)
+            part, hides = screen.hides(*own)
+            share, count = share + part, count + hides
+        return share, count
