@@ -54,9 +54,9 @@ class KeptRun:
             if any(self._journal.read(key_of(*name)) is None for name in whole):  # before any of it is written
                 break
             for k in chunks:
-                result = self._read("events", k)
+                stored = self._read("events", k)
                 # in the blocks in which they came, which decide the bytes of the file
-                for block in np.split(result["events"], np.cumsum(result["sizes"])[:-1]):
+                for block in np.split(stored["events"], np.cumsum(stored["sizes"])[:-1]):
                     writer.add_events(block)
             for k in frames:
                 writer.add_frame(self._frame(self._read("frame", k)))
@@ -100,14 +100,14 @@ class KeptRun:
             self._blocks = []
             self._chunks += 1
 
-    def _frame(self, result: SavedState) -> Frame:
+    def _frame(self, stored: SavedState) -> Frame:
         valid = self._capture.frame_mask
         return Frame(
-            raw=result["raw"],
+            raw=stored["raw"],
             valid=valid,
-            electrons_mean=result["electrons"],
+            electrons_mean=stored["electrons"],
             electrons_stderr=np.where(valid, np.float32(0), np.float32(np.nan)),
-            **result["times"],
+            **stored["times"],
         )
 
     def _read(self, *name: object) -> SavedState:

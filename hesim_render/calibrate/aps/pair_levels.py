@@ -91,9 +91,9 @@ def pair_levels(pairs: PairSet, series: tuple[Series, ...], progress: Progress |
     return levels([s.exposure_s for s in series], photons, [result[s] for s in series])
 
 
-def levels(exposure_s: Iterable[float], photons: Iterable[float], result: list[tuple[float, ...]]) -> Levels:
+def levels(exposure_s: Iterable[float], photons: Iterable[float], statistics: list[tuple[float, ...]]) -> Levels:
     """`pair_statistics` of several pairs as one table."""
-    table = np.array(result, np.float64).T
+    table = np.array(statistics, np.float64).T
     return Levels(np.array(list(exposure_s)), np.array(list(photons)), *table)
 
 
@@ -126,14 +126,14 @@ def pair_statistics(first: NDArray, second: NDArray, full_scale_dn: int) -> tupl
     return mean, change, variance, float(per_row.std(ddof=1)) / np.sqrt(rows), *shared, squares, *ends
 
 
-def _check(entry: Series, result: tuple[float, ...], first: NDArray, second: NDArray, full: int) -> None:
-    mean, change, variance = result[:3]
-    low, high = result[-2:]
+def _check(entry: Series, statistics: tuple[float, ...], first: NDArray, second: NDArray, full: int) -> None:
+    mean, change, variance = statistics[:3]
+    low, high = statistics[-2:]
     if max(low, high) > 0.5:
         return
     if np.array_equal(first, second):
         raise entry.error("both frames are the same; a pair has two exposures")
-    noise = np.sqrt(2 * variance / first.size + 2 * max(result[4], 0.0) / first.shape[0])
+    noise = np.sqrt(2 * variance / first.size + 2 * max(statistics[4], 0.0) / first.shape[0])
     if entry.lit and abs(change) > MOST_CHANGE * mean and abs(change) > _SIGMAS * noise:
         raise entry.error(
             f"the light drifts: the second frame is {100 * abs(change) / mean:.2g} % "
