@@ -16,7 +16,7 @@ def about_edges(
     tracer: PairTracer,
     pairs: tuple[NDArray[np.uint32], NDArray[np.integer], Windows],
     rays: NDArray[np.integer],
-    lit: NDArray[np.bool_],
+    controlled: NDArray[np.bool_],
     wanted: NDArray[np.float32],
     floor: NDArray[np.integer],
     gain: Gain,
@@ -36,7 +36,7 @@ def about_edges(
     tracer : traces the decision rays.
     pairs : pixels [n] on the full sensor, their windows, and all windows.
     rays : [n], by the law of errors, powers of two.
-    lit : [n], estimator of each pair.
+    controlled : [n], estimator of each pair.
     wanted : [n], wanted error, e⁻/s.
     floor : [n], number of rays that knowledge of an edge does not lower.
     gain : error law of stratified rays.
@@ -61,7 +61,7 @@ def about_edges(
         fit.replace(np.flatnonzero(known[0][place]), known[1])
         new = np.flatnonzero(~known[0][place])
     some = place[new]
-    of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[some]
+    of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, controlled[some]
     fit.replace(new, tracer.edges(*of, stream))
     # fluxes of fits are those on the optical axis
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
