@@ -11,7 +11,7 @@ import pytest
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
 from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement, allocate
-from hesim_render.sources.render.change_driven.plan import Plan, changes, fill_in, longer, plan
+from hesim_render.sources.render.change_driven.plan import Plan, changes, longer, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
 
 
@@ -64,15 +64,6 @@ def test_longer_marks_reach_no_further():
     marked = np.zeros((7, 1), np.bool_)
     marked[3] = True
     assert longer(marked, 1)[:, 0].astype(int).tolist() == [0, 0, 1, 1, 1, 0, 0]
-
-
-def test_what_is_not_known_lies_on_straight_lines_in_time():
-    centre = np.array([0.0, 10, 30, 60, 100])
-    known = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [1, 1]], np.bool_)
-    values = np.where(known, np.array([[0, 5.0], [9, 7], [9, 9], [6, 9], [7, 25]]), 99).astype(np.float32)
-    fill_in(values, known, centre)
-    np.testing.assert_allclose(values[:, 0], [0, 1, 3, 6, 7], rtol=1e-6)
-    np.testing.assert_allclose(values[:, 1], [5, 7, 7 + 18 * 20 / 90, 7 + 18 * 50 / 90, 25], rtol=1e-6)
 
 
 def test_neighbours_of_a_crop_are_those_of_the_full_sensor():
@@ -171,9 +162,6 @@ def test_a_plan_ends_at_the_first_window_after_the_run():
     cut = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [0, 0]], bool)
     np.testing.assert_array_equal(one.until(2).rendered, cut)
     np.testing.assert_array_equal(one.until(5).rendered, rendered)
-    values = np.where(cut, [[2.0, 8.0], [0, 7], [0, 0], [8, 0], [0, 1], [0, 0]], 0).astype(np.float32)
-    fill_in(values, cut, np.arange(6.0) * 3)
-    np.testing.assert_allclose(values, [[2, 8], [4, 7], [6, 5], [8, 3], [0, 1], [0, 0]])
     # the first window with a fit after the end is rendered as well
     fitted[[3, 4, 5], [1, 1, 1]] = True
     rendered[3, 1] = rendered[4, 0] = True

@@ -13,7 +13,6 @@ from hesim_render.core.backend import jit
 from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.differences import difference_of, differences
-from hesim_render.sources.render.change_driven.event_blocks import intervals_of
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
@@ -149,10 +148,9 @@ def test_anchors_lie_at_multiples_of_64_ms_or_of_four_blocks():
     assert period_us(ticks) == 128_000 and anchor_us(ticks - 700, ticks) == (127_300, 128_000)
 
 
-def test_small_asynchronous_sensors_have_longer_blocks():
-    """By the size of the sensor, not of what is read out, so that a crop has the values of the whole."""
-    assert [intervals_of(rows * cols) for rows, cols in ((260, 346), (480, 640), (720, 1280))] == [64, 32, 16]
-    sensor = hr.load_sensor("davis346").crop(20, 12)
+@pytest.mark.parametrize("name", ["davis346", "imx636"])
+def test_blocks_of_asynchronous_sensors_are_long(name):
+    sensor = hr.load_sensor(name).crop(20, 12)
     blocks = list(ChangeDrivenFlux(shadow_scene(), sensor, seed=1).sample_blocks(1, 0, 33_000))
     assert max(block.wanted.size for block in blocks) == 65
 

@@ -91,6 +91,13 @@ def difference_of(
     unseen = (np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * contrast / wanted_error) ** 2
     brighter = np.float32(tuning.bright_rays) * sites.most(np.abs(moved), 2) / units[here]
     rays = np.maximum(rays, np.minimum(np.maximum(unseen, brighter), np.float32(tuning.most_unseen_rays)))
+    if pilot.all_move:
+        # Every edge moves, even by less than the distance of two pilot rays, and may come into this pixel.
+        flux = np.where(controlled, pilot.controlled[window], pilot.plain[window])
+        beside = np.maximum(sites.most(flux, 1) - flux[here], flux[here] + sites.most(-flux, 1))
+        rays = np.maximum(
+            rays, np.square(np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * beside / wanted_error)
+        )
     return np.maximum(rays, np.float32(tuning.least_difference_rays)), scatter
 
 

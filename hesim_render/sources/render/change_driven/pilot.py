@@ -90,6 +90,7 @@ class Pilot:
     refined : results of extra rays at some sites, one entry per window; empty where there were none.
     aims : small objects at which rays are aimed; None if there are none.
     change : differences to other windows; None where nothing is compared.
+    all_move : True if the camera moves, and with it every edge in the image.
     """
 
     controlled: NDArray[np.float32]
@@ -100,6 +101,7 @@ class Pilot:
     refined: list[Refinement] = field(default_factory=list)
     aims: Aims | None = None
     change: Change | None = None
+    all_move: bool = False
 
     @property
     def windows(self) -> int:
@@ -218,7 +220,7 @@ def take_pilot(
     near_by = [(window, one) for window, row in enumerate(extra_looks) for one in row if one.place.size]
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
     refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
-    return replace(pilot, refined=refined, aims=aims, change=change), near
+    return replace(pilot, refined=refined, aims=aims, change=change, all_move=tracer.camera is not None), near
 
 
 def _refine(

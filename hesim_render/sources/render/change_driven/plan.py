@@ -181,24 +181,3 @@ def plan(
         worth = out.rendered & (out.rays >= tuning.edge_least_rays) & (chosen.rays == 0) & ~out.barred
         out.fitted[:] = fitted_windows(worth)
     return replace(out, differences=chosen)
-
-
-def fill_in(values: NDArray[np.float32], known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> None:
-    """Interpolate unknown values linearly between known ones, in place.
-
-    Parameters
-    ----------
-    values : [window, pixel], changed in place.
-    known : [window, pixel], True where a value is known; the first window is. Windows after the last known one stay as
-        they are.
-    centre_us : [window], increasing, µs.
-    """
-    number = np.arange(known.shape[0], dtype=np.int16)[:, None]
-    before = np.maximum.accumulate(np.where(known, number, np.int16(-1)), axis=0)
-    after = np.minimum.accumulate(np.where(known, number, np.int16(known.shape[0]))[::-1], axis=0)[::-1]
-    for window in range(1, known.shape[0] - 1):
-        place = np.flatnonzero(~known[window] & (after[window] < known.shape[0]))
-        low, high = before[window, place], after[window, place]
-        part = ((centre_us[window] - centre_us[low]) / (centre_us[high] - centre_us[low])).astype(np.float32)
-        begin = values[low, place]
-        values[window, place] = begin + part * (values[high, place] - begin)
