@@ -139,17 +139,12 @@ class AdaptiveRenderer:
         if window.size == 0:
             return what, None, Courses.none()
         index, tuning, before = band.index[pixel], self.tuning, self.tracer.rays_done
-        of = (
-            index,
-            numbers[what.fitted],
-            windows,
-            tuning.edge_rays,
-            tuning.edge_footprint_px,
-            what.controlled[what.fitted],
-        )
-        fit = self.tracer.edges(*of)
+        scale = self.tracer.axis_factor(index)
+        little = np.float32(tuning.flat_contrast) * what.wanted[what.fitted] / scale
+        of = index, numbers[what.fitted], windows, tuning.edge_rays, tuning.edge_footprint_px
+        fit = self.tracer.edges(*of, what.controlled[what.fitted], little)
         self.counts.rays += self.tracer.rays_done - before
-        own = fit.scaled(self.tracer.axis_factor(index))
+        own = fit.scaled(scale)
         centre_us = 0.5 * (windows.begin_us + windows.end_us)
         given = what.pilot, self._footprint_px(band), what.wanted[what.fitted], centre_us, what.barred
         edge_courses = courses(window, pixel, own, *given)

@@ -169,6 +169,7 @@ class PairTracer(PacketTracer):
         samples: int,
         footprint_px: float,
         controlled: NDArray[np.bool_],
+        least: NDArray[np.float32],
         stream: Stream = Stream.RENDER_EDGE,
     ) -> EdgeFit:
         """Lines fitted to a few rays of every listed pair, with random numbers of their own.
@@ -176,8 +177,10 @@ class PairTracer(PacketTracer):
         Parameters
         ----------
         pixel, window, windows, controlled, stream : see `trace`.
-        samples : rays per pair, a power of two, at least `LEAST_SAMPLES`; twice as many where there is a line.
-        footprint_px : width of the area in which the first ones start, pixels.
+        samples : rays per pair, a power of two, at least twice `LEAST_SAMPLES`; half as many where the first half shows
+            little contrast, and twice as many where there is a line.
+        footprint_px : width of the area in which these rays start, pixels.
+        least : [n], contrast below which it is little, e⁻/s on the optical axis.
 
         Returns
         -------
@@ -190,8 +193,18 @@ class PairTracer(PacketTracer):
         for first in range(0, pixel.size, room):
             part = slice(first, min(pixel.size, first + room))
             lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
-            inputs = "edges", *lanes, controlled[part], samples, footprint_px, stream, *flux_inputs(windows, None, None)
-            trace = partial(self._edge_block, lanes, controlled[part], moments, key, samples, footprint, out, part)
+            inputs = (
+                "edges",
+                *lanes,
+                controlled[part],
+                least[part],
+                samples,
+                footprint_px,
+                stream,
+                *flux_inputs(windows, None, None),
+            )
+            given = lanes, controlled[part], least[part], moments, key, samples, footprint, out, part
+            trace = partial(self._edge_block, *given)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(out.rays[part].sum(dtype=np.int64)))
         return out
@@ -200,6 +213,7 @@ class PairTracer(PacketTracer):
         self,
         lanes: Sequence[NDArray[np.uint32]],
         controlled: NDArray[np.bool_],
+        least: NDArray[np.float32],
         moments: Moments,
         key: UInt64,
         samples: int,
@@ -207,31 +221,41 @@ class PairTracer(PacketTracer):
         out: EdgeFit,
         part: slice,
     ) -> None:
-        """Lines of some pairs: of rays all over the pixel, and, where these show a line, of as many more about it."""
+        """Lines of some pairs: of rays all over the pixel, as many more where these show contrast, and twice as many
+        about a line, where there is one.
+        """
         import drjit as dr
 
-        def decision_rays(some: NDArray[np.int64], repeat: int, about: PairEdges | None) -> list[Float]:
+        def decision_rays(
+            some: NDArray[np.int64], rays: int, repeat: int, about: PairEdges | None = None
+        ) -> list[Float]:
             """Place and flux of the rays of some pairs."""
-            packets = np.full(some.size, samples // PACKET)
+            packets = np.full(some.size, rays // PACKET)
             chosen = [values[some] for values in lanes[:2]] + [np.full(some.size, repeat, np.uint32)]
             width = footprint if about is None else dr.opaque(jit().Float, 1.0)
             traced = self._packets_of(chosen, packets, packets * PACKET, moments, key, width, about, is_weighted=False)
             types = jit()
             packet = dr.arange(types.UInt32, len(traced.fluxes[0])) // PACKET
-            is_controlled = spread_out(types.UInt32, np.repeat(controlled[some].astype(np.uint32), packets), packet)
-            values = [*traced.place, dr.select(is_controlled != 0, traced.fluxes[0], traced.fluxes[1])]
+            by_control = spread_out(types.UInt32, np.repeat(controlled[some].astype(np.uint32), packets), packet)
+            values = [*traced.place, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
             dr.eval(values)
             return values
 
-        every = np.arange(lanes[0].size)
-        first, fit = decision_rays(every, 0, None), EdgeFit.empty(every.size)
-        fit.put(slice(None), first, samples)
-        lines = np.flatnonzero(fit.is_line)
-        if lines.size:
-            refined = EdgeFit.empty(lines.size)
-            more = decision_rays(lines, 1, fit.models(lines, wider=True))
-            refined.put(slice(None), joined_rays(first, lines, more, samples), 2 * samples)
-            fit.replace(lines, refined)
+        every, half = np.arange(lanes[0].size), samples // 2
+        first, fit = decision_rays(every, half, 0), EdgeFit.empty(every.size)
+        fit.put(slice(None), first, half)
+        uneven = np.flatnonzero(fit.high - fit.low >= least)
+        if uneven.size:
+            both = joined_rays(first, uneven, decision_rays(uneven, half, 1), half)
+            better = EdgeFit.empty(uneven.size)
+            better.put(slice(None), both, samples)
+            lines = np.flatnonzero(better.is_line)
+            if lines.size:
+                refined = EdgeFit.empty(lines.size)
+                more = decision_rays(uneven[lines], samples, 2, better.models(lines, wider=True))
+                refined.put(slice(None), joined_rays(both, lines, more, samples), 2 * samples)
+                better.replace(lines, refined)
+            fit.replace(uneven, better)
         out.replace(part, fit)
 
     def _trace_block(

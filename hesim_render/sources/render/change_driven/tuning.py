@@ -85,7 +85,7 @@ class Tuning:
         interpolated from there carry its error.
     edge_least_rays : rays, C. Pairs that the law gives at least as many rays get decision rays for a line. Without
         (0): decision rays of cheap pairs cost more than they save.
-    edge_rays : rays, F. Decision rays of a pair. Half as many: the strip about a line is wider. Larger: they cost more
+    edge_rays : rays, F. Decision rays of a pair; half as many where they show little contrast. Half as many: the strip about a line is wider. Larger: they cost more
         than they save.
     edge_footprint_px : px, F. Width of the area in which the first half of the decision rays start. Without (1): a
         line that only just enters a pixel, or passes beside it, is not seen.
@@ -137,7 +137,7 @@ class Tuning:
     extreme_change: float = 128.0
     extreme_windows: int = 1
     least_rays: int = 8
-    ray_weight: float = 1.0
+    ray_weight: float = 2.0
     most_rays: int = 4096
     diffuse_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
@@ -149,9 +149,9 @@ class Tuning:
     edge_least_rays: int = 256
     edge_rays: int = 64
     edge_footprint_px: float = 1.5
-    edge_contrast_rays: float = 0.4
+    edge_contrast_rays: float = 0.2
     flat_contrast: float = 4.0
-    flat_part: float = 1 / 8
+    flat_part: float = 1 / 16
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.5
