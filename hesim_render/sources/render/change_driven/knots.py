@@ -71,13 +71,13 @@ class Knots:
         begin, end = self.centre_us[self.window[low]], self.centre_us[self.window[high]]
         part = ((self.centre_us[window] - begin) / np.where(high > low, end - begin, 1)).astype(np.float32)
         part[high == low] = 0
-        found = []
+        interpolated = []
         for values in self.values:
             start = values[low]
             value = start + part * (values[high] - start)
             value[~is_knot & ~has_next] = 0
-            found.append(value[None])
-        return Flux(*found)
+            interpolated.append(value[None])
+        return Flux(*interpolated)
 
 
 class BlockFlux:
