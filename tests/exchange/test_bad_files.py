@@ -4,6 +4,7 @@ import json
 import os
 import struct
 
+import h5py
 import lz4.frame
 import numpy as np
 import pytest
@@ -134,6 +135,22 @@ def test_events_in_blocks_that_go_back_are_refused_as_they_are_written(tmp_path)
     with pytest.raises(ValueError, match="in order of time"):
         writer.append(made((50, 1, 0, 1)))
     writer.abandon()
+
+
+def test_a_file_of_events_holds_32_bits_of_us_from_its_own_begin_on(tmp_path):
+    EventFileWriter(tmp_path / "late.h5", (3, 5), 700, 700 + (1 << 32) - 1).abandon()
+    with pytest.raises(SpecError, match="at most 4294967295 µs, not 4294967296"):
+        EventFileWriter(tmp_path / "long.h5", (3, 5), 700, 700 + (1 << 32))
+
+
+def test_the_index_of_milliseconds_counts_from_the_begin_and_goes_to_the_end(tmp_path):
+    writer = EventFileWriter(tmp_path / "e.h5", (3, 5), 700, 6_900)
+    writer.append(made((900, 4, 1, 1), (1700, 2, 2, -1), (1701, 1, 0, 1)))
+    writer.append(made((3600, 1, 0, 1)))
+    writer.close()
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert list(file["ms_to_idx"]) == [0, 1, 3, 4, 4, 4, 4, 4]
+        assert list(file["events/t"]) == [200, 1000, 1001, 2900] and file["t_offset"][()] == 700
 
 
 def test_no_file_and_no_such_format(tmp_path):

@@ -17,7 +17,7 @@ from test_round_trips import lists_of_events
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.hdf5 import require_sound_heaps
-from hesim_render.exchange import EVENT_FORMATS, EventStream, ecf, event_packets, mcap_file, open_events
+from hesim_render.exchange import EVENT_FORMATS, EventStream, ecf, event_packets, mcap_file, open_events, prophesee_hdf5
 from hesim_render.exchange.triggers import TRIGGER_DTYPE, exposure_triggers, exposures
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.imports import import_recording
@@ -27,6 +27,13 @@ QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCh
 
 def edges(*items):
     return np.array(list(items), dtype=TRIGGER_DTYPE)
+
+
+@pytest.mark.parametrize("geometry", ["640x480", np.bytes_(b"640x480")])
+def test_the_size_in_an_hdf5_file_may_be_text_or_bytes(tmp_path, geometry):
+    with h5py.File(tmp_path / "e.hdf5", "w") as file:
+        file.attrs["geometry"] = geometry
+    assert prophesee_hdf5.read_shape(tmp_path / "e.hdf5") == (480, 640)
 
 
 def stream_of(events, triggers, shape=SHAPE):
