@@ -320,6 +320,7 @@ def test_the_file_is_laid_out_as_metavision_writes_it(tmp_path, monkeypatch):
         stored, index = file["CD/events"], file["CD/indexes"]
         assert dict(file.attrs) == {"version": "1.0", "geometry": "1280x720", "camera_integrator_name": "hesim_render"}
         assert stored.shape == (40_000,) and stored.chunks == (16384,) and stored.id.get_num_chunks() == 3
+        assert {name: stored.dtype.fields[name][1] for name in "xypt"} == {"x": 0, "y": 2, "p": 4, "t": 8}
         assert stored.dtype.names == ("x", "y", "p", "t") and stored.dtype.itemsize == 16
         assert stored.id.get_create_plist().get_filter(0)[0] == 0x8ECF
         parts = [ecf.decoded(stored.id.read_direct_chunk((k,))[1], min(16384, 40_000 - k), path, "c")

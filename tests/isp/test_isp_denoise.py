@@ -8,7 +8,7 @@ from scipy.stats import chi2
 import hesim_render as hr
 from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
-from hesim_render.isp import FrameNoise, rows
+from hesim_render.isp import FrameNoise, collaborate, rows
 from hesim_render.isp.denoise import _each, denoise
 from hesim_render.isp.rows import row_offsets
 from hesim_render.isp.stabilise import Stabiliser
@@ -224,6 +224,20 @@ def test_saturated_samples_stay_and_positions_have_their_own_noise():
     assert (found[20:30, 20:40] == 959).all()
     bad = found[1::4, 1::4][found[1::4, 1::4] < 900]
     assert np.abs(bad - 30).mean() < 1.5 < np.abs(raw[1::4, 1::4][raw[1::4, 1::4] < 900] - 30).mean()
+
+
+def test_a_patch_of_the_first_pass_is_shrunk_by_the_spread_of_its_group():
+    """Moments of each group written out; a mean counts above 2.7 of its own deviations, 1/4 of that of a patch."""
+    rng = np.random.default_rng(6)
+    noisy = rng.normal([0, 0.4, 0.8, 1, 2, 5], 1.6, (2, 20, 6)).astype(np.float32)
+    alike, flat = rng.integers(0, 40, (5, 16)), noisy.reshape(40, 6).astype(np.float64)
+    found, weights = collaborate._estimate(noisy, None, alike, 3)
+    for number, members in enumerate(alike):
+        mean, spread = flat[members].mean(axis=0), flat[members].var(axis=0, ddof=1)
+        kept, share = np.abs(mean) > 2.7 / 4, np.maximum(spread - 1, 0) / spread
+        expected = kept * mean + share * (flat[3 + number] - mean)
+        np.testing.assert_allclose(found[number], expected, rtol=1e-4, atol=1e-5)
+        assert weights[number] == pytest.approx(1 / (1 + (share**2).sum() + kept.sum() / 16), rel=1e-4)
 
 
 def test_each_position_of_a_tile_that_is_not_square_has_its_own_transform():

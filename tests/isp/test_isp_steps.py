@@ -1,11 +1,14 @@
 """Each step against its formula, written out again."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
 from hesim_render.core.errors import RangeError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
+from hesim_render.isp.steps import WhiteBalance
 from hesim_render.spectral import transfer
 from hesim_render.spectral.transfer import from_root, to_root
 
@@ -58,6 +61,32 @@ def test_fill_does_not_reach_across_an_edge():
     picture[:, 18:] = 0.9
     filled = fill.fill_positions(mosaic_of(picture, MIPI).astype(np.float32), MIPI, QUAD)
     np.testing.assert_allclose(filled, mosaic_of(picture, QUAD), atol=0.01)
+
+
+def test_each_hole_of_a_tile_that_is_not_square_gets_its_own_colour():
+    tile, filled = ((0, 1, 2, -1), (2, 0, -1, 1), (1, 2, 0, 0)), ((0, 1, 2, 2), (2, 0, 1, 1), (1, 2, 0, 0))
+    shape = (15, 22)
+    colours = np.array([3.0, 7.0, 11.0, np.nan], np.float32)
+    found = fill.fill_positions(mosaic_of(np.broadcast_to(colours, (*shape, 4)), tile).astype(np.float32), tile, filled)
+    np.testing.assert_allclose(found, mosaic_of(np.broadcast_to(colours, (*shape, 4)), filled), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("size", "period", "margin"), [(13, 3, 8), (8, 4, 8), (5, 2, 4), (9, 5, 10)])
+def test_lines_beyond_the_sides_are_those_of_the_same_place_in_the_tile(size, period, margin):
+    found, place = fill._kept_in_phase(size, period, margin), np.arange(-margin, size + margin)
+    assert found.min() >= 0 and found.max() < size and not np.any((found - place) % period)
+    np.testing.assert_array_equal(found[margin : margin + size], np.arange(size))
+    assert np.abs(found - np.clip(place, 0, size - 1)).max() < period
+
+
+def test_bridges_count_by_their_length_and_evenness():
+    """From 0.9 to 0.8 over 1 + 1 px, from 0.2 to 0.5 over 2 + 1 px, and one with a single end, which counts little."""
+    values = {(0, 1): 0.9, (0, -1): 0.8, (2, 0): 0.2, (-1, 0): 0.5, (3, 3): 0.7, (-1, -1): np.nan}
+    bridges = [((0, 1), (0, -1)), ((2, 0), (-1, 0)), ((3, 3), (-1, -1))]
+    total, weight = fill._mean_of_bridges(bridges, lambda offset: np.float32([values[offset]]))
+    weights = [1 / ((0.1 + fill._EVEN) ** 2 * 2), 1 / ((0.3 + fill._EVEN) ** 2 * 3), 1]
+    assert weight[0] == pytest.approx(sum(weights), rel=1e-5)
+    assert total[0] == pytest.approx(np.dot(weights, [0.85, 0.4, 0.7]), rel=1e-5)
 
 
 def test_bad_pixels_and_their_clusters_are_filled():
@@ -277,6 +306,15 @@ def test_integer_depths_round_the_curve(depth):
     assert found.dtype == (np.uint8 if depth == 8 else np.uint16)
     # 8 bit: a table of 65536 levels, at most 0.03 of a code off half a code; 16 bit: float32 input rounds once
     assert np.abs(found - exact).max() < 0.55
+
+
+def test_each_method_has_its_own_gains():
+    image = RNG.uniform(0.2, 0.6, (8, 12)).astype(np.float32)
+    state = SimpleNamespace(image=image, tile=QUAD, camera=SimpleNamespace(white_balance=[1.7, 1.0, 1.3]))
+    step = WhiteBalance(step="white_balance", gains=[2.0, 1.1, 1.4])
+    expected = {"camera": [1.7, 1.0, 1.3], "given": [2.0, 1.1, 1.4], "grey_world": balance.grey_world(image, QUAD)}
+    for method, gains in expected.items():
+        assert step.model_copy(update={"method": method})._gains(state) == gains
 
 
 def test_grey_world_leaves_out_tiles_of_which_one_channel_is_dark_or_saturated():

@@ -54,6 +54,8 @@ def test_equal_laws_do_not_differ():
     """Seven figures, eight pairs: at 5 % each three differ on average; 10 or more have a chance of 1e-3."""
     found = [event_distances(poisson(2 * k), poisson(2 * k + 1)) for k in range(8)]
     assert sum(one.differs for distances in found for one in distances) < 10
+    assert all(one.value == 0 for one in event_distances(poisson(3), poisson(3)))
+    assert {one.name for one in found[0] if one.first is not None} == {"rate", "polarity", "hot pixels"}
     for distances in found:
         assert {one.name: one for one in distances}["rate"].value < 0.03
 

@@ -100,6 +100,18 @@ def test_it_begins_as_after_a_long_time():
     assert stats.kstest(first * 2.6e-6, "uniform").pvalue > 1e-5
 
 
+@pytest.mark.parametrize("events_hz", [0.0, 0.4, 30.0])
+def test_the_last_event_lies_back_by_its_own_law(events_hz):
+    """Drift of 2.6 events/s; noise events end it earlier: what passed is exponential, cut at a whole drift."""
+    drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.6}))
+    chance = np.linspace(0.01, 0.99, PIXELS)
+    drift.start(jit().Float(np.zeros(PIXELS, np.float32)), False, np.full(PIXELS, events_hz), chance)
+    passed_s = chance / 2.6
+    if events_hz:
+        passed_s = stats.truncexpon(events_hz / 2.6, scale=1 / events_hz).ppf(chance)
+    np.testing.assert_allclose(np.array(drift.way), THETA_ON * 2.6 * passed_s, rtol=1e-5)
+
+
 @pytest.mark.parametrize(("sigma", "rate_hz"), ((0.045, 2.2), (0.07, 0.9)), ids=("regular", "with-noise-events"))
 def test_noise_and_drift_against_numpy(sigma, rate_hz):
     """Counts of both polarities within 4.5 standard errors, ON intervals by Kolmogorov and Smirnov."""

@@ -180,13 +180,14 @@ def test_hot_and_flickering_pixels_fire_as_their_closed_forms(reference):
 
 def test_every_flickering_pixel_has_quiet_times_and_those_of_a_single_one_are_its_own():
     """800 Hz during 0.2 s, then none during 0.5 s: a gap of 0.1 s by chance has e⁻⁸⁰."""
-    rates = [np.full(3, value) for value in (500.0, 300.0, 2 / 7, 7.0)]
+    rates = [*(np.full(3, value) for value in (500.0, 300.0, 2 / 7)), np.array([7.0, 0.9, 7.0])]
     defects = PixelDefects(np.empty(0, int), np.array([4, 7, 9]), np.array([40, 70, 90], np.uint32), *rates)
     t_us, pixel, polarity = DefectEvents(defects, 5).between(0, 20e6)
     for one in (4, 7, 9):
         assert np.diff(t_us[pixel == one]).max() > 1e5, one
     assert abs(np.mean(polarity > 0) - 5 / 8) < 4.5 * np.sqrt(15 / 64 / t_us.size)
-    assert abs(t_us.size / (3 * 20 * 800 * 2 / 7) - 1) < 0.3  # some 86 spells of firing
+    quick = np.isin(pixel, (4, 9))  # some 57 spells of firing
+    assert abs(quick.sum() / (2 * 20 * 800 * 2 / 7) - 1) < 0.4
 
 
 def test_moments_of_flicker_are_their_sums():
