@@ -32,7 +32,7 @@ for key in numbers(spec):
         try:
             sensor = hr.load_sensor(name, change) if kind == "sensor" else hr.load_sensor("davis346")
             scene = hr.load_scene("flat-field") if kind == "sensor" else hr.load_scene(name, change)
-            run = hr.simulate(scene, sensor.crop(16, 8), duration_s=0.03, quality=20, max_minutes=1, audit=False)
+            run = hr.simulate(scene, sensor.crop(8, 8), duration_s=0.03, quality=20, max_minutes=1, audit=False)
         except HesimError as error:
             assert "\\n" not in str(error) and len(str(error)) < 400, error
             continue
