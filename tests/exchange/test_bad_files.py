@@ -187,6 +187,20 @@ def test_the_index_of_milliseconds_counts_from_the_begin_and_goes_to_the_end(tmp
         file["events/x"] = columns_
     with pytest.raises(SpecError, match="events/x holds int16; expected uint16"):
         read_all(tmp_path / "e.h5", None, (3, 5))
+    with h5py.File(tmp_path / "e.h5", "r+") as file:
+        del file["events/x"]
+        file.create_dataset("events/x", data=columns_.astype("<u2"), chunks=(1 << 26,), maxshape=(None,))
+    with pytest.raises(SpecError, match=r"a chunk of events/x would take 0\.134 GB"):
+        read_all(tmp_path / "e.h5", None, (3, 5))
+
+
+def test_blocks_of_a_file_of_events_follow_each_other(tmp_path, monkeypatch):
+    events = many(50, 1 << 20)
+    path = written(events, "dsec", tmp_path)
+    monkeypatch.setattr("hesim_render.exchange.dsec.BLOCK", 7)
+    blocks = list(open_events(path))
+    assert [block.size for block in blocks] == [7] * 7 + [1]
+    np.testing.assert_array_equal(np.concatenate(blocks), events)
 
 
 def test_no_file_and_no_such_format(tmp_path):

@@ -413,6 +413,8 @@ def with_chunk(file, data, skipped=0):
     (lambda f: f["CD"].__delitem__("events") or f.__setitem__("CD/events", np.arange(3)), "is no data set of records"),
     (lambda f: f["CD"].__delitem__("events") or f["CD"].__setitem__("events", h5py.ExternalLink("x", "y")),
      "is a link"),
+    (lambda f: f["CD"].__delitem__("events") or f["CD"].create_dataset(
+        "events", (0,), prophesee_hdf5._RECORD, maxshape=(None,), chunks=(1 << 23,)), "would take 0.134 GB of memory"),
 ])  # fmt: skip
 def test_damaged_files_are_one_clear_error(change, told, tmp_path):
     path = damaged(file_of(many(50, 1 << 20), EDGES[:0], "prophesee", tmp_path), change)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
-from hesim_render.isp.steps import WhiteBalance
+from hesim_render.isp.steps import ColourMatrix, WhiteBalance
 from hesim_render.spectral import transfer
 from hesim_render.spectral.transfer import from_root, to_root
 
@@ -310,11 +310,18 @@ def test_integer_depths_round_the_curve(depth):
 
 def test_each_method_has_its_own_gains():
     image = RNG.uniform(0.2, 0.6, (8, 12)).astype(np.float32)
-    state = SimpleNamespace(image=image, tile=QUAD, camera=SimpleNamespace(white_balance=[1.7, 1.0, 1.3]))
+    state = SimpleNamespace(image=image, tile=QUAD, camera=SimpleNamespace(white_balance=[1.7, 1.0, 1.3], matrix=None))
     step = WhiteBalance(step="white_balance", gains=[2.0, 1.1, 1.4])
     expected = {"camera": [1.7, 1.0, 1.3], "given": [2.0, 1.1, 1.4], "grey_world": balance.grey_world(image, QUAD)}
     for method, gains in expected.items():
         assert step.model_copy(update={"method": method})._gains(state) == gains
+    for method in ("given", "chart"):
+        for lacking in (
+            WhiteBalance(step="white_balance", method=method),
+            ColourMatrix(step="colour_matrix", method=method),
+        ):
+            with pytest.raises(SpecError, match=f"is required by method {method}"):
+                lacking.run(state)
 
 
 def test_grey_world_leaves_out_tiles_of_which_one_channel_is_dark_or_saturated():
