@@ -8,7 +8,7 @@ from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
-from hesim_render.isp.steps import ColourMatrix, WhiteBalance
+from hesim_render.isp.steps import BlackLevel, ColourMatrix, WhiteBalance
 from hesim_render.spectral import transfer
 from hesim_render.spectral.transfer import from_root, to_root
 
@@ -332,3 +332,25 @@ def test_grey_world_leaves_out_tiles_of_which_one_channel_is_dark_or_saturated()
         part = raw[rows]
         part[np.tile(tile, (6, 30)) == channel] = level
     np.testing.assert_allclose(balance.grey_world(raw, tile), colour.max() / colour, rtol=1e-5)
+
+
+def test_black_and_white_of_a_step_are_its_own_or_the_cameras():
+    image = np.array([[40.0, 470.0], [900.0, 255.0]], np.float32)
+    for given, black, white in (({}, 64.0, 1023.0), ({"black_level_dn": 40.0, "white_level_dn": 900.0}, 40.0, 900.0)):
+        state = SimpleNamespace(image=image, camera=SimpleNamespace(black_level_dn=64.0, white_level_dn=1023.0))
+        BlackLevel(step="black_level", **given).run(state)
+        assert state.span_dn == white - black
+        np.testing.assert_allclose(state.image, (image - black) / (white - black), rtol=1e-6)
+
+
+def test_gains_of_a_tile_that_is_not_square_reach_their_own_pixels():
+    tile, gains = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 0, 2]]), np.array([1.7, 1.0, 1.3])
+    raw = RNG.uniform(0.1, 0.5, (11, 8)).astype(np.float32)
+    channel = tile[np.arange(11)[:, None] % 4, np.arange(8) % 3]
+    np.testing.assert_allclose(balance.white_balance(raw, tile, gains), raw * gains[channel], rtol=1e-6)
+
+
+def test_eight_bits_are_those_of_the_nearest_of_65536_levels():
+    levels = np.arange(1 << 16)
+    found = transfer.encode((levels[:, None, None] / 65535).astype(np.float32) * np.ones(3, np.float32), depth=8)
+    np.testing.assert_array_equal(found[:, 0, 1], np.rint(255 * transfer.encode_exactly(levels / 65535)))

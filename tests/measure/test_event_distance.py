@@ -109,3 +109,14 @@ def test_neighbours_that_are_active_together_more_often_than_by_chance_correlate
     active = np.append(0.25 * 24, pairs * both)[None] * 400
     found = event_distance._over_space(SimpleNamespace(active=active, shape=(4, 6), windows=400), np.array([0]))
     assert found == pytest.approx((both - 0.0625) / (0.25 * 0.75)) and found[1] == 0
+
+
+def test_the_rate_correlates_with_itself_at_lags_of_1_to_32_ms():
+    series = np.random.default_rng(8).poisson(3.0, (4, 90))
+    found = event_distance._over_time(SimpleNamespace(series=series), np.array([2, 0, 2]))
+    drawn = series[[2, 0, 2]] - series[[2, 0, 2]].mean()
+    expected = [
+        sum(a * b for row in drawn for a, b in zip(row, row[lag:], strict=False)) / (3 * (90 - lag)) / drawn.var()
+        for lag in (1, 2, 4, 8, 16, 32)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)

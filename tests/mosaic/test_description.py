@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.mosaic.description import _colour_matrices
+from hesim_render.mosaic.description import _colour_matrices, describe
 from hesim_render.recording import manifest
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colorimetry import responses_to, tristimulus, xyz_to_linear_srgb
@@ -62,3 +62,9 @@ def test_files_do_not_depend_on_the_last_digits_of_a_fit(name, monkeypatch):
     monkeypatch.setattr(np.linalg, "lstsq", other_build)
     assert described() == before
     assert len(calls) == (3 if before[1] > 1 else 1)  # matrices of colours, and the noise of frames
+
+
+def test_a_sensor_without_frames_has_levels_that_need_no_care():
+    made = describe(hr.load_sensor("dvs128"))
+    found = made.bit_depth, made.black_level_dn, made.white_level_dn, made.system_gain_dn_per_e
+    assert found == (1, 0.0, 1, 1.0)

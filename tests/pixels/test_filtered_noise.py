@@ -62,6 +62,7 @@ def test_variance_and_correlation_are_those_of_each_pixels_own_corner():
     photoreceptor = Photoreceptor(noise)
     photoreceptor.start(log, 0)
     band = BandNoise(noise, 7, photoreceptor)
+    np.testing.assert_allclose(band.share(width), np.repeat(SHARES, width // len(SIGNALS)), rtol=1e-4)
     poles = 2 * np.pi * 100 * SHARES / np.sqrt(np.sqrt(2) - 1)
     values = [np.array(band.start(0))]
     period_us = 1e6 / 1600

@@ -19,6 +19,7 @@ from hesim_render.core.rng import Stream
 from hesim_render.pixels.aps.model import APS_TERMS
 from hesim_render.pixels.evs import formulas as evs_formulas
 from hesim_render.pixels.evs.defects import DefectEvents, PixelDefects
+from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.evs.model import EVS_TERMS
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
@@ -188,6 +189,17 @@ def test_every_flickering_pixel_has_quiet_times_and_those_of_a_single_one_are_it
     assert abs(np.mean(polarity > 0) - 5 / 8) < 4.5 * np.sqrt(15 / 64 / t_us.size)
     quick = np.isin(pixel, (4, 9))  # some 57 spells of firing
     assert abs(quick.sum() / (2 * 20 * 800 * 2 / 7) - 1) < 0.4
+
+
+def test_at_a_tick_the_first_event_of_a_pixel_counts():
+    rates = [np.full(3, value) for value in (600.0, 500.0, 1.0, 0.0)]
+    defects = PixelDefects(np.array([2]), np.array([0, 1, 4]), np.array([40, 70, 90], np.uint32), *rates)
+    events, given = DefectEvents(defects, 5), np.array([0, 0, 1, -1, -1, 0], np.int8)
+    for begin_us in range(0, 200_000, 10_000):
+        _, place_, polarity = events.between(begin_us, begin_us + 10_000)
+        first = {int(where): int(sign) for where, sign in zip(place_[::-1], polarity[::-1], strict=True)}
+        expected = [Origin.DEFECT * first[0], Origin.DEFECT * first[1], 0, -1, -1, 0]
+        assert events.at_tick(given, begin_us, begin_us + 10_000).tolist() == expected
 
 
 def test_moments_of_flicker_are_their_sums():
