@@ -115,6 +115,12 @@ def test_temporal_row_noise_is_in_no_map():
     assert FrameNoise.of_sensor(sensor.spec, sensor.layout, frozenset({"row_noise"})).unknown_rows_dn == 0
 
 
+@pytest.mark.parametrize("name", ["offset_dn", "dark_dn_per_s", "response"])
+def test_one_map_is_a_known_one(name):
+    assert noise_of(((0, 1),), **{name: np.full((4, 6), 1.5, np.float32)}).describe()["maps"] == "known"
+    assert noise_of(((0, 1),)).describe()["maps"] == "none"
+
+
 def test_without_maps_what_they_would_tell_counts_as_noise():
     sensor = hr.load_sensor("eiger").crop(80, 48)
     aps = sensor.spec.aps

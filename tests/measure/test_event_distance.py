@@ -120,3 +120,5 @@ def test_the_rate_correlates_with_itself_at_lags_of_1_to_32_ms():
         for lag in (1, 2, 4, 8, 16, 32)
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
+    short = event_distance._over_time(SimpleNamespace(series=series[:, :32]), np.array([2, 0, 2]))
+    assert np.isfinite(short).all() and short[-1] == 0 and np.all(short[:-1] != 0)
