@@ -29,6 +29,12 @@ def edges(*items):
     return np.array(list(items), dtype=TRIGGER_DTYPE)
 
 
+@pytest.mark.parametrize("shape", [(5, 2048), (2048, 5)])
+def test_the_largest_sensor_of_the_packed_form(tmp_path, shape):
+    path = written(made((7, 4, 4, 1)), "prophesee", tmp_path, shape)
+    assert open_events(path).shape == shape
+
+
 @pytest.mark.parametrize("geometry", ["640x480", np.bytes_(b"640x480")])
 def test_the_size_in_an_hdf5_file_may_be_text_or_bytes(tmp_path, geometry):
     with h5py.File(tmp_path / "e.hdf5", "w") as file:

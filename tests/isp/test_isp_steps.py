@@ -8,7 +8,8 @@ from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
-from hesim_render.isp.steps import BlackLevel, ColourMatrix, WhiteBalance
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.steps import BlackLevel, ColourMatrix, Denoise, Development, WhiteBalance
 from hesim_render.spectral import transfer
 from hesim_render.spectral.transfer import from_root, to_root
 
@@ -341,6 +342,17 @@ def test_black_and_white_of_a_step_are_its_own_or_the_cameras():
         BlackLevel(step="black_level", **given).run(state)
         assert state.span_dn == white - black
         np.testing.assert_allclose(state.image, (image - black) / (white - black), rtol=1e-6)
+
+
+def test_the_report_of_noise_reduction_has_the_rms_of_the_row_offsets(monkeypatch):
+    offsets = np.array([3.0, -1.0, 2.0, 0.0], np.float32)
+    monkeypatch.setattr("hesim_render.isp.steps.row_offsets", lambda *given: offsets)
+    noise = FrameNoise(np.tile([0.6, 0.2, 0, 0, 0, 0], (1, 1, 1)), 1000.0)
+    tile, camera = np.zeros((1, 1), int), SimpleNamespace(white_balance=[1.0])
+    state = Development(np.full((4, 6), 0.5, np.float32), camera, tile, noise=noise, span_dn=200.0)
+    Denoise(step="denoise", strength=0, row_std_dn=1.3).run(state)
+    assert state.report == {"row_offsets_rms_dn": pytest.approx(np.sqrt(14 / 4))}
+    np.testing.assert_allclose(state.image, 0.5 - offsets[:, None] / 200 + np.zeros((4, 6)), rtol=1e-6)
 
 
 def test_gains_of_a_tile_that_is_not_square_reach_their_own_pixels():

@@ -179,6 +179,11 @@ def test_hot_and_flickering_pixels_fire_as_their_closed_forms(reference):
     assert abs(counts[flickering].var(ddof=1) / (spread + own) - 1) < 4.2 * np.sqrt(2.3 / n)
 
 
+def test_share_and_rate_of_a_flickering_pixel():
+    assert evs_formulas.firing_share(0.2, 0.5) == pytest.approx(2 / 7)
+    assert evs_formulas.change_rate_hz(0.2, 0.5) == pytest.approx(7.0)
+
+
 def test_every_flickering_pixel_has_quiet_times_and_those_of_a_single_one_are_its_own():
     """800 Hz during 0.2 s, then none during 0.5 s: a gap of 0.1 s by chance has e⁻⁸⁰."""
     rates = [*(np.full(3, value) for value in (500.0, 300.0, 2 / 7)), np.array([7.0, 0.9, 7.0])]
