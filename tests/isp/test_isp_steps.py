@@ -280,6 +280,9 @@ def test_guided_filter_against_its_definition():
             models.append((a, p.mean() - a * g.mean()))
     a, b = np.mean(models, axis=0)
     assert found == pytest.approx(a * guide[7, 7] + b, abs=1e-5)
+    for radius_px, epsilon in ((0, 0.01), (1, 0.0)):
+        with pytest.raises(RangeError, match="radius_px, epsilon"):
+            smooth.guided_filter(image, guide, radius_px, epsilon)
 
 
 @pytest.mark.parametrize("name", ["srgb", "bt709", "gamma", "linear"])
