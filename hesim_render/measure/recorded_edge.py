@@ -84,8 +84,7 @@ def measure_mtf(
                 f"{', '.join(known)}",
             )  # fmt: skip
         raise RangeError("filter_name", filter_name, f"one of {', '.join(known)}{did_you_mean(filter_name, known)}")
-    tiles = -(-rows // filters.shape[0]), -(-cols // filters.shape[1])
-    own = np.tile((filters == filter_name) & aps, tiles)[:rows, :cols] & chosen.valid
+    own = mosaic.tiled((filters == filter_name) & aps, chosen.raw.shape) & chosen.valid
     part = np.s_[y : y + height, x : x + width]
     values = np.asarray(chosen.raw if signal == "raw" else chosen.electrons_mean, dtype=np.float64)[part]
     used = own[part]

@@ -133,7 +133,7 @@ def edge_response(
     spline, bins = _edge_spread(along, value, half, oversampling)
     # E' has the coefficients Δc/δ on quadratic B-splines, whose transform is that of three boxes of width δ
     steps = np.diff(spline.c) * _fading(spline.c.size - 1)
-    at = (np.arange(steps.size) - (steps.size - 1) / 2) / oversampling
+    at = np.arange(steps.size) / oversampling  # the modulus does not depend on the origin
     transform = np.abs(np.exp(-2j * np.pi * np.outer(frequency, at)) @ steps) / np.abs(steps.sum())
     mtf = transform * np.abs(np.sinc(frequency / oversampling)) ** 3
     place = (np.arange(2 * bins) - bins + 0.5) / oversampling

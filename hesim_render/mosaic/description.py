@@ -189,10 +189,13 @@ def _colour_matrices(
     white = tristimulus(light, [constant(1.0)])[0]
     target = xyz_to_linear_srgb(xyz, white)
     # fit differences to the first channel, so that rows sum to 1 and neutral stays neutral
-    free, *_ = np.linalg.lstsq(camera[:, 1:] - camera[:, :1], target - camera[:, :1], rcond=None)
+    free = _least_squares(camera[:, 1:] - camera[:, :1], target - camera[:, :1])
     to_srgb = np.vstack([1.0 - free.sum(axis=0), free]).T
     camera_d65 = responses_to(daylight, patches, responses)
-    from_xyz, *_ = np.linalg.lstsq(
-        tristimulus(daylight, patches) / white_d65[1], camera_d65 / camera_d65.max(), rcond=None
-    )
+    from_xyz = _least_squares(tristimulus(daylight, patches) / white_d65[1], camera_d65 / camera_d65.max())
     return (neutral / neutral.max()).tolist(), to_srgb.tolist(), from_xyz.T.tolist()
+
+
+def _least_squares(inputs: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The solution to 12 decimals: further ones depend on the build of LAPACK, and with them the bytes of manifests."""
+    return np.round(np.linalg.lstsq(inputs, target, rcond=None)[0], 12)

@@ -9,6 +9,7 @@ import reset_captures
 from reset_captures import Pixels
 from scipy.special import ndtr
 from scipy.stats import binom
+from scipy.stats import f as f_law
 
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
@@ -579,3 +580,22 @@ def test_a_session_with_defects_gives_a_sensor_that_has_them(tmp_path):
     place = truth.place[order][flickers]
     assert two[:, place].mean() == pytest.approx(one[:, place].mean(), rel=0.25)
     assert two[:, place].var(axis=0).mean() == pytest.approx(one[:, place].var(axis=0).mean(), rel=0.35)
+
+
+@pytest.mark.parametrize("count", [40, 61])
+def test_a_family_of_columns_is_judged_by_the_law_of_hotelling(count):
+    """Three columns whose model is exact but for 2e-5 of its events: T² of their means, referred to F."""
+    residual = np.random.default_rng(count).multivariate_normal(
+        [0.3, 0, -0.2], [[2, 0.5, 0], [0.5, 1, 0], [0, 0, 3]], count
+    )
+    expected = np.full(3, 1e-2)
+    columns = SimpleNamespace(residual=residual, expected=expected, silent=expected, family=np.zeros(3, int))
+    fit = SimpleNamespace(scores=np.zeros((count, 2)), free=slice(None))
+    found = checks._judge(columns, np.arange(3), fit)
+    mean, covariance = residual.mean(axis=0), np.cov(residual, rowvar=False)
+    t2 = count * mean @ np.linalg.solve(covariance, mean)
+    # the mean of the very sample whose covariance is used: (1 + 1/n) is the only difference
+    t2 *= count**2 / (count**2 - 1)
+    assert (found.chi2, found.dof) == (pytest.approx(t2, rel=1e-6), 3)
+    chance = f_law.sf(t2 * (count - 3) / (3 * (count - 1)), 3, count - 3)
+    assert found.p_value == pytest.approx(chance, rel=1e-5)

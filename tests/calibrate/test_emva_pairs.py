@@ -14,7 +14,7 @@ import hesim_render as hr
 from hesim_render.calibrate import calibrate_aps, read_calibration, read_maps
 from hesim_render.calibrate.aps import light_curve, pair_levels, spatial
 from hesim_render.calibrate.aps.pair_levels import pair_statistics
-from hesim_render.calibrate.aps.pairs import evaluate
+from hesim_render.calibrate.aps.pairs import _bins, evaluate
 from hesim_render.calibrate.aps.pairs_output import calibrate_pairs, content
 from hesim_render.calibrate.aps.sensor_file import write_sensor
 from hesim_render.calibrate.aps.spatial import Temporal, pattern_of, spatial_variance
@@ -444,3 +444,26 @@ def test_a_faint_pattern_keeps_its_variance_below_the_noise_of_the_mean():
     image = 700 + np.sqrt((noise + pattern) / values.var()) * values
     found = pattern_of(image, (noise / 512, noise / 384, noise)).pixel
     assert found.var() == pytest.approx(pattern, rel=0.05)
+
+
+def test_pairs_are_bins_of_the_fit_with_the_squares_of_their_variances():
+    """Sums over 15 pixels: powers of the signal, variance less 1/12, and its square, from the pixels' own."""
+    rng = np.random.default_rng(3)
+    own = {"dark": rng.gamma(3, 2, (3, 15)), "lit": rng.gamma(3, 9, (2, 15))}
+    levels = {
+        name: SimpleNamespace(
+            variance=values.mean(axis=1),
+            squares=(values**2).mean(axis=1),
+            exposure_s=0.003 + 0.01 * np.arange(len(values)),
+        )
+        for name, values in own.items()
+    }
+    signal, clear, distinct = np.array([40.0, 7.0]), np.array([False, True]), np.array([0, 2])
+    bins = _bins(SimpleNamespace(shape=(3, 5)), levels["lit"], levels["dark"], signal, clear, distinct)
+    used = np.stack([own["dark"][0], own["dark"][2], own["lit"][1]]) - 1 / 12
+    light = np.array([0.0, 0.0, 7.0])
+    np.testing.assert_allclose(bins.squares, (used**2).sum(axis=1))
+    np.testing.assert_allclose(bins.powers, 15 * light[:, None] ** np.arange(7))
+    np.testing.assert_allclose(bins.products, used.sum(axis=1)[:, None] * light[:, None] ** np.arange(4))
+    np.testing.assert_allclose(bins.exposure_s, [0.003, 0.023, 0.013])
+    np.testing.assert_array_equal(bins.lit, [False, False, True])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hesim_render.calibration.measured import MeasuredMaps
+from hesim_render.calibration.spec import Defect
 from hesim_render.core.errors import SpecError
 from hesim_render.mosaic.layout import Layout
 from hesim_render.pixels.measured import frame_maps, measured_part, relative_threshold, telegraph_rates
@@ -44,6 +45,17 @@ def test_the_region_of_the_maps_is_cut_in_pixels_and_in_event_pixels():
         values, good = sections["evs"][f"threshold_{polarity}_rel"], ~sections["evs"]["bad_pixels"]
         expected = 1 + (values - values[good].mean()) / values[good].std() * 0.07
         np.testing.assert_allclose(relative_threshold(crop, polarity, 0.07), expected[8:14, 4:9], rtol=1e-6)
+
+
+def test_pixels_with_events_of_their_own_have_the_mean_threshold():
+    defect = np.zeros((20, 11), np.uint8)
+    defect[3, 7], defect[12, 2], defect[5, 5] = Defect.HOT, Defect.FLICKERING, Defect.STUCK
+    plain, found = (
+        relative_threshold(measured_part(layout(**given)[0]), "off", 0.07) for given in ({}, {"defect": defect})
+    )
+    own = np.isin(defect, (Defect.HOT, Defect.FLICKERING))
+    np.testing.assert_array_equal(found, np.where(own, 1, plain))
+    assert np.all(plain[own] != 1)
 
 
 def test_maps_of_another_size_are_refused_with_the_size_that_fits():

@@ -9,7 +9,7 @@ import pytest
 import hesim_render as hr
 from hesim_render.calibrate import calibrate_evs, read_calibration, read_maps
 from hesim_render.calibration.measured import measured_maps
-from hesim_render.calibration.rates import EventDefectsPerTrial, TelegraphPerFrame, change_hz, rate_hz
+from hesim_render.calibration.rates import EventDefectsPerTrial, TelegraphPerFrame, change_hz, needs_interval, rate_hz
 from hesim_render.calibration.spec import Defect
 from hesim_render.core.backend import jit
 from hesim_render.core.errors import SpecError
@@ -163,6 +163,13 @@ def test_rates_from_chances_and_correlations():
     np.testing.assert_allclose(found["defect_firing_share"], [0.4, 1, 1], rtol=1e-6)
     np.testing.assert_allclose(found["defect_change_hz"], [-np.log(0.8) / 0.004, 0, 0], rtol=1e-6)
     frames = [np.array(values, np.float32) for values in ([7.5, 0], [0.3, 0.2], [0.6, 0.9])]
+    counted_maps = TelegraphPerFrame(*frames).maps()
+    rates = TelegraphPerFrame(*frames).per_second(0.04).maps()
+    still = counted_maps | {"telegraph_amplitude_dn": np.zeros(2, np.float32)}
+    for maps, needed in ((counted_maps, True), (still, False), (rates | counted_maps, False), ({}, False)):
+        assert needs_interval("aps", maps) == needed
+    for amplitude, jumps in (([0.4, 0], True), ([0, 0], False)):
+        assert TelegraphPerFrame(np.float32(amplitude), *frames[1:]).misbehaves == jumps
     found = TelegraphPerFrame(*frames).per_second(0.04).maps()
     assert list(found) == ["telegraph_amplitude_dn", "telegraph_high_share", "telegraph_change_hz"]
     np.testing.assert_allclose(found["telegraph_change_hz"], [-np.log(0.6) / 0.04, 0], rtol=1e-6)

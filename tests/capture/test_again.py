@@ -42,7 +42,7 @@ def test_a_recording_made_again_has_the_same_bytes(scene, sensor, given, tmp_pat
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     folder = tmp_path_factory.mktemp("again") / "recording"
-    sensor = hr.load_sensor("reference-mono").crop(8, 8)
+    sensor = hr.load_sensor("reference-mono").crop(16, 8)
     return hr.simulate(hr.load_scene("dark"), sensor, duration_s=0.001, out=folder, exact=True, samples=4).path
 
 

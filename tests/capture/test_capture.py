@@ -100,14 +100,14 @@ def test_rolling_shutter_integrates_each_rows_own_window(edges):
 
 
 def test_slices_do_not_change_the_electrons():
-    sensor = hr.load_sensor("gen2").crop(16, 16)
+    sensor = hr.load_sensor("gen2").crop(24, 16)
     one, _ = run(RampFlux(sensor), sensor, 30_000)
     many, _ = run(RampFlux(sensor, edges=np.linspace(50, 29_950, 333)), sensor, 30_000)
     np.testing.assert_allclose(one[0].electrons_mean, many[0].electrons_mean, rtol=2e-6)
 
 
 def test_standard_error_is_half_the_difference_of_the_halves_accumulated_over_time():
-    sensor = hr.load_sensor("gen2").crop(16, 16)
+    sensor = hr.load_sensor("gen2").crop(24, 16)
     frames, _ = run(RampFlux(sensor, edges=np.arange(500.0, 30_000, 500), split=0.01), sensor, 30_000)
     valid = frames[0].valid
     np.testing.assert_allclose(frames[0].electrons_stderr[valid], 0.01 * frames[0].electrons_mean[valid], rtol=1e-4)
@@ -115,15 +115,15 @@ def test_standard_error_is_half_the_difference_of_the_halves_accumulated_over_ti
 
 def test_event_window_straddling_slices_is_integrated_whole():
     """ON events of a clean ramp: ticks at which ln(x₁/x₀) of the window electrons passes θ."""
-    sensor = hr.load_sensor("reference-mono").crop(4, 4)
+    sensor = hr.load_sensor("reference-mono").crop(8, 4)
     spec = sensor.spec.evs
     for edges in ((), np.arange(333.0, 40_000, 333.0)):
         _, events = run(RampFlux(sensor, slope=1e7, edges=edges), sensor, 40_000)
         t = np.arange(1, 41) * 1000e-6
-        signal = np.multiply.outer(1.0 + np.arange(4), (1e5 + 1e7 * (t - 0.5e-3)) * 1e-3)  # electrons of 1 ms
+        signal = np.multiply.outer(1.0 + np.arange(8), (1e5 + 1e7 * (t - 0.5e-3)) * 1e-3)  # electrons of 1 ms
         x = signal * 0.2 * 10 + 1.0  # I = K·N·t_ref/t_evs; x = β1 I + β2
         fires = np.diff(np.log(x), axis=1) > spec.contrast_threshold_on
-        expected = {(int(1000 * (k + 2)), c) for c in range(4) for k in np.flatnonzero(fires[c])}
+        expected = {(int(1000 * (k + 2)), c) for c in range(8) for k in np.flatnonzero(fires[c])}
         assert {(int(e["t_us"]), int(e["x"])) for e in events} == expected
         assert len(events) == 4 * len(expected) and (events["polarity"] == 1).all()
 
@@ -145,7 +145,7 @@ def test_last_event_sensor_samples_at_the_sources_own_pace():
 
 
 def test_static_source_is_asked_once():
-    sensor = hr.load_sensor("gen2").crop(16, 16)
+    sensor = hr.load_sensor("gen2").crop(24, 16)
     flux = RampFlux(sensor, slope=0.0)
     flux.is_static = True
     frames, events = run(flux, sensor, 100_000)

@@ -28,14 +28,14 @@ from hesim_render.spectral import spectrum as spectra
 BUSY = {
     "evs.contrast_threshold_on": 0.15, "evs.contrast_threshold_off": 0.153, "evs.threshold_mismatch_std": 0.05,
 }  # fmt: skip
-SIDE, FRAMES, TICKS = 128, 32, 6000
+WIDE, HIGH, FRAMES, TICKS = 144, 112, 32, 6000
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """(folder, sensor, calibration file) of one session on a part of the sensor."""
     folder = tmp_path_factory.mktemp("lab")
-    sensor = hr.load_sensor("eiger", BUSY).crop(SIDE, SIDE)
+    sensor = hr.load_sensor("eiger", BUSY).crop(WIDE, HIGH)
     write_captures(sensor, folder / "captures", frames=FRAMES, ticks=TICKS, seed=3)
     calibration = folder / "calibration.yaml"
     calibrate_aps(folder / "captures", calibration)
@@ -70,7 +70,7 @@ def test_the_target_is_a_wedge_above_two_ramps():
 
 
 def test_flux_is_the_closed_form_through_each_pixels_own_filter():
-    sensor = hr.load_sensor("gen2").crop(64, 64)
+    sensor = hr.load_sensor("gen2").crop(80, 48)
     bench = set_up(sensor, LIT_EXPOSURES_US, "A")
     source = spectra.illuminant("A")
     grid = np.arange(360.0, 830.5, 0.5)
@@ -82,8 +82,8 @@ def test_flux_is_the_closed_form_through_each_pixels_own_filter():
     area = (1.4e-6) ** 2
     cone = np.pi / (1 + 4 * lens.f_number**2)  # focused at infinity: m = 0
     photons = grid * 1e-9 / (6.62607015e-34 * 299792458.0)
-    target = step_target(64, 64)
-    for row, col in ((0, 0), (1, 2), (3, 3), (20, 41), (60, 5)):
+    target = step_target(48, 80)
+    for row, col in ((0, 0), (1, 2), (3, 3), (20, 61), (44, 5)):
         name = spec.pixels[spec.tile_rows[row % 4][col % 4]].filter
         transmittance = spec.filters[name].load().at(grid)
         expected = area * cone * 0.9 * 0.7 * np.trapezoid(transmittance * photons * radiance, grid) * target[row, col]
@@ -92,7 +92,7 @@ def test_flux_is_the_closed_form_through_each_pixels_own_filter():
 
 
 def test_the_light_suits_the_frames():
-    sensor = hr.load_sensor("eiger").crop(64, 64)
+    sensor = hr.load_sensor("eiger").crop(80, 48)
     bench = set_up(sensor, (1000, 9000, 81000))
     brightest = bench.flux_e_per_s[sensor.layout.aps_mask].max() * 9e-3
     assert brightest == pytest.approx(0.9 * (1023 - 64) / 0.16, rel=1e-9)  # 6000 e⁻ of full well are a little more
@@ -100,7 +100,7 @@ def test_the_light_suits_the_frames():
 
 @pytest.mark.usefixtures("few_trials")
 def test_frames_without_noise_are_the_flux_times_exposure(tmp_path):
-    sensor = hr.load_sensor("eiger").crop(32, 32)
+    sensor = hr.load_sensor("eiger").crop(48, 24)
     off = [f"aps.{term}" for term in APS_TERMS]
     write_captures(
         sensor, tmp_path / "c", frames=8, ticks=1, without=off, dark_exposures_us=(1000, 2000),
@@ -127,18 +127,18 @@ def test_the_capture_set_has_the_format_that_calibration_reads(session):
     ]  # fmt: skip
     captures = read_captures(folder)
     assert captures.spec.roi.model_dump() == {
-        "x": sensor.layout.col0, "y": sensor.layout.row0, "width_px": SIDE, "height_px": SIDE
+        "x": sensor.layout.col0, "y": sensor.layout.row0, "width_px": WIDE, "height_px": HIGH
     }  # fmt: skip
     assert captures.spec.contrast_of == "signal" and captures.spec.theta_hardware_v == 0.00075
     assert captures.sensor.evs.contrast_threshold_on == 0.15  # changed, so its own file is beside
     for name, exposures in (("aps_dark", DARK_EXPOSURES_US), ("aps_lit", LIT_EXPOSURES_US)):
         stack = captures.frames(name)
-        assert stack.shape == (len(exposures), FRAMES, SIDE, SIDE)
+        assert stack.shape == (len(exposures), FRAMES, HIGH, WIDE)
         np.testing.assert_array_equal(stack.exposures_us, exposures)
     static, steps = arrays(folder / "evs_static.npz"), arrays(folder / "evs_steps.npz")
     assert static["n_trials"] == TICKS and steps["n_trials"] == TICKS // 100
-    assert static["signal_dn"].shape == static["n_on"].shape == (SIDE // 2, SIDE // 2)
-    assert steps["contrast"].shape == (21,) and steps["n_on"].shape == (21, SIDE // 2, SIDE // 2)
+    assert static["signal_dn"].shape == static["n_on"].shape == (HIGH // 2, WIDE // 2)
+    assert steps["contrast"].shape == (21,) and steps["n_on"].shape == (21, HIGH // 2, WIDE // 2)
     np.testing.assert_allclose(steps["contrast"][[0, 10, 20]], [-0.303, 0, 0.303], atol=1e-12)
 
 
@@ -190,13 +190,13 @@ def test_the_truth_knows_what_is_off_or_mixed():
 
 @pytest.mark.usefixtures("few_trials")
 def test_a_shipped_sensor_is_named_not_copied(tmp_path):
-    folder = write_captures(hr.load_sensor("gen2").crop(32, 32), tmp_path / "c", frames=8, ticks=5)
+    folder = write_captures(hr.load_sensor("gen2").crop(48, 24), tmp_path / "c", frames=8, ticks=5)
     assert read_captures(folder).spec.sensor == "gen2" and not (folder / "sensor.yaml").exists()
 
 
 @pytest.mark.usefixtures("few_trials")
 def test_the_same_seed_gives_the_same_bytes_and_no_frame_repeats(tmp_path):
-    sensor = hr.load_sensor("eiger").crop(16, 16)
+    sensor = hr.load_sensor("eiger").crop(24, 16)
     digests = []
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         folder = write_captures(
@@ -207,20 +207,20 @@ def test_the_same_seed_gives_the_same_bytes_and_no_frame_repeats(tmp_path):
     assert digests[0] == digests[1]
     assert digests[0]["aps_dark.npz"] != digests[2]["aps_dark.npz"]
     folder = tmp_path / "a"
-    frames = np.concatenate([arrays(folder / f"aps_{k}.npz")["frames"].reshape(-1, 256) for k in ("dark", "lit")])
+    frames = np.concatenate([arrays(folder / f"aps_{k}.npz")["frames"].reshape(-1, 16 * 24) for k in ("dark", "lit")])
     assert len(np.unique(frames, axis=0)) == len(frames) == 5 * 8
 
 
 @pytest.mark.usefixtures("few_trials")
 def test_only_what_can_be_calibrated_is_captured(tmp_path):
-    folder = write_captures(hr.load_sensor("reference-bayer").crop(16, 16), tmp_path / "none", frames=8, ticks=5)
+    folder = write_captures(hr.load_sensor("reference-bayer").crop(24, 16), tmp_path / "none", frames=8, ticks=5)
     assert not list(folder.glob("evs_*")) and (folder / "aps_lit.npz").is_file()
     assert "signal_reference" not in (folder / "capture.yaml").read_text()
     text = (hr.specs.files.data_folder("sensors") / "reference-mono.yaml").read_text()
     begin, end = text.index("aps:\n"), text.index("evs:\n")
     text = text[:begin] + text[end:].replace("  aps: ideal, round figures\n", "")
     (tmp_path / "events.yaml").write_text(text.replace("[aps, evs]", "[evs]"))
-    folder = write_captures(hr.load_sensor(tmp_path / "events.yaml").crop(32, 32), tmp_path / "e", ticks=50)
+    folder = write_captures(hr.load_sensor(tmp_path / "events.yaml").crop(48, 24), tmp_path / "e", ticks=50)
     assert sorted(p.name for p in folder.glob("*.npz")) == ["evs_static.npz", "evs_steps.npz"]
     assert arrays(folder / "evs_static.npz")["signal_dn"].max() == pytest.approx(1000.0)
 
@@ -239,7 +239,7 @@ def test_only_what_can_be_calibrated_is_captured(tmp_path):
 )
 def test_bad_numbers_write_nothing(options, text, tmp_path):
     with pytest.raises(RangeError, match=text.replace("(", r"\(")):
-        write_captures(hr.load_sensor("eiger").crop(16, 16), tmp_path / "c", **options)
+        write_captures(hr.load_sensor("eiger").crop(24, 16), tmp_path / "c", **options)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -250,7 +250,7 @@ def test_a_session_that_breaks_off_leaves_nothing(tmp_path):
         if what == "aps_lit":
             raise KeyboardInterrupt
 
-    sensor = hr.load_sensor("eiger").crop(16, 16)
+    sensor = hr.load_sensor("eiger").crop(24, 16)
     with pytest.raises(KeyboardInterrupt):
         write_captures(sensor, tmp_path / "c", frames=8, ticks=5, progress=stop)
     assert list(tmp_path.iterdir()) == []
@@ -376,14 +376,14 @@ def calibrated(session):
     """The captured bench with the calibrated sensor in place of the true one."""
     _, sensor, calibration = session
     true = set_up(sensor, LIT_EXPOSURES_US)
-    again = hr.load_sensor("eiger", {"noise": str(calibration)}).crop(SIDE, SIDE)
+    again = hr.load_sensor("eiger", {"noise": str(calibration)}).crop(WIDE, HIGH)
     return Bench(again, true.flux_e_per_s, true.lux, *noise_models(again))
 
 
 def test_calibrated_values_replace_the_files_own(session):
     _, _, calibration = session
     data, maps = read_calibration(calibration), read_maps(calibration, "aps")
-    sensor = hr.load_sensor("eiger", {"noise": str(calibration)}).crop(SIDE, SIDE)
+    sensor = hr.load_sensor("eiger", {"noise": str(calibration)}).crop(WIDE, HIGH)
     spec = sensor.spec
     assert spec.aps.system_gain_dn_per_e == data["aps"]["K"]["value"] != 0.16
     assert spec.aps.black_level_dn == data["aps"]["black_dn"]
@@ -404,7 +404,7 @@ def test_calibrated_values_replace_the_files_own(session):
     relative = sensor.evs.threshold_on_map / spec.evs.contrast_threshold_on
     good = ~read_maps(calibration, "evs")["bad_pixels"]
     assert relative[good].std() == pytest.approx(spec.evs.threshold_mismatch_std, rel=1e-4)
-    true = hr.load_sensor("eiger", BUSY).crop(SIDE, SIDE).evs.threshold_on_map / 0.15
+    true = hr.load_sensor("eiger", BUSY).crop(WIDE, HIGH).evs.threshold_on_map / 0.15
     assert np.corrcoef(relative[good], true[good])[0, 1] > 0.8  # the pixels' own thresholds, not another draw
     assert spec.sources["aps.system_gain_dn_per_e"].startswith("measured: ")
 
@@ -443,8 +443,8 @@ def test_frames_simulated_with_the_calibration_are_those_captured(session, tmp_p
 
 
 def test_temporal_row_noise_goes_from_the_sensor_file_through_the_captures_into_the_calibrated_sensor(tmp_path):
-    """1.2 DN on 64 rows; 4.5 standard errors of each of three figures: a false alarm in 2e-5."""
-    sensor = hr.load_sensor("eiger", {"aps.row_noise_dn": 1.2}).crop(64, 64)
+    """1.2 DN on 48 rows; 4.5 standard errors of each of three figures: a false alarm in 2e-5."""
+    sensor = hr.load_sensor("eiger", {"aps.row_noise_dn": 1.2}).crop(80, 48)
     exposures = {"dark_exposures_us": (1000, 20000, 80000), "lit_exposures_us": (1000, 10000, 80000)}
     write_captures(sensor, tmp_path / "captures", frames=32, ticks=1000, seed=5, **exposures)
     calibrate_aps(tmp_path / "captures", tmp_path / "c.yaml")
@@ -495,14 +495,14 @@ def test_maps_hold_for_the_region_captured_and_parts_of_it(session):
     _, sensor, calibration = session
     x, y = sensor.layout.col0, sensor.layout.row0
     whole = hr.load_sensor("eiger", {"noise": str(calibration)})
-    for region in ((SIDE + 4, SIDE, x, y), (SIDE, SIDE, x - 4, y), (64, 64, 0, 0)):
+    for region in ((WIDE + 4, HIGH, x, y), (WIDE, HIGH, x - 4, y), (64, 64, 0, 0)):
         for part in ("aps", "evs"):
-            with pytest.raises(SpecError, match=rf"--roi {SIDE}x{SIDE}\+{x}\+{y}"):
+            with pytest.raises(SpecError, match=rf"--roi {WIDE}x{HIGH}\+{x}\+{y}"):
                 getattr(whole.crop(*region), part)
     with pytest.raises(SpecError, match="was measured on"):
         _ = whole.aps
     part = whole.crop(32, 16, x + 8, y + 12)
-    full = whole.crop(SIDE, SIDE)
+    full = whole.crop(WIDE, HIGH)
     np.testing.assert_array_equal(part.aps.fixed_pattern.offset_dn, full.aps.fixed_pattern.offset_dn[12:28, 8:40])
     np.testing.assert_array_equal(part.evs.threshold_off_map, full.evs.threshold_off_map[6:14, 4:20])
 

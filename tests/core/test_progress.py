@@ -196,7 +196,7 @@ def test_a_notebook_shows_a_bar_without_being_asked(monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython.display", display)
     monkeypatch.setattr(progress, "_REFRESH_S", 0.02)
     run = dict(duration_s=0.002, samples=2)
-    scene, sensor = hr.load_scene("rotating-star"), hr.load_sensor("reference-mono").crop(16, 16)
+    scene, sensor = hr.load_scene("rotating-star"), hr.load_sensor("reference-mono").crop(24, 16)
     hr.simulate(scene, sensor, **run)
     assert shown[0].startswith("<progress value='0.000'") and "rotating-star → reference-mono" in shown[0]
     assert len(shown) > 2 and shown[-1] == ""
@@ -213,7 +213,7 @@ def test_simulate_tells_its_estimate_to_who_shows_it():
     seen = []
     with ProgressReport(view) as report:
         hr.simulate(
-            hr.load_scene("flat-field"), hr.load_sensor("reference-mono").crop(8, 8), duration_s=0.002,
+            hr.load_scene("flat-field"), hr.load_sensor("reference-mono").crop(16, 8), duration_s=0.002,
             progress=report, on_estimate=seen.append,
         )  # fmt: skip
     assert report.pace.estimate_s == seen[0].seconds

@@ -1,9 +1,11 @@
 """Damaged and foreign event files, and outputs that exist: one clear line, and nothing is changed."""
 
+import io
 import json
 import os
 import struct
 
+import h5py
 import lz4.frame
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from event_files import DATA, SHAPE, columns, made, many, raw, written
 import hesim_render as hr
 from hesim_render.cli import main
 from hesim_render.core.errors import HesimError, OutputError, RangeError, SpecError
-from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events
+from hesim_render.exchange import EVENT_FORMATS, EventStream, aedat4, open_events, raw_file
 from hesim_render.exchange.dsec_writer import EventFileWriter
 from hesim_render.recording.exports import SUFFIXES, import_events
 
@@ -134,6 +136,71 @@ def test_events_in_blocks_that_go_back_are_refused_as_they_are_written(tmp_path)
     with pytest.raises(ValueError, match="in order of time"):
         writer.append(made((50, 1, 0, 1)))
     writer.abandon()
+
+
+def test_arrays_of_events_may_lack_their_size_and_have_polarities_as_bool(tmp_path):
+    columns_ = {"t": np.uint64([5, 9]), "x": np.uint16([3, 1]), "y": np.uint16([0, 2]), "p": np.array([True, False])}
+    np.savez(tmp_path / "e.npz", **columns_)
+    with pytest.raises(SpecError, match="does not state the size of the sensor"):
+        open_events(tmp_path / "e.npz")
+    stream = open_events(tmp_path / "e.npz", shape=(3, 5))
+    assert stream.shape == (3, 5) and np.concatenate(list(stream))["polarity"].tolist() == [1, -1]
+
+
+def test_blocks_are_encoded_behind_their_predecessors(tmp_path):
+    blocks = [made((30, 4, 1, 1), (80, 2, 2, -1)), made((90, 1, 0, 1))]
+    out, seen = io.BytesIO(), []
+
+    def encode(events, before):
+        seen.append(None if before is None else int(before["t_us"]))
+        return events["t_us"].astype("<u4")
+
+    stream = EventStream(lambda: iter(blocks), (3, 5))
+    stream.encode_into(out, "words", encode, 90)
+    assert seen == [None, 80] and np.frombuffer(out.getvalue(), "<u4").tolist() == [30, 80, 90]
+    assert stream.span_us() == (30, 90) and EventStream(lambda: iter(()), (3, 5)).span_us() == (0, 0)
+    with pytest.raises(SpecError, match="words ends at 89 µs; an event is at 90 µs"):
+        stream.encode_into(io.BytesIO(), "words", encode, 89)
+    (tmp_path / "words.raw").write_bytes(b"\x01\x80% end\n")
+    assert raw_file.read_lines(tmp_path / "words.raw") == ({}, 0)
+    # words without a time have that of the latest word before them that has one
+    assert raw_file.latest(np.array([True, False, False, True, False])).tolist() == [0, 0, 0, 3, 3]
+
+
+def test_a_file_of_events_holds_32_bits_of_us_from_its_own_begin_on(tmp_path):
+    EventFileWriter(tmp_path / "late.h5", (3, 5), 700, 700 + (1 << 32) - 1).abandon()
+    with pytest.raises(SpecError, match="at most 4294967295 µs, not 4294967296"):
+        EventFileWriter(tmp_path / "long.h5", (3, 5), 700, 700 + (1 << 32))
+
+
+def test_the_index_of_milliseconds_counts_from_the_begin_and_goes_to_the_end(tmp_path):
+    writer = EventFileWriter(tmp_path / "e.h5", (3, 5), 700, 6_900)
+    writer.append(made((900, 4, 1, 1), (1700, 2, 2, -1), (1701, 1, 0, 1)))
+    writer.append(made((4703, 1, 0, 1)))
+    writer.close()
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert list(file["ms_to_idx"]) == [0, 1, 3, 3, 3, 4, 4, 4]
+        assert list(file["events/t"]) == [200, 1000, 1001, 4003] and file["t_offset"][()] == 700
+    with h5py.File(tmp_path / "e.h5", "r+") as file:
+        columns_ = file["events/x"][:].astype("<i2")
+        del file["events/x"]
+        file["events/x"] = columns_
+    with pytest.raises(SpecError, match="events/x holds int16; expected uint16"):
+        read_all(tmp_path / "e.h5", None, (3, 5))
+    with h5py.File(tmp_path / "e.h5", "r+") as file:
+        del file["events/x"]
+        file.create_dataset("events/x", data=columns_.astype("<u2"), chunks=(1 << 26,), maxshape=(None,))
+    with pytest.raises(SpecError, match=r"a chunk of events/x would take 0\.134 GB"):
+        read_all(tmp_path / "e.h5", None, (3, 5))
+
+
+def test_blocks_of_a_file_of_events_follow_each_other(tmp_path, monkeypatch):
+    events = many(50, 1 << 20)
+    path = written(events, "dsec", tmp_path)
+    monkeypatch.setattr("hesim_render.exchange.dsec.BLOCK", 7)
+    blocks = list(open_events(path))
+    assert [block.size for block in blocks] == [7] * 7 + [1]
+    np.testing.assert_array_equal(np.concatenate(blocks), events)
 
 
 def test_no_file_and_no_such_format(tmp_path):

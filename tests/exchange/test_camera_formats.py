@@ -17,7 +17,7 @@ from test_round_trips import lists_of_events
 
 from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.core.hdf5 import require_sound_heaps
-from hesim_render.exchange import EVENT_FORMATS, EventStream, ecf, event_packets, mcap_file, open_events
+from hesim_render.exchange import EVENT_FORMATS, EventStream, ecf, event_packets, mcap_file, open_events, prophesee_hdf5
 from hesim_render.exchange.triggers import TRIGGER_DTYPE, exposure_triggers, exposures
 from hesim_render.pixels.evs.events import EVENT_DTYPE
 from hesim_render.recording.imports import import_recording
@@ -27,6 +27,19 @@ QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCh
 
 def edges(*items):
     return np.array(list(items), dtype=TRIGGER_DTYPE)
+
+
+@pytest.mark.parametrize("shape", [(5, 2048), (2048, 5)])
+def test_the_largest_sensor_of_the_packed_form(tmp_path, shape):
+    path = written(made((7, 4, 4, 1)), "prophesee", tmp_path, shape)
+    assert open_events(path).shape == shape
+
+
+@pytest.mark.parametrize("geometry", ["640x480", np.bytes_(b"640x480")])
+def test_the_size_in_an_hdf5_file_may_be_text_or_bytes(tmp_path, geometry):
+    with h5py.File(tmp_path / "e.hdf5", "w") as file:
+        file.attrs["geometry"] = geometry
+    assert prophesee_hdf5.read_shape(tmp_path / "e.hdf5") == (480, 640)
 
 
 def stream_of(events, triggers, shape=SHAPE):
@@ -313,6 +326,7 @@ def test_the_file_is_laid_out_as_metavision_writes_it(tmp_path, monkeypatch):
         stored, index = file["CD/events"], file["CD/indexes"]
         assert dict(file.attrs) == {"version": "1.0", "geometry": "1280x720", "camera_integrator_name": "hesim_render"}
         assert stored.shape == (40_000,) and stored.chunks == (16384,) and stored.id.get_num_chunks() == 3
+        assert {name: stored.dtype.fields[name][1] for name in "xypt"} == {"x": 0, "y": 2, "p": 4, "t": 8}
         assert stored.dtype.names == ("x", "y", "p", "t") and stored.dtype.itemsize == 16
         assert stored.id.get_create_plist().get_filter(0)[0] == 0x8ECF
         parts = [ecf.decoded(stored.id.read_direct_chunk((k,))[1], min(16384, 40_000 - k), path, "c")
@@ -405,6 +419,8 @@ def with_chunk(file, data, skipped=0):
     (lambda f: f["CD"].__delitem__("events") or f.__setitem__("CD/events", np.arange(3)), "is no data set of records"),
     (lambda f: f["CD"].__delitem__("events") or f["CD"].__setitem__("events", h5py.ExternalLink("x", "y")),
      "is a link"),
+    (lambda f: f["CD"].__delitem__("events") or f["CD"].create_dataset(
+        "events", (0,), prophesee_hdf5._RECORD, maxshape=(None,), chunks=(1 << 23,)), "would take 0.134 GB of memory"),
 ])  # fmt: skip
 def test_damaged_files_are_one_clear_error(change, told, tmp_path):
     path = damaged(file_of(many(50, 1 << 20), EDGES[:0], "prophesee", tmp_path), change)

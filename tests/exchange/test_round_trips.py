@@ -326,3 +326,10 @@ def test_a_hundred_million_events_take_bounded_memory(name, tmp_path):
     )
     same, peak_mb = done.stdout.split()
     assert same == "True" and int(peak_mb) < 500
+
+
+def test_a_field_that_a_table_leaves_out_has_its_default():
+    """A table of its own layout: two fields, the second one left out, behind its list of offsets."""
+    table = FlatTable(struct.pack("<HHHHii", 8, 8, 4, 0, 8, 42), 8)
+    assert [table.number(field, "<i", 7) for field in (0, 1, 5)] == [42, 7, 7]
+    assert table.structures(1, np.dtype("u1")).size == 0 and table.text(5) == ""

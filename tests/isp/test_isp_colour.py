@@ -72,6 +72,12 @@ def test_wrong_corners_of_a_chart_are_told_as_corners():
     assert chart.patch_means(image, [(10, 80), (10, 10), (50, 10), (50, 80)]).shape == (24, 3)  # seen in a mirror
 
 
+def test_patches_of_a_chart_with_a_single_row():
+    image = np.repeat(np.arange(60.0)[None, :, None], 30, axis=0) * [1.0, 2.0, 3.0]
+    found = chart.patch_means(image, [(10, 10), (10, 50), (20, 50), (20, 10)], rows=1, cols=3)
+    np.testing.assert_allclose(found, np.outer([10, 30, 50], [1, 2, 3]))
+
+
 def test_patches_of_a_chart_in_perspective():
     """A plane that is turned about two axes before a pinhole: its patches are projected one by one."""
     turn = Rotation.from_euler("xyz", [0.5, -0.35, 0.2]).as_matrix()

@@ -8,8 +8,8 @@ from scipy.stats import chi2
 import hesim_render as hr
 from hesim_render.core import bands
 from hesim_render.core.errors import RangeError
-from hesim_render.isp import FrameNoise, rows
-from hesim_render.isp.denoise import denoise
+from hesim_render.isp import FrameNoise, collaborate, rows
+from hesim_render.isp.denoise import _each, denoise
 from hesim_render.isp.rows import row_offsets
 from hesim_render.isp.stabilise import Stabiliser
 
@@ -94,12 +94,12 @@ def test_variance_and_maps_are_those_of_the_simulators_frames():
 
 
 def test_terms_switched_off_are_not_looked_for():
-    sensor = hr.load_sensor("eiger").crop(64, 64)
+    sensor = hr.load_sensor("eiger").crop(80, 48)
     everything = FrameNoise.of_sensor(sensor.spec, sensor.layout)
     no_rows = FrameNoise.of_sensor(sensor.spec, sensor.layout, frozenset({"row"}))
     assert everything.offset_dn.mean(axis=1).std() > 1 > 0.2 > no_rows.offset_dn.mean(axis=1).std()
     recording = hr.simulate_video(
-        np.full((2, 64, 64), 128, np.uint8), sensor, fps=10, transfer="srgb", duration_s=0.06, clean=True, fit="pixel"
+        np.full((2, 48, 80), 128, np.uint8), sensor, fps=10, transfer="srgb", duration_s=0.06, clean=True, fit="pixel"
     )
     clean = FrameNoise.of_recording(recording.manifest)
     assert clean.is_clean and clean.describe()["clean"] and not everything.is_clean
@@ -107,7 +107,7 @@ def test_terms_switched_off_are_not_looked_for():
 
 
 def test_temporal_row_noise_is_in_no_map():
-    sensor = hr.load_sensor("eiger", {"aps.row_noise_dn": 1.5}).crop(64, 64)
+    sensor = hr.load_sensor("eiger", {"aps.row_noise_dn": 1.5}).crop(80, 48)
     noise = FrameNoise.of_sensor(sensor.spec, sensor.layout)
     assert noise.unknown_rows_dn == 1.5 and noise.describe() == {"maps": "known", "row_std_dn": 1.5, "clean": False}
     unknown = FrameNoise.of_sensor(sensor.spec, sensor.layout, maps=False)
@@ -115,8 +115,14 @@ def test_temporal_row_noise_is_in_no_map():
     assert FrameNoise.of_sensor(sensor.spec, sensor.layout, frozenset({"row_noise"})).unknown_rows_dn == 0
 
 
+@pytest.mark.parametrize("name", ["offset_dn", "dark_dn_per_s", "response"])
+def test_one_map_is_a_known_one(name):
+    assert noise_of(((0, 1),), **{name: np.full((4, 6), 1.5, np.float32)}).describe()["maps"] == "known"
+    assert noise_of(((0, 1),)).describe()["maps"] == "none"
+
+
 def test_without_maps_what_they_would_tell_counts_as_noise():
-    sensor = hr.load_sensor("eiger").crop(64, 64)
+    sensor = hr.load_sensor("eiger").crop(80, 48)
     aps = sensor.spec.aps
     noise = FrameNoise.of_sensor(sensor.spec, sensor.layout, maps=False)
     assert noise.row_std_dn == aps.row_offset_std_dn and noise.describe()["maps"] == "unknown"
@@ -224,6 +230,28 @@ def test_saturated_samples_stay_and_positions_have_their_own_noise():
     assert (found[20:30, 20:40] == 959).all()
     bad = found[1::4, 1::4][found[1::4, 1::4] < 900]
     assert np.abs(bad - 30).mean() < 1.5 < np.abs(raw[1::4, 1::4][raw[1::4, 1::4] < 900] - 30).mean()
+
+
+def test_a_patch_of_the_first_pass_is_shrunk_by_the_spread_of_its_group():
+    """Moments of each group written out; a mean counts above 2.7 of its own deviations, 1/4 of that of a patch."""
+    rng = np.random.default_rng(6)
+    noisy = rng.normal([0, 0.4, 0.8, 1, 2, 5], 1.6, (2, 20, 6)).astype(np.float32)
+    alike, flat = rng.integers(0, 40, (5, 16)), noisy.reshape(40, 6).astype(np.float64)
+    found, weights = collaborate._estimate(noisy, None, alike, 3)
+    for number, members in enumerate(alike):
+        mean, spread = flat[members].mean(axis=0), flat[members].var(axis=0, ddof=1)
+        kept, share = np.abs(mean) > 2.7 / 4, np.maximum(spread - 1, 0) / spread
+        expected = kept * mean + share * (flat[3 + number] - mean)
+        np.testing.assert_allclose(found[number], expected, rtol=1e-4, atol=1e-5)
+        assert weights[number] == pytest.approx(1 / (1 + (share**2).sum() + kept.sum() / 16), rel=1e-4)
+
+
+def test_each_position_of_a_tile_that_is_not_square_has_its_own_transform():
+    laws = {(row, col): Stabiliser(0.5 + row, 0.1 + 0.2 * col, 0.0, 900.0) for row in range(2) for col in range(3)}
+    image = np.random.default_rng(4).uniform(0, 800, (7, 11)).astype(np.float32)
+    found = _each(image, (2, 3), laws, Stabiliser.forward)
+    for row, col in np.ndindex(image.shape):
+        assert found[row, col] == laws[row % 2, col % 3].forward(image[row : row + 1, col : col + 1])[0, 0]
 
 
 # -- rows --------------------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """Pictures of recordings: what is written, and what is known of the noise of the sensor that made them."""
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import capture_sets
 import numpy as np
@@ -26,8 +28,10 @@ from hesim_render.isp import (
     tone,
 )
 from hesim_render.isp.colour import colour_matrix
+from hesim_render.isp.develop import _illumination
 from hesim_render.isp.smooth import reduce_noise
 from hesim_render.mosaic.layout import Layout
+from hesim_render.recording import manifest
 from hesim_render.recording.recording import Recording
 from hesim_render.specs.sensor import SensorSpec
 from hesim_render.spectral.transfer import encode
@@ -323,3 +327,12 @@ def test_known_maps_and_estimated_rows_take_the_bands_out():
         )
     )
     assert known < 0.1 * raw and estimated < 0.3 * raw
+
+
+def test_the_illumination_of_a_recording_is_that_of_its_lens_about_its_own_axis():
+    whole = hr.load_sensor("eiger")
+    sensor = replace(whole, lens=replace(whole.lens, axis_mm=(0.31, -0.17))).crop(24, 16, 40, 904)
+    made = manifest.build(sensor, scene=None, seed=5, duration_us=3000, settings={})
+    found = _illumination(SimpleNamespace(manifest=made, path=None))
+    np.testing.assert_allclose(found, sensor.relative_illumination, rtol=1e-6)
+    assert np.ptp(found) > 1e-4 and found.shape == (16, 24)

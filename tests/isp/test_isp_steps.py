@@ -1,11 +1,15 @@
 """Each step against its formula, written out again."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from isp_images import MIPI, QUAD, images, linear, mosaic_of, psnr
 
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import RangeError, SpecError
 from hesim_render.isp import balance, chart, colour, fill, levels, smooth, tone
+from hesim_render.isp.frame_noise import FrameNoise
+from hesim_render.isp.steps import BlackLevel, ColourMatrix, Denoise, Development, WhiteBalance
 from hesim_render.spectral import transfer
 from hesim_render.spectral.transfer import from_root, to_root
 
@@ -58,6 +62,32 @@ def test_fill_does_not_reach_across_an_edge():
     picture[:, 18:] = 0.9
     filled = fill.fill_positions(mosaic_of(picture, MIPI).astype(np.float32), MIPI, QUAD)
     np.testing.assert_allclose(filled, mosaic_of(picture, QUAD), atol=0.01)
+
+
+def test_each_hole_of_a_tile_that_is_not_square_gets_its_own_colour():
+    tile, filled = ((0, 1, 2, -1), (2, 0, -1, 1), (1, 2, 0, 0)), ((0, 1, 2, 2), (2, 0, 1, 1), (1, 2, 0, 0))
+    shape = (15, 22)
+    colours = np.array([3.0, 7.0, 11.0, np.nan], np.float32)
+    found = fill.fill_positions(mosaic_of(np.broadcast_to(colours, (*shape, 4)), tile).astype(np.float32), tile, filled)
+    np.testing.assert_allclose(found, mosaic_of(np.broadcast_to(colours, (*shape, 4)), filled), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("size", "period", "margin"), [(13, 3, 8), (8, 4, 8), (5, 2, 4), (9, 5, 10)])
+def test_lines_beyond_the_sides_are_those_of_the_same_place_in_the_tile(size, period, margin):
+    found, place = fill._kept_in_phase(size, period, margin), np.arange(-margin, size + margin)
+    assert found.min() >= 0 and found.max() < size and not np.any((found - place) % period)
+    np.testing.assert_array_equal(found[margin : margin + size], np.arange(size))
+    assert np.abs(found - np.clip(place, 0, size - 1)).max() < period
+
+
+def test_bridges_count_by_their_length_and_evenness():
+    """From 0.9 to 0.8 over 1 + 1 px, from 0.2 to 0.5 over 2 + 1 px, and one with a single end, which counts little."""
+    values = {(0, 1): 0.9, (0, -1): 0.8, (2, 0): 0.2, (-1, 0): 0.5, (3, 3): 0.7, (-1, -1): np.nan}
+    bridges = [((0, 1), (0, -1)), ((2, 0), (-1, 0)), ((3, 3), (-1, -1))]
+    total, weight = fill._mean_of_bridges(bridges, lambda offset: np.float32([values[offset]]))
+    weights = [1 / ((0.1 + fill._EVEN) ** 2 * 2), 1 / ((0.3 + fill._EVEN) ** 2 * 3), 1]
+    assert weight[0] == pytest.approx(sum(weights), rel=1e-5)
+    assert total[0] == pytest.approx(np.dot(weights, [0.85, 0.4, 0.7]), rel=1e-5)
 
 
 def test_bad_pixels_and_their_clusters_are_filled():
@@ -250,6 +280,9 @@ def test_guided_filter_against_its_definition():
             models.append((a, p.mean() - a * g.mean()))
     a, b = np.mean(models, axis=0)
     assert found == pytest.approx(a * guide[7, 7] + b, abs=1e-5)
+    for radius_px, epsilon in ((0, 0.01), (1, 0.0)):
+        with pytest.raises(RangeError, match="radius_px, epsilon"):
+            smooth.guided_filter(image, guide, radius_px, epsilon)
 
 
 @pytest.mark.parametrize("name", ["srgb", "bt709", "gamma", "linear"])
@@ -279,6 +312,22 @@ def test_integer_depths_round_the_curve(depth):
     assert np.abs(found - exact).max() < 0.55
 
 
+def test_each_method_has_its_own_gains():
+    image = RNG.uniform(0.2, 0.6, (8, 12)).astype(np.float32)
+    state = SimpleNamespace(image=image, tile=QUAD, camera=SimpleNamespace(white_balance=[1.7, 1.0, 1.3], matrix=None))
+    step = WhiteBalance(step="white_balance", gains=[2.0, 1.1, 1.4])
+    expected = {"camera": [1.7, 1.0, 1.3], "given": [2.0, 1.1, 1.4], "grey_world": balance.grey_world(image, QUAD)}
+    for method, gains in expected.items():
+        assert step.model_copy(update={"method": method})._gains(state) == gains
+    for method in ("given", "chart"):
+        for lacking in (
+            WhiteBalance(step="white_balance", method=method),
+            ColourMatrix(step="colour_matrix", method=method),
+        ):
+            with pytest.raises(SpecError, match=f"is required by method {method}"):
+                lacking.run(state)
+
+
 def test_grey_world_leaves_out_tiles_of_which_one_channel_is_dark_or_saturated():
     """The gains are those of the well exposed part; the others have other colours."""
     tile, colour = ((0, 1), (1, 2)), np.array([0.31, 0.62, 0.44])
@@ -287,3 +336,36 @@ def test_grey_world_leaves_out_tiles_of_which_one_channel_is_dark_or_saturated()
         part = raw[rows]
         part[np.tile(tile, (6, 30)) == channel] = level
     np.testing.assert_allclose(balance.grey_world(raw, tile), colour.max() / colour, rtol=1e-5)
+
+
+def test_black_and_white_of_a_step_are_its_own_or_the_cameras():
+    image = np.array([[40.0, 470.0], [900.0, 255.0]], np.float32)
+    for given, black, white in (({}, 64.0, 1023.0), ({"black_level_dn": 40.0, "white_level_dn": 900.0}, 40.0, 900.0)):
+        state = SimpleNamespace(image=image, camera=SimpleNamespace(black_level_dn=64.0, white_level_dn=1023.0))
+        BlackLevel(step="black_level", **given).run(state)
+        assert state.span_dn == white - black
+        np.testing.assert_allclose(state.image, (image - black) / (white - black), rtol=1e-6)
+
+
+def test_the_report_of_noise_reduction_has_the_rms_of_the_row_offsets(monkeypatch):
+    offsets = np.array([3.0, -1.0, 2.0, 0.0], np.float32)
+    monkeypatch.setattr("hesim_render.isp.steps.row_offsets", lambda *given: offsets)
+    noise = FrameNoise(np.tile([0.6, 0.2, 0, 0, 0, 0], (1, 1, 1)), 1000.0)
+    tile, camera = np.zeros((1, 1), int), SimpleNamespace(white_balance=[1.0])
+    state = Development(np.full((4, 6), 0.5, np.float32), camera, tile, noise=noise, span_dn=200.0)
+    Denoise(step="denoise", strength=0, row_std_dn=1.3).run(state)
+    assert state.report == {"row_offsets_rms_dn": pytest.approx(np.sqrt(14 / 4))}
+    np.testing.assert_allclose(state.image, 0.5 - offsets[:, None] / 200 + np.zeros((4, 6)), rtol=1e-6)
+
+
+def test_gains_of_a_tile_that_is_not_square_reach_their_own_pixels():
+    tile, gains = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 0, 2]]), np.array([1.7, 1.0, 1.3])
+    raw = RNG.uniform(0.1, 0.5, (11, 8)).astype(np.float32)
+    channel = tile[np.arange(11)[:, None] % 4, np.arange(8) % 3]
+    np.testing.assert_allclose(balance.white_balance(raw, tile, gains), raw * gains[channel], rtol=1e-6)
+
+
+def test_eight_bits_are_those_of_the_nearest_of_65536_levels():
+    levels = np.arange(1 << 16)
+    found = transfer.encode((levels[:, None, None] / 65535).astype(np.float32) * np.ones(3, np.float32), depth=8)
+    np.testing.assert_array_equal(found[:, 0, 1], np.rint(255 * transfer.encode_exactly(levels / 65535)))

@@ -54,6 +54,8 @@ def test_equal_laws_do_not_differ():
     """Seven figures, eight pairs: at 5 % each three differ on average; 10 or more have a chance of 1e-3."""
     found = [event_distances(poisson(2 * k), poisson(2 * k + 1)) for k in range(8)]
     assert sum(one.differs for distances in found for one in distances) < 10
+    assert all(one.value == 0 for one in event_distances(poisson(3), poisson(3)))
+    assert {one.name for one in found[0] if one.first is not None} == {"rate", "polarity", "hot pixels"}
     for distances in found:
         assert {one.name: one for one in distances}["rate"].value < 0.03
 
@@ -107,3 +109,16 @@ def test_neighbours_that_are_active_together_more_often_than_by_chance_correlate
     active = np.append(0.25 * 24, pairs * both)[None] * 400
     found = event_distance._over_space(SimpleNamespace(active=active, shape=(4, 6), windows=400), np.array([0]))
     assert found == pytest.approx((both - 0.0625) / (0.25 * 0.75)) and found[1] == 0
+
+
+def test_the_rate_correlates_with_itself_at_lags_of_1_to_32_ms():
+    series = np.random.default_rng(8).poisson(3.0, (4, 90))
+    found = event_distance._over_time(SimpleNamespace(series=series), np.array([2, 0, 2]))
+    drawn = series[[2, 0, 2]] - series[[2, 0, 2]].mean()
+    expected = [
+        sum(a * b for row in drawn for a, b in zip(row, row[lag:], strict=False)) / (3 * (90 - lag)) / drawn.var()
+        for lag in (1, 2, 4, 8, 16, 32)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    short = event_distance._over_time(SimpleNamespace(series=series[:, :32]), np.array([2, 0, 2]))
+    assert np.isfinite(short).all() and short[-1] == 0 and np.all(short[:-1] != 0)

@@ -77,6 +77,8 @@ def test_one_filter_of_a_mosaic_is_measured_in_a_part_of_a_frame(recording):
         np.testing.assert_allclose(found.mtf[:51], expected, atol=0.05)
         assert abs(found.angle_deg - 5) < 0.2
     raw = measure_mtf(loaded, region=(10, 0, 100, 96), filter_name=known[1])
+    whole, same = (measure_mtf(loaded, region=part, filter_name=known[1]) for part in (None, (0, 0, 120, 96)))
+    np.testing.assert_array_equal(whole.mtf, same.mtf)
     assert not raw.clipped
     assert abs(raw.mtf[10] - expected[10]) < 0.05
     with pytest.raises(RangeError, match="say on which to measure"):

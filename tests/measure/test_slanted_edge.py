@@ -6,6 +6,7 @@ from scipy.special import erf
 
 from hesim_render.core.errors import RangeError
 from hesim_render.measure import edge_response
+from hesim_render.measure.slanted_edge import EdgeResponse
 
 FREQUENCY = np.linspace(0, 0.5, 51)
 
@@ -105,6 +106,15 @@ def test_frequency_at_a_level_lies_between_those_of_the_response():
     expected = fine[np.argmin(np.abs(closed_form(fine, 5.0, 0.5) - 0.5))]
     assert abs(found.frequency_at(0.5) - expected) < 0.002
     assert np.isnan(edge_response(edge_image(80, 60, 5.0, 0.5), frequency_cy_per_px=[0, 0.1]).frequency_at(0.5))
+
+
+def test_frequency_at_a_level_is_that_of_the_first_crossing():
+    response = EdgeResponse(
+        np.array([0, 0.1, 0.25, 0.4, 0.5]), np.array([1, 0.8, 0.6, 0.3, 0.1]), 5.0, np.zeros(1), np.zeros(1)
+    )
+    levels = {0.9: 0.05, 0.5: 0.3, 0.3: 0.4, 0.2: 0.45}
+    assert [response.frequency_at(level) for level in levels] == pytest.approx(list(levels.values()))
+    assert np.isnan(response.frequency_at(0.05)) and np.isnan(response.frequency_at(1.5))
 
 
 WRONG = {

@@ -1,10 +1,13 @@
 """Colour description of mosaics of one, two and three colours, by its own conditions."""
 
+import json
+
 import numpy as np
 import pytest
 
 import hesim_render as hr
-from hesim_render.mosaic.description import _colour_matrices
+from hesim_render.mosaic.description import _colour_matrices, describe
+from hesim_render.recording import manifest
 from hesim_render.spectral import spectrum as spectra
 from hesim_render.spectral.colorimetry import responses_to, tristimulus, xyz_to_linear_srgb
 
@@ -36,3 +39,32 @@ def test_a_sensor_of_one_colour_is_grey():
     white = tristimulus(spectra.illuminant("D65"), [spectra.constant(1.0)])[0]
     # the white of D65 has the response 1, whichever of X, Y and Z a light has it by
     assert np.shape(from_xyz) == (1, 3) and np.ptp(from_xyz) == 0 and np.array(from_xyz)[0] @ white == pytest.approx(1)
+
+
+@pytest.mark.parametrize("name", ["reference-mono", "reference-bayer", "gen2", "davis346"])
+def test_files_do_not_depend_on_the_last_digits_of_a_fit(name, monkeypatch):
+    """Builds of NumPy for other Pythons bring other builds of LAPACK; DNG files and manifests have the same bytes."""
+    sensor = hr.load_sensor(name)
+
+    def described():
+        made = manifest.build(sensor, scene=None, seed=5, duration_us=3000, settings={})["mosaic"]
+        return json.dumps(made), len(made["channels"])
+
+    exact, calls = np.linalg.lstsq, []
+
+    def other_build(*given, **options):
+        solution, *rest = exact(*given, **options)
+        calls.append(solution.shape)
+        wobble = np.resize([3, -2, 5, -7], solution.shape) * np.finfo(np.float64).eps
+        return solution * (1 + wobble), *rest
+
+    before = described()
+    monkeypatch.setattr(np.linalg, "lstsq", other_build)
+    assert described() == before
+    assert len(calls) == (3 if before[1] > 1 else 1)  # matrices of colours, and the noise of frames
+
+
+def test_a_sensor_without_frames_has_levels_that_need_no_care():
+    made = describe(hr.load_sensor("dvs128"))
+    found = made.bit_depth, made.black_level_dn, made.white_level_dn, made.system_gain_dn_per_e
+    assert found == (1, 0.0, 1, 1.0)

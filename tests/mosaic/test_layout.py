@@ -14,7 +14,7 @@ def full(name):
 
 
 def test_tile_is_drawn_as_the_file_shows_it():
-    layout = full("eiger").crop(8, 8)
+    layout = full("eiger").crop(16, 8)
     letters = ["RRGG", "RrGg", "GGBB", "GgBb"]
     names = {"r": "red", "g": "green", "b": "blue"}
     for row in range(8):

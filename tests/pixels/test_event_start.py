@@ -137,6 +137,18 @@ def test_levels_of_comparison_are_drawn_from_the_law():
     assert np.median(other) == pytest.approx(median, abs=0.08)
 
 
+def test_between_octaves_of_bandwidth_the_start_is_linear():
+    noise = pixels(evs__refractory_period_us=400)
+    count = int(np.prod(noise.layout.evs_shape))
+    spread = np.full(count, 0.07, np.float32)
+    one, half, between = (
+        start_of(noise, 3, spread, np.full(count, share), start.POLE / 16) for share in (1.0, 0.5, 0.5**0.3)
+    )
+    np.testing.assert_allclose(between.reference, 0.7 * one.reference + 0.3 * half.reference, atol=1e-5)
+    np.testing.assert_allclose(between.events_hz, 0.7 * one.events_hz + 0.3 * half.events_hz, rtol=1e-5)
+    assert np.abs(one.reference - half.reference).max() > 0.01
+
+
 # ---- the law ---------------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,8 @@
 """Photoreceptor bandwidth, refractory period and read-out limit of event pixels, against closed forms."""
 
+import math
+from fractions import Fraction
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -539,3 +542,10 @@ def test_all_together_do_not_depend_on_the_samples():
 def test_keys_that_do_not_fit(changes, message):
     with pytest.raises(SpecError, match=message):
         read_sensor("reference-mono", changes)
+
+
+@pytest.mark.parametrize("rows", [1, 7, 480])
+def test_the_scan_begins_at_rows_of_the_golden_section(rows):
+    t_us = np.array([0, 1, 2, 3, 5, 1_000_003, 2**33 + 7])
+    exact = [Fraction(int(t) * 2654435769, 2**32) % 1 * rows for t in t_us]
+    assert scan_start_row(t_us, rows).tolist() == [math.floor(place) for place in exact]

@@ -191,6 +191,12 @@ def test_leak_of_previous_sample():
     assert off.sum() == 0
     assert abs(on.mean() - 50 * p) < 5.5 * np.sqrt(50 * p * (1 - p) / on.size)
     assert abs(on.var() / (50 * p * (1 - p)) - 1) < 5.5 * np.sqrt(3.0 / on.size)
+    # where the signal fires, the leak is not seen
+    busy = model(64, evs__leak_rate_hz=900.0).without("shot", "dark_current")
+    for electrons, sign in ((4.0, -1), (25.0, 1)):
+        stage = EvsStage(busy, seed=1)
+        stage.step(flat(10.0, busy), 0)
+        assert np.all(stage.step(flat(electrons, busy), TICK_US)["polarity"] == sign)
 
 
 # ---- last_event ------------------------------------------------------------------------------------

@@ -100,6 +100,32 @@ def test_it_begins_as_after_a_long_time():
     assert stats.kstest(first * 2.6e-6, "uniform").pvalue > 1e-5
 
 
+@pytest.mark.parametrize("events_hz", [0.0, 0.4, 30.0])
+def test_the_last_event_lies_back_by_its_own_law(events_hz):
+    """Drift of 2.6 events/s; noise events end it earlier: what passed is exponential, cut at a whole drift."""
+    drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.6}))
+    chance = np.linspace(0.01, 0.99, PIXELS)
+    drift.start(jit().Float(np.zeros(PIXELS, np.float32)), False, np.full(PIXELS, events_hz), chance)
+    passed_s = chance / 2.6
+    if events_hz:
+        passed_s = stats.truncexpon(events_hz / 2.6, scale=1 / events_hz).ppf(chance)
+    np.testing.assert_allclose(np.array(drift.way), THETA_ON * 2.6 * passed_s, rtol=1e-5)
+
+
+def test_the_way_at_an_event_counts_from_the_last_sample():
+    drift = LeakDrift(pixels({"process": "drift", "rate_hz": 2.6}))
+    light = jit().Float(np.zeros(PIXELS, np.float32))
+    drift.start(light, True, np.zeros(PIXELS), np.zeros(PIXELS))
+    events = np.zeros(2, EVENT_DTYPE)
+    events["t_us"], events["x"], events["y"], events["polarity"] = (252_000, 257_000), (5, 9), (3, 3), 1
+    drift.pass_by(events, SHAPE[1], light, 250_000, 260_000)
+    per_us = THETA_ON * 2.6e-6
+    expected = np.zeros(PIXELS)
+    expected[[3 * SHAPE[1] + 5, 3 * SHAPE[1] + 9]] = 2000 * per_us, 7000 * per_us
+    np.testing.assert_allclose(drift._at_event, expected, rtol=1e-5)
+    np.testing.assert_allclose(np.array(drift.way), 10_000 * per_us, rtol=1e-5)
+
+
 @pytest.mark.parametrize(("sigma", "rate_hz"), ((0.045, 2.2), (0.07, 0.9)), ids=("regular", "with-noise-events"))
 def test_noise_and_drift_against_numpy(sigma, rate_hz):
     """Counts of both polarities within 4.5 standard errors, ON intervals by Kolmogorov and Smirnov."""

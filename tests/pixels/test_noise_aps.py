@@ -457,11 +457,13 @@ def test_wrong_exposure(exposure_us):
         model().sample(1.0, exposure_us, seed=1)
 
 
-def test_columns_neighbours_and_interference_share_what_they_say():
-    """500 frames of 64×96 px without light: bounds of 5 standard errors, seven comparisons, a false alarm in 4e-6."""
+@pytest.mark.parametrize("law", ["poisson", "gaussian"])
+def test_columns_neighbours_and_interference_share_what_they_say(law):
+    """500 frames of 64×96 px without light: bounds of 5 standard errors, 14 comparisons, a false alarm in 8e-6."""
     line = {"cycles_per_row": 0.25, "cycles_per_col": -0.375, "rms_dn": 1.7}
     noise = model(
-        "eiger", crop=(96, 64), aps__column_noise_dn=1.3, aps__read_noise_correlation=-0.31, aps__interference=[line],
+        "eiger", crop=(96, 64), aps__law=law, aps__column_noise_dn=1.3, aps__read_noise_correlation=-0.31,
+        aps__interference=[line],
         aps__dark_current_e_per_s=0.0, aps__read_noise_e=3.1, aps__system_gain_dn_per_e=2.3, aps__beta=None,
         aps__row_noise_dn=0.0, aps__telegraph=None, aps__residual_noise_dn=0.0,
     )  # fmt: skip

@@ -18,6 +18,8 @@ from hesim_render.core.errors import SpecError
 from hesim_render.core.rng import Stream
 from hesim_render.pixels.aps.model import APS_TERMS
 from hesim_render.pixels.evs import formulas as evs_formulas
+from hesim_render.pixels.evs.defects import DefectEvents, PixelDefects
+from hesim_render.pixels.evs.events import Origin
 from hesim_render.pixels.evs.model import EVS_TERMS
 from hesim_render.pixels.evs.stage import EvsStage
 from hesim_render.pixels.poisson_points import PoissonPoints, Telegraph
@@ -175,6 +177,34 @@ def test_hot_and_flickering_pixels_fire_as_their_closed_forms(reference):
     # the state may change within a tick, which lowers a tick's chance by up to 0.3·λΔt/2·(1 − p)·0.15 < 0.3 %
     assert abs(counts[flickering].mean() - mean) < 4.2 * np.sqrt((spread + own) / n) + 3e-3 * mean
     assert abs(counts[flickering].var(ddof=1) / (spread + own) - 1) < 4.2 * np.sqrt(2.3 / n)
+
+
+def test_share_and_rate_of_a_flickering_pixel():
+    assert evs_formulas.firing_share(0.2, 0.5) == pytest.approx(2 / 7)
+    assert evs_formulas.change_rate_hz(0.2, 0.5) == pytest.approx(7.0)
+
+
+def test_every_flickering_pixel_has_quiet_times_and_those_of_a_single_one_are_its_own():
+    """800 Hz during 0.2 s, then none during 0.5 s: a gap of 0.1 s by chance has e⁻⁸⁰."""
+    rates = [*(np.full(3, value) for value in (500.0, 300.0, 2 / 7)), np.array([7.0, 0.9, 7.0])]
+    defects = PixelDefects(np.empty(0, int), np.array([4, 7, 9]), np.array([40, 70, 90], np.uint32), *rates)
+    t_us, pixel, polarity = DefectEvents(defects, 5).between(0, 20e6)
+    for one in (4, 7, 9):
+        assert np.diff(t_us[pixel == one]).max() > 1e5, one
+    assert abs(np.mean(polarity > 0) - 5 / 8) < 4.5 * np.sqrt(15 / 64 / t_us.size)
+    quick = np.isin(pixel, (4, 9))  # some 57 spells of firing
+    assert abs(quick.sum() / (2 * 20 * 800 * 2 / 7) - 1) < 0.4
+
+
+def test_at_a_tick_the_first_event_of_a_pixel_counts():
+    rates = [np.full(3, value) for value in (600.0, 500.0, 1.0, 0.0)]
+    defects = PixelDefects(np.array([2]), np.array([0, 1, 4]), np.array([40, 70, 90], np.uint32), *rates)
+    events, given = DefectEvents(defects, 5), np.array([0, 0, 1, -1, -1, 0], np.int8)
+    for begin_us in range(0, 200_000, 10_000):
+        _, place_, polarity = events.between(begin_us, begin_us + 10_000)
+        first = {int(where): int(sign) for where, sign in zip(place_[::-1], polarity[::-1], strict=True)}
+        expected = [Origin.DEFECT * first[0], Origin.DEFECT * first[1], 0, -1, -1, 0]
+        assert events.at_tick(given, begin_us, begin_us + 10_000).tolist() == expected
 
 
 def test_moments_of_flicker_are_their_sums():

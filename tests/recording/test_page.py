@@ -92,7 +92,7 @@ def test_plots_hold_all_events_and_all_pixels(recording):
 
 def test_recordings_without_frames_or_without_events_have_plots_and_pages(tmp_path):
     for name in ("imx636", "reference-bayer"):
-        sensor = hr.load_sensor(name).crop(16, 16)
+        sensor = hr.load_sensor(name).crop(24, 16)
         found = hr.simulate(hr.load_scene("dark"), sensor, duration_s=0.002, out=tmp_path / name)
         found.plot().savefig(tmp_path / f"{name}.png")
         assert write_page(found, found.path).is_file()

@@ -109,7 +109,7 @@ def test_each_pixel_collects_over_its_own_interval():
 
 def captured(name, source, without=(), part=PART, duration_us=40_000):
     """Mean electrons of the first frame [row, col] and mean flux of the event pixels [y, x]."""
-    sensor = hr.load_sensor(name, {"geometry.crosstalk": part}).crop(32, 32)
+    sensor = hr.load_sensor(name, {"geometry.crosstalk": part}).crop(48, 24)
     aps, evs = noise_models(sensor, without=without)
     aps = dataclasses.replace(aps, spec=aps.spec.model_copy(update={"exposure_us": 5000}))
     capture = Capture(source, sensor, aps, evs, duration_us, seed=1)
@@ -119,7 +119,7 @@ def captured(name, source, without=(), part=PART, duration_us=40_000):
 
 @pytest.mark.parametrize("name", ("mipi-hybridevs", "reference-mono", "eiger"))
 def test_frames_and_events_of_a_static_scene(name):
-    image = np.random.default_rng(3).uniform(0, 50_000, (32, 32))
+    image = np.random.default_rng(3).uniform(0, 50_000, (24, 48))
     for without, aps_part, evs_part in (
         ((), PART, PART), (("aps.crosstalk",), 0, PART), (("evs.crosstalk",), PART, 0),
         (("aps.crosstalk", "evs.crosstalk"), 0, 0),
@@ -137,7 +137,7 @@ def test_frames_and_events_of_a_static_scene(name):
 
 def test_light_on_event_pixels_alone_reaches_frame_pixels_and_back():
     """mipi-hybridevs has them apart: at (1, 1) and (3, 3) of each 4×4 tile."""
-    sensor = hr.load_sensor("mipi-hybridevs").crop(32, 32)
+    sensor = hr.load_sensor("mipi-hybridevs").crop(48, 24)
     image = np.where(sensor.layout.aps_mask, 0.0, 1e5)
     _, frame, events = captured("mipi-hybridevs", Still(image))
     np.testing.assert_allclose(events[:-1, :-1], (1 - PART) * 1e5, rtol=1e-5)
@@ -148,9 +148,9 @@ def test_light_on_event_pixels_alone_reaches_frame_pixels_and_back():
 
 def test_rolling_shutter_in_changing_light():
     """Row r integrates from r lines on: its neighbours' light over that time, closed form for light ∝ t."""
-    image = np.random.default_rng(4).uniform(0, 50_000, (32, 32))
+    image = np.random.default_rng(4).uniform(0, 50_000, (24, 48))
     sensor, frame, events = captured("eiger", Rising(image), duration_us=400_000)
-    middle_us = frame.exposure_start_us + frame.line_time_us * np.arange(32) + 2500.0
+    middle_us = frame.exposure_start_us + frame.line_time_us * np.arange(24) + 2500.0
     expected = kernel_by_hand(image, PART) * 1e-6 * middle_us[:, None] * 5e-3
     valid = sensor.layout.aps_mask
     np.testing.assert_allclose(frame.electrons_mean[valid], expected[valid], rtol=1e-5)
@@ -161,7 +161,7 @@ def test_rolling_shutter_in_changing_light():
 def test_bench_of_the_lab_sees_it_too():
     from hesim_render.capture.bench import set_up
 
-    sensor = hr.load_sensor("eiger", {"geometry.crosstalk": PART}).crop(64, 64)
+    sensor = hr.load_sensor("eiger", {"geometry.crosstalk": PART}).crop(80, 48)
     bench = set_up(sensor, (1000, 4000))
     expected = kernel_by_hand(bench.flux_e_per_s, PART)
     np.testing.assert_allclose(bench.frame_flux_e_per_s, expected, rtol=1e-12)

@@ -24,6 +24,12 @@ def test_product_of_ramps_against_the_closed_form():
     assert spectra.integrate_product(up, down) == pytest.approx(exact, rel=1e-12)
 
 
+def test_a_sum_has_each_table_where_it_is_known():
+    found = spectra.summed(Spectrum([400, 600], [0.2, 0.6]), constant(3.0, 500, 700), constant(0.5, 450, 460))
+    np.testing.assert_allclose(found.at([399, 400, 455, 499.9, 500, 600, 601, 700]),
+                               [0, 0.2, 0.81, 0.3998, 3.4, 3.6, 3, 3], rtol=1e-9)  # fmt: skip
+
+
 def test_product_of_tables_against_adaptive_quadrature():
     light, surface = spectra.illuminant("FL11"), list(spectra.colorchecker().values())[13]
     low, high = max(light.support_nm[0], surface.support_nm[0]), min(light.support_nm[1], surface.support_nm[1])

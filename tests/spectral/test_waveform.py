@@ -90,7 +90,7 @@ def test_following_times_keep_the_logarithm_straight(name):
     times = w.follow_us(0, 20_000)
     assert np.all(np.diff(times) > 0) and times.min() > 0 and times.max() < 20_000
     jumps = w.jumps_us(0, 20_000)
-    assert np.isin(jumps, times).all()
+    assert np.isin(jumps, times).all() and (jumps.size > 0) == (name not in ("mains", "table"))
     nodes = np.concatenate([[0.0], times, [20_000.0]])
     # just inside each stretch, so that a jump at its ends does not count
     first, last = nodes[:-1] + 1e-6, nodes[1:] - 1e-6

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from hesim_render.core.errors import RangeError
+from hesim_render.core.errors import ConflictError, RangeError
 from hesim_render.specs.files import Strict
 from hesim_render.specs.spectrum import SpectrumSpec
 
@@ -69,10 +69,10 @@ class CubeOptions(Strict):
             return cls.model_validate(given)
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
-            name = ".".join(map(str, problem["loc"])) or "options"
-            value = problem.get("input")
-            shown = "…" if isinstance(value, dict) else value
-            raise RangeError(name, shown, problem["msg"].removeprefix("Value error, ")) from None
+            name, text = ".".join(map(str, problem["loc"])), problem["msg"].removeprefix("Value error, ")
+            if not name:  # of several options together
+                raise ConflictError("options", None, text) from None
+            raise RangeError(name, problem.get("input"), text) from None
 
     @property
     def is_moving(self) -> bool:

@@ -164,7 +164,7 @@ def test_recordings_of_cubes_have_frames_and_events(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"illuminance_lux": None}, "reflectances need illuminance_lux"),
+    ({"illuminance_lux": None}, "^reflectances need illuminance_lux$"),
     ({"quantity": "radiance"}, "illuminance_lux is for reflectances"),
     ({"mean_luminance_cd_m2": 5}, "mean_luminance_cd_m2 is for radiance"),
     ({"zoom_per_s": 0}, "zoom_per_s"), ({"fit": "crop"}, "fit"), ({"speed": 3}, "speed"),
