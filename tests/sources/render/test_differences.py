@@ -261,7 +261,7 @@ class MadeUp:
         self.traced += zip(window.tolist(), index.tolist(), strict=True)
         found = PilotFlux.empty(index.size)
         found.controlled[:], found.plain[:] = self.light[window, index], 0.5 * self.light[window, index]
-        found.controlled_change[:], found.met[:] = 3000 + before[1], self.near[index]
+        found.controlled_change[:], found.met[:] = 3000 + (before[1] if before else 0), self.near[index]
         return found
 
     def pilot_rays(self, index, window, windows, rays, width_px, span_us=None, before=None):
@@ -269,6 +269,15 @@ class MadeUp:
         return self.pilot(index, window, windows, rays, width_px, before=before), PilotRays(
             zeros, zeros, rays, (5.0, 6.0)
         )
+
+
+def test_a_pilot_says_whether_the_camera_moves():
+    sites, windows = sites_of(), Windows(np.arange(2.0), np.arange(2.0) + 1)
+    tracer = MadeUp(np.full((2, 121), 250.0, np.float32), np.ones(121, bool))
+    given = sites, windows, np.zeros((2, 121), np.int64), 16, 1.25, None
+    assert not take_pilot(tracer, *given)[0].all_move
+    tracer.camera = object()
+    assert take_pilot(tracer, *given)[0].all_move
 
 
 def test_what_a_pilot_compares_and_between_which_looks_it_traces():
@@ -284,6 +293,7 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces():
     windows = Windows(np.arange(9.0), np.arange(9.0) + 1)
     pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, 1.25, None, anchored=anchored, stride=4)
     np.testing.assert_array_equal(pilot.controlled, light)
+    assert not pilot.all_move
     row, col = np.indices((11, 11))
     busy = np.flatnonzero(((abs(row - 5) <= 2) & (abs(col - 5) <= 2)).ravel())
     looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]

@@ -234,14 +234,14 @@ def test_rays_follow_from_what_the_decision_rays_saw():
         def axis_factor(self, pixel):
             return np.full(pixel.size, 0.8, np.float32)
 
-    pixel, law = np.arange(8, dtype=np.uint32), np.array([2048, 4096, 2048, 512, 1024, 1024, 1024, 128])
+    pixel, law = np.arange(8, dtype=np.uint32), np.array([2048, 4096, 2048, 256, 1024, 1024, 1024, 128])
     floor, controlled, wanted = np.array([0, 0, 0, 0, 0, 300, 0, 0]), np.ones(8, bool), np.full(8, 2.0, np.float32)
     given = law, controlled, wanted, floor, Gain(*TUNING.diffuse_gain), TUNING
     rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given)
-    # 0.2 rays for each wanted error of contrast, 64 at least; a sixteenth of the law where there is no
+    # 0.2 rays for each wanted error of contrast, 64 at least; an eighth of the law where there is no
     # contrast, also if rounding makes a line of it, 32 at least; a corner as by the law; the floor;
     # three levels as by the law; and a pair of few rays is not looked at
-    assert rays.tolist() == [64, 256, 128, 32, 1024, 512, 1024, 128]
+    assert rays.tolist() == [64, 256, 256, 32, 1024, 512, 1024, 128]
     assert edges.is_there.tolist() == [True, True, False, False, False, True, False, False]
     assert tried == [(list(range(7)), 64, 1.5, Stream.RENDER_EDGE)]
     np.testing.assert_allclose(edges.half_width[:2], [0.009, 0.014], rtol=1e-5)

@@ -137,7 +137,7 @@ class Tuning:
     extreme_change: float = 128.0
     extreme_windows: int = 1
     least_rays: int = 8
-    ray_weight: float = 2.0
+    ray_weight: float = 1.0
     most_rays: int = 4096
     diffuse_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
@@ -151,7 +151,7 @@ class Tuning:
     edge_footprint_px: float = 1.5
     edge_contrast_rays: float = 0.2
     flat_contrast: float = 4.0
-    flat_part: float = 1 / 16
+    flat_part: float = 1 / 8
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.5
