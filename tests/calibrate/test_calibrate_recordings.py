@@ -184,6 +184,20 @@ def test_readout_limit_and_saturated_recordings(tmp_path):
     assert "at least" in readout_limit([free])[0]["reason"]
 
 
+def test_windows_with_the_same_events_of_every_pixel_are_no_readout_limit():
+    """The pixels fire twice in each of 40 windows: more of them would give more."""
+    events = np.zeros(80 * PIXELS, EVENT_DTYPE)
+    events["t_us"] = np.repeat(np.arange(80) * 500 + 7, PIXELS)
+    events["x"], events["y"] = np.tile(np.arange(PIXELS) % SHAPE[1], 80), np.tile(np.arange(PIXELS) // SHAPE[1], 80)
+    events["polarity"] = 1
+    for silent in (0, round(0.015 * PIXELS)):
+        one = tally(EventStream.of(events[events["x"] + SHAPE[1] * events["y"] >= silent], SHAPE))
+        found, saturated = readout_limit([one])
+        assert "2 events of every pixel" in found["reason"] and saturated == []
+    part = tally(EventStream.of(events[events["x"] + SHAPE[1] * events["y"] >= 0.04 * PIXELS], SHAPE))
+    assert readout_limit([part])[0]["value"] == pytest.approx(2000 * np.ceil(0.96 * PIXELS), rel=0.01)
+
+
 def test_hot_and_silent_pixels():
     rng = np.random.default_rng(7)
     rates = rng.uniform(15, 25, PIXELS)
