@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hesim_render.calibrate.estimate import estimated, not_identifiable
 from hesim_render.report.bench import EventBench
-from hesim_render.report.estimates import corrected, crossing, log_estimated
+from hesim_render.report.estimates import corrected, crossing, figure, log_estimated
 from hesim_render.report.latency import Answers
 from hesim_render.specs.event_bench import Steady
 
@@ -86,12 +86,12 @@ def dynamic_range(answers: list[Answers], false: list[float]) -> DynamicRange:
     else:
         top = -high[0] if high is not None else log[last]
         bottom = low[0] if low is not None else log[first]
-        range_db = not_identifiable(f"at least {(top - bottom) * _DB:.4g} dB, from {np.exp(bottom):.3g} to "
-                                    f"{np.exp(top):.3g} lx: the captures end there")  # fmt: skip
+        range_db = not_identifiable(f"at least {(top - bottom) * _DB:.4g} dB, from {figure(np.exp(bottom), 3)} to "
+                                    f"{figure(np.exp(top), 3)} lx: the captures end there")  # fmt: skip
     return DynamicRange(lux, share, error, least, most, range_db)
 
 
 def _end(place: tuple[float, float] | None, lux: float, sign: int, word: str) -> dict[str, Any]:
     if place is None:
-        return not_identifiable(f"{word} {lux:.4g} lx, the last light of the captures")
+        return not_identifiable(f"{word} {figure(lux)} lx, the last light of the captures")
     return log_estimated(sign * place[0], place[1], "lx")

@@ -15,9 +15,9 @@ from hesim_render.report import figures, make_report
 from hesim_render.report.bench import EventBench
 from hesim_render.report.definitions import EVENTS, FRAMES
 from hesim_render.report.emva import frame_figures
-from hesim_render.report.estimates import corrected, crossing, mean_error
+from hesim_render.report.estimates import corrected, crossing, figure, mean_error
 from hesim_render.report.s_curves import s_curve
-from hesim_render.report.texts import event_tables, figure
+from hesim_render.report.texts import event_tables
 from tests.support.bench_pixels import HALF_US, LUX, PIXELS, SHAPE, Pixels
 
 
