@@ -145,6 +145,18 @@ def test_dead_time(dead_us):
     assert "no step" in dead_time([tally(EventStream.of(slow, SHAPE))])["reason"]
 
 
+def test_the_shortest_time_of_a_moving_target_is_no_dead_time():
+    """Pixels that see an edge pass have 900 µs between events; their noise in still light has a dead time of 61."""
+    rng = np.random.default_rng(4)
+    target = random_events(rng, np.full(PIXELS, 300.0), 900.0, seconds=0.5, shape=SHAPE)
+    quiet = random_events(rng, np.full(PIXELS, 2.0), 0.0, seconds=0.4, shape=SHAPE)
+    noisy = random_events(rng, np.full(PIXELS, 400.0), 61.0, seconds=0.5, shape=SHAPE)
+    quiet, noisy, moving = (tally(EventStream.of(one, SHAPE)) for one in (quiet, noisy, target))
+    found = calibration.figures([quiet], moving, None, 3.0, None)["dead_time_us"]
+    assert found["value"] is None and "at most 90" in found["reason"]
+    assert calibration.figures([noisy], moving, None, 3.0, None)["dead_time_us"]["value"] == pytest.approx(61, abs=2)
+
+
 def test_the_shortest_dead_time_is_judged_by_the_four_microseconds_after_it():
     """30 intervals in each µs from 2 µs on: 120 of them are within a factor of two and a µs, and 100 are needed."""
     counts = np.full(LONG_US, 30)
