@@ -36,8 +36,11 @@ def ratios(name: str, activity: int, length_us: float, pixels: int) -> list[floa
     pixel = np.sort(rng.choice(full, min(full.size, 4 * pixels), replace=False))
     window, zero = Windows(np.array([20_000.0]), np.array([20_000.0 + length_us])), np.zeros(pixel.size, np.int64)
     pilot = tracer.pilot(pixel, zero, window, 64, 1.0)
-    lit = pilot.lit_scatter <= pilot.hidden_scatter
-    scatter, flux = np.where(lit, pilot.lit_scatter, pilot.hidden_scatter), np.where(lit, pilot.lit, pilot.hidden)
+    controlled = pilot.controlled_scatter <= pilot.plain_scatter
+    scatter, flux = (
+        np.where(controlled, pilot.controlled_scatter, pilot.plain_scatter),
+        np.where(controlled, pilot.controlled, pilot.plain),
+    )
     # what has an error that counts: half a per cent of the flux in a single ray
     some = np.flatnonzero(scatter > 0.005 * np.maximum(flux, 1e-9))
     some = rng.permutation(some)[:pixels]
@@ -45,7 +48,7 @@ def ratios(name: str, activity: int, length_us: float, pixels: int) -> list[floa
 
     def traced(rays: int, repeat: int) -> np.ndarray:
         count = np.full(some.size, rays)
-        told = tracer.trace(pixel[some], zero[some], window, count, lit[some], Stream.AUDIT, repeat=repeat)
+        told = tracer.trace(pixel[some], zero[some], window, count, controlled[some], Stream.AUDIT, repeat=repeat)
         return told.mean.astype(np.float64)
 
     truth = np.mean([traced(4096, repeat) for repeat in range(6)], axis=0)

@@ -309,7 +309,7 @@ def print_events(run: Run, reference: WindowReference, place: np.ndarray, unit: 
     maps = noise.threshold_on_map, noise.threshold_off_map
     thresholds = tuple(np.broadcast_to(m, layout.evs_shape).ravel()[place].astype(np.float64) for m in maps)
     counted = compare_ticks(level, truth, above - level, thresholds, np.ones(len(own), np.bool_))
-    true, total = counted.true.sum(), counted.found.sum()
+    true, total = counted.true.sum(), counted.in_run.sum()
     print(
         f"   events of {place.size} pixels: {true:.0f} true, {total:.0f} found, {counted.missed.sum():.0f} missed, "
         f"{counted.extra.sum():.0f} extra, {counted.flips.sum():.0f} within three stated errors of a threshold",

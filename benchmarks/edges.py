@@ -38,19 +38,20 @@ def main(scene="rotating-star", sensor="davis346", region="96x72", milliseconds=
     loaded = hr.load_sensor(sensor).crop(*map(int, region.split("x")))
     source = ChangeDrivenFlux(hr.load_scene(scene), loaded, seed=7)
     pixel, window, windows = changing_pairs(source, loaded, round(1000 * float(milliseconds)))
-    tracer, index, lit = source._tracer, source._index[pixel], np.ones(PAIRS, np.bool_)
+    tracer, index, controlled = source._tracer, source._index[pixel], np.ones(PAIRS, np.bool_)
     truth = np.stack([
-        tracer.trace(index, window, windows, np.full(PAIRS, 4096), lit, Stream.AUDIT, repeat=k).mean for k in range(4)
+        tracer.trace(index, window, windows, np.full(PAIRS, 4096), controlled, Stream.AUDIT, repeat=k).mean
+        for k in range(4)
     ]).astype(float)  # fmt: skip
     unit = source.noise_unit(pixel, truth.mean(axis=0)[None], True)[0]
     own = truth.std(axis=0, ddof=1) / 2 / unit
 
     def rms(some, rays, edges=None):
-        got = tracer.trace(index[some], window[some], windows, np.full(some.size, rays), lit[some], edges=edges)
+        got = tracer.trace(index[some], window[some], windows, np.full(some.size, rays), controlled[some], edges=edges)
         error = (got.mean - truth.mean(axis=0)[some]) / unit[some]
         return np.sqrt(max(0, np.mean(error**2) - np.mean(own[some] ** 2)))
 
-    fit = tracer.edges(index, window, windows, 64, 1.5, lit)
+    fit = tracer.edges(index, window, windows, 64, 1.5, controlled)
     contrast = (fit.high - fit.low) * tracer.axis_factor(index) / unit
     share = 100 * fit.is_edge.mean()
     print(f"{scene}, {sensor} {region}, {milliseconds} ms: {share:.0f} % of changing pairs hold an edge")

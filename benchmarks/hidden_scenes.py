@@ -54,7 +54,7 @@ def report(path: Path) -> int:
         if not runs:
             continue
         print(f"{name}: {len(runs)} runs, {sum(one['true'] for one in runs):.0f} true events", end="")
-        for kind, of in (("missed", "true"), ("extra", "found")):
+        for kind, of in (("missed", "true"), ("extra", "in_run")):
             most = max(one[kind][0] for one in runs)
             print(f"; {100 * pooled(runs, kind, of):.2f} % {kind}, at most {100 * most:.2f} % in a run", end="")
         broken = sum(any(one[kind][0] > one[kind][1] for kind in ("missed", "extra")) for one in runs)

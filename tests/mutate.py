@@ -183,9 +183,9 @@ FIXED = (
         ("tests/sources/render/test_changes.py",),
     ),
     Fixed(
-        "plan: great changes next to a pixel do not count by themselves",
-        "near = sites.most(great[window], 1) | sites.most(huge[window], 2)",
-        "near = sites.most(great[window], 1) & sites.most(huge[window], 2)",
+        "plan: large changes next to a pixel do not count by themselves",
+        "near = sites.most(large[window], 1) | sites.most(extreme[window], 2)",
+        "near = sites.most(large[window], 1) & sites.most(extreme[window], 2)",
         ("tests/sources/render/test_changes.py",),
     ),
     Fixed(

@@ -105,13 +105,13 @@ class EventDataset:
     def __getitem__(self, item: int) -> tuple[Any, Any]:
         # opened anew for each item: an open HDF5 file must not be shared by the processes of a loader
         clip = BenchmarkClip(self._folders[item])
-        found = clip.recording.events
-        events = np.empty(found.size, self.dtype)
+        stored = clip.recording.events
+        events = np.empty(stored.size, self.dtype)
         events["x"], events["y"], events["t"], events["p"] = (
-            found["x"],
-            found["y"],
-            found["t_us"],
-            found["polarity"] > 0,
+            stored["x"],
+            stored["y"],
+            stored["t_us"],
+            stored["polarity"] > 0,
         )
         target = self._target_of(clip)
         if self.transforms is not None:

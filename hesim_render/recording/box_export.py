@@ -54,11 +54,11 @@ def pixel_boxes(objects: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArra
     -------
     Numbers of the visible objects [box], and their boxes [box, 4]: x, y, w, h, whole px.
     """
-    found = ndimage.find_objects(np.asarray(objects, np.int32))
-    numbers = [number for number, part in enumerate(found, start=1) if part is not None]
+    slices = ndimage.find_objects(np.asarray(objects, np.int32))
+    numbers = [number for number, part in enumerate(slices, start=1) if part is not None]
     boxes = [
         (cols.start, rows.start, cols.stop - cols.start, rows.stop - rows.start)
-        for rows, cols in (found[number - 1] for number in numbers)
+        for rows, cols in (slices[number - 1] for number in numbers)
     ]
     return np.array(numbers, np.int64), np.array(boxes, np.int64).reshape(-1, 4)
 
@@ -88,8 +88,10 @@ def classes(names: Sequence[str], labels: Mapping[str, str | None]) -> tuple[lis
         if name not in names[1:]:
             raise SpecError(f"no object {name!r} in the scene; there are {', '.join(names[1:])}", key="labels")
     of_object = [labels.get(name, re.sub(r"[\s_.-]*\d+$", "", name) or name) for name in names[1:]]
-    found = list(dict.fromkeys(name for name in of_object if name is not None))
-    return found, np.array([-1, *(-1 if name is None else found.index(name) for name in of_object)], np.int64)
+    class_names = list(dict.fromkeys(name for name in of_object if name is not None))
+    return class_names, np.array(
+        [-1, *(-1 if name is None else class_names.index(name) for name in of_object)], np.int64
+    )
 
 
 def box_records(
@@ -186,9 +188,9 @@ def write_coco(recording: Recorded, truth: SceneTruth, folder: Path, every_us: i
             entry = {"id": frame.index, "file_name": f"{frame.index:06d}.png", "width": cols, "height": rows}
             images.append(entry | {"t_us": frame.exposure_start_us + frame.exposure_us / 2})
             Image.fromarray(picture).save(folder / "images" / entry["file_name"], format="PNG")
-            for found in _annotations(truth.ids(frame).object, class_of):
+            for annotation in _annotations(truth.ids(frame).object, class_of):
                 count += 1
-                file.write((", " if count > 1 else "") + _json({"id": count, "image_id": frame.index, **found}))
+                file.write((", " if count > 1 else "") + _json({"id": count, "image_id": frame.index, **annotation}))
         file.write(f'], "images": {_json(images)}}}\n')
     return {"frames": len(images), "classes": names, "tracks": _tracks(truth, class_of)}
 

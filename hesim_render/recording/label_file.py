@@ -229,10 +229,10 @@ def _of_events(file: Any, name: str, path: Path, kind: Any, count: int, part: sl
 
 
 def _column(file: Any, name: str, path: Path, kind: Any, part: slice = _ALL) -> NDArray:
-    found = dataset_of(file, name, path)
-    if found.dtype != np.dtype(kind) or found.ndim != 1:
-        raise SpecError(f"{name} holds {found.dtype.name} {found.shape}; expected one column of {np.dtype(kind).name}",
-                        file=path)  # fmt: skip
-    begin, end, _ = part.indices(found.shape[0])
-    require_memory((end - begin) * found.dtype.itemsize, name, path)
-    return found[begin:end]
+    dataset = dataset_of(file, name, path)
+    if dataset.dtype != np.dtype(kind) or dataset.ndim != 1:
+        held, wanted = f"{dataset.dtype.name} {dataset.shape}", np.dtype(kind).name
+        raise SpecError(f"{name} holds {held}; expected one column of {wanted}", file=path)
+    begin, end, _ = part.indices(dataset.shape[0])
+    require_memory((end - begin) * dataset.dtype.itemsize, name, path)
+    return dataset[begin:end]

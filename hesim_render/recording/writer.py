@@ -205,8 +205,8 @@ class RecordingWriter:
         self._end_live(is_whole=True)
         scene = Scene(self._scene) if isinstance(self._scene, SceneSpec) else None
         if self._folder is not None:
-            found = Recording.load(self._folder.finish())
-            return Recording(found.frames, found.manifest, path=found.path, scene=scene)
+            recording = Recording.load(self._folder.finish())
+            return Recording(recording.frames, recording.manifest, path=recording.path, scene=scene)
         events = np.concatenate(self._events) if self._events else no_events()
         on = int(np.count_nonzero(events["polarity"] > 0))
         self._manifest["frames"] = [frame.times for frame in self._frames]

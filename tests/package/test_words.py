@@ -21,17 +21,7 @@ ALLOWED = {
         "captures with light: aps_lit.npz, and keys of sets of pairs and of Mitsuba scenes",
     ),
 }  # fmt: skip
-#: Packages and modules in which the words are still to be replaced; this list only becomes shorter.
-LEFT = (
-    "sources/render", "calibrate/recordings/still.py", "calibrate/recordings/target.py", "benchmark/tonic_dataset.py",
-    "recording/box_export.py", "recording/label_file.py", "recording/writer.py", "cli/simulate.py",
-    "pixels/evs/model.py", "pixels/evs/events.py",
-)  # fmt: skip
-FILES = [
-    path.relative_to(PACKAGE).as_posix()
-    for path in sorted(PACKAGE.rglob("*.py"))
-    if not path.relative_to(PACKAGE).as_posix().startswith(LEFT)
-]
+FILES = [path.relative_to(PACKAGE).as_posix() for path in sorted(PACKAGE.rglob("*.py"))]
 
 
 def parts(identifier):
@@ -54,8 +44,3 @@ def test_identifiers_have_the_words_of_the_field(name):
         token.string for token in tokenize.generate_tokens(io.StringIO(text).readline) if token.type == tokenize.NAME
     }
     assert {each for each in names if FORBIDDEN.search(parts(each))} <= set(ALLOWED)
-
-
-def test_what_is_left_is_there():
-    for name in LEFT:
-        assert (PACKAGE / name).exists(), name

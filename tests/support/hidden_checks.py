@@ -93,7 +93,7 @@ def shares(name, seed, rays):
     """What a run has wrong, by the truth; and what its manifest says of that."""
     rec, seen = run_of(name, seed)
     total = compared(seen, truth(name, rays), seen[:2].mean(axis=0))
-    assert rec.events.size == pytest.approx(total["found"], abs=0.02 * total["found"] + 1)
+    assert rec.events.size == pytest.approx(total["in_run"], abs=0.02 * total["in_run"] + 1)
     return total, rec.manifest["settings"]["render"]["audit"]
 
 
@@ -111,7 +111,7 @@ def judge(name, seed):
     """Counts by the truth, what the manifest says of events, and the shares of events missed and extra."""
     total, audit = shares(name, seed, RAYS[name])
     told = audit["events"]
-    missed, extra = total["missed"] / max(1, total["true"]), total["extra"] / max(1, total["found"])
+    missed, extra = total["missed"] / max(1, total["true"]), total["extra"] / max(1, total["in_run"])
     return total, told, missed, extra
 
 
@@ -120,14 +120,14 @@ def not_held(runs):
 
     Parameters
     ----------
-    runs : for each ``true`` and ``found`` events, and of ``missed`` and ``extra`` the share and the audit's bound; and
-        the audit's ``verdict``, which a run needs only where a share is above its limit.
+    runs : for each ``true`` events and those ``in_run``, and of ``missed`` and ``extra`` the share and the audit's
+        bound; and the audit's ``verdict``, which a run needs only where a share is above its limit.
     """
     wrong = []
     broken = sum(any(one[kind][0] > one[kind][1] for kind in ("missed", "extra")) for one in runs)
     if broken > max(1, MOST_BROKEN * len(runs)):
         wrong.append(f"{broken} of {len(runs)} runs have more wrong than their audits say")
-    for kind, of, most in (("missed", "true", MOST_MISSED), ("extra", "found", MOST_EXTRA)):
+    for kind, of, most in (("missed", "true", MOST_MISSED), ("extra", "in_run", MOST_EXTRA)):
         share = pooled(runs, kind, of)
         silent = sum(one[kind][0] > most and one.get("verdict") != "not met" for one in runs)
         if share > most:
@@ -148,6 +148,6 @@ def record_of(name, seed):
     rec, _ = run_of(name, seed)
     return {
         "verdict": rec.manifest["settings"]["render"]["audit"]["verdict"],
-        "true": total["true"], "found": total["found"],
+        "true": total["true"], "in_run": total["in_run"],
         "missed": [missed, told["missed_at_most"]], "extra": [extra, told["extra_at_most"]],
     }  # fmt: skip

@@ -126,7 +126,7 @@ def judged_run(random: RandomScene, most_windows: int = 24) -> dict[str, Any]:
     off = np.abs(deviation) > 3 * QUALITY
     events = audit["events"]
     counts = {"off": (int(off[:, at_random].sum()), int(off[:, at_random].size))}
-    for name, of in (("missed", "true"), ("extra", "found")):
+    for name, of in (("missed", "true"), ("extra", "in_run")):
         counts[name] = float(getattr(counted, name).sum()), float(getattr(counted, of).sum())
     return {
         "seed": random.seed, "scene": random.text, "mode": settings["mode"], "verdict": audit["verdict"],

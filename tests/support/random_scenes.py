@@ -2,8 +2,8 @@
 
 The camera is 2 m before the plane z = 0, of which it sees 0.8 m. 1 to 20 shapes move, or some of them; they are as
 small as a twentieth of a pixel and as large as a third of the picture, and go from a pixel in a second to 25 pixels
-in the 12.5 ms of a run. Half of the scenes have matt solids under this project's own lights, half are Mitsuba's, with
-glass and metal.
+in the 12.5 ms of a run. Half of the scenes have diffuse solids under this project's own lights, half are Mitsuba's,
+with glass and metal.
 """
 
 from __future__ import annotations
@@ -65,9 +65,8 @@ def random_scene(seed: int, folder: Path, cols: int = COLS, rows: int = ROWS) ->
     sensor = hr.load_sensor(name)
     sensor = sensor.crop(cols, rows)
     moved = ", ".join(track["object"] for track in content["motion"])
-    text = (
-        f"{'Mitsuba' if is_mitsuba else 'matt'}, {name}, {count} shapes, depth {content['max_depth']}, moving: {moved}"
-    )
+    kind = "Mitsuba" if is_mitsuba else "diffuse"
+    text = f"{kind}, {name}, {count} shapes, depth {content['max_depth']}, moving: {moved}"
     flicker = "waveform" in json.dumps(content)
     text += ", flicker" if flicker else ""
     return RandomScene(seed, hr.load_scene(file), sensor, text, kind == "asynchronous")

@@ -70,9 +70,9 @@ def pair_tracer(scene, sensor, seed=3):
     return PairTracer(scene, sensor, seed, used_responses(sensor))
 
 
-def traced(tracer, rays, begin_us=0.0, end_us=1000.0, lit=False):
+def traced(tracer, rays, begin_us=0.0, end_us=1000.0, controlled=False):
     """Every pixel of the region in one window, a `PairFlux`."""
     pixel = tracer.sensor.layout.full_index.ravel()
     window = Windows(np.array([begin_us]), np.array([end_us]))
     count = pixel.size
-    return tracer.trace(pixel, np.zeros(count, np.int64), window, np.full(count, rays), np.full(count, lit))
+    return tracer.trace(pixel, np.zeros(count, np.int64), window, np.full(count, rays), np.full(count, controlled))

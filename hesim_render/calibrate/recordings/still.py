@@ -127,12 +127,12 @@ def balance(tallies: Sequence[EventTally], lux: Sequence[float] | None) -> LeakB
     elif len(set(lux)) < 3:
         reason = not_identifiable("it takes still scenes at three different lights, or a moving target (--target)")
     else:
-        found = _three_lights(rates, np.asarray(lux, np.float64))
-        error = float(np.hypot(jackknife(found), _RATIO_SHIFT * USUAL_MISMATCH**2 * found[0]))
-        if np.isfinite(found).all() and 0 < 2 * error < found[0]:
-            leak = rates[:, 0] - found * rates[:, 1]
-            unknown = _LEAK_SHIFT * USUAL_MISMATCH**2 * found[0] * rates[:, 1, 0]
-            return _with_ratio(leak, unknown, lux, estimated(found[0], error, "", GROUPS))
+        ratio = _three_lights(rates, np.asarray(lux, np.float64))
+        error = float(np.hypot(jackknife(ratio), _RATIO_SHIFT * USUAL_MISMATCH**2 * ratio[0]))
+        if np.isfinite(ratio).all() and 0 < 2 * error < ratio[0]:
+            leak = rates[:, 0] - ratio * rates[:, 1]
+            unknown = _LEAK_SHIFT * USUAL_MISMATCH**2 * ratio[0] * rates[:, 1, 0]
+            return _with_ratio(leak, unknown, lux, estimated(ratio[0], error, "", GROUPS))
         reason = not_identifiable(
             "OFF events are too few, or follow the light as ON events do: noise and leak do not come apart"
         )
@@ -226,11 +226,11 @@ def _line(
     design = np.stack([np.ones(level.size), level], axis=1) * weight[:, None]
     size = np.linalg.norm(design, axis=0)
     line = np.linalg.pinv(design / size) / size[:, None] * weight
-    found = line @ leak[known]
-    errors = np.hypot(jackknife(found), np.sqrt(line**2 @ unknown[known] ** 2))
+    coefficients = line @ leak[known]
+    errors = np.hypot(jackknife(coefficients), np.sqrt(line**2 @ unknown[known] ** 2))
     dark, growth = (
         estimated(v[0], float(error), unit, GROUPS)
-        for v, error, unit in zip(found, errors, ("Hz", "Hz/lx"), strict=True)
+        for v, error, unit in zip(coefficients, errors, ("Hz", "Hz/lx"), strict=True)
     )
     return dark, growth
 

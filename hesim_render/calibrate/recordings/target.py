@@ -69,27 +69,27 @@ def thresholds(tally: EventTally, contrast: float, cycles_hz: float | None, leak
     group = tally.group.astype(np.int64)[seen]
     whole = _moments(count)
     parts = np.array([_moments(count[:, group != k]) for k in range(GROUPS)])
-    found, slope = simulated.fit(whole)
-    every = np.concatenate([found[:, None], found[:, None] + np.linalg.solve(slope, (parts - whole).T)], axis=1)
+    fitted, slope = simulated.fit(whole)
+    every = np.concatenate([fitted[:, None], fitted[:, None] + np.linalg.solve(slope, (parts - whole).T)], axis=1)
     # the simulated pixels scatter as the real ones do
-    of_simulated = simulated.moment_covariance(found)
+    of_simulated = simulated.moment_covariance(fitted)
     inverse = np.linalg.inv(slope)
     of_simulated = inverse @ of_simulated @ inverse.T
-    errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + (found * np.append(unsure, 0.0)) ** 2)
+    errors = np.sqrt(jackknife(every) ** 2 + np.diag(of_simulated) + (fitted * np.append(unsure, 0.0)) ** 2)
     entries = {
-        "theta_on": estimated(found[0], errors[0], "ln", GROUPS),
-        "theta_off": estimated(found[1], errors[1], "ln", GROUPS),
+        "theta_on": estimated(fitted[0], errors[0], "ln", GROUPS),
+        "theta_off": estimated(fitted[1], errors[1], "ln", GROUPS),
     }
-    if found[2] > 2 * errors[2]:
-        spread = float(np.sqrt(found[2]))
+    if fitted[2] > 2 * errors[2]:
+        spread = float(np.sqrt(fitted[2]))
         entries["threshold_mismatch"] = estimated(spread, errors[2] / (2 * spread), "relative std", GROUPS)
     else:
         entries["threshold_mismatch"] = {
-            "value": 0.0, "upper_limit": float(np.sqrt(max(found[2], 0.0) + 2 * errors[2])),
+            "value": 0.0, "upper_limit": float(np.sqrt(max(fitted[2], 0.0) + 2 * errors[2])),
             "note": "the pixels scatter no more than the place of their turns makes them",
         }  # fmt: skip
     ratio = every[1] / every[0]
-    away = np.array([-1 / found[0], 1 / found[1], 0.0])  # slope of ln ρ
+    away = np.array([-1 / fitted[0], 1 / fitted[1], 0.0])  # slope of ln ρ
     error = float(np.sqrt(jackknife(ratio) ** 2 + ratio[0] ** 2 * (unsure.sum() ** 2 + away @ of_simulated @ away)))
     return TargetThresholds(entries, estimated(ratio[0], error, "", GROUPS))
 

@@ -117,6 +117,6 @@ class EventLabels:
 
     def counts(self) -> dict[str, int]:
         """Number of events of each cause, of lost ones, and of noise-free ones."""
-        found = {label.name.lower(): int(np.count_nonzero(self.label == label)) for label in Label}
+        per_label = {label.name.lower(): int(np.count_nonzero(self.label == label)) for label in Label}
         lost = {f"lost_{place.name.lower()}": int(np.count_nonzero(self.lost_in == place)) for place in Lost}
-        return {**found, **lost, "noise_free": int(self.clean.size)}
+        return {**per_label, **lost, "noise_free": int(self.clean.size)}

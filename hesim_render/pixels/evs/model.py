@@ -99,10 +99,10 @@ class EvsNoise(PlainState):
     @cached_property
     def defects(self) -> PixelDefects:
         """Stuck, hot and flickering pixels of this device."""
-        found = defects_of(self.spec, self.layout, self.device_seed)
+        pixel_defects = defects_of(self.spec, self.layout, self.device_seed)
         for term in self.off.intersection(_DEFECTS):
-            found = found.without(term)
-        return found
+            pixel_defects = pixel_defects.without(term)
+        return pixel_defects
 
     @property
     def crosstalk(self) -> float:

@@ -77,15 +77,15 @@ class GaussianBlur:
     def __init__(self, sensor: Sensor) -> None:
         import drjit as dr
 
-        types, pitch_um, told = jit(), sensor.spec.geometry.pitch_um, sensor.optics.psf
-        widths = told.fwhm_um if isinstance(told, GaussianPsf) else [sensor.optics.psf_fwhm_um]
+        types, pitch_um, psf = jit(), sensor.spec.geometry.pitch_um, sensor.optics.psf
+        widths = psf.fwhm_um if isinstance(psf, GaussianPsf) else [sensor.optics.psf_fwhm_um]
         sigma_px = np.array(widths) / FWHM_PER_SIGMA / pitch_um
         self._widest = dr.opaque(types.Float, float(sigma_px.max()))
         #: Radius that holds nearly all of it, px.
         self.reach_px = float(2 * sigma_px.max())
         self._of_height = None
-        if isinstance(told, GaussianPsf) and len(widths) > 1:
-            self._of_height = _OverHeight(sensor, told.image_height_mm, np.maximum(sigma_px, _LEAST_SIGMA_PX))
+        if isinstance(psf, GaussianPsf) and len(widths) > 1:
+            self._of_height = _OverHeight(sensor, psf.image_height_mm, np.maximum(sigma_px, _LEAST_SIGMA_PX))
 
     @property
     def widest_px(self) -> Float:
@@ -122,19 +122,19 @@ class KernelBlur:
     def __init__(self, sensor: Sensor) -> None:
         import drjit as dr
 
-        types, told = jit(), sensor.optics.psf
-        assert isinstance(told, MeasuredPsf)
+        types, psf = jit(), sensor.optics.psf
+        assert isinstance(psf, MeasuredPsf)
         self._sensor = sensor
-        kernels = np.array(told.kernels, dtype=np.float64)
+        kernels = np.array(psf.kernels, dtype=np.float64)
         kernels /= kernels.sum(axis=(1, 2), keepdims=True)
         count, self._rows, self._cols = kernels.shape
         by_row = np.cumsum(kernels.sum(axis=2), axis=1)
         within = np.cumsum(kernels, axis=2)
         within /= np.maximum(within[..., -1:], 1e-300)
         self._row_sums, self._col_sums = (table(types.Float, values.astype(np.float32)) for values in (by_row, within))
-        self._on_axis = told.image_height_mm[0] == 0
-        self._which = _OverHeight(sensor, told.image_height_mm, np.arange(count, dtype=np.float64))
-        step_px = told.sample_um / sensor.spec.geometry.pitch_um
+        self._on_axis = psf.image_height_mm[0] == 0
+        self._which = _OverHeight(sensor, psf.image_height_mm, np.arange(count, dtype=np.float64))
+        step_px = psf.sample_um / sensor.spec.geometry.pitch_um
         self._step = dr.opaque(types.Float, step_px)
         dr.make_opaque(self._row_sums, self._col_sums)
         row, col = np.mgrid[: self._rows, : self._cols]
@@ -177,11 +177,11 @@ def _drawn(sums: Float, first: UInt32, count: int, u: Float) -> tuple[UInt32, Fl
     import drjit as dr
 
     types = jit()
-    found = dr.binary_search(0, count - 1, lambda k: dr.gather(types.Float, sums, first + types.UInt32(k)) <= u)
-    found = types.UInt32(found)
-    low = dr.select(found > 0, dr.gather(types.Float, sums, first + dr.maximum(found, 1) - 1), 0.0)
-    high = dr.gather(types.Float, sums, first + found)
-    return found, dr.clip((u - low) / dr.maximum(high - low, 1e-30), 0, 1)
+    entry = dr.binary_search(0, count - 1, lambda k: dr.gather(types.Float, sums, first + types.UInt32(k)) <= u)
+    entry = types.UInt32(entry)
+    low = dr.select(entry > 0, dr.gather(types.Float, sums, first + dr.maximum(entry, 1) - 1), 0.0)
+    high = dr.gather(types.Float, sums, first + entry)
+    return entry, dr.clip((u - low) / dr.maximum(high - low, 1e-30), 0, 1)
 
 
 @cache

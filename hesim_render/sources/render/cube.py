@@ -115,9 +115,9 @@ def render_cube(
     _check_bands(scene, bands)
     if end_us is not None and not end_us > t_us:
         raise RangeError("end_us", end_us, f"a time after the begin of the window, {t_us:g} µs")
-    lit, _ = in_absolute_light(scene)
+    absolute, _ = in_absolute_light(scene)
     halves = np.zeros((2, *chosen.layout.shape, bands.size), np.float32)
-    for waveform, part in light_parts(lit):
+    for waveform, part in light_parts(absolute):
         tracer = PixelTracer(part, chosen, samples, seed, {})
         if not tracer.built.is_dark:
             for begin, end, share in _slices(tracer, waveform, t_us, t_us if end_us is None else end_us):

@@ -106,17 +106,17 @@ def warn_if_unseen(spec: SceneSpec, view: View, duration_us: float) -> None:
     """
     moves = any(track.object in ("target", "camera") for track in spec.motion)
     times = np.linspace(0, duration_us, _TIMES) if moves else np.zeros(1)
-    found = [seen for seen in (framing(spec, view, float(t)) for t in times) if seen is not None]
-    if not found:
+    views = [seen for seen in (framing(spec, view, float(t)) for t in times) if seen is not None]
+    if not views:
         return
     file = f"{spec.file}: " if spec.file is not None else ""
-    if all(seen.inside == 0 for seen in found):
-        told = "no part of the target is in the picture at any time of the run (see --framing)"
-    elif all(seen.from_behind for seen in found if seen.inside > 0):
-        told = "the camera sees the target from behind, where it is black (see --framing)"
+    if all(seen.inside == 0 for seen in views):
+        problem = "no part of the target is in the picture at any time of the run (see --framing)"
+    elif all(seen.from_behind for seen in views if seen.inside > 0):
+        problem = "the camera sees the target from behind, where it is black (see --framing)"
     else:
         return
-    warnings.warn(f"{file}{told}", HesimWarning, stacklevel=3)
+    warnings.warn(f"{file}{problem}", HesimWarning, stacklevel=3)
 
 
 def outline(spec: SceneSpec, view: View) -> NDArray[np.float64] | None:

@@ -64,8 +64,8 @@ class VeilingGlare:
             self._known = key, [self._means(spans[:, group == number]) for number in range(int(group[-1]) + 1)]
         means = np.stack(self._known[1])
         filter_of = self._tracer.sensor.layout.filter_index.ravel()[pixel]
-        found = means[group[which], filter_of]
-        half_a, half_b = (types.Float(np.ascontiguousarray(values, np.float32)) for values in found.T)
+        own_means = means[group[which], filter_of]
+        half_a, half_b = (types.Float(np.ascontiguousarray(values, np.float32)) for values in own_means.T)
         return half_a, half_b
 
     def _means(self, spans_us: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,7 +73,7 @@ class VeilingGlare:
         import drjit as dr
 
         types, count = jit(), self._index.size
-        found = np.zeros((max(self._filters) + 1, 2))
+        means = np.zeros((max(self._filters) + 1, 2))
         begin, end = spans_us[:, np.arange(count) % spans_us.shape[1]]
         for number in self._filters:
             own = dr.opaque(types.UInt32, number)
@@ -90,5 +90,5 @@ class VeilingGlare:
                 elsewhere=self._index,
                 name=f"glare of filter {number}",
             )
-            found[number] = [np.array(half, np.float64).mean() for half in halves]
-        return found
+            means[number] = [np.array(half, np.float64).mean() for half in halves]
+        return means

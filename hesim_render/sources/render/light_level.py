@@ -78,12 +78,12 @@ def in_absolute_light(scene: Scene) -> tuple[Scene, LightLevel | None]:
     source = scene.spec.mitsuba
     if source is None or not source.has_level:
         return scene, None
-    found = _measured(scene.spec, source)
+    level = _measured(scene.spec, source)
     scaled = source.model_copy(
-        update={"radiance_scale": found.radiance_scale, "illuminance_lux": None, "irradiance_w_m2": None,
+        update={"radiance_scale": level.radiance_scale, "illuminance_lux": None, "irradiance_w_m2": None,
                 "plane_point_m": None, "plane_normal": None}
     )  # fmt: skip
-    return Scene(scene.spec.model_copy(update={"mitsuba": scaled})), found
+    return Scene(scene.spec.model_copy(update={"mitsuba": scaled})), level
 
 
 def _measured(spec: SceneSpec, source: MitsubaSpec) -> LightLevel:
@@ -162,15 +162,15 @@ class _Meter:
         types = jit()
         key = dr.opaque(types.UInt64, stream_key(0, stream))
         at_once = max(1, _BLOCK // rays)
-        found = []
+        estimates = []
         for first in range(0, _ESTIMATES, at_once):
             lane = dr.arange(types.UInt32, min(at_once, _ESTIMATES - first) * rays)
             number = lane // rays
             estimate = number + dr.opaque(types.UInt32, first)
             self._sampler.setup(key, estimate, types.UInt32(0), lane - number * rays, rays)
-            found.append(np.array(dr.block_sum(self._level(), rays), np.float64) / rays)
+            estimates.append(np.array(dr.block_sum(self._level(), rays), np.float64) / rays)
             self._sampler.rest()
-        return np.concatenate(found)
+        return np.concatenate(estimates)
 
     def _level(self) -> Float:
         """Level from one ray per lane."""

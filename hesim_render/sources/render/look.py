@@ -108,11 +108,11 @@ def _colours(mi: MitsubaModule, scene: MitsubaObject, view: View, x: NDArray, y:
     reflected = dr.select(clear & ~dr.any(reflected > 0), _CLEAR, reflected)
     shade = _GRAZING + (1 - _GRAZING) * dr.abs(dr.dot(si.n, ray.d))
     shines = dr.any(si.emitter(scene, hit).eval(si, hit) > 0) & hit
-    found = []
+    channels = []
     for k, sky in enumerate(_SKY):
         colour = dr.select(shines, 1.0, reflected[k] * shade)
-        found.append(np.array(dr.select(hit, colour, sky), dtype=np.float64))
-    return np.stack(found, axis=-1)
+        channels.append(np.array(dr.select(hit, colour, sky), dtype=np.float64))
+    return np.stack(channels, axis=-1)
 
 
 def _with_lines(

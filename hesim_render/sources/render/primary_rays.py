@@ -51,8 +51,8 @@ class RayFactory:
         self._airy = AiryBlur(sensor) if optics.diffraction else None
         self._shrink = None
         if optics.lateral_chromatic is not None:
-            told, grid = optics.lateral_chromatic, np.arange(RENDERABLE_NM[0], RENDERABLE_NM[1] + 1)
-            larger = np.interp(grid, told.wavelength_nm, told.relative)
+            chromatic, grid = optics.lateral_chromatic, np.arange(RENDERABLE_NM[0], RENDERABLE_NM[1] + 1)
+            larger = np.interp(grid, chromatic.wavelength_nm, chromatic.relative)
             self._shrink = table(types.Float, (1 / (1 + larger)).astype(np.float32))
             dr.make_opaque(self._shrink)
         self.is_dispersive = self._airy is not None or self._shrink is not None
@@ -228,10 +228,10 @@ class RayFactory:
         if not isinstance(self._blur, GaussianBlur):
             return dr.select(inside, jit().Float(1), 0)
         scale = dr.rcp(self._blur.sigma_px(place) * 2**0.5)
-        found = jit().Float(0.25)
+        density = jit().Float(0.25)
         for side in (x, y):
-            found = found * (dr.erf((0.5 - side) * scale) + dr.erf((0.5 + side) * scale))
-        return dr.select(inside, found, 0)
+            density = density * (dr.erf((0.5 - side) * scale) + dr.erf((0.5 + side) * scale))
+        return dr.select(inside, density, 0)
 
     def seen(self, point: Vector3) -> tuple[Float, Float, Float]:
         """Column and row on the full sensor at which a point is seen, with the camera at rest, and its scale.

@@ -223,8 +223,8 @@ class _DeviceDistortion:
         x, y = types.Float(u) * start, types.Float(v) * start
         for last in [False] * _STEPS + [True]:
             kind = types.Float64 if last else types.Float
-            found_u, found_v, xx, xy, yy = self._formula(kind(x), kind(y), exact=last)
-            du, dv, per_det = u - types.Float64(found_u), v - types.Float64(found_v), dr.rcp(xx * yy - xy * xy)
+            projected_u, projected_v, xx, xy, yy = self._formula(kind(x), kind(y), exact=last)
+            du, dv, per_det = u - types.Float64(projected_u), v - types.Float64(projected_v), dr.rcp(xx * yy - xy * xy)
             du, dv, per_det = (types.Float(values) for values in (du, dv, per_det))
             xx, xy, yy = (types.Float(values) for values in (xx, xy, yy))
             x, y = x + (yy * du - xy * dv) * per_det, y + (xx * dv - xy * du) * per_det

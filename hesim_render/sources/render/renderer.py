@@ -87,12 +87,12 @@ class FlickerRenderer(FlickerFlux):
 
     def estimate(self, demand: Demand, progress: Progress | None = None) -> Estimate:
         """See `Renderer.estimate`."""
-        found = []
+        estimates = []
         for number, part in enumerate(self.renderers):
             if progress is not None:
                 progress(number, len(self.renderers), "estimate")
-            found.append(part.estimate(demand))
-        return Estimate.together(found)
+            estimates.append(part.estimate(demand))
+        return Estimate.together(estimates)
 
     def report(self, demand: Demand, expected: Estimate | None, progress: Progress) -> None:
         """See `Renderer.report`."""

@@ -224,9 +224,9 @@ class PixelTracer(Tracer):
         known = np.empty((1, 2, pixels), np.float32)
         if self._journal.recall(key, [known]):
             return [(kind(half_a), kind(half_b)) for half_a, half_b in known]
-        found = trace()
-        self._journal.keep(key, [np.array(half) for halves in found for half in halves])
-        return found
+        traced = trace()
+        self._journal.keep(key, [np.array(half) for halves in traced for half in halves])
+        return traced
 
     def _block(
         self,

@@ -72,11 +72,11 @@ def test_the_flux_is_that_of_uniform_rays(changes):
     groups = np.arange(len(tracer.parts.groups), dtype=np.uint32)
     # every object in the list of every pair: most are elsewhere, or behind the camera
     every = PairAims(np.zeros(pixel.size, np.uint32), np.full(pixel.size, groups.size, np.uint32), groups)
-    lit = np.ones(pixel.size, np.bool_)
+    controlled = np.ones(pixel.size, np.bool_)
 
     def runs(rays, aims, first):
         count = np.full(pixel.size, rays)
-        parts = [tracer.trace(pixel, window, TIMES, count, lit, repeat=first + k, aims=aims) for k in range(10)]
+        parts = [tracer.trace(pixel, window, TIMES, count, controlled, repeat=first + k, aims=aims) for k in range(10)]
         return np.array([part.mean for part in parts], np.float64)
 
     aimed, uniform = runs(512, every, 1), runs(2048, None, 11)
@@ -105,29 +105,29 @@ def test_the_error_is_much_smaller_and_as_expected():
     pixel, window = (values[aims.count > 0] for values in pairs())
     aims = aims.part(aims.count > 0)
     assert pixel.size > 100
-    lit = np.ones(pixel.size, np.bool_)
+    controlled = np.ones(pixel.size, np.bool_)
 
     def error(own):
         count = np.full(pixel.size, 256)
-        parts = [tracer.trace(pixel, window, TIMES, count, lit, repeat=k, aims=own) for k in range(6)]
+        parts = [tracer.trace(pixel, window, TIMES, count, controlled, repeat=k, aims=own) for k in range(6)]
         return np.std([part.mean for part in parts], axis=0, ddof=1)
 
     aimed, uniform = error(aims), error(None)
     assert np.sqrt(np.mean(aimed**2)) < 0.2 * np.sqrt(np.mean(uniform**2))
     pilot = tracer.pilot(pixel, window, TIMES, 32, 1.0, Stream.RENDER_ZOOM, aims=aims)
-    expected = Gain(*TUNING.matt_gain).error(pilot.lit_scatter, np.full(pixel.size, 256))
+    expected = Gain(*TUNING.diffuse_gain).error(pilot.controlled_scatter, np.full(pixel.size, 256))
     assert 0.7 < np.sqrt(np.mean(expected**2)) / np.sqrt(np.mean(aimed**2)) < 1.6
     # the pilot sees the flux itself with little error: 16 uniform rays are off by a factor of two
-    flux = tracer.trace(pixel, window, TIMES, np.full(pixel.size, 1024), lit, aims=aims).mean
-    assert np.sqrt(np.mean((pilot.lit / flux - 1) ** 2)) < 0.2
+    flux = tracer.trace(pixel, window, TIMES, np.full(pixel.size, 1024), controlled, aims=aims).mean
+    assert np.sqrt(np.mean((pilot.controlled / flux - 1) ** 2)) < 0.2
 
 
 def test_pairs_without_small_objects_keep_their_bits():
     source, aims = source_and_aims()
     tracer, (pixel, window) = source._tracer, pairs()
-    count, lit = np.full(pixel.size, 32), np.ones(pixel.size, np.bool_)
-    alone = tracer.trace(pixel, window, TIMES, count, lit)
-    together = tracer.trace(pixel, window, TIMES, count, lit, aims=aims)
+    count, controlled = np.full(pixel.size, 32), np.ones(pixel.size, np.bool_)
+    alone = tracer.trace(pixel, window, TIMES, count, controlled)
+    together = tracer.trace(pixel, window, TIMES, count, controlled, aims=aims)
     plain = aims.count == 0
     assert 20 < plain.sum() < plain.size
     np.testing.assert_array_equal(together.half_a[plain], alone.half_a[plain])

@@ -69,7 +69,7 @@ def true_shares(run, truth):
     theta = np.full(pixels.size, 0.2), np.full(pixels.size, 0.27)
     counted = compare_ticks(*signals, error, theta, np.ones(TICKS, np.bool_))
     off = np.mean(np.abs(run / truth - 1) > 3 * QUALITY * UNIT)
-    return off, counted.missed.sum() / counted.true.sum(), counted.extra.sum() / counted.found.sum()
+    return off, counted.missed.sum() / counted.true.sum(), counted.extra.sum() / counted.in_run.sum()
 
 
 def scene(kind, rng):
@@ -244,12 +244,12 @@ def ticks(run, reference, error=0.001):
 
 def test_events_one_tick_apart_are_alike():
     told = ticks([0, 0, 0.5, 0.5, 0.5], [0, 0.5, 0.5, 0.5, 0.5])
-    assert told == {"true": 1, "found": 1, "missed": 0, "extra": 0, "flips": 0}
+    assert told == {"true": 1, "in_run": 1, "missed": 0, "extra": 0, "flips": 0}
     told = ticks([0, 0, 0, 0.5, 0.5], [0, 0.5, 0.5, 0.5, 0.5])
-    assert told == {"true": 1, "found": 1, "missed": 1, "extra": 1, "flips": 0}
+    assert told == {"true": 1, "in_run": 1, "missed": 1, "extra": 1, "flips": 0}
     # polarity counts
     told = ticks([0, -0.5, -0.5], [0, 0.5, 0.5])
-    assert told == {"true": 1, "found": 1, "missed": 1, "extra": 1, "flips": 0}
+    assert told == {"true": 1, "in_run": 1, "missed": 1, "extra": 1, "flips": 0}
 
 
 def test_events_within_three_errors_of_the_threshold_are_flips():
@@ -268,9 +268,9 @@ def test_crossings_within_three_errors_of_the_threshold_are_flips():
             step = np.array([0, 0, 1, 1.0])[:, None] * sign * (level + over)
             flat, error = np.zeros((4, 1)), np.full((4, 1), 0.001)
             told = compare_crossings(step, flat, error, theta, core, 8)
-            assert (told.extra[0], told.flips[0], told.found[0], told.true[0]) == (beyond, 1 - beyond, 1, 0)
+            assert (told.extra[0], told.flips[0], told.in_run[0], told.true[0]) == (beyond, 1 - beyond, 1, 0)
             told = compare_crossings(flat, step, error, theta, core, 8)
-            assert (told.missed[0], told.flips[0], told.found[0], told.true[0]) == (beyond, 1 - beyond, 0, 1)
+            assert (told.missed[0], told.flips[0], told.in_run[0], told.true[0]) == (beyond, 1 - beyond, 0, 1)
 
 
 def test_each_polarity_has_its_own_threshold():
@@ -303,7 +303,7 @@ def test_crossings_start_anew_at_each_event_of_the_reference():
         return {name: float(values[0]) for name, values in vars(counted).items()}
 
     rising = [0, 0.1, 0.21, 0.3, 0.41, 0.5, 0.61]
-    assert crossings(rising, rising) == {"true": 2, "found": 2, "missed": 0, "extra": 0, "flips": 0}
+    assert crossings(rising, rising) == {"true": 2, "in_run": 2, "missed": 0, "extra": 0, "flips": 0}
     # one step late is alike; not rising at all is not
     late = [0, 0, 0.1, 0.21, 0.3, 0.41, 0.5]
     assert crossings(late, rising)["missed"] == 0

@@ -37,7 +37,7 @@ def fluxes(source, begin_us, end_us, pixels=None):
 
 
 def ball_before_a_wall(light=None):
-    """A matt ball that crosses the middle of the picture, and nothing else moves."""
+    """A diffuse ball that crosses the middle of the picture, and nothing else moves."""
     ball = {"name": "ball", "shape": "sphere", "size_m": [0.1] * 3, "position_m": [0, 0, 0.05], "reflectance": 0.8}
     wall = {"name": "wall", "shape": "rectangle", "size_m": [4, 4, 0], "position_m": [0, 0, -0.05], "reflectance": 0.3,
             "pattern": 0.6, "pattern_count": [80, 80]}  # fmt: skip

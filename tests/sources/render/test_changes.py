@@ -10,8 +10,8 @@ import pytest
 
 from hesim_render.sources.render.change_driven.differences import Differences
 from hesim_render.sources.render.change_driven.neighbours import REACH, Sites
-from hesim_render.sources.render.change_driven.pilot import Closer, Pilot, allocate
-from hesim_render.sources.render.change_driven.plan import Plan, changes, fill_in, longer, plan
+from hesim_render.sources.render.change_driven.pilot import Pilot, Refinement, allocate
+from hesim_render.sources.render.change_driven.plan import Plan, changes, longer, plan
 from hesim_render.sources.render.change_driven.tuning import TUNING, Gain, Tuning
 
 
@@ -49,7 +49,7 @@ def test_what_is_rendered_around_a_change(step, reach):
     nothing = np.zeros_like(flux)
     found = plan(
         Pilot(flux, flux, nothing, nothing, flux), sites, lambda told: np.full_like(told, unit), quality,
-        Gain(*TUNING.matt_gain), TUNING, True,
+        Gain(*TUNING.diffuse_gain), TUNING, True,
     ).rendered.reshape(windows, 9, 9)  # fmt: skip
     row, col = np.indices((9, 9))
     away = np.maximum(abs(row - 4), abs(col - 4))
@@ -64,15 +64,6 @@ def test_longer_marks_reach_no_further():
     marked = np.zeros((7, 1), np.bool_)
     marked[3] = True
     assert longer(marked, 1)[:, 0].astype(int).tolist() == [0, 0, 1, 1, 1, 0, 0]
-
-
-def test_what_is_not_known_lies_on_straight_lines_in_time():
-    centre = np.array([0.0, 10, 30, 60, 100])
-    known = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [1, 1]], np.bool_)
-    values = np.where(known, np.array([[0, 5.0], [9, 7], [9, 9], [6, 9], [7, 25]]), 99).astype(np.float32)
-    fill_in(values, known, centre)
-    np.testing.assert_allclose(values[:, 0], [0, 1, 3, 6, 7], rtol=1e-6)
-    np.testing.assert_allclose(values[:, 1], [5, 7, 7 + 18 * 20 / 90, 7 + 18 * 50 / 90, 25], rtol=1e-6)
 
 
 def test_neighbours_of_a_crop_are_those_of_the_full_sensor():
@@ -93,10 +84,10 @@ def test_neighbours_of_a_crop_are_those_of_the_full_sensor():
     assert some.mean(image[some.index])[where] == pytest.approx(plane[12:15, 19:22].mean(), rel=1e-6)
 
 
-def pilot_of(flux, scatter, unshadowed=None, closer=()):
+def pilot_of(flux, scatter, unshadowed=None, refined=()):
     tables = [np.array(values, np.float32)[None] for values in (flux, scatter)]
     open_ = tables[0] if unshadowed is None else np.array(unshadowed, np.float32)[None]
-    return Pilot(tables[0], tables[0], tables[1], tables[1], open_, list(closer))
+    return Pilot(tables[0], tables[0], tables[1], tables[1], open_, list(refined))
 
 
 def rays_of(pilot, quality=0.5, unit=0.03):
@@ -105,17 +96,17 @@ def rays_of(pilot, quality=0.5, unit=0.03):
 
 
 def allocated(pilot, quality=0.5, unit=0.03):
-    count = pilot.lit.shape[1]
+    count = pilot.controlled.shape[1]
     sites = Sites.around(np.arange(count, dtype=np.uint32), 1, count)
-    units = unit * np.ones(pilot.lit.shape, np.float32)
-    return allocate(pilot, 0, sites, units, quality, Gain(*TUNING.matt_gain), TUNING, False)
+    units = unit * np.ones(pilot.controlled.shape, np.float32)
+    return allocate(pilot, 0, sites, units, quality, Gain(*TUNING.diffuse_gain), TUNING, False)
 
 
 def test_rays_follow_scatter_quality_and_what_is_near_by():
     calm = np.ones(9)
-    rays, lit, error = rays_of(pilot_of(calm, np.zeros(9)))
+    rays, controlled, error = rays_of(pilot_of(calm, np.zeros(9)))
     # one ray may bring one wanted error at most: 1 / (0.5 · 0.03) = 67
-    assert rays.tolist() == [64] * 9 and lit.all() and np.all(error == 0)
+    assert rays.tolist() == [64] * 9 and controlled.all() and np.all(error == 0)
     scatter = np.zeros(9)
     scatter[4] = 1.5
     rays, _, error = rays_of(pilot_of(calm, scatter))
@@ -128,12 +119,14 @@ def test_rays_follow_scatter_quality_and_what_is_near_by():
     bright[6] = 30.0
     rays, _, _ = rays_of(pilot_of(bright, np.zeros(9)))
     assert rays[4] > 128 and rays[2] == 64  # two pixels off the edge of something bright; four off
-    seen_closer = Closer(np.array([4]), np.array([8]), np.array([2.0], np.float32), np.array([2.0], np.float32))
-    rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), closer=[seen_closer]))
+    seen_refined = Refinement(np.array([4]), np.array([8]), np.array([2.0], np.float32), np.array([2.0], np.float32))
+    rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), refined=[seen_refined]))
     assert rays[4] > 256 and rays[2] == 64
     # what 256 rays did not meet, as many are looked for with
     nothing = np.zeros(1, np.float32)
-    rays, _, _ = rays_of(pilot_of(calm, np.zeros(9), closer=[Closer(np.array([4]), np.array([256]), nothing, nothing)]))
+    rays, _, _ = rays_of(
+        pilot_of(calm, np.zeros(9), refined=[Refinement(np.array([4]), np.array([256]), nothing, nothing)])
+    )
     assert rays[4] == 256 and rays[3] == 64
 
 
@@ -153,7 +146,7 @@ def test_knowledge_of_an_edge_leaves_the_rays_for_what_stays_unseen():
     hidden, flux = np.full(9, 1.5), np.full(9, 1.5)
     hidden[3] = 4.5
     nothing = np.zeros(1, np.float32)
-    looks = [Closer(np.array([7]), np.array([256]), nothing, nothing)]
+    looks = [Refinement(np.array([7]), np.array([256]), nothing, nothing)]
     floor = allocated(pilot_of(flux, np.zeros(9), hidden, looks))[3]
     np.testing.assert_allclose(floor, [0, 0, 0, 200, 0, 0, 0, 256, 0], atol=1)
 
@@ -169,9 +162,6 @@ def test_a_plan_ends_at_the_first_window_after_the_run():
     cut = np.array([[1, 1], [0, 1], [0, 0], [1, 0], [0, 1], [0, 0]], bool)
     np.testing.assert_array_equal(one.until(2).rendered, cut)
     np.testing.assert_array_equal(one.until(5).rendered, rendered)
-    values = np.where(cut, [[2.0, 8.0], [0, 7], [0, 0], [8, 0], [0, 1], [0, 0]], 0).astype(np.float32)
-    fill_in(values, cut, np.arange(6.0) * 3)
-    np.testing.assert_allclose(values, [[2, 8], [4, 7], [6, 5], [8, 3], [0, 1], [0, 0]])
     # the first window with a fit after the end is rendered as well
     fitted[[3, 4, 5], [1, 1, 1]] = True
     rendered[3, 1] = rendered[4, 0] = True

@@ -13,11 +13,10 @@ from hesim_render.core.backend import jit
 from hesim_render.mosaic.schedule import tick_blocks
 from hesim_render.sources.render.change_driven.anchor import anchor_us, period_us
 from hesim_render.sources.render.change_driven.differences import difference_of, differences
-from hesim_render.sources.render.change_driven.event_blocks import intervals_of
 from hesim_render.sources.render.change_driven.flux import ChangeDrivenFlux
 from hesim_render.sources.render.change_driven.neighbours import Sites
 from hesim_render.sources.render.change_driven.pair_flux import PairFlux, PilotFlux, PilotRays, not_negative
-from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Closer, Pilot, take_pilot
+from hesim_render.sources.render.change_driven.pilot import Anchored, Change, Pilot, Refinement, take_pilot
 from hesim_render.sources.render.change_driven.tuning import TUNING
 from hesim_render.sources.render.change_driven.windows import Windows
 from hesim_render.sources.render.transport import outlines
@@ -35,13 +34,13 @@ def pilot_of(windows, open_flux=0.0, **tables):
     """A pilot of 11×11 sites with changes; tables not given are 0."""
     zero = np.zeros((windows, 121), np.float32)
     change = {name: np.broadcast_to(np.asarray(table, np.float32), zero.shape).copy() for name, table in tables.items()}
-    names = "lit", "hidden", "lit_scatter", "hidden_scatter"
+    names = "controlled", "plain", "controlled_scatter", "plain_scatter"
     found = Change(*(change.get(name, zero.copy()) for name in names))
     return Pilot(zero, zero, zero, zero, zero + np.float32(open_flux), change=found)
 
 
-def rays_of(pilot, lit=True):
-    chosen = np.full(121, lit)
+def rays_of(pilot, controlled=True):
+    chosen = np.full(121, controlled)
     return difference_of(pilot, 0, chosen, sites_of(), np.full(121, UNIT, np.float32), QUALITY, TUNING)
 
 
@@ -53,24 +52,26 @@ def one_site(value, others=0.0):
 
 def test_rays_follow_the_scatter_of_a_pixel_and_of_those_around():
     """s² = ½·300² + ½·(300² + 8·90²)/9; n = (0.95·s/ε)²."""
-    rays, scatter = rays_of(pilot_of(1, lit_scatter=one_site(300, 90), hidden_scatter=7.0))
+    rays, scatter = rays_of(pilot_of(1, controlled_scatter=one_site(300, 90), plain_scatter=7.0))
     square = 0.5 * 300**2 + 0.5 * (300**2 + 8 * 90**2) / 9
     assert scatter[CENTRE] == pytest.approx(square**0.5, rel=1e-5)
     assert rays[CENTRE] == pytest.approx((0.95 / WANTED) ** 2 * square, rel=1e-4)
-    assert rays_of(pilot_of(1, lit_scatter=300.0, hidden_scatter=7.0), lit=False)[0][CENTRE] == 64
+    assert rays_of(pilot_of(1, controlled_scatter=300.0, plain_scatter=7.0), controlled=False)[0][CENTRE] == 64
 
 
 def test_what_a_pilot_does_not_show_has_rays_too():
     """Half of all light over the root of 144 rays, 2400/24 = 100 e⁻/s, beside a scatter of 240; and never less than 64
     rays. A pixel without neighbours has but 32 rays of its own.
     """
-    rays, scatter = rays_of(pilot_of(1, open_flux=2400, lit_scatter=240.0))
+    rays, scatter = rays_of(pilot_of(1, open_flux=2400, controlled_scatter=240.0))
     assert scatter[CENTRE] == pytest.approx(260, rel=1e-5)
     assert rays[CENTRE] == pytest.approx((0.95 * 260 / WANTED) ** 2, rel=1e-4)
     assert rays_of(pilot_of(1))[0][CENTRE] == 64
     alone = Sites.alone(np.arange(121, dtype=np.uint32))
-    units, lit = np.full(121, UNIT, np.float32), np.ones(121, bool)
-    _, scatter = difference_of(pilot_of(1, open_flux=2400, lit_scatter=240.0), 0, lit, alone, units, QUALITY, TUNING)
+    units, controlled = np.full(121, UNIT, np.float32), np.ones(121, bool)
+    _, scatter = difference_of(
+        pilot_of(1, open_flux=2400, controlled_scatter=240.0), 0, controlled, alone, units, QUALITY, TUNING
+    )
     assert scatter[CENTRE] == pytest.approx(np.hypot(240, 1200 / 32**0.5), rel=1e-5)
 
 
@@ -78,17 +79,17 @@ def test_what_a_pilot_does_not_show_has_rays_too():
 def test_a_change_beside_a_pixel_may_reach_into_it(sign):
     """A 32nd of a pixel may have changed as the neighbour did: (0.95/ε)²·contrast²/32; two away, by its light alone."""
     moved = sign * 1500.0
-    rays, _ = rays_of(pilot_of(1, lit=one_site(moved, sign * 150.0)))
+    rays, _ = rays_of(pilot_of(1, controlled=one_site(moved, sign * 150.0)))
     assert rays[CENTRE + 1] == pytest.approx((0.95 * 1350 / WANTED) ** 2 / 32, rel=1e-4)
     assert rays[CENTRE + 12] == rays[CENTRE + 1] > rays[CENTRE + 2]
-    far, _ = rays_of(pilot_of(1, lit=one_site(sign * 16_000.0)))
+    far, _ = rays_of(pilot_of(1, controlled=one_site(sign * 16_000.0)))
     assert far[CENTRE + 2] == pytest.approx(0.25 * 16_000 / UNIT) and far[CENTRE + 3] == 64
-    lamp, _ = rays_of(pilot_of(1, lit=one_site(sign * 1e6)))
+    lamp, _ = rays_of(pilot_of(1, controlled=one_site(sign * 1e6)))
     assert lamp[CENTRE + 2] == 512  # at most
 
 
 def chosen(pilot, alone, rendered=None):
-    shape = pilot.lit.shape
+    shape = pilot.controlled.shape
     rendered = np.ones(shape, bool) if rendered is None else rendered
     units = np.full(shape, UNIT, np.float32)
     return differences(pilot, sites_of(), units, QUALITY, rendered, np.broadcast_to(np.int16(alone), shape), TUNING)
@@ -106,14 +107,14 @@ def test_windows_within_a_block_share_their_rays_and_pay_for_those_in_its_first(
     """Scatters of 93 and 143 want 64 and 128 rays; both windows take 128, and 128 more in the first window."""
     scatter = np.zeros((4, 1))
     scatter[1:3, 0] = 93, 143
-    pilot = pilot_of(4, lit_scatter=scatter, hidden_scatter=5e4)
+    pilot = pilot_of(4, controlled_scatter=scatter, plain_scatter=5e4)
     found = chosen(pilot, 1024)
-    assert found.rays[:, CENTRE].tolist() == [64, 128, 128, 64] and found.lit.all()
+    assert found.rays[:, CENTRE].tolist() == [64, 128, 128, 64] and found.controlled.all()
     np.testing.assert_allclose(found.error[1:3, CENTRE], 0.95 * np.array([93, 143]) / np.sqrt(128), rtol=1e-5)
     # one window alone would take 128 rays and 128 in the first, which is as much as 256 of its own
     once = np.ones((4, 121), bool)
     once[1] = False
-    assert chosen(pilot_of(4, lit_scatter=143.0, hidden_scatter=5e4), 512, once).rays[:, CENTRE].tolist() == [
+    assert chosen(pilot_of(4, controlled_scatter=143.0, plain_scatter=5e4), 512, once).rays[:, CENTRE].tolist() == [
         128,
         0,
         128,
@@ -126,17 +127,17 @@ def test_windows_within_a_block_share_their_rays_and_pay_for_those_in_its_first(
 
 
 def test_the_estimator_is_the_steadier_one():
-    lit = np.array([[3.0], [900.0], [40.0], [500.0]])
-    hidden = np.array([[8.0], [70.0], [600.0], [20.0]])
-    found = chosen(pilot_of(4, lit_scatter=lit, hidden_scatter=hidden), 4096)
+    controlled = np.array([[3.0], [900.0], [40.0], [500.0]])
+    plain = np.array([[8.0], [70.0], [600.0], [20.0]])
+    found = chosen(pilot_of(4, controlled_scatter=controlled, plain_scatter=plain), 4096)
     # ends by themselves; the two windows between together: 940 against 670
-    assert found.lit[:, CENTRE].tolist() == [True, False, False, False]
+    assert found.controlled[:, CENTRE].tolist() == [True, False, False, False]
 
 
 def test_pixels_with_small_objects_are_rendered_by_themselves():
-    looks = [Closer(*(np.empty(0, kind) for kind in (int, int, np.float32, np.float32))) for _ in range(3)]
-    looks[1] = Closer(np.array([7]), np.array([256]), np.zeros(1, np.float32), np.zeros(1, np.float32))
-    rays = chosen(replace(pilot_of(3), closer=looks), 1024).rays
+    looks = [Refinement(*(np.empty(0, kind) for kind in (int, int, np.float32, np.float32))) for _ in range(3)]
+    looks[1] = Refinement(np.array([7]), np.array([256]), np.zeros(1, np.float32), np.zeros(1, np.float32))
+    rays = chosen(replace(pilot_of(3), refined=looks), 1024).rays
     assert rays[1, 7] == 0 and np.count_nonzero(rays == 0) == 1
 
 
@@ -147,10 +148,9 @@ def test_anchors_lie_at_multiples_of_64_ms_or_of_four_blocks():
     assert period_us(ticks) == 128_000 and anchor_us(ticks - 700, ticks) == (127_300, 128_000)
 
 
-def test_small_asynchronous_sensors_have_longer_blocks():
-    """By the size of the sensor, not of what is read out, so that a crop has the values of the whole."""
-    assert [intervals_of(rows * cols) for rows, cols in ((260, 346), (480, 640), (720, 1280))] == [64, 32, 16]
-    sensor = hr.load_sensor("davis346").crop(20, 12)
+@pytest.mark.parametrize("name", ["davis346", "imx636"])
+def test_blocks_of_asynchronous_sensors_are_long(name):
+    sensor = hr.load_sensor(name).crop(20, 12)
     blocks = list(ChangeDrivenFlux(shadow_scene(), sensor, seed=1).sample_blocks(1, 0, 33_000))
     assert max(block.wanted.size for block in blocks) == 65
 
@@ -246,8 +246,8 @@ class MadeUp:
     def pilot(self, index, window, windows, rays, width_px, span_us=None, before=None):
         self.traced += zip(window.tolist(), index.tolist(), strict=True)
         found = PilotFlux.empty(index.size)
-        found.lit[:], found.hidden[:] = self.light[window, index], 0.5 * self.light[window, index]
-        found.lit_change[:], found.met[:] = 3000 + before[1], self.near[index]
+        found.controlled[:], found.plain[:] = self.light[window, index], 0.5 * self.light[window, index]
+        found.controlled_change[:], found.met[:] = 3000 + before[1], self.near[index]
         return found
 
     def pilot_rays(self, index, window, windows, rays, width_px, span_us=None, before=None):
@@ -263,27 +263,27 @@ def test_what_a_pilot_compares_and_between_which_looks_it_traces():
     light, near = np.full((9, 121), 250.0, np.float32), np.ones(121, bool)
     light[6:, CENTRE], near[far] = 700.0, False
     tracer, anchor = MadeUp(light, near), PilotFlux.empty(121)
-    anchor.lit[:], anchor.hidden[:] = 240.0, 90.0
+    anchor.controlled[:], anchor.plain[:] = 240.0, 90.0
     zeros = jit().Float(np.zeros(16 * 121, np.float32))
     anchored = Anchored(anchor, PilotRays(zeros, zeros, 16, (1.0, 2.0)))
     numbers = np.repeat(np.arange(9)[:, None], 121, axis=1)
     windows = Windows(np.arange(9.0), np.arange(9.0) + 1)
     pilot, _ = take_pilot(tracer, sites, windows, numbers, 16, 1.25, None, anchored=anchored, stride=4)
-    np.testing.assert_array_equal(pilot.lit, light)
+    np.testing.assert_array_equal(pilot.controlled, light)
     row, col = np.indices((11, 11))
     busy = np.flatnonzero(((abs(row - 5) <= 2) & (abs(col - 5) <= 2)).ravel())
     looks = [(window, site) for window in (0, 4, 8) for site in range(121) if window == 0 or site != far]
     assert sorted(tracer.traced) == sorted([*looks, *((window, site) for window in (5, 6) for site in busy)])
     # the ends are compared with the anchor, those between with the first window
-    scatter, site = pilot.change.lit_scatter, np.arange(121)
+    scatter, site = pilot.change.controlled_scatter, np.arange(121)
     near_by = site != far
     np.testing.assert_array_equal(scatter[0], 3000 + site)
     np.testing.assert_array_equal(scatter[8, near_by], (3000 + site + 121)[near_by])
     assert scatter[8, far] == scatter[0, far] and np.all(scatter[1:4] == 0) and np.all(scatter[1:8, far] == 0)
     np.testing.assert_array_equal(scatter[4:8, near_by], np.tile((3000 + site)[near_by], (4, 1)))
-    np.testing.assert_array_equal(pilot.change.lit[[0, 8]], light[[0, 8]] - 240)
-    np.testing.assert_array_equal(pilot.change.hidden[8], 0.5 * light[8] - 90)
-    np.testing.assert_array_equal(pilot.change.lit[1:8], light[1:8] - 250)
+    np.testing.assert_array_equal(pilot.change.controlled[[0, 8]], light[[0, 8]] - 240)
+    np.testing.assert_array_equal(pilot.change.plain[8], 0.5 * light[8] - 90)
+    np.testing.assert_array_equal(pilot.change.controlled[1:8], light[1:8] - 250)
 
 
 def test_windows_that_save_less_than_their_rays_in_the_first_one_are_rendered_by_themselves():
@@ -291,7 +291,7 @@ def test_windows_that_save_less_than_their_rays_in_the_first_one_are_rendered_by
     scatter, alone = np.zeros((8, 1)), np.full((8, 121), 256, np.int16)
     scatter[3, 0], alone[3] = 285, 2048
     units, every = np.full((8, 121), UNIT, np.float32), np.ones((8, 121), bool)
-    pilot = pilot_of(8, lit_scatter=scatter, hidden_scatter=5e4)
+    pilot = pilot_of(8, controlled_scatter=scatter, plain_scatter=5e4)
     for rendered, expected in ((range(8), 0), ((0, 3, 4, 5, 7), 512)):
         some = np.zeros_like(every)
         some[list(rendered)] = True

@@ -118,12 +118,12 @@ def edges():
     window = np.repeat(np.arange(2), pixel.size // 2)
     begin = np.array([1300.0, 21_000.0])
     windows = Windows(begin, begin + 7)
-    lit = np.ones(pixel.size, np.bool_)
-    busy = tracer.edges(pixel, window, windows, 64, 1.5, lit)
+    controlled = np.ones(pixel.size, np.bool_)
+    busy = tracer.edges(pixel, window, windows, 64, 1.5, controlled)
     here = np.flatnonzero(busy.high > 1.02 * busy.low)
-    pairs, lit = (pixel[here], window[here], windows), lit[here]
-    traced = [tracer.trace(*pairs, np.full(here.size, 4096), lit, Stream.AUDIT, repeat=k).mean for k in range(8)]
-    return tracer, pairs, lit, np.stack(traced).astype(np.float64)
+    pairs, controlled = (pixel[here], window[here], windows), controlled[here]
+    traced = [tracer.trace(*pairs, np.full(here.size, 4096), controlled, Stream.AUDIT, repeat=k).mean for k in range(8)]
+    return tracer, pairs, controlled, np.stack(traced).astype(np.float64)
 
 
 def test_no_model_moves_the_mean(edges):
@@ -131,15 +131,15 @@ def test_no_model_moves_the_mean(edges):
 
     One χ² over all pairs, to which one extreme z of the pairs is added; false alarms: 1e-4 each.
     """
-    tracer, pairs, lit, plain = edges
-    rng, count, times = np.random.default_rng(6), lit.size, 96
+    tracer, pairs, controlled, plain = edges
+    rng, count, times = np.random.default_rng(6), controlled.size, 96
     x, y, offset = lines(rng, count)
     level = plain.mean(axis=0) / tracer.axis_factor(pairs[0])
     low, high = level * rng.uniform(0.3, 0.9, count), level * rng.uniform(1.1, 2, count)
     wrong = x, y, offset, rng.uniform(0.01, 0.4, count), low, high
     models = PairEdges(*(values.astype(np.float32) for values in wrong))
     rays = rng.choice([64, 256], count)
-    found = np.stack([tracer.trace(*pairs, rays, lit, repeat=k, edges=models).mean for k in range(times)])
+    found = np.stack([tracer.trace(*pairs, rays, controlled, repeat=k, edges=models).mean for k in range(times)])
     error2 = found.var(axis=0, ddof=1) / times + plain.var(axis=0, ddof=1) / 8
     busy = error2 > (1e-6 * plain.mean(axis=0)) ** 2  # in the others all rays have the same value
     z = (found.mean(axis=0) - plain.mean(axis=0))[busy] / np.sqrt(error2[busy])
@@ -154,29 +154,29 @@ def test_few_rays_about_a_line_do_the_work_of_many(edges):
     Half of the pairs have a smaller error than with 1024 plain rays. Where the decision rays missed a corner, single
     rays weigh more, so the rms error is below that of 256.
     """
-    tracer, pairs, lit, plain = edges
-    fit = tracer.edges(*pairs, 64, 1.5, lit)
+    tracer, pairs, controlled, plain = edges
+    fit = tracer.edges(*pairs, 64, 1.5, controlled)
     lines_ = np.flatnonzero(fit.is_edge)
     chosen = pairs[0][lines_], pairs[1][lines_], pairs[2]
     truth, few = plain.mean(axis=0)[lines_], np.full(lines_.size, 64)
-    assert lines_.size > 0.3 * lit.size
-    by_line = tracer.trace(*chosen, few, lit[lines_], edges=fit.models(lines_)).mean - truth
-    plainly = {times: tracer.trace(*chosen, times * few, lit[lines_]).mean - truth for times in (4, 16)}
+    assert lines_.size > 0.3 * controlled.size
+    by_line = tracer.trace(*chosen, few, controlled[lines_], edges=fit.models(lines_)).mean - truth
+    plainly = {times: tracer.trace(*chosen, times * few, controlled[lines_]).mean - truth for times in (4, 16)}
     assert np.sqrt(np.mean(by_line**2)) < np.sqrt(np.mean(plainly[4] ** 2))
     assert np.median(np.abs(by_line)) < np.median(np.abs(plainly[16]))
 
 
 def test_a_line_depends_on_its_pair_alone(edges):
-    tracer, pairs, lit, _ = edges
-    every = tracer.edges(*pairs, 64, 1.5, lit)
-    some = np.arange(5, lit.size, 7)[::-1]
-    alone = tracer.edges(pairs[0][some], pairs[1][some], pairs[2], 64, 1.5, lit[some])
+    tracer, pairs, controlled, _ = edges
+    every = tracer.edges(*pairs, 64, 1.5, controlled)
+    some = np.arange(5, controlled.size, 7)[::-1]
+    alone = tracer.edges(pairs[0][some], pairs[1][some], pairs[2], 64, 1.5, controlled[some])
     for name in vars(every):
         np.testing.assert_array_equal(getattr(alone, name), getattr(every, name)[some])
-    models = every.models(np.arange(lit.size))
-    rays = np.full(lit.size, 64)
-    whole = tracer.trace(*pairs, rays, lit, edges=models)
-    part = tracer.trace(pairs[0][some], pairs[1][some], pairs[2], rays[some], lit[some], edges=models.part(some))
+    models = every.models(np.arange(controlled.size))
+    rays = np.full(controlled.size, 64)
+    whole = tracer.trace(*pairs, rays, controlled, edges=models)
+    part = tracer.trace(pairs[0][some], pairs[1][some], pairs[2], rays[some], controlled[some], edges=models.part(some))
     np.testing.assert_array_equal(part.half_a, whole.half_a[some])
 
 
@@ -207,7 +207,7 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     tried = []
 
     class Tracer:
-        def edges(self, pixel, window, windows, samples, footprint_px, lit, stream):
+        def edges(self, pixel, window, windows, samples, footprint_px, controlled, stream):
             tried.append((pixel.tolist(), samples, footprint_px, stream))
             return EdgeFit(*(getattr(fit, name)[pixel] for name in vars(fit)))
 
@@ -215,8 +215,8 @@ def test_rays_follow_from_what_the_decision_rays_saw():
             return np.full(pixel.size, 0.8, np.float32)
 
     pixel, law = np.arange(8, dtype=np.uint32), np.array([2048, 4096, 2048, 512, 1024, 1024, 1024, 128])
-    floor, lit, wanted = np.array([0, 0, 0, 0, 0, 300, 0, 0]), np.ones(8, bool), np.full(8, 2.0, np.float32)
-    given = law, lit, wanted, floor, Gain(*TUNING.matt_gain), TUNING
+    floor, controlled, wanted = np.array([0, 0, 0, 0, 0, 300, 0, 0]), np.ones(8, bool), np.full(8, 2.0, np.float32)
+    given = law, controlled, wanted, floor, Gain(*TUNING.diffuse_gain), TUNING
     rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given)
     # 0.4 rays for each wanted error of contrast, 64 at least; an eighth of the law where there is no
     # contrast, also if rounding makes a line of it; a corner as by the law; the floor;

@@ -120,7 +120,7 @@ def test_the_picture_shows_the_surfaces_and_the_region():
 
 @pytest.mark.parametrize("material", ["dielectric", "conductor", "diffuse"])
 def test_glass_and_metal_are_shown_in_grey(material):
-    """A ball that is seen, before a black card; a matt ball keeps its own reflectance."""
+    """A ball that is seen, before a black card; a diffuse ball keeps its own reflectance."""
     ball = {"name": "ball", "shape": "sphere", "size_m": [0.1] * 3, "position_m": [0, 0, 0.06], "material": material}
     scene = scene_of({**CARD, "reflectance": 0.0}, {"fit": "target", "fit_margin": 0.5}, objects=[ball])
     picture = look(scene, mono(60, 40)).picture

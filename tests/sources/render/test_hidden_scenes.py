@@ -73,7 +73,7 @@ def test_flips_are_those_that_the_stated_error_causes():
 
 
 def made(missed=0.0, extra=0.0, told=0.03, **verdict):
-    return {"true": 1000.0, "found": 1000.0, "missed": [missed, told], "extra": [extra, told], **verdict}
+    return {"true": 1000.0, "in_run": 1000.0, "missed": [missed, told], "extra": [extra, told], **verdict}
 
 
 def test_what_does_not_hold_is_named():

@@ -37,12 +37,12 @@ def swarm(count):
     return make_scene(objects=objects, light=SKY, camera=CAMERA, motion=motion)
 
 
-def traced(scene, lit=False):
+def traced(scene, controlled=False):
     """All pixels in all windows; boxes hold for few windows, or for the whole run."""
     tracer = pair_tracer(scene, mono(COLS, ROWS))
     pixel = np.tile(tracer.sensor.layout.full_index.ravel(), STARTS_US.size)
     number, windows = np.repeat(np.arange(STARTS_US.size), COLS * ROWS), Windows(STARTS_US, STARTS_US + 400)
-    rays, which = np.full(pixel.size, RAYS), np.full(pixel.size, lit)
+    rays, which = np.full(pixel.size, RAYS), np.full(pixel.size, controlled)
     return [tracer.trace(pixel, number, windows, rays, which, span_us=span) for span in (None, (0.0, 25_000.0))]
 
 

@@ -20,7 +20,7 @@ CAMERA = {"origin_m": [0, 0, 5], "horizontal_fov_deg": 30}
 
 
 def two_parts():
-    """A matt box of linear red 0.5 on the left, a textured plate on the right, upper half light."""
+    """A diffuse box of linear red 0.5 on the left, a textured plate on the right, upper half light."""
     red = PBRMaterial(baseColorFactor=[128, 0, 0, 255], metallicFactor=0.0, roughnessFactor=1.0)
     box = trimesh.creation.box((1, 1, 0.2))
     box.visual = TextureVisuals(material=red)
@@ -47,10 +47,10 @@ def test_parts_lie_in_the_box_of_the_object_with_its_own_reflectance(tmp_path):
     radiance = seen(tmp_path / "two.glb", reflectance=0.3)[..., 0]
     # 2 m at 5 m: 30° across is 2.679 m, so 0.0447 m a pixel; box and plate are a third of the 3 units each
     cols = (np.arange(60) - 29.5) * 0.04465
-    matt = np.isclose(radiance[20], 0.3, rtol=1e-3)
+    diffuse = np.isclose(radiance[20], 0.3, rtol=1e-3)
     on = (np.abs(cols) < 0.97) & (np.abs(cols) > 0.37)
     off = (np.abs(cols) > 1.05) | (np.abs(cols) < 0.3)
-    assert matt[on].all() and not matt[off].any()
+    assert diffuse[on].all() and not diffuse[off].any()
     np.testing.assert_allclose(radiance[20][off], 1.0, rtol=1e-5)  # the sky
 
 

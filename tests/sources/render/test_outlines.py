@@ -162,14 +162,14 @@ def test_light_beside_a_moving_target_has_no_bias_and_little_noise():
     source = ChangeDrivenFlux(hr.load_scene("rotating-star"), sensor, seed=3)
     tracer, index = source._tracer, source._index
     window, first = Windows(np.array([3700.0]), np.array([4100.0])), np.zeros(index.size, np.int64)
-    lit, hidden = (
+    controlled, plain = (
         tracer.trace(index, first, window, np.full(index.size, 256), np.full(index.size, by), Stream.AUDIT).mean
         for by in (True, False)
     )
     pilot = tracer.pilot(index, first, window, 64, 1.0)
-    shadowed = (pilot.hidden < 0.97 * pilot.unshadowed) & (pilot.hidden_scatter > 0.1 * pilot.unshadowed)
+    shadowed = (pilot.plain < 0.97 * pilot.unshadowed) & (pilot.plain_scatter > 0.1 * pilot.unshadowed)
     assert np.count_nonzero(shadowed) > 500
-    difference = (lit - hidden)[shadowed] / pilot.unshadowed[shadowed]
+    difference = (controlled - plain)[shadowed] / pilot.unshadowed[shadowed]
     assert abs(difference.mean()) < 4 * difference.std() / np.sqrt(difference.size)
-    calm = shadowed & (pilot.lit_scatter < 0.05 * pilot.hidden_scatter)
+    calm = shadowed & (pilot.controlled_scatter < 0.05 * pilot.plain_scatter)
     assert np.count_nonzero(calm) > 0.6 * np.count_nonzero(shadowed)

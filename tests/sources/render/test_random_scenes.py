@@ -76,9 +76,9 @@ def test_an_event_within_the_error_of_the_comparison_is_not_counted():
         (near, (exact, rough), 0),
     ):
         counted = count_events(sensor, chosen, own, reference, *errors)
-        assert (counted.found.sum(), counted.true.sum(), counted.extra.sum()) == (1, 0, extra)
+        assert (counted.in_run.sum(), counted.true.sum(), counted.extra.sum()) == (1, 0, extra)
         swapped = count_events(sensor, chosen, reference, own, *errors)
-        assert (swapped.found.sum(), swapped.true.sum(), swapped.missed.sum()) == (0, 1, extra)
+        assert (swapped.in_run.sum(), swapped.true.sum(), swapped.missed.sum()) == (0, 1, extra)
 
 
 def record(seed, off=0, missed=0, count_off=0, mean=0.0):

@@ -1,4 +1,4 @@
-"""Light that a flat mirror throws on matt surfaces: closed form, Mitsuba's own paths, and what it saves."""
+"""Light that a flat mirror throws on diffuse surfaces: closed form, Mitsuba's own paths, and what it saves."""
 
 import numpy as np
 import pytest
@@ -100,12 +100,12 @@ def test_it_takes_fewer_rays(monkeypatch):
 @pytest.mark.parametrize(
     "bsdf",
     [
-        pytest.param(GREY, marks=pytest.mark.slow),  # as in `test_matt`
+        pytest.param(GREY, marks=pytest.mark.slow),  # as in `test_diffuse`
         {"type": "plastic", "diffuse_reflectance": {"type": "uniform", "value": 0.4}},
         {"type": "roughplastic", "diffuse_reflectance": {"type": "uniform", "value": 0.4}, "alpha": 0.2},
         pytest.param({"type": "twosided", "nested": GREY}, marks=pytest.mark.slow),
     ],
-    ids=["matt", "plastic", "rough plastic", "both sides"],
+    ids=["diffuse", "plastic", "rough plastic", "both sides"],
 )
 def test_flux_is_that_of_mitsuba(bsdf):
     """Two mirrors that face each other, a glass ball, a sky, five segments; the exact mode has Mitsuba's own paths.

@@ -120,7 +120,7 @@ def test_paths_are_those_of_mitsuba(light, depth, roulette, draws_of_mitsuba):
 
 
 @pytest.mark.parametrize("name", ["rotating-star", pytest.param("camera-sweep", marks=pytest.mark.slow)])
-def test_matt_surfaces_have_the_flux_of_the_exact_mode(name):
+def test_diffuse_surfaces_have_the_flux_of_the_exact_mode(name):
     """Both estimates against Mitsuba's own paths, in a window so short that nothing moves.
 
     Sums over 8×6 pixels, differences over their standard errors from both halves: beyond 5 in one of 10^5 runs; the
@@ -137,8 +137,8 @@ def test_matt_surfaces_have_the_flux_of_the_exact_mode(name):
     tracer = pair_tracer(scene, sensor)
     for t_us in (1000.0, 777_000.0):
         wanted, their_error = groups(*exact.mean_flux(pixels, t_us, t_us))
-        for lit in (True, False):
-            told = traced(tracer, 512, t_us, t_us, lit)
+        for controlled in (True, False):
+            told = traced(tracer, 512, t_us, t_us, controlled)
             found, error = groups(told.half_a, told.half_b)
             spread = np.sqrt(np.mean(error**2) + np.mean(their_error**2))
             assert spread < 0.01 * wanted.mean()
@@ -161,9 +161,9 @@ def test_the_scatter_of_a_pilot_has_no_range(power):
         out.put(slice(0, 2), flux, 2 * flux, flux, met, 32, 16)
     deviation = rays.reshape(2, 2, 16) - rays.reshape(2, 2, 16).mean(axis=2, keepdims=True)
     expected = np.sqrt((deviation**4).sum(axis=(1, 2)) / (deviation**2).sum(axis=(1, 2)) * 16 / 15)
-    np.testing.assert_allclose(np.ldexp(out.lit_scatter.astype(np.float64), -power), expected, rtol=1e-5)
-    np.testing.assert_allclose(np.ldexp(out.hidden_scatter.astype(np.float64), -power), 2 * expected, rtol=1e-5)
-    np.testing.assert_allclose(np.ldexp(out.lit.astype(np.float64), -power), rays.mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(np.ldexp(out.controlled_scatter.astype(np.float64), -power), expected, rtol=1e-5)
+    np.testing.assert_allclose(np.ldexp(out.plain_scatter.astype(np.float64), -power), 2 * expected, rtol=1e-5)
+    np.testing.assert_allclose(np.ldexp(out.controlled.astype(np.float64), -power), rays.mean(axis=1), rtol=1e-5)
 
 
 def test_a_pilot_says_how_much_single_rays_change():
@@ -177,11 +177,11 @@ def test_a_pilot_says_how_much_single_rays_change():
     some = [types.Float(np.array(values).reshape(3, 16)[pairs].ravel()) for values in fluxes[:2]]
     met = types.UInt32(np.zeros(32, np.uint32))
     out.put(slice(0, 2), *some, some[0], met, 16, 16, rays.at(pairs))
-    for found, difference in ((out.lit_change, now - before), (out.hidden_change, 0.5 * now - 0.3 * before)):
+    for found, difference in ((out.controlled_change, now - before), (out.plain_change, 0.5 * now - 0.3 * before)):
         np.testing.assert_allclose(found, difference[pairs].std(axis=1, ddof=1), rtol=1e-4)
     every = PilotFlux.empty(3)
     every.put(slice(0, 3), *fluxes[:2], fluxes[0], types.UInt32(np.zeros(48, np.uint32)), 16, 16, rays.at(np.arange(3)))
-    assert every.lit_change[1] < 0.05 and every.lit_change[0] > 500
+    assert every.controlled_change[1] < 0.05 and every.controlled_change[0] > 500
 
 
 @pytest.mark.slow
@@ -206,16 +206,18 @@ def test_a_pair_does_not_depend_on_its_company():
     tracer, rng = pair_tracer(hr.load_scene("camera-sweep"), mono()), np.random.default_rng(0)
     pixel = tracer.sensor.layout.full_index.ravel()[rng.permutation(64 * 48)]
     begin = rng.uniform(0, 5e5, pixel.size)
-    samples, lit = 2 ** rng.integers(3, 8, pixel.size), rng.random(pixel.size) < 0.5
+    samples, controlled = 2 ** rng.integers(3, 8, pixel.size), rng.random(pixel.size) < 0.5
     number = np.arange(pixel.size)
-    together = tracer.trace(pixel, number, Windows(begin, begin + 1000), samples, lit)
+    together = tracer.trace(pixel, number, Windows(begin, begin + 1000), samples, controlled)
     some = rng.choice(pixel.size, 40, replace=False)
-    alone = tracer.trace(pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), samples[some], lit[some])
+    alone = tracer.trace(
+        pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), samples[some], controlled[some]
+    )
     for field in ("half_a", "half_b", "met"):
         np.testing.assert_array_equal(getattr(together, field)[some], getattr(alone, field))
     pilot = tracer.pilot(pixel, number, Windows(begin, begin + 1000), 16, 1.25)
     alone = tracer.pilot(pixel[some], np.arange(40), Windows(begin[some], begin[some] + 1000), 16, 1.25)
-    for field in ("lit", "hidden", "unshadowed", "lit_scatter", "hidden_scatter"):
+    for field in ("controlled", "plain", "unshadowed", "controlled_scatter", "plain_scatter"):
         np.testing.assert_array_equal(getattr(pilot, field)[some], getattr(alone, field))
 
 

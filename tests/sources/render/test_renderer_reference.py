@@ -107,7 +107,7 @@ def test_lamp_that_flickers_while_it_moves():
         assert np.all(found.stderr < 1e-2 * unit)
 
 
-def test_matt_plate_under_an_area_light():
+def test_diffuse_plate_under_an_area_light():
     """E is given on the plane; L = ρ E/π there."""
     light = {
         "type": "area",

@@ -77,7 +77,7 @@ def test_the_picture_has_a_corner_where_depth_pose_and_camera_put_it(name):
     still = scene(name, (2 * reach, 2 * reach), corner + np.array([reach, -reach]), camera_moves=False)
     truth = SceneTruth(still, sensor)
     t_us = 0.0
-    flux = rendering.traced(rendering.pair_tracer(still, sensor), 1024, t_us, t_us, lit=True)
+    flux = rendering.traced(rendering.pair_tracer(still, sensor), 1024, t_us, t_us, controlled=True)
     light = flux.mean.reshape(ROWS, COLS) / flux.mean.max()
     offsets = []
     for way in (np.array([0.0, -1.0]), np.array([1.0, 0.0])):  # left rim, top rim

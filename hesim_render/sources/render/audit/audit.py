@@ -73,14 +73,14 @@ class Audit:
         """Run the audit. Returns bounds, estimates, deviations and a verdict, as plain values."""
         own = self._source.rays_traced
         room = max(_PART * own, _RAYS)
-        found: dict[str, Any] = {
+        report: dict[str, Any] = {
             "compares_with": _COMPARES_WITH, "confidence": CONFIDENCE, "tolerance_noise": TOLERANCE * self._quality
         }  # fmt: skip
         kinds = [name for name in ("events", "frames") if getattr(self._noted, name)]
         for name in kinds:
-            found[name] = self._one(getattr(self._noted, name), name == "events", room / len(kinds))
-        found["rays"] = self._source.rays_traced - own
-        return found | self._verdict([found[name] for name in kinds])
+            report[name] = self._one(getattr(self._noted, name), name == "events", room / len(kinds))
+        report["rays"] = self._source.rays_traced - own
+        return report | self._verdict([report[name] for name in kinds])
 
     def _one(self, noted: list[Units], events: bool, room: float) -> dict[str, Any]:
         """Audit the event pixels, or the frames.
@@ -114,7 +114,7 @@ class Audit:
         """All units in random order, in batches of growing size, grouped by shape, with their places in that order."""
         which = np.concatenate([np.full(units.pixel.size, number) for number, units in enumerate(noted)])
         inside = np.concatenate([np.arange(units.pixel.size) for units in noted])
-        order, found, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
+        order, batches, first, size = self._rng.permutation(which.size), [], 0, _LEAST_BATCH
         while first < order.size:
             chosen = order[first : first + size]
             by_shape: dict[bytes, list[tuple[NDArray[np.int64], Units]]] = {}
@@ -122,12 +122,12 @@ class Audit:
                 here = np.flatnonzero(which[chosen] == one)
                 units = noted[one].at(inside[chosen[here]])
                 by_shape.setdefault(units.core.tobytes(), []).append((first + here, units))
-            found.append(
+            batches.append(
                 [(np.concatenate([place for place, _ in parts]), Units.joined([units for _, units in parts]))
                  for parts in by_shape.values()]
             )  # fmt: skip
             first, size = first + chosen.size, min(2 * size, _MOST_BATCH)
-        return found
+        return batches
 
     def _look_at(self, batch: list[tuple[NDArray[np.int64], Units]], tally: Tally, which: str) -> None:
         """Render the reference of some units of a batch and count the results.
@@ -167,8 +167,8 @@ class Audit:
         if events:
             moving = np.flatnonzero(~still)
             part, other = units.at(moving), reference[:, moving]
-            found = self._compare(part, part.flux, other)
-            for total, values in zip(vars(tally.events).values(), vars(found).values(), strict=True):
+            counts = self._compare(part, part.flux, other)
+            for total, values in zip(vars(tally.events).values(), vars(counts).values(), strict=True):
                 total[place[moving]] = values
             # counts that errors as large as those of the run and of the reference cause on their own
             by_error = self._compare(part, other + part.difference, other + difference[:, moving])
@@ -241,7 +241,7 @@ class Audit:
         deviation, weight = tally.deviations()
         cumulated = np.cumsum(weight)
         parts = {name: deviation[np.searchsorted(cumulated, p * cumulated[-1])] for name, p in _PARTS.items()}
-        found: dict[str, Any] = {
+        bounds: dict[str, Any] = {
             "units": int(off.size),
             "off": float(off.mean()),
             "off_at_most": min(1.0, most * upper_bound(off / most, CONFIDENCE)),
@@ -253,7 +253,7 @@ class Audit:
             },
             "off_by_stated_error_alone": float(tally.expected[: tally.looked_at].mean()),
         }
-        return found | self._event_bounds(tally) if events else found
+        return bounds | self._event_bounds(tally) if events else bounds
 
     def _event_bounds(self, tally: Tally) -> dict[str, Any]:
         """Bounds of missed and extra events. Units in which nothing can move have neither."""
@@ -265,17 +265,17 @@ class Audit:
         known[eventful] = np.minimum(counted.true[eventful], most)
         at_least = lower_bound(known / most, each)
         missed = upper_bound(np.minimum(counted.missed[: tally.looked_at], most) / most, each)
-        part, whole = (np.minimum(values[eventful], most) for values in (counted.extra, counted.found))
+        part, whole = (np.minimum(values[eventful], most) for values in (counted.extra, counted.in_run))
         seen = bool(counted.true.any())
         true = tally.rate(counted.true) if seen else np.inf
-        found = tally.rate(counted.found) or np.inf
+        in_run = tally.rate(counted.in_run) or np.inf
         return {
             "true_events": float(counted.true.sum()),
-            "found_events": float(counted.found.sum()),
+            "found_events": float(counted.in_run.sum()),
             "missed": tally.rate(counted.missed) / true,
             "missed_at_most": min(1.0, missed / at_least) if at_least > 0 else 1.0,
             "missed_wanted_at_most": MOST_MISSED,
-            "extra": tally.rate(counted.extra) / found,
+            "extra": tally.rate(counted.extra) / in_run,
             "extra_at_most": ratio_upper_bound(part, whole, most, CONFIDENCE),
             "extra_wanted_at_most": MOST_EXTRA,
             "flips": tally.rate(counted.flips) / true,

@@ -17,15 +17,15 @@ class Counted:
 
     Parameters
     ----------
-    true, found : number of events of the reference and of the run.
-    missed : true events without a matching found one, where the reference exceeds the threshold by more than `SURE`
-        standard errors.
-    extra : found events without a matching true one, where the run exceeds the threshold by that much.
+    true, in_run : number of events of the reference and of the run.
+    missed : true events without a matching one of the run, where the reference exceeds the threshold by more than
+        `SURE` standard errors.
+    extra : events of the run without a matching true one, where the run exceeds the threshold by that much.
     flips : all other events without a match.
     """
 
     true: NDArray[np.float64]
-    found: NDArray[np.float64]
+    in_run: NDArray[np.float64]
     missed: NDArray[np.float64]
     extra: NDArray[np.float64]
     flips: NDArray[np.float64]
@@ -53,18 +53,18 @@ def compare_ticks(
     -------
     Counts per unit.
     """
-    true, found, missed, extra, flips = counts = [np.zeros(run.shape[1]) for _ in range(5)]
+    true, in_run, missed, extra, flips = counts = [np.zeros(run.shape[1]) for _ in range(5)]
     change, wanted = np.diff(run, axis=0), np.diff(reference, axis=0)
     spread = np.hypot(error[1:], error[:-1])
     counted = core[1:, None]
     for sign, theta in ((1.0, thresholds[0]), (-1.0, thresholds[1])):
         own, other = sign * change - theta, sign * wanted - theta
-        is_found, is_true = own > 0, other > 0
-        lost, added = is_true & ~_near(is_found), is_found & ~_near(is_true)
+        is_in_run, is_true = own > 0, other > 0
+        lost, added = is_true & ~_near(is_in_run), is_in_run & ~_near(is_true)
         sure_lost, sure_added = lost & (other > SURE * spread), added & (own > SURE * spread)
         for total, which in (
             (true, is_true),
-            (found, is_found),
+            (in_run, is_in_run),
             (missed, sure_lost),
             (extra, sure_added),
             (flips, (lost | added) & ~sure_lost & ~sure_added),
@@ -75,10 +75,10 @@ def compare_ticks(
 
 def _near(which: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The marked windows and their direct neighbours in time, [window, unit]."""
-    found = which.copy()
-    found[1:] |= which[:-1]
-    found[:-1] |= which[1:]
-    return found
+    widened = which.copy()
+    widened[1:] |= which[:-1]
+    widened[:-1] |= which[1:]
+    return widened
 
 
 def compare_crossings(
@@ -104,7 +104,7 @@ def compare_crossings(
     Counts per unit.
     """
     count = run.shape[1]
-    true, found, missed, extra, flips = (np.zeros(count) for _ in range(5))
+    true, in_run, missed, extra, flips = (np.zeros(count) for _ in range(5))
     level = reference[0].copy()
     theta_on, theta_off = thresholds
     last = run.shape[0] - 1
@@ -120,7 +120,7 @@ def compare_crossings(
             if core[k]:
                 extra += sure
                 flips += over & ~sure
-                found += over
+                in_run += over
             for _ in range(most):
                 crosses = ahead[k] > goal
                 if not crosses.any():
@@ -129,9 +129,9 @@ def compare_crossings(
                 sure = crosses & ~like & (ahead[around].max(axis=0) > goal + SURE * spread)
                 if core[k]:
                     true += crosses
-                    found += crosses & like
+                    in_run += crosses & like
                     missed += sure
                     flips += crosses & ~like & ~sure
                 level = np.where(crosses, level + sign * theta, level)
                 goal = sign * level + theta
-    return Counted(*(np.minimum(total, most) for total in (true, found, missed, extra, flips)))
+    return Counted(*(np.minimum(total, most) for total in (true, in_run, missed, extra, flips)))

@@ -136,7 +136,7 @@ class NotedFlux:
         among = np.flatnonzero(np.isin(pixel, self._event_pixel))
         times: deque[tuple[float, float]] = deque()
 
-        def told(blocks: Iterable[Block]) -> Iterator[Block]:
+        def noted(blocks: Iterable[Block]) -> Iterator[Block]:
             for block in blocks:
                 begin, end = block.begin_us[block.wanted], block.end_us[block.wanted]
                 times.extend(zip(begin.tolist(), end.tolist(), strict=True))
@@ -146,7 +146,7 @@ class NotedFlux:
         if among.size:
             # units at the begin of the run have fewer windows before the judged ones
             units.extend(self._open(among, skipped) for skipped in range(self._before, 0, -self._core))
-        for number, sample in enumerate(self.source.flux_of_blocks(pixel, told(blocks))):
+        for number, sample in enumerate(self.source.flux_of_blocks(pixel, noted(blocks))):
             window = times.popleft()
             if among.size and (number + self._before) % self._core == 0:
                 units.append(self._open(among, 0))

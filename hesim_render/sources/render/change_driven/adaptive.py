@@ -49,7 +49,7 @@ class AdaptiveRenderer:
 
     def __init__(self, tracer: PairTracer, noise: Noise, quality: float, tuning: Tuning) -> None:
         self.tracer, self.noise, self.quality, self.tuning = tracer, noise, quality, tuning
-        self.gain = Gain(*(tuning.matt_gain if tracer.is_matt else tuning.path_gain))
+        self.gain = Gain(*(tuning.diffuse_gain if tracer.is_diffuse else tuning.path_gain))
         self.counts = Counts()
         self._sensor = tracer.sensor
         self.index = self._sensor.layout.full_index.ravel()
@@ -57,7 +57,7 @@ class AdaptiveRenderer:
         # windows of an asynchronous sensor are so close that nothing moves far from one to the next
         self.look_stride = tuning.look_stride if evs is not None and evs.tick_us is None else 1
         self.zoom = Zoom(
-            tracer.view, tracer.camera, tracer.parts.groups, tracer.is_matt, tuning, rays.can_aim, rays.blur_px
+            tracer.view, tracer.camera, tracer.parts.groups, tracer.is_diffuse, tuning, rays.can_aim, rays.blur_px
         )
         self._kept: dict[Role, Still] = {}
 
@@ -99,21 +99,21 @@ class AdaptiveRenderer:
         before, cols = self.tracer.rays_done, self._sensor.spec.geometry.cols
         width = self._footprint_px(band)
         row, col = np.divmod(band.sites.index.astype(np.int64), cols)
-        closer = self.zoom.sites(row, col, windows, numbers)
-        given = self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, closer, anchored, stride
-        found = take_pilot(*given, lambda flux: np.float32(band.quality) * band.unit(flux))
+        looks = self.zoom.sites(row, col, windows, numbers)
+        given = self.tracer, band.sites, windows, numbers, band.pilot_rays, width, span_us, looks, anchored, stride
+        piloted = take_pilot(*given, lambda flux: np.float32(band.quality) * band.unit(flux))
         self.counts.pilot_rays += self.tracer.rays_done - before
-        return found
+        return piloted
 
     def pilot_rays(self, band: Band, windows: Windows) -> Anchored:
         """Pilot of a band in the only window, with its rays."""
         before, sites = self.tracer.rays_done, band.sites
         first = np.zeros(sites.size, np.int64)
-        found = Anchored(
+        anchored = Anchored(
             *self.tracer.pilot_rays(sites.index, first, windows, band.pilot_rays, self._footprint_px(band))
         )
         self.counts.pilot_rays += self.tracer.rays_done - before
-        return found
+        return anchored
 
     def _footprint_px(self, band: Band) -> float:
         """Width of the area in which pilot rays of a band start, px."""
@@ -139,14 +139,16 @@ class AdaptiveRenderer:
         if window.size == 0:
             return what, None, Courses.none()
         index, tuning, before = band.index[pixel], self.tuning, self.tracer.rays_done
-        of = index, numbers[what.fitted], windows, tuning.edge_rays, tuning.edge_footprint_px, what.lit[what.fitted]
-        fit = self.tracer.edges(*of)
+        scale = self.tracer.axis_factor(index)
+        little = np.float32(tuning.flat_contrast) * what.wanted[what.fitted] / scale
+        of = index, numbers[what.fitted], windows, tuning.edge_rays, tuning.edge_footprint_px
+        fit = self.tracer.edges(*of, what.controlled[what.fitted], little)
         self.counts.rays += self.tracer.rays_done - before
-        own = fit.scaled(self.tracer.axis_factor(index))
+        own = fit.scaled(scale)
         centre_us = 0.5 * (windows.begin_us + windows.end_us)
         given = what.pilot, self._footprint_px(band), what.wanted[what.fitted], centre_us, what.barred
-        found = courses(window, pixel, own, *given)
-        return what.without(found.window, found.pixel), fit, found
+        edge_courses = courses(window, pixel, own, *given)
+        return what.without(edge_courses.window, edge_courses.pixel), fit, edge_courses
 
     def render(
         self,
@@ -181,7 +183,7 @@ class AdaptiveRenderer:
         aims = None if what.aims is None else what.aims.at(window, band.sites.listed[place])
         pairs = band.index[place], numbers[todo], windows
         rays, edges = self.rays_of(pairs, what, todo, aims, fit)
-        got = self.tracer.trace(*pairs, rays, what.lit[todo], span_us=span_us, aims=aims, edges=edges)
+        got = self.tracer.trace(*pairs, rays, what.controlled[todo], span_us=span_us, aims=aims, edges=edges)
         self.counts.rays += self.tracer.rays_done - before
         self.counts.pairs += place.size
         out.half_a[todo], out.half_b[todo], met[todo] = got.half_a, got.half_b, got.met
@@ -211,7 +213,7 @@ class AdaptiveRenderer:
         if not self.tracer.rays.is_box:
             return rays, None
         tried = None if aims is None else aims.count == 0
-        given = rays, what.lit[todo], what.wanted[todo], what.floor[todo]
+        given = rays, what.controlled[todo], what.wanted[todo], what.floor[todo]
         known = None if fit is None else (what.fitted[todo], fit.at(todo[what.fitted]))
         return about_edges(self.tracer, pairs, *given, self.gain, self.tuning, tried=tried, known=known)
 

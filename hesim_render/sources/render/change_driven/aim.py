@@ -247,8 +247,8 @@ class Aim:
         density = density / lanes.count
         pixel = self._rays.density(x, y, centre)
         # an aimed ray whose object is not there at this instant finds nothing
-        found = (pixel > 0) & (~lanes.is_aimed | (own.density > 0))
-        weight = dr.select(found, 2 * pixel / (pixel + density), 0)
+        meets = (pixel > 0) & (~lanes.is_aimed | (own.density > 0))
+        weight = dr.select(meets, 2 * pixel / (pixel + density), 0)
         return x, y, weight
 
     def _square(self, group: UInt32, now: Moment, camera: DevicePose | None, centre: tuple[Float, Float]) -> _Square:

@@ -80,17 +80,17 @@ class Anchor:
             window, place = np.nonzero(some)
             if place.size == 0:
                 continue
-            rays, lit = chosen.rays[some], chosen.lit[some]
-            now = renderer.tracer.trace(band.index[place], window, windows, rays, lit, signed=True)
+            rays, controlled = chosen.rays[some], chosen.controlled[some]
+            now = renderer.tracer.trace(band.index[place], window, windows, rays, controlled, signed=True)
             if is_inner:
                 assert first is not None
                 # the same rays of a pixel in the first window serve all others
                 pixel, own = np.unique(place, return_index=True)
-                of = band.index[pixel], np.zeros(pixel.size, np.int64), windows, rays[own], lit[own]
+                of = band.index[pixel], np.zeros(pixel.size, np.int64), windows, rays[own], controlled[own]
                 then = renderer.tracer.trace(*of, signed=True).at(np.searchsorted(pixel, place))
                 base = first.at(place)
             else:
-                then, base = self._means_of(place, rays, lit), self._flux_of(place)
+                then, base = self._means_of(place, rays, controlled), self._flux_of(place)
             halves = [
                 own[0] + (new - old)
                 for own, new, old in zip(
@@ -138,21 +138,25 @@ class Anchor:
             self._is_known |= new
         return self._flux.at(place)
 
-    def _means_of(self, place: NDArray[np.int64], rays: NDArray[np.integer], lit: NDArray[np.bool_]) -> PairFlux:
+    def _means_of(self, place: NDArray[np.int64], rays: NDArray[np.integer], controlled: NDArray[np.bool_]) -> PairFlux:
         """Means of numbers of rays of some pixels in the anchor."""
-        found = PairFlux.empty(place.size)
+        means = PairFlux.empty(place.size)
         size = self._band.place.size
-        for count, is_lit in {(int(n), bool(by)) for n, by in zip(*np.unique([rays, lit], axis=1), strict=True)}:
-            values, is_known = self._means.setdefault((count, is_lit), (PairFlux.empty(size), np.zeros(size, np.bool_)))
-            own = np.flatnonzero((rays == count) & (lit == is_lit))
+        for count, is_controlled in {
+            (int(n), bool(by)) for n, by in zip(*np.unique([rays, controlled], axis=1), strict=True)
+        }:
+            values, is_known = self._means.setdefault(
+                (count, is_controlled), (PairFlux.empty(size), np.zeros(size, np.bool_))
+            )
+            own = np.flatnonzero((rays == count) & (controlled == is_controlled))
             new = np.unique(place[own])
             new = new[~is_known[new]]
             if new.size:
                 every = np.zeros(new.size, np.int64)
                 got = self._renderer.tracer.trace(
-                    *(self._band.index[new], every, self._windows, every + count, np.full(new.size, is_lit)),
+                    *(self._band.index[new], every, self._windows, every + count, np.full(new.size, is_controlled)),
                     signed=True,
                 )
                 values.half_a[new], values.half_b[new], is_known[new] = got.half_a, got.half_b, True
-            found.half_a[own], found.half_b[own] = values.half_a[place[own]], values.half_b[place[own]]
-        return found
+            means.half_a[own], means.half_b[own] = values.half_a[place[own]], values.half_b[place[own]]
+        return means

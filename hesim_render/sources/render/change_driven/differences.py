@@ -31,17 +31,17 @@ class Differences:
     Parameters
     ----------
     rays : number of rays of each in either window, a power of two; 0 for pairs that are rendered by themselves.
-    lit : estimator of the difference, see `MattIntegrator`.
+    controlled : estimator of the difference, see `MattIntegrator`.
     error : expected standard error of the difference, e⁻/s.
     """
 
     rays: NDArray[np.int16]
-    lit: NDArray[np.bool_]
+    controlled: NDArray[np.bool_]
     error: NDArray[np.float32]
 
     def first(self) -> Differences:
         """Those in the first window."""
-        return Differences(self.rays[:1], self.lit[:1], self.error[:1])
+        return Differences(self.rays[:1], self.controlled[:1], self.error[:1])
 
     @classmethod
     def none(cls, windows: int, pixels: int) -> Differences:
@@ -53,7 +53,7 @@ class Differences:
 def difference_of(
     pilot: Pilot,
     window: int,
-    lit: NDArray[np.bool_],
+    controlled: NDArray[np.bool_],
     sites: Sites,
     units: NDArray[np.float32],
     quality: float,
@@ -64,7 +64,7 @@ def difference_of(
     Parameters
     ----------
     pilot, window : statistics with their changes, and number of the window.
-    lit : [site], estimator of the difference.
+    controlled : [site], estimator of the difference.
     sites : the pixels with their neighbours.
     units : [site], noise units, e⁻/s.
     quality : wanted error of a pair in noise units.
@@ -77,7 +77,7 @@ def difference_of(
     assert pilot.change is not None
     change, here = pilot.change, sites.listed
     # Few rays change, and a pixel's own pilot may have met none of them: half of the scatter is that of pixels around.
-    square = (np.where(lit, change.lit_scatter[window], change.hidden_scatter[window]) * _SMALLER) ** 2
+    square = (np.where(controlled, change.controlled_scatter[window], change.plain_scatter[window]) * _SMALLER) ** 2
     scatter = np.sqrt(np.float32(0.5) * (square[here] + sites.mean(square))) / _SMALLER
     # What these rays can not have seen: a small part of the light that changed, the larger the fewer rays looked.
     looked = tuning.lone_pilot_rays if sites.shape is None else 9 * tuning.pilot_rays
@@ -86,11 +86,18 @@ def difference_of(
     wanted_error = np.float32(tuning.difference_part * quality) * units[here]
     rays = (np.float32(tuning.difference_factor) * scatter / wanted_error) ** 2
     # An edge that has moved in a neighbour may reach into this pixel between the pilot rays.
-    moved = np.where(lit, change.lit[window], change.hidden[window])
+    moved = np.where(controlled, change.controlled[window], change.plain[window])
     contrast = np.maximum(sites.most(moved, 1) - moved[here], moved[here] + sites.most(-moved, 1))
     unseen = (np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * contrast / wanted_error) ** 2
     brighter = np.float32(tuning.bright_rays) * sites.most(np.abs(moved), 2) / units[here]
     rays = np.maximum(rays, np.minimum(np.maximum(unseen, brighter), np.float32(tuning.most_unseen_rays)))
+    if pilot.all_move:
+        # Every edge moves, even by less than the distance of two pilot rays, and may come into this pixel.
+        flux = np.where(controlled, pilot.controlled[window], pilot.plain[window])
+        beside = np.maximum(sites.most(flux, 1) - flux[here], flux[here] + sites.most(-flux, 1))
+        rays = np.maximum(
+            rays, np.square(np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * beside / wanted_error)
+        )
     return np.maximum(rays, np.float32(tuning.least_difference_rays)), scatter
 
 
@@ -118,19 +125,23 @@ def differences(
     if change is None:
         return out
     inner = slice(1, max(1, last))
-    steadier = change.lit_scatter <= change.hidden_scatter
+    steadier = change.controlled_scatter <= change.plain_scatter
     # those windows share rays in the first one, and so the estimator
-    steadier[inner] = change.lit_scatter[inner].sum(axis=0) <= change.hidden_scatter[inner].sum(axis=0)
-    for window, lit in enumerate(steadier):
-        wanted, scatter = difference_of(pilot, window, lit, sites, units[window], quality, tuning)
+    steadier[inner] = change.controlled_scatter[inner].sum(axis=0) <= change.plain_scatter[inner].sum(axis=0)
+    for window, controlled in enumerate(steadier):
+        wanted, scatter = difference_of(pilot, window, controlled, sites, units[window], quality, tuning)
         bits = np.rint(np.log2(np.minimum(wanted, tuning.most_rays))).astype(np.int16)
         rays = np.left_shift(np.int16(1), bits)
         pays = rendered[window] & (np.float32(tuning.difference_gain) * rays <= alone[window])
-        out.rays[window], out.lit[window], out.error[window] = np.where(pays, rays, 0), lit[sites.listed], scatter
-    for window, closer in enumerate(pilot.closer):
+        out.rays[window], out.controlled[window], out.error[window] = (
+            np.where(pays, rays, 0),
+            controlled[sites.listed],
+            scatter,
+        )
+    for window, refined in enumerate(pilot.refined):
         # a small object passes: many rays look for it
         looked_at = np.zeros(sites.size, np.bool_)
-        looked_at[closer.place] = True
+        looked_at[refined.place] = True
         out.rays[window, looked_at[sites.listed]] = 0
     if pilot.aims is not None:
         which, place = np.nonzero(out.rays)

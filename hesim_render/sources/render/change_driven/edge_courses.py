@@ -152,8 +152,8 @@ def courses(
         for k in (one, other)
     ]
     model = share - (ends[0] + part * (ends[1] - ends[0]))
-    found = now, pixel[one], window[one], window[other], model.astype(np.float32)
-    return Courses(*(values[keep] for values in found))
+    columns = now, pixel[one], window[one], window[other], model.astype(np.float32)
+    return Courses(*(values[keep] for values in columns))
 
 
 def _angle(fit: EdgeFit, which: NDArray[np.int64]) -> NDArray[np.float64]:

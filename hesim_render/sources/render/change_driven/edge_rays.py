@@ -16,7 +16,7 @@ def about_edges(
     tracer: PairTracer,
     pairs: tuple[NDArray[np.uint32], NDArray[np.integer], Windows],
     rays: NDArray[np.integer],
-    lit: NDArray[np.bool_],
+    controlled: NDArray[np.bool_],
     wanted: NDArray[np.float32],
     floor: NDArray[np.integer],
     gain: Gain,
@@ -36,7 +36,7 @@ def about_edges(
     tracer : traces the decision rays.
     pairs : pixels [n] on the full sensor, their windows, and all windows.
     rays : [n], by the law of errors, powers of two.
-    lit : [n], estimator of each pair.
+    controlled : [n], estimator of each pair.
     wanted : [n], wanted error, e⁻/s.
     floor : [n], number of rays that knowledge of an edge does not lower.
     gain : error law of stratified rays.
@@ -60,11 +60,11 @@ def about_edges(
     if known is not None:
         fit.replace(np.flatnonzero(known[0][place]), known[1])
         new = np.flatnonzero(~known[0][place])
-    some = place[new]
-    of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, lit[some]
-    fit.replace(new, tracer.edges(*of, stream))
     # fluxes of fits are those on the optical axis
     wanted = wanted[place] / tracer.axis_factor(pixel[place])
+    some, little = place[new], np.float32(tuning.flat_contrast) * wanted[new]
+    of = pixel[some], window[some], windows, tuning.edge_rays, tuning.edge_footprint_px, controlled[some], little
+    fit.replace(new, tracer.edges(*of, stream))
     # of rays that all see the same, none is above the middle
     contrast = np.maximum(fit.high - fit.low, 0) / wanted
     is_edge = fit.is_edge & (contrast >= 1)
@@ -76,7 +76,8 @@ def about_edges(
     # little contrast: the neighbours gave this pair its rays, and what they show does not reach it
     part = tuning.flat_part if flat_part is None else flat_part
     needed = np.where(is_flat, np.maximum(needed, part * rays[place].astype(np.float32)), needed)
-    needed = np.clip(np.maximum(needed, floor[place]), tuning.edge_rays, tuning.most_rays)
+    least = np.where(is_flat, tuning.edge_rays // 2, tuning.edge_rays)
+    needed = np.clip(np.maximum(needed, floor[place]), least, tuning.most_rays)
     fewer = 1 << np.ceil(np.log2(needed)).astype(np.int64)
     # all other pairs, such as corners and penumbrae, keep the rays of the law
     pays = (is_edge | is_flat) & (fewer < rays[place])

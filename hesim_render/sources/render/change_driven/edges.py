@@ -54,10 +54,10 @@ class PairEdges:
     @classmethod
     def at(cls, count: int, place: NDArray[np.int64], models: PairEdges) -> PairEdges:
         """Models of `count` pairs, of which those at some places have one."""
-        found = cls(*(np.zeros(count, np.float32) for _ in fields(cls)))
-        for values, own in zip(astuple_of(found), astuple_of(models), strict=True):
+        padded = cls(*(np.zeros(count, np.float32) for _ in fields(cls)))
+        for values, own in zip(astuple_of(padded), astuple_of(models), strict=True):
             values[place] = own
-        return found
+        return padded
 
     def part(self, part: slice | NDArray) -> PairEdges:
         """Those of some pairs."""
@@ -144,8 +144,8 @@ class EdgeFit:
 
     def replace(self, part: slice | NDArray[np.int64], fits: EdgeFit) -> None:
         """Put in the fits of some pairs."""
-        for values, found in zip(astuple_of(self), astuple_of(fits), strict=True):
-            values[part] = found
+        for values, fitted in zip(astuple_of(self), astuple_of(fits), strict=True):
+            values[part] = fitted
 
     def models(self, part: NDArray, wider: bool = False) -> PairEdges:
         """Models of some pairs; `wider` strips hold lines that lie askew in the gap as well."""
@@ -212,12 +212,12 @@ def joined_rays(first: Sequence[Float], pairs: NDArray[np.int64], more: Sequence
     is_first, pair = half % 2 == 0, half // 2
     own = spread_out(types.UInt32, pairs.astype(np.uint32), pair) * dr.opaque(types.UInt32, rays) + within
     other = pair * dr.opaque(types.UInt32, rays) + within
-    found = [
+    merged = [
         dr.select(is_first, dr.gather(types.Float, a, own), dr.gather(types.Float, b, other, ~is_first))
         for a, b in zip(first, more, strict=True)
     ]
-    dr.eval(found)
-    return found
+    dr.eval(merged)
+    return merged
 
 
 def _widest_gap(x: Float, y: Float, side: Float, rays: int) -> tuple[Float, Float, Float]:
@@ -264,10 +264,10 @@ def _widest_gap(x: Float, y: Float, side: Float, rays: int) -> tuple[Float, Floa
 
     zero = dr.zeros(types.Float, len(pair))
     state = dr.zeros(types.UInt32, len(pair)), zero, zero, dr.full(types.Float, -100, len(pair)), zero
-    found = dr.while_loop(
+    best_fit = dr.while_loop(
         state, lambda number, *_: number < _COARSE + _ROUNDS * _FINE, attempt, label="directions of edges"
     )
-    return found[2], found[3], found[4]
+    return best_fit[2], best_fit[3], best_fit[4]
 
 
 @dataclass(frozen=True)

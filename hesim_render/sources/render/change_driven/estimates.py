@@ -40,8 +40,8 @@ class Flux:
 
     def put(self, place: slice | NDArray, flux: Flux) -> None:
         """Set the flux of the pixels at some places."""
-        for values, found in zip(self.arrays, flux.arrays, strict=True):
-            values[:, place] = found
+        for values, new in zip(self.arrays, flux.arrays, strict=True):
+            values[:, place] = new
 
 
 @dataclass

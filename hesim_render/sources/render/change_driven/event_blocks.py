@@ -5,21 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.mosaic.schedule import BLOCK_INTERVALS, Block
+from hesim_render.mosaic.schedule import Block
 from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.estimates import Flux
-from hesim_render.sources.render.change_driven.plan import fill_in
+from hesim_render.sources.render.change_driven.knots import BlockFlux, Knots
 from hesim_render.sources.render.change_driven.windows import Windows
 
-#: Intervals of a block of an asynchronous sensor, and the largest sensor, in pixels, that has as many. The last window
-#: of each block is rendered at all pixels, so that fewer blocks cost less; all windows of a block are held in memory.
-_INTERVALS = ((64, 150_000), (32, 500_000))
-
-
-def intervals_of(pixels: int) -> int:
-    """Largest number of intervals of a block, for a sensor of so many pixels."""
-    return next((intervals for intervals, most in _INTERVALS if pixels <= most), BLOCK_INTERVALS)
+#: Largest number of intervals of a block of an asynchronous sensor. The last window of each block is rendered at all
+#: pixels, so that fewer blocks cost less; of a band of pixels, the plan of all windows is held in memory.
+INTERVALS = 64
 
 
 class Blocks:
@@ -52,11 +47,11 @@ class Blocks:
         self._time: tuple[float, float] | None = None
         self._last = known
 
-    def take(self, block: Block) -> Flux:
-        """Flux of the pixels that may change, [window, alive pixel]."""
+    def take(self, block: Block) -> BlockFlux:
+        """Flux of the pixels that may change."""
         renderer, windows = self._renderer, Windows(block.begin_us, block.end_us)
         is_next = self._time == (block.begin_us[0], block.end_us[0])
-        out = Flux.zeros(windows.size, self.alive.size)
+        parts: list[tuple[NDArray[np.int64], Knots]] = []
         centre = 0.5 * (block.begin_us + block.end_us)
         span_us = anchor_us(block.begin_us, block.end_us)
         for number, band in enumerate(self._bands):
@@ -65,7 +60,7 @@ class Blocks:
             anchor = self._anchors[number]
             first = self._last.at(band.place) if is_next else None
             if first is not None and windows.size == 1:
-                out.put(band.place, first)
+                parts.append((band.place, Knots.of(first, np.ones((1, band.place.size), np.bool_), centre)))
                 continue
             numbers = np.repeat(np.arange(windows.size)[:, None], band.sites.size, axis=1)
             pilot, _ = renderer.pilot(band, windows, numbers, windows.span_us, anchor.pilot, renderer.look_stride)
@@ -81,11 +76,10 @@ class Blocks:
             followed.fill(flux, centre)
             known = what.rendered.copy()
             known[followed.window, followed.pixel] = True
-            for values in flux.arrays:
-                fill_in(values, known, centre)
-            out.put(band.place, flux)
+            parts.append((band.place, Knots.of(flux, known, centre)))
+        out = BlockFlux(self.alive.size, parts)
         # where a block goes on after the run, its last window may be unknown
         is_whole = bool(block.wanted[-1])
         self._time = (float(block.begin_us[-1]), float(block.end_us[-1])) if is_whole else None
-        self._last = Flux(*(values[-1:].copy() for values in out.arrays))
+        self._last = out.at(windows.size - 1)
         return out

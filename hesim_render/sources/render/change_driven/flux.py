@@ -29,8 +29,9 @@ from hesim_render.sources.render.change_driven.adaptive import AdaptiveRenderer
 from hesim_render.sources.render.change_driven.anchor import Anchor, anchor_us
 from hesim_render.sources.render.change_driven.error_target import Noise, Role
 from hesim_render.sources.render.change_driven.estimates import Counts, Flux
-from hesim_render.sources.render.change_driven.event_blocks import Blocks, intervals_of
+from hesim_render.sources.render.change_driven.event_blocks import INTERVALS, Blocks
 from hesim_render.sources.render.change_driven.forecast import forecast
+from hesim_render.sources.render.change_driven.knots import BlockFlux
 from hesim_render.sources.render.change_driven.pair_tracer import PairTracer
 from hesim_render.sources.render.change_driven.resting_depth import least_depth_m
 from hesim_render.sources.render.change_driven.retrace import KnownPairs, traced_again
@@ -159,10 +160,7 @@ class ChangeDrivenFlux:
 
     def sample_blocks(self, window_us: int, begin_us: int, end_us: int) -> Iterator[Block]:
         """See `FluxSource.sample_blocks`."""
-        geometry = self.sensor.spec.geometry
-        return blocks_of_run(
-            self._clock.instants_us, window_us, begin_us, end_us, intervals_of(geometry.rows * geometry.cols)
-        )
+        return blocks_of_run(self._clock.instants_us, window_us, begin_us, end_us, INTERVALS)
 
     def sample_times_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside the interval that follow all motion, including that of the camera, µs."""
@@ -305,17 +303,15 @@ class ChangeDrivenFlux:
         work: Blocks | None = None
         for block in blocks:
             if pixels.size == 0 or self._is_dark:
-                flux = Flux.zeros(block.wanted.size, pixels.size)
-                alive = np.arange(pixels.size)
-                base = Flux.zeros(1, pixels.size)
+                alive, base, flux = np.empty(0, np.int64), Flux.zeros(1, pixels.size), BlockFlux(0, [])
             else:
                 work = work or Blocks(self._renderer, pixels, block)
                 flux, alive, base = work.take(block), work.alive, work.base
             for window in np.flatnonzero(block.wanted):
                 self.counts.values += pixels.size
                 values = [part[0].copy() for part in base.arrays]
-                for whole, part in zip(values, flux.arrays, strict=True):
-                    whole[alive] = part[window]
+                for whole, part in zip(values, flux.at(int(window)).arrays, strict=True):
+                    whole[alive] = part[0]
                 half_a, half_b = types.Float(values[0]), types.Float(values[1])
                 require_finite(half_a, half_b, self._scene, self.sensor.layout, pixels)
                 yield Sample(half_a, half_b, values[2])

@@ -77,7 +77,7 @@ def _patches(pixel: NDArray[np.uint32], source: ChangeDrivenFlux, rng: np.random
     """Listed pixels in some small squares. Squares keep neighbours together, as in the run."""
     row, col = np.divmod(pixel.astype(np.int64), source.sensor.cols)
     side = _SIDE * max(1.0, np.sqrt(source.sensor.rows * source.sensor.cols / pixel.size))
-    found = np.zeros(pixel.size, np.bool_)
+    is_inside = np.zeros(pixel.size, np.bool_)
     for centre in rng.choice(pixel.size, _PATCHES):
-        found |= (np.abs(row - row[centre]) <= side / 2) & (np.abs(col - col[centre]) <= side / 2)
-    return pixel[found]
+        is_inside |= (np.abs(row - row[centre]) <= side / 2) & (np.abs(col - col[centre]) <= side / 2)
+    return pixel[is_inside]

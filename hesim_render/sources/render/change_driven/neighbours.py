@@ -87,10 +87,10 @@ class Sites:
         across = image[:, :cols]
         for shift in range(1, 2 * radius + 1):
             across = np.maximum(across, image[:, shift : shift + cols])
-        found = across[:rows]
+        within = across[:rows]
         for shift in range(1, 2 * radius + 1):
-            found = np.maximum(found, across[shift : shift + rows])
-        return self._at_listed(found)
+            within = np.maximum(within, across[shift : shift + rows])
+        return self._at_listed(within)
 
     def near(self, marked: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
         """True at sites [m] at most `radius` pixels away from a marked one [m], also diagonally."""
@@ -101,10 +101,10 @@ class Sites:
         across = image[:, :cols].copy()
         for shift in range(1, 2 * radius + 1):
             across |= image[:, shift : shift + cols]
-        found = across[:rows].copy()
+        within = across[:rows].copy()
         for shift in range(1, 2 * radius + 1):
-            found |= across[shift : shift + rows]
-        return found.ravel()[self.cell]
+            within |= across[shift : shift + rows]
+        return within.ravel()[self.cell]
 
     def _image(self, values: NDArray, margin: int, empty: float | bool) -> NDArray:
         assert self.shape is not None

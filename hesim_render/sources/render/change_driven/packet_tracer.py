@@ -21,7 +21,7 @@ from hesim_render.sources.render.change_driven.windows import Moments, Windows
 from hesim_render.sources.render.sampling.wavelengths import WavelengthSampler
 from hesim_render.sources.render.scene.mitsuba_version import mitsuba, path_depths
 from hesim_render.sources.render.tracer import BLOCK_RAYS, Tracer
-from hesim_render.sources.render.transport.matt import MattIntegrator
+from hesim_render.sources.render.transport.diffuse import DiffuseIntegrator
 from hesim_render.sources.render.transport.moving_scene import MovingScene
 from hesim_render.sources.render.transport.paths import PathIntegrator
 from hesim_render.sources.render.transport.swept_boxes import Moment
@@ -108,9 +108,11 @@ class PacketTracer(Tracer):
         types, self._seed, self._light = jit(), seed, light
         self.rays.require_one_path()
         self.parts = MovingScene(self.built)
-        self._integrator: MattIntegrator | PathIntegrator
+        self._integrator: DiffuseIntegrator | PathIntegrator
         if self.built.paints is not None:
-            self._integrator = MattIntegrator(self.parts, self.built.paints, scene.spec.lights, self.sensor.responses)
+            self._integrator = DiffuseIntegrator(
+                self.parts, self.built.paints, scene.spec.lights, self.sensor.responses
+            )
         else:
             depth, roulette = path_depths(self.built.integrator)
             self._integrator = PathIntegrator(self.parts, depth, roulette, WavelengthSampler(self.sensor.responses))
@@ -123,9 +125,9 @@ class PacketTracer(Tracer):
         dr.make_opaque(self._filter_tile)
 
     @property
-    def is_matt(self) -> bool:
-        """True if all visible light is direct light on matt surfaces."""
-        return isinstance(self._integrator, MattIntegrator)
+    def is_diffuse(self) -> bool:
+        """True if all visible light is direct light on diffuse surfaces."""
+        return isinstance(self._integrator, DiffuseIntegrator)
 
     def _key(self, stream: Stream) -> UInt64:
         import drjit as dr

@@ -74,36 +74,36 @@ class PilotFlux:
 
     Parameters
     ----------
-    lit, hidden : mean flux, e⁻/s, float32.
-    lit_scatter, hidden_scatter : scatter of single rays, e⁻/s, float32: the root of the mean fourth power of deviations
-        over their mean square. It equals the standard deviation if half of the rays give one value and half another.
-        It is larger if few rays deviate, because stratification then gains less.
+    controlled, plain : mean flux, e⁻/s, float32.
+    controlled_scatter, plain_scatter : scatter of single rays, e⁻/s, float32: the root of the mean fourth power of
+        deviations over their mean square. It equals the standard deviation if half of the rays give one value and half
+        another. It is larger if few rays deviate, because stratification then gains less.
     unshadowed : flux if nothing hid any light, e⁻/s, float32.
     met : see `PairFlux`.
-    lit_change, hidden_change : standard deviation of the difference of single rays to the same rays in another window,
-        e⁻/s, float32; 0 where there is none to compare with.
+    controlled_change, plain_change : standard deviation of the difference of single rays to the same rays in another
+        window, e⁻/s, float32; 0 where there is none to compare with.
     """
 
-    lit: NDArray[np.float32]
-    hidden: NDArray[np.float32]
+    controlled: NDArray[np.float32]
+    plain: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
-    lit_scatter: NDArray[np.float32]
-    hidden_scatter: NDArray[np.float32]
+    controlled_scatter: NDArray[np.float32]
+    plain_scatter: NDArray[np.float32]
     met: NDArray[np.bool_]
-    lit_change: NDArray[np.float32]
-    hidden_change: NDArray[np.float32]
+    controlled_change: NDArray[np.float32]
+    plain_change: NDArray[np.float32]
 
     @classmethod
     def empty(cls, count: int) -> PilotFlux:
         """Statistics to be filled in."""
-        lit, hidden, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
-        return cls(lit, hidden, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
+        controlled, plain, unshadowed, *others = (np.zeros(count, np.float32) for _ in range(7))
+        return cls(controlled, plain, unshadowed, others[0], others[1], np.zeros(count, np.bool_), others[2], others[3])
 
     def put(
         self,
         part: slice,
-        lit: Float,
-        hidden: Float,
+        controlled: Float,
+        plain: Float,
         unshadowed: Float,
         met: UInt32,
         samples: int,
@@ -115,11 +115,11 @@ class PilotFlux:
         Parameters
         ----------
         part : pairs that were traced.
-        lit, hidden, unshadowed, met : of each ray, one pair after the other; `met` is 1 where the ray came near a
+        controlled, plain, unshadowed, met : of each ray, one pair after the other; `met` is 1 where the ray came near a
             moving object.
         samples : number of rays of each pair.
         alike : number of successive rays that are of one kind. Scatter is that within each kind.
-        before : `lit` and `hidden` of the same rays in the window to compare with; None where there is none.
+        before : `controlled` and `plain` of the same rays in the window to compare with; None where there is none.
         """
         import drjit as dr
 
@@ -128,7 +128,7 @@ class PilotFlux:
         kind, pair = ray // dr.opaque(types.UInt32, alike), ray // dr.opaque(types.UInt32, samples)
         share, unbiased = dr.opaque(types.Float, 1 / samples), dr.opaque(types.Float, alike / (alike - 1))
         per_share = dr.opaque(types.Float, 1 / alike)
-        for values, name in ((lit, "lit"), (hidden, "hidden")):
+        for values, name in ((controlled, "controlled"), (plain, "plain")):
             mean = dr.block_sum(values, samples) * share
             own = dr.block_sum(values, alike) * per_share
             deviation = values - dr.gather(types.Float, own, kind)
@@ -140,7 +140,9 @@ class PilotFlux:
             scatter = unit * dr.sqrt(dr.select(second > 0, fourth / second, 0.0) * unbiased)
             dr.eval(mean, scatter)
             getattr(self, name)[part], getattr(self, f"{name}_scatter")[part] = np.array(mean), np.array(scatter)
-        for values, other, name in zip((lit, hidden), before or (), ("lit_change", "hidden_change"), strict=False):
+        for values, other, name in zip(
+            (controlled, plain), before or (), ("controlled_change", "plain_change"), strict=False
+        ):
             difference = values - other
             mean = dr.block_sum(difference, samples) * share
             deviation = difference - dr.gather(types.Float, mean, pair)
@@ -167,13 +169,13 @@ class PilotRays:
 
     Parameters
     ----------
-    lit, hidden : by both estimators of `MattIntegrator`.
+    controlled, plain : by both estimators of `MattIntegrator`.
     samples : rays of each pair.
     spans_us : begins and ends of the windows, µs.
     """
 
-    lit: Float
-    hidden: Float
+    controlled: Float
+    plain: Float
     samples: int
     spans_us: tuple[float, ...]
 
@@ -186,15 +188,17 @@ class PilotRays:
         which = ray // dr.opaque(types.UInt32, self.samples)
         place = spread_out(types.UInt32, pair.astype(np.uint32), which) * dr.opaque(types.UInt32, self.samples)
         place += ray - which * dr.opaque(types.UInt32, self.samples)
-        return dr.gather(types.Float, self.lit, place), dr.gather(types.Float, self.hidden, place)
+        return dr.gather(types.Float, self.controlled, place), dr.gather(types.Float, self.plain, place)
 
 
 def joined(first: PilotRays, second: PilotRays) -> PilotRays:
     """Rays of two lists of pairs, one after the other."""
     import drjit as dr
 
-    lit, hidden = (dr.concat([getattr(each, name) for each in (first, second)]) for name in ("lit", "hidden"))
-    return PilotRays(lit, hidden, first.samples, first.spans_us + second.spans_us)
+    controlled, plain = (
+        dr.concat([getattr(each, name) for each in (first, second)]) for name in ("controlled", "plain")
+    )
+    return PilotRays(controlled, plain, first.samples, first.spans_us + second.spans_us)
 
 
 def power_below(values: Float) -> Float:
@@ -227,16 +231,16 @@ def remembered(
         trace()
         return
     every = [getattr(out, each.name) for each in fields(out)]
-    key, found = key_of(*inputs), [values[part].copy() for values in every]
-    if journal.recall(key, found):
-        for values, known in zip(every, found, strict=True):
+    key, kept = key_of(*inputs), [values[part].copy() for values in every]
+    if journal.recall(key, kept):
+        for values, known in zip(every, kept, strict=True):
             values[part] = known
     else:
         trace()
         journal.keep(key, [values[part] for values in every])
 
 
-def told_of(
+def flux_inputs(
     windows: Windows, span_us: tuple[float, float] | None, aims: PairAims | PairEdges | None
 ) -> tuple[object, ...]:
     """What the flux of pairs depends on besides the pairs themselves."""

@@ -20,9 +20,9 @@ from hesim_render.sources.render.change_driven.pair_flux import (
     PairFlux,
     PilotFlux,
     PilotRays,
+    flux_inputs,
     not_negative,
     remembered,
-    told_of,
 )
 from hesim_render.sources.render.change_driven.windows import Moments, Windows
 
@@ -36,7 +36,7 @@ class PairTracer(PacketTracer):
         window: NDArray[np.integer],
         windows: Windows,
         samples: NDArray[np.integer],
-        lit: NDArray[np.bool_],
+        controlled: NDArray[np.bool_],
         stream: Stream = Stream.RENDER,
         span_us: tuple[float, float] | None = None,
         repeat: NDArray[np.integer] | int = 0,
@@ -52,7 +52,7 @@ class PairTracer(PacketTracer):
         window : [n], number of the window among `windows`.
         windows : the windows.
         samples : [n], rays per pair, a power of two from `LEAST_SAMPLES` to `MOST_SAMPLES`.
-        lit : [n], True takes the lit estimator, False the hidden one, see `MattIntegrator`.
+        controlled : [n], True takes the estimator with a control variate, False the plain one, see `MattIntegrator`.
         stream : stream of random numbers.
         span_us : interval in which `PairFlux.met` tests for moving objects, µs; default: the windows themselves.
         repeat : [n] or one number, the repetition; each has random numbers of its own.
@@ -71,8 +71,8 @@ class PairTracer(PacketTracer):
         key, times = self._key(stream), np.broadcast_to(np.asarray(repeat, np.uint32), pixel.shape)
         for part, aimed in in_blocks(packets, self._block_rays // PACKET, aims, edges):
             lanes = pixel[part], window[part].astype(np.uint32), times[part]
-            inputs = "flux", *lanes, lit[part], packets[part], stream, *told_of(windows, span_us, aimed)
-            trace = partial(self._trace_block, lanes, lit[part], packets[part], moments, key, aimed, out, part)
+            inputs = "flux", *lanes, controlled[part], packets[part], stream, *flux_inputs(windows, span_us, aimed)
+            trace = partial(self._trace_block, lanes, controlled[part], packets[part], moments, key, aimed, out, part)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(packets[part].sum()) * PACKET)
         if edges is not None:
@@ -131,7 +131,7 @@ class PairTracer(PacketTracer):
             aimed = None if aims is None else aims.part(part)
             compared = None if before is None else (before[0], before[1][part])
             others = () if compared is None else (compared[0].spans_us, compared[1])
-            inputs = "pilot", *lanes, samples, footprint_px, stream, *told_of(windows, span_us, aimed), *others
+            inputs = "pilot", *lanes, samples, footprint_px, stream, *flux_inputs(windows, span_us, aimed), *others
             trace = partial(
                 self._pilot_block, lanes, moments, key, samples, footprint, aimed, out, part, compared, kept
             )
@@ -156,8 +156,10 @@ class PairTracer(PacketTracer):
         """As `pilot`, and the fluxes of the single rays, to compare the same rays in other windows with."""
         kept, used = np.empty((2, pixel.size * samples), np.float32), np.unique(window)
         out = self.pilot(pixel, window, windows, samples, footprint_px, span_us=span_us, before=before, kept=kept)
-        lit, hidden = (table(jit().Float, values) for values in kept)
-        return out, PilotRays(lit, hidden, samples, (*windows.begin_us[used].tolist(), *windows.end_us[used].tolist()))
+        controlled, plain = (table(jit().Float, values) for values in kept)
+        return out, PilotRays(
+            controlled, plain, samples, (*windows.begin_us[used].tolist(), *windows.end_us[used].tolist())
+        )
 
     def edges(
         self,
@@ -166,16 +168,19 @@ class PairTracer(PacketTracer):
         windows: Windows,
         samples: int,
         footprint_px: float,
-        lit: NDArray[np.bool_],
+        controlled: NDArray[np.bool_],
+        least: NDArray[np.float32],
         stream: Stream = Stream.RENDER_EDGE,
     ) -> EdgeFit:
         """Lines fitted to a few rays of every listed pair, with random numbers of their own.
 
         Parameters
         ----------
-        pixel, window, windows, lit, stream : see `trace`.
-        samples : rays per pair, a power of two, at least `LEAST_SAMPLES`; twice as many where there is a line.
-        footprint_px : width of the area in which the first ones start, pixels.
+        pixel, window, windows, controlled, stream : see `trace`.
+        samples : rays per pair, a power of two, at least twice `LEAST_SAMPLES`; half as many where the first half shows
+            little contrast, and twice as many where there is a line.
+        footprint_px : width of the area in which these rays start, pixels.
+        least : [n], contrast below which it is little, e⁻/s on the optical axis.
 
         Returns
         -------
@@ -188,8 +193,18 @@ class PairTracer(PacketTracer):
         for first in range(0, pixel.size, room):
             part = slice(first, min(pixel.size, first + room))
             lanes = pixel[part], window[part].astype(np.uint32), np.zeros(part.stop - first, np.uint32)
-            inputs = "edges", *lanes, lit[part], samples, footprint_px, stream, *told_of(windows, None, None)
-            trace = partial(self._edge_block, lanes, lit[part], moments, key, samples, footprint, out, part)
+            inputs = (
+                "edges",
+                *lanes,
+                controlled[part],
+                least[part],
+                samples,
+                footprint_px,
+                stream,
+                *flux_inputs(windows, None, None),
+            )
+            given = lanes, controlled[part], least[part], moments, key, samples, footprint, out, part
+            trace = partial(self._edge_block, *given)
             remembered(self._journal, self._run_part + inputs, out, part, trace)
             self._report(int(out.rays[part].sum(dtype=np.int64)))
         return out
@@ -197,7 +212,8 @@ class PairTracer(PacketTracer):
     def _edge_block(
         self,
         lanes: Sequence[NDArray[np.uint32]],
-        lit: NDArray[np.bool_],
+        controlled: NDArray[np.bool_],
+        least: NDArray[np.float32],
         moments: Moments,
         key: UInt64,
         samples: int,
@@ -205,37 +221,47 @@ class PairTracer(PacketTracer):
         out: EdgeFit,
         part: slice,
     ) -> None:
-        """Lines of some pairs: of rays all over the pixel, and, where these show a line, of as many more about it."""
+        """Lines of some pairs: of rays all over the pixel, as many more where these show contrast, and twice as many
+        about a line, where there is one.
+        """
         import drjit as dr
 
-        def decision_rays(some: NDArray[np.int64], repeat: int, about: PairEdges | None) -> list[Float]:
+        def decision_rays(
+            some: NDArray[np.int64], rays: int, repeat: int, about: PairEdges | None = None
+        ) -> list[Float]:
             """Place and flux of the rays of some pairs."""
-            packets = np.full(some.size, samples // PACKET)
+            packets = np.full(some.size, rays // PACKET)
             chosen = [values[some] for values in lanes[:2]] + [np.full(some.size, repeat, np.uint32)]
             width = footprint if about is None else dr.opaque(jit().Float, 1.0)
-            found = self._packets_of(chosen, packets, packets * PACKET, moments, key, width, about, is_weighted=False)
+            traced = self._packets_of(chosen, packets, packets * PACKET, moments, key, width, about, is_weighted=False)
             types = jit()
-            packet = dr.arange(types.UInt32, len(found.fluxes[0])) // PACKET
-            takes_lit = spread_out(types.UInt32, np.repeat(lit[some].astype(np.uint32), packets), packet)
-            values = [*found.place, dr.select(takes_lit != 0, found.fluxes[0], found.fluxes[1])]
+            packet = dr.arange(types.UInt32, len(traced.fluxes[0])) // PACKET
+            by_control = spread_out(types.UInt32, np.repeat(controlled[some].astype(np.uint32), packets), packet)
+            values = [*traced.place, dr.select(by_control != 0, traced.fluxes[0], traced.fluxes[1])]
             dr.eval(values)
             return values
 
-        every = np.arange(lanes[0].size)
-        first, fit = decision_rays(every, 0, None), EdgeFit.empty(every.size)
-        fit.put(slice(None), first, samples)
-        lines = np.flatnonzero(fit.is_line)
-        if lines.size:
-            closer = EdgeFit.empty(lines.size)
-            more = decision_rays(lines, 1, fit.models(lines, wider=True))
-            closer.put(slice(None), joined_rays(first, lines, more, samples), 2 * samples)
-            fit.replace(lines, closer)
+        every, half = np.arange(lanes[0].size), samples // 2
+        first, fit = decision_rays(every, half, 0), EdgeFit.empty(every.size)
+        fit.put(slice(None), first, half)
+        uneven = np.flatnonzero(fit.high - fit.low >= least)
+        if uneven.size:
+            both = joined_rays(first, uneven, decision_rays(uneven, half, 1), half)
+            better = EdgeFit.empty(uneven.size)
+            better.put(slice(None), both, samples)
+            lines = np.flatnonzero(better.is_line)
+            if lines.size:
+                refined = EdgeFit.empty(lines.size)
+                more = decision_rays(uneven[lines], samples, 2, better.models(lines, wider=True))
+                refined.put(slice(None), joined_rays(both, lines, more, samples), 2 * samples)
+                better.replace(lines, refined)
+            fit.replace(uneven, better)
         out.replace(part, fit)
 
     def _trace_block(
         self,
         lanes: Sequence[NDArray[np.uint32]],
-        lit: NDArray[np.bool_],
+        controlled: NDArray[np.bool_],
         packets: NDArray[np.int64],
         moments: Moments,
         key: UInt64,
@@ -249,10 +275,12 @@ class PairTracer(PacketTracer):
         types = jit()
         rays = packets * PACKET
         footprint = dr.opaque(types.Float, 1.0)
-        if_lit, if_hidden, _, met = self._packets_of(lanes, packets, rays // 2, moments, key, footprint, aims).fluxes
+        controlled_flux, plain_flux, _, met = self._packets_of(
+            lanes, packets, rays // 2, moments, key, footprint, aims
+        ).fluxes
         packet = dr.arange(types.UInt32, len(met)) // PACKET
-        takes_lit = spread_out(types.UInt32, np.repeat(lit.astype(np.uint32), packets), packet)
-        out.put(part, dr.select(takes_lit != 0, if_lit, if_hidden), met, packets, PACKET)
+        is_controlled = spread_out(types.UInt32, np.repeat(controlled.astype(np.uint32), packets), packet)
+        out.put(part, dr.select(is_controlled != 0, controlled_flux, plain_flux), met, packets, PACKET)
 
     def _pilot_block(
         self,
@@ -270,10 +298,10 @@ class PairTracer(PacketTracer):
         """Statistics of some pairs, each with the same number of rays, and their single rays where they are kept."""
         packets = np.full(lanes[0].size, samples // PACKET)
         # all rays belong to the first half
-        found = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
+        traced = self._packets_of(lanes, packets, packets * PACKET, moments, key, footprint, aims).fluxes
         # rays that are aimed are a kind of their own: their mean differs from that of the others
         compared = None if before is None else before[0].at(before[1])
-        out.put(part, *found, samples, samples if aims is None else samples // 2, compared)
+        out.put(part, *traced, samples, samples if aims is None else samples // 2, compared)
         if kept is not None:
-            for values, flux in zip(kept, found[:2], strict=True):
+            for values, flux in zip(kept, traced[:2], strict=True):
                 values[part.start * samples : part.stop * samples] = np.array(flux)

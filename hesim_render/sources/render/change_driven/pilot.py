@@ -30,20 +30,20 @@ _SMALLER = np.float32(1e-4)
 
 
 @dataclass(frozen=True)
-class Closer:
+class Refinement:
     """Sites where a small object may pass during a window, and the statistics of extra pilot rays there.
 
     Parameters
     ----------
     place : [k], places among the sites.
     rays : [k], number of rays.
-    lit_scatter, hidden_scatter : [k], scatter of single rays, e⁻/s.
+    controlled_scatter, plain_scatter : [k], scatter of single rays, e⁻/s.
     """
 
     place: NDArray[np.int64]
     rays: NDArray[np.int64]
-    lit_scatter: NDArray[np.float32]
-    hidden_scatter: NDArray[np.float32]
+    controlled_scatter: NDArray[np.float32]
+    plain_scatter: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ class Change:
 
     Parameters
     ----------
-    lit, hidden : mean of the differences, by both estimators.
-    lit_scatter, hidden_scatter : their standard deviation from ray to ray.
+    controlled, plain : mean of the differences, by both estimators.
+    controlled_scatter, plain_scatter : their standard deviation from ray to ray.
     """
 
-    lit: NDArray[np.float32]
-    hidden: NDArray[np.float32]
-    lit_scatter: NDArray[np.float32]
-    hidden_scatter: NDArray[np.float32]
+    controlled: NDArray[np.float32]
+    plain: NDArray[np.float32]
+    controlled_scatter: NDArray[np.float32]
+    plain_scatter: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -84,40 +84,42 @@ class Pilot:
 
     Parameters
     ----------
-    lit, hidden : mean flux by each estimator, e⁻/s.
-    lit_scatter, hidden_scatter : scatter of single rays for each estimator, e⁻/s.
+    controlled, plain : mean flux by each estimator, e⁻/s.
+    controlled_scatter, plain_scatter : scatter of single rays for each estimator, e⁻/s.
     unshadowed : flux if nothing hid any light, e⁻/s.
-    closer : results of extra rays at some sites, one entry per window; empty where there were none.
+    refined : results of extra rays at some sites, one entry per window; empty where there were none.
     aims : small objects at which rays are aimed; None if there are none.
     change : differences to other windows; None where nothing is compared.
+    all_move : True if the camera moves, and with it every edge in the image.
     """
 
-    lit: NDArray[np.float32]
-    hidden: NDArray[np.float32]
-    lit_scatter: NDArray[np.float32]
-    hidden_scatter: NDArray[np.float32]
+    controlled: NDArray[np.float32]
+    plain: NDArray[np.float32]
+    controlled_scatter: NDArray[np.float32]
+    plain_scatter: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
-    closer: list[Closer] = field(default_factory=list)
+    refined: list[Refinement] = field(default_factory=list)
     aims: Aims | None = None
     change: Change | None = None
+    all_move: bool = False
 
     @property
     def windows(self) -> int:
         """Number of windows."""
-        return self.lit.shape[0]
+        return self.controlled.shape[0]
 
     def flux_of(self, window: int) -> NDArray[np.float32]:
         """Flux in one window, by the estimator with less scatter there, [site], e⁻/s."""
-        chosen = self.lit_scatter[window] <= self.hidden_scatter[window]
-        return np.where(chosen, self.lit[window], self.hidden[window])
+        chosen = self.controlled_scatter[window] <= self.plain_scatter[window]
+        return np.where(chosen, self.controlled[window], self.plain[window])
 
     @property
     def steady_flux(self) -> NDArray[np.float32]:
         """Flux by the same estimator in all windows, [window, site], e⁻/s, so that every difference is a change of
         the scene.
         """
-        chosen = self.lit_scatter.sum(axis=0) <= self.hidden_scatter.sum(axis=0)
-        return np.where(chosen, self.lit, self.hidden)
+        chosen = self.controlled_scatter.sum(axis=0) <= self.plain_scatter.sum(axis=0)
+        return np.where(chosen, self.controlled, self.plain)
 
 
 def take_pilot(
@@ -128,7 +130,7 @@ def take_pilot(
     rays: int,
     width_px: float,
     span_us: tuple[float, float] | None,
-    closer: Sequence[Sequence[Look]] = (),
+    extra_looks: Sequence[Sequence[Look]] = (),
     anchored: Anchored | None = None,
     stride: int = 1,
     wanted: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
@@ -142,7 +144,7 @@ def take_pilot(
     rays : rays per site and window.
     width_px : width of the area in which the rays start, px.
     span_us : interval around all windows for which `near` is computed, µs; None: not computed.
-    closer : for each window, the sites that get extra rays; see `Zoom`.
+    extra_looks : for each window, the sites that get extra rays; see `Zoom`.
     anchored : pilot of the anchor with which the first and the last window are compared; None: nothing is compared.
     stride : number of windows from one look to the next; between two looks that show the same, nothing is traced.
     wanted : maps the flux of each site to the wanted error of a pair, both e⁻/s; needed where `stride` is above 1.
@@ -156,18 +158,18 @@ def take_pilot(
     count, every, given = numbers.shape[0], np.arange(sites.size), (windows, rays, width_px)
     own_rays: PilotRays | None = None
     if anchored is None:
-        found = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us)
+        first = tracer.pilot(sites.index, numbers[0], *given, span_us=span_us)
     else:
         before = anchored.rays, every
-        found, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before)
+        first, own_rays = tracer.pilot_rays(sites.index, numbers[0], *given, span_us=span_us, before=before)
     knows = tracer.camera is None and not (tracer.rays.spreads and tracer.parts.groups)
-    near = found.met if knows else np.ones(sites.size, np.bool_)
-    lit, hidden, *others = (np.repeat(values[None], count, axis=0) for values in _tables(found))
-    pilot = Pilot(lit, hidden, others[0], others[1], others[2])
+    near = first.met if knows else np.ones(sites.size, np.bool_)
+    controlled, plain, *others = (np.repeat(values[None], count, axis=0) for values in _tables(first))
+    pilot = Pilot(controlled, plain, others[0], others[1], others[2])
     moving = np.flatnonzero(near)
     scatters = np.zeros((2, count, sites.size), np.float32)
     # where nothing is near, the last window has the difference of the first one to the anchor
-    scatters[0, [0, -1]], scatters[1, [0, -1]] = found.lit_change, found.hidden_change
+    scatters[0, [0, -1]], scatters[1, [0, -1]] = first.controlled_change, first.plain_change
     if count > 1 and moving.size:
 
         def look(window: NDArray[np.int64], place: NDArray[np.int64]) -> None:
@@ -177,10 +179,10 @@ def take_pilot(
                 compared = joined(own_rays, anchored.rays), place + np.where(window == count - 1, sites.size, 0)
             more = tracer.pilot(sites.index[place], numbers[window, place], *given, before=compared)
             tables = zip(
-                (*_tables(pilot), *scatters), (*_tables(more), more.lit_change, more.hidden_change), strict=True
+                (*_tables(pilot), *scatters), (*_tables(more), more.controlled_change, more.plain_change), strict=True
             )
-            for values, told in tables:
-                values[window, place] = told
+            for values, values_there in tables:
+                values[window, place] = values_there
 
         looks = np.append(np.arange(0, count - 1, stride), count - 1)
         look(np.repeat(looks[1:], moving.size), np.tile(moving, looks.size - 1))
@@ -189,8 +191,8 @@ def take_pilot(
             windows_of, places_of = [], []
             for early, late in spans:
                 # what shows the same in two looks, in all pixels around, has kept its light between them
-                is_lit = pilot.lit_scatter[early] <= pilot.hidden_scatter[early]
-                begin, end = (np.where(is_lit, pilot.lit[k], pilot.hidden[k]) for k in (early, late))
+                is_controlled = pilot.controlled_scatter[early] <= pilot.plain_scatter[early]
+                begin, end = (np.where(is_controlled, pilot.controlled[k], pilot.plain[k]) for k in (early, late))
                 least = _ROUNDING * np.abs(begin)
                 if wanted is not None:
                     least = np.maximum(least, _SAME * wanted(begin))
@@ -209,19 +211,19 @@ def take_pilot(
             spans = [span for span in halves if span[1] - span[0] > 1]
     change = None
     if anchored is not None:
-        means = [values - values[:1] for values in (pilot.lit, pilot.hidden)]
+        means = [values - values[:1] for values in (pilot.controlled, pilot.plain)]
         for mean, values, other in zip(
-            means, (pilot.lit, pilot.hidden), (anchored.flux.lit, anchored.flux.hidden), strict=True
+            means, (pilot.controlled, pilot.plain), (anchored.flux.controlled, anchored.flux.plain), strict=True
         ):
             mean[[0, -1]] = values[[0, -1]] - other
         change = Change(means[0], means[1], scatters[0], scatters[1])
-    near_by = [(window, one) for window, row in enumerate(closer) for one in row if one.place.size]
+    near_by = [(window, one) for window, row in enumerate(extra_looks) for one in row if one.place.size]
     aims = Aims.of([(window, *one.aims) for window, one in near_by if one.aims is not None], sites.size)
-    found_closer = _look_closer(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
-    return replace(pilot, closer=found_closer, aims=aims, change=change), near
+    refined = _refine(tracer, sites, windows, numbers, pilot, width_px, near_by, aims)
+    return replace(pilot, refined=refined, aims=aims, change=change, all_move=tracer.camera is not None), near
 
 
-def _look_closer(
+def _refine(
     tracer: PairTracer,
     sites: Sites,
     windows: Windows,
@@ -230,11 +232,11 @@ def _look_closer(
     width_px: float,
     looks: Sequence[tuple[int, Look]],
     aims: Aims | None,
-) -> list[Closer]:
+) -> list[Refinement]:
     """Trace extra pilot rays, listed with their windows. Results for large objects, and those of aimed rays, replace
     those of the pilot; results for small objects are returned.
     """
-    nothing = Closer(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+    nothing = Refinement(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
     parts = [[nothing] for _ in range(numbers.shape[0])]
     kinds = sorted({(look.is_small, look.aims is not None, look.rays) for _, look in looks})
     # large objects first: a pixel may show a small object as well, whose result must stay
@@ -248,23 +250,31 @@ def _look_closer(
         window = np.concatenate([np.full(places.size, window) for window, places in alike])
         own_aims = aims.at(window, place) if is_aimed and aims is not None else None
         width = 1.0 if is_aimed else width_px
-        told = tracer.pilot(
+        refined = tracer.pilot(
             *(sites.index[place], numbers[window, place], windows, rays, width, Stream.RENDER_ZOOM), aims=own_aims
         )
         if is_aimed or not is_small:
-            for values, found in zip(_tables(pilot), _tables(told), strict=True):
-                values[window, place] = found
+            for values, new in zip(_tables(pilot), _tables(refined), strict=True):
+                values[window, place] = new
         if not is_small:
             continue
         for number in np.unique(window):
             own = window == number
             counts = np.full(np.count_nonzero(own), rays)
-            parts[number].append(Closer(place[own], counts, told.lit_scatter[own], told.hidden_scatter[own]))
-    return [Closer(*map(np.concatenate, zip(*map(astuple, each), strict=True))) for each in parts]
+            parts[number].append(
+                Refinement(place[own], counts, refined.controlled_scatter[own], refined.plain_scatter[own])
+            )
+    return [Refinement(*map(np.concatenate, zip(*map(astuple, each), strict=True))) for each in parts]
 
 
-def _tables(told: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
-    return told.lit, told.hidden, told.lit_scatter, told.hidden_scatter, told.unshadowed
+def _tables(statistics: Pilot | PilotFlux) -> tuple[NDArray[np.float32], ...]:
+    return (
+        statistics.controlled,
+        statistics.plain,
+        statistics.controlled_scatter,
+        statistics.plain_scatter,
+        statistics.unshadowed,
+    )
 
 
 def allocate(
@@ -291,42 +301,42 @@ def allocate(
 
     Returns
     -------
-    rays, lit, error, floor : [n] each: number of rays, choice of the lit estimator, expected error, and number of rays
-        that knowledge of an edge does not lower; see `Plan`.
+    rays, controlled, error, floor : [n] each: number of rays, choice of the estimator with a control variate, expected
+        error, and number of rays that knowledge of an edge does not lower; see `Plan`.
     """
     low, high = (window, window + 1) if is_knot else (max(0, window - 1), window + 2)
     flux, here = pilot.flux_of(window), sites.listed
     own, value = units[window][here], flux[here]
     squares = []
-    for table in (pilot.lit_scatter, pilot.hidden_scatter):
+    for table in (pilot.controlled_scatter, pilot.plain_scatter):
         square = (table[window] * _SMALLER) ** 2
         squares.append(np.float32(0.5) * (square[here] + sites.mean(square)))
-    if pilot.closer:
-        closer = pilot.closer[window]
-        for square, told in zip(squares, (closer.lit_scatter, closer.hidden_scatter), strict=True):
+    if pilot.refined:
+        refined = pilot.refined[window]
+        for square, scatter_there in zip(squares, (refined.controlled_scatter, refined.plain_scatter), strict=True):
             seen = np.zeros(sites.size, np.float32)
-            seen[closer.place] = (told * _SMALLER) ** 2
+            seen[refined.place] = (scatter_there * _SMALLER) ** 2
             np.maximum(square, seen[here], out=square)
     open_flux = pilot.unshadowed[window]
-    lit = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
-    scatter = np.sqrt(np.where(lit, *squares)) / _SMALLER
+    controlled = (squares[0] <= squares[1]) & (2 * value >= open_flux[here])
+    scatter = np.sqrt(np.where(controlled, *squares)) / _SMALLER
     # an edge in a neighbour may reach into this pixel between the pilot rays
     around = np.stack([pilot.flux_of(number) for number in range(low, min(high, units.shape[0]))])
     highest, lowest = around.max(axis=0), around.min(axis=0)
     contrast = np.maximum(sites.most(highest, 1) - value, value + sites.most(-lowest, 1))
     unseen = np.float32(tuning.unseen_area**0.5) * contrast
     # if a neighbour sees light that is hidden here, part of it may be visible here too
-    lit_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
-    brighter = np.maximum(sites.most(highest, 2) - value, np.where(lit_near, open_flux[here] - value, 0))
+    is_light_near = sites.most(flux > np.float32(1e-6) * open_flux, REACH)
+    brighter = np.maximum(sites.most(highest, 2) - value, np.where(is_light_near, open_flux[here] - value, 0))
     wanted_error = np.float32(quality) * own
     for_unseen = np.maximum(gain.rays(unseen / wanted_error), np.float32(tuning.bright_rays) * brighter / own)
     wanted = gain.rays(scatter / wanted_error) * np.float32(tuning.knot_factor if is_knot else 1.0)
     wanted = np.maximum(wanted, np.minimum(for_unseen, np.float32(tuning.most_unseen_rays)))
     looked = None
-    if pilot.closer:
+    if pilot.refined:
         # With fewer rays than the closer look, a single ray could hit the small object and weigh far too much.
         looked = np.zeros(sites.size, np.float32)
-        np.maximum.at(looked, pilot.closer[window].place, pilot.closer[window].rays.astype(np.float32))
+        np.maximum.at(looked, pilot.refined[window].place, pilot.refined[window].rays.astype(np.float32))
         wanted = np.maximum(wanted, looked[here])
     heavy = np.float32(tuning.ray_weight) * wanted_error
     wanted = np.maximum(wanted, open_flux[here] / heavy)
@@ -334,4 +344,4 @@ def allocate(
     floor = np.maximum(np.zeros_like(value) if looked is None else looked[here], (open_flux[here] - value) / heavy)
     bits = np.rint(np.log2(np.clip(wanted, tuning.least_rays, tuning.most_rays))).astype(np.int16)
     rays = np.left_shift(np.int16(1), bits)
-    return rays, lit, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16)
+    return rays, controlled, gain.error(scatter, rays), np.clip(floor, 0, tuning.most_rays).astype(np.int16)

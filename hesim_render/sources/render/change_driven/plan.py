@@ -46,11 +46,11 @@ def changes(flux: NDArray[np.float32], least: NDArray[np.float32]) -> NDArray[np
 
 def longer(marked: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
     """Extend marks [window, site] by `by` windows before and after each."""
-    found = marked.copy()
+    extended = marked.copy()
     for shift in range(1, by + 1):
-        found[shift:] |= marked[:-shift]
-        found[:-shift] |= marked[shift:]
-    return found
+        extended[shift:] |= marked[:-shift]
+        extended[:-shift] |= marked[shift:]
+    return extended
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Plan:
     ----------
     rendered : True for rendered pairs. The first and the last window always are; the others are interpolated linearly.
     rays : number of rays of each rendered pair, a power of two.
-    lit : True for the lit estimator, False for the hidden one, see `MattIntegrator`.
+    controlled : True for the estimator with a control variate, False for the plain one, see `MattIntegrator`.
     error : expected standard error, e⁻/s.
     wanted : wanted standard error, e⁻/s.
     floor : number of rays that a pair gets whatever is known of its edges.
@@ -74,7 +74,7 @@ class Plan:
 
     rendered: NDArray[np.bool_]
     rays: NDArray[np.int16]
-    lit: NDArray[np.bool_]
+    controlled: NDArray[np.bool_]
     error: NDArray[np.float32]
     wanted: NDArray[np.float32]
     floor: NDArray[np.int16]
@@ -110,7 +110,7 @@ class Plan:
 
     def first(self) -> Plan:
         """The plan of the first window alone."""
-        names = "rendered", "rays", "lit", "error", "wanted", "floor", "fitted", "barred", "pilot"
+        names = "rendered", "rays", "controlled", "error", "wanted", "floor", "fitted", "barred", "pilot"
         first = {name: getattr(self, name)[:1] for name in names}
         return replace(self, differences=self.differences.first(), **first)
 
@@ -160,45 +160,24 @@ def plan(
     if last > 1:
         flux, least = pilot.steady_flux, np.float32(tuning.change * tuning.tolerance * quality) * units
         marked = changes(flux, least)
-        great = changes(flux, np.float32(tuning.great) * least)
-        huge = longer(changes(flux, np.float32(tuning.huge) * least), tuning.huge_windows)
+        large = changes(flux, np.float32(tuning.large_change) * least)
+        extreme = longer(changes(flux, np.float32(tuning.extreme_change) * least), tuning.extreme_windows)
         for window in range(1, last):
-            near = sites.most(great[window], 1) | sites.most(huge[window], 2)
+            near = sites.most(large[window], 1) | sites.most(extreme[window], 2)
             out.rendered[window] = marked[window][sites.listed] | near
-        if pilot.closer:
+        if pilot.refined:
             # an object that passes within a window or two does not change the flux linearly
             looked_at = np.zeros(flux.shape, np.bool_)
-            for window, closer in enumerate(pilot.closer):
-                looked_at[window, closer.place] = True
+            for window, refined in enumerate(pilot.refined):
+                looked_at[window, refined.place] = True
             out.barred[:] = longer(looked_at, 1)[:, sites.listed]
             out.rendered[1:last] |= out.barred[1:last]
     for window in range(count):
         at_end = is_knot and window in (0, last)
         part = allocate(pilot, window, sites, units, quality, gain, tuning, at_end)
-        out.rays[window], out.lit[window], out.error[window], out.floor[window] = part
+        out.rays[window], out.controlled[window], out.error[window], out.floor[window] = part
     chosen = differences(pilot, sites, units, quality, out.rendered, out.rays, tuning)
     if follows and last > 1:
         worth = out.rendered & (out.rays >= tuning.edge_least_rays) & (chosen.rays == 0) & ~out.barred
         out.fitted[:] = fitted_windows(worth)
     return replace(out, differences=chosen)
-
-
-def fill_in(values: NDArray[np.float32], known: NDArray[np.bool_], centre_us: NDArray[np.float64]) -> None:
-    """Interpolate unknown values linearly between known ones, in place.
-
-    Parameters
-    ----------
-    values : [window, pixel], changed in place.
-    known : [window, pixel], True where a value is known; the first window is. Windows after the last known one stay as
-        they are.
-    centre_us : [window], increasing, µs.
-    """
-    number = np.arange(known.shape[0], dtype=np.int16)[:, None]
-    before = np.maximum.accumulate(np.where(known, number, np.int16(-1)), axis=0)
-    after = np.minimum.accumulate(np.where(known, number, np.int16(known.shape[0]))[::-1], axis=0)[::-1]
-    for window in range(1, known.shape[0] - 1):
-        place = np.flatnonzero(~known[window] & (after[window] < known.shape[0]))
-        low, high = before[window, place], after[window, place]
-        part = ((centre_us[window] - centre_us[low]) / (centre_us[high] - centre_us[low])).astype(np.float32)
-        begin = values[low, place]
-        values[window, place] = begin + part * (values[high, place] - begin)

@@ -56,13 +56,13 @@ class KnownPairs:
         is_known = np.zeros(index.size, np.bool_)
         if self._hash.size:
             is_known = np.all(self._pairs[:, place] == pairs, axis=0)
-        found = np.empty((2, index.size))
-        found[:, is_known] = self._values[:, place[is_known]]
+        values = np.empty((2, index.size))
+        values[:, is_known] = self._values[:, place[is_known]]
         new = np.flatnonzero(~is_known)
         if new.size:
-            found[:, new] = traced(new)
-            self._keep(hashed[new], pairs[:, new], found[:, new])
-        return found
+            values[:, new] = traced(new)
+            self._keep(hashed[new], pairs[:, new], values[:, new])
+        return values
 
     def _keep(self, hashed: NDArray[np.uint64], pairs: NDArray[np.float64], values: NDArray[np.float64]) -> None:
         every, first = np.unique(np.concatenate([self._hash, hashed]), return_index=True)
@@ -115,9 +115,9 @@ def traced_again(
     windows = Windows(span[0], span[1])
     aims = _aims(zoom, pixel, tracer.sensor.spec.geometry.cols, windows, window)
     pilot = _pilot(tracer, pixel, windows, window, tuning.audit_pilot_rays, aims)
-    lit = (pilot.lit_scatter <= pilot.hidden_scatter) & (2 * pilot.lit >= pilot.unshadowed)
-    flux = np.where(lit, pilot.lit, pilot.hidden)
-    scatter = np.where(lit, pilot.lit_scatter, pilot.hidden_scatter)
+    controlled = (pilot.controlled_scatter <= pilot.plain_scatter) & (2 * pilot.controlled >= pilot.unshadowed)
+    flux = np.where(controlled, pilot.controlled, pilot.plain)
+    scatter = np.where(controlled, pilot.controlled_scatter, pilot.plain_scatter)
     own_unit = unit_of(pixel)
     wanted_error = np.float32(quality) * own_unit(flux)
     wanted = np.maximum(
@@ -132,13 +132,13 @@ def traced_again(
         if aims is not None:
             tried &= aims.count == 0
         rays, edges = about_edges(
-            *(tracer, (pixel, window, windows), law, lit, wanted_error, floor, gain, tuning),
+            *(tracer, (pixel, window, windows), law, controlled, wanted_error, floor, gain, tuning),
             tried=tried, flat_part=1.0, stream=Stream.AUDIT_EDGE,
         )  # fmt: skip
         wanted_times = np.where(rays < law, 1, wanted_times)
     times = np.clip(wanted_times, 1, tuning.most_audit_times).astype(np.int64)
     each, first = np.repeat(np.arange(pixel.size), times), np.cumsum(times) - times
-    of = pixel[each], window[each], windows, rays[each], lit[each], Stream.AUDIT
+    of = pixel[each], window[each], windows, rays[each], controlled[each], Stream.AUDIT
     repeat = np.arange(each.size) - first[each]
     got = tracer.trace(
         *of, repeat=repeat, aims=None if aims is None else aims.part(each),
@@ -154,8 +154,8 @@ def _aims(
     """Objects at which rays of listed pairs are aimed; None if there are none."""
     row, col = np.divmod(pixel.astype(np.int64), cols)
     looks = [look for looks in zoom.sites(row, col, windows, window[None]) for look in looks]
-    found = Aims.of([(0, *look.aims) for look in looks if look.aims is not None], pixel.size)
-    return None if found is None else found.at(np.zeros(pixel.size, np.int64), np.arange(pixel.size))
+    aims = Aims.of([(0, *look.aims) for look in looks if look.aims is not None], pixel.size)
+    return None if aims is None else aims.at(np.zeros(pixel.size, np.int64), np.arange(pixel.size))
 
 
 def _pilot(

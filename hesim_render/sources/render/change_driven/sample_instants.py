@@ -72,8 +72,8 @@ class MotionClock:
         cells = range(int(begin_us // CELL_US), -(-int(np.ceil(end_us)) // CELL_US))
         ends = np.rint([begin_us, end_us]).astype(np.int64)
         keyframes = (_keyframes(track, begin_us, end_us) for track in self._tracks)
-        found = np.unique(np.concatenate([ends, *(self._cell(k) for k in cells), *keyframes]))
-        return found[(found >= ends[0]) & (found <= ends[1])]
+        instants = np.unique(np.concatenate([ends, *(self._cell(k) for k in cells), *keyframes]))
+        return instants[(instants >= ends[0]) & (instants <= ends[1])]
 
     def _cell(self, number: int) -> NDArray[np.int64]:
         begin, end = number * CELL_US, (number + 1) * CELL_US

@@ -70,10 +70,10 @@ class Outline:
 
     def inside(self, col: NDArray[np.float64], row: NDArray[np.float64], margin_px: float) -> NDArray[np.bool_]:
         """True for points inside the outline or at most `margin_px` pixels outside it."""
-        found = np.ones(np.broadcast(col, row).shape, np.bool_)
+        is_inside = np.ones(np.broadcast(col, row).shape, np.bool_)
         for a, b, c in self.sides:
-            found &= a * col + b * row + c <= margin_px
-        return found
+            is_inside &= a * col + b * row + c <= margin_px
+        return is_inside
 
 
 class Zoom:
@@ -84,7 +84,7 @@ class Zoom:
     view : the camera at rest.
     camera : track of the camera, None if it rests.
     groups : moving objects.
-    is_matt : True if all surfaces are matt; large objects then need no extra rays.
+    is_diffuse : True if all surfaces are diffuse; large objects then need no extra rays.
     tuning : constants.
     can_aim : False if rays of this lens cannot be aimed.
     blur_px : radius of the PSF that holds nearly all of it, px.
@@ -95,13 +95,13 @@ class Zoom:
         view: View,
         camera: Trajectory | None,
         groups: list[Group],
-        is_matt: bool,
+        is_diffuse: bool,
         tuning: Tuning,
         can_aim: bool = True,
         blur_px: float = 0.0,
     ) -> None:
         self._view, self._camera, self._groups = view, camera, groups
-        self._is_matt, self._tuning = is_matt, tuning
+        self._is_diffuse, self._tuning = is_diffuse, tuning
         # bands of rows ask for the same windows one after another, and so does the audit
         self._outlines = method_cache(self._outlines_in, maxsize=64)
         geometry = view.sensor.spec.geometry
@@ -116,16 +116,16 @@ class Zoom:
         """Outlines in one window, the number of pilot rays of a pixel inside any of them, and whether they are
         small.
         """
-        found: dict[bool, list[tuple[float, Outline]]] = {True: [], False: []}
+        by_size: dict[bool, list[tuple[float, Outline]]] = {True: [], False: []}
         margin, tuning = self._tuning.zoom_margin_px, self._tuning
         for number, group in enumerate(self._groups):
             outline = self._outline(number, group, begin_us, end_us)
-            if outline is None or (self._is_matt and not outline.is_small):
+            if outline is None or (self._is_diffuse and not outline.is_small):
                 continue
             size = np.maximum(np.minimum(outline.high, self._high) - np.maximum(outline.low, self._low), 0) + 2 * margin
-            found[outline.is_small].append((float(np.prod(size)), outline))
+            by_size[outline.is_small].append((float(np.prod(size)), outline))
         looks = []
-        for is_small, entries in found.items():
+        for is_small, entries in by_size.items():
             entries.sort(key=lambda entry: entry[0])
             picture = float(np.prod(self._high - self._low))
             room = (tuning.zoom_room if is_small else tuning.gloss_room) * picture
@@ -143,10 +143,10 @@ class Zoom:
         """The area that an object sweeps; None outside the view."""
         points, extents, wider = [], [], 0.0
         if self._camera is None:
-            found = places(group.corners, group.trajectory, begin_us, end_us)
+            pieces = places(group.corners, group.trajectory, begin_us, end_us)
         else:
-            found = places_seen(group.corners, group.trajectory, self._camera, begin_us, end_us)
-        for corners, margin in found:
+            pieces = places_seen(group.corners, group.trajectory, self._camera, begin_us, end_us)
+        for corners, margin in pieces:
             rest = np.broadcast_to(self._view.camera_to_world, (len(corners), 4, 4))
             seen, px_per_m = self._view.project_on_sensor(self._along_edges(corners), rest)
             points.append(seen.reshape(-1, 2))
@@ -203,14 +203,14 @@ class Zoom:
         step = np.maximum((end - begin) / _PARTS, 1.0)
         times = np.stack([np.floor(begin / step) * step, np.ceil(end / step) * step])
         looks, which = distinct_columns(times)
-        found: list[Look] = []
+        chosen: list[Look] = []
         for look, (low, high) in enumerate(looks.T):
             mine = np.flatnonzero(which == look)
             places = np.full(shape, -1)
             places[row[mine] - top, col[mine] - left] = mine
             for outlines, rays, is_small in self._outlines(float(low), float(high)):
-                found.extend(self._looks(outlines, rays, is_small, places, top, left))
-        return found
+                chosen.extend(self._looks(outlines, rays, is_small, places, top, left))
+        return chosen
 
     def _looks(
         self, outlines: list[Outline], rays: int, is_small: bool, places: NDArray[np.int64], top: int, left: int

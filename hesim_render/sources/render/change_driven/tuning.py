@@ -58,20 +58,20 @@ class Tuning:
         linear interpolation has no limit.
     change : tolerances, F. Smallest change of the pilot's flux that counts. Larger: interpolated values are further
         off. Smaller: more pixels are rendered.
-    great : changes that count, F. From this size on, the neighbours of a changing pixel are rendered too. Without:
-        the faint outskirts of an edge are interpolated.
-    huge : changes that count, F. From this size on, pixels two away are rendered too. Without: as above, for lamps
-        and their glare.
-    huge_windows : windows, F. A huge change counts this much longer, before and after. Without (0): the first light
-        of an approaching lamp is interpolated.
+    large_change : changes that count, F. From this size on, the neighbours of a changing pixel are rendered too.
+        Without: the faint outskirts of an edge are interpolated.
+    extreme_change : changes that count, F. From this size on, pixels two away are rendered too. Without: as above,
+        for lamps and their glare.
+    extreme_windows : windows, F. An extreme change counts this much longer, before and after. Without (0): the first
+        light of an approaching lamp is interpolated.
     least_rays : rays, C. Least number for a pair: two halves of four. Without: the difference of the halves gives no
         error estimate.
     ray_weight : wanted errors, H. Largest contribution of a single ray to a pair. Without: a ray that sees what no
         pilot ray saw (a lamp through a gap) makes a value that is far off, and its stated error with it.
     most_rays : rays, C. Largest number for a pair. Without: one pixel that sees a lamp in a rough mirror takes all the
         time.
-    matt_gain, path_gain : (factor, power), no unit, F. The standard error of n stratified rays is factor · n^-power
-        times the scatter, for direct light on matt surfaces and for paths. Without (1, 0.5): the plan assumes
+    diffuse_gain, path_gain : (factor, power), no unit, F. The standard error of n stratified rays is factor · n^-power
+        times the scatter, for direct light on diffuse surfaces and for paths. Without (1, 0.5): the plan assumes
         independent rays and spends several times as many.
     frame_margin : factor, H. The wanted error of an exposure is divided by this. Without (1): the error is too large
         where much moves within the exposure, because rays gain less there than the fit says.
@@ -85,7 +85,7 @@ class Tuning:
         interpolated from there carry its error.
     edge_least_rays : rays, C. Pairs that the law gives at least as many rays get decision rays for a line. Without
         (0): decision rays of cheap pairs cost more than they save.
-    edge_rays : rays, F. Decision rays of a pair. Half as many: the strip about a line is wider. Larger: they cost more
+    edge_rays : rays, F. Decision rays of a pair; half as many where they show little contrast. Half as many: the strip about a line is wider. Larger: they cost more
         than they save.
     edge_footprint_px : px, F. Width of the area in which the first half of the decision rays start. Without (1): a
         line that only just enters a pixel, or passes beside it, is not seen.
@@ -133,13 +133,13 @@ class Tuning:
     lone_footprint_px: float = 1.75
     tolerance: float = 3.0
     change: float = 0.7
-    great: float = 16.0
-    huge: float = 128.0
-    huge_windows: int = 1
+    large_change: float = 16.0
+    extreme_change: float = 128.0
+    extreme_windows: int = 1
     least_rays: int = 8
-    ray_weight: float = 1.0
+    ray_weight: float = 2.0
     most_rays: int = 4096
-    matt_gain: tuple[float, float] = (0.68, 0.70)
+    diffuse_gain: tuple[float, float] = (0.68, 0.70)
     path_gain: tuple[float, float] = (0.46, 0.56)
     frame_margin: float = 1.5
     unseen_area: float = 1 / 32
@@ -149,9 +149,9 @@ class Tuning:
     edge_least_rays: int = 256
     edge_rays: int = 64
     edge_footprint_px: float = 1.5
-    edge_contrast_rays: float = 0.4
+    edge_contrast_rays: float = 0.2
     flat_contrast: float = 4.0
-    flat_part: float = 1 / 8
+    flat_part: float = 1 / 16
     least_difference_rays: int = 64
     difference_gain: float = 4.0
     difference_part: float = 0.5

@@ -30,7 +30,7 @@ from hesim_render.sources.render.scene.mitsuba_version import (
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.scene.parents import trajectories
 from hesim_render.sources.render.scene.pictures import picture_texture
-from hesim_render.sources.render.scene.surfaces import area_emitter, is_matt, paint_of, radiance_of, surface_of
+from hesim_render.sources.render.scene.surfaces import area_emitter, is_diffuse, paint_of, radiance_of, surface_of
 from hesim_render.sources.render.scene.trajectory import Trajectory
 from hesim_render.sources.render.scene.vertex_normals import MESH_FILES, brings_normals
 from hesim_render.specs.geometry import rotation_about
@@ -56,7 +56,7 @@ class BuiltScene:
     groups : movable shapes by name: ``target``, an object's name, a Mitsuba shape id.
     trajectories : tracks of the groups that really move.
     is_dark : True where nothing emits.
-    paints : paint of all shapes except lamps, if all are matt and the light is direct; otherwise None.
+    paints : paint of all shapes except lamps, if all are diffuse and the light is direct; otherwise None.
     exact_because : why the scene needs the exact mode; None if it does not.
     camera : the Mitsuba scene's own camera, if it is used.
     integrator_plugin : plugin description of a Mitsuba scene's integrator; None if it was given as an object.
@@ -199,7 +199,7 @@ def _describe(
     a shape shines or has a picture), and the objects that change their shape.
     """
     deformations: dict[str, Deformation] = {}
-    all_matt = True
+    all_diffuse = True
     content: dict[str, Any] = {}
     groups: dict[str, list[str]] = {}
     paints: list[Paint] = []
@@ -210,7 +210,7 @@ def _describe(
             content[name] = _piece(mi, name, piece)
             groups["target"].append(name)
             if isinstance(piece.reflectance, Picture) or piece.radiance is not None:
-                all_matt = False
+                all_diffuse = False
             else:
                 paints.append(Paint(name, (piece.reflectance,)))
     for number, item in enumerate(spec.objects):
@@ -225,16 +225,16 @@ def _describe(
             parts = {name: _object(mi, item, name, placement, bsdf)}
         content.update(parts)
         groups[item.name] = list(parts)
-        if is_matt(item):
+        if is_diffuse(item):
             paints += [paint_of(item, part) for part in parts]
         else:
-            all_matt = False
+            all_diffuse = False
     try:
         content.update(lights.emitters(mi, spec.lights))
     except SpecError as error:
         raise SpecError(str(error), file=spec.file) from None
     has_map = any(light.type == "environment" for light in spec.lights)
-    return content, groups, paints if all_matt and not has_map else None, deformations
+    return content, groups, paints if all_diffuse and not has_map else None, deformations
 
 
 def _without_normals(item: ObjectSpec, spec: SceneSpec, groups: Mapping[str, list[str]]) -> list[str]:

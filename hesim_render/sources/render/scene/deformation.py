@@ -71,25 +71,25 @@ def read_deformation(
     """
     count, faces = int(mesh.vertex_count()), mesh_faces(mesh)
     if spec.path.is_dir():
-        times, found = _from_folder(mi, spec, count, faces, key)
+        times, vertices = _from_folder(mi, spec, count, faces, key)
     else:
         arrays = read_arrays(spec.path, ("t_us", "vertices"), only=("t_us", "vertices"), kinds="fiu")
-        times, found = arrays["t_us"].astype(np.float64), arrays["vertices"]
-        if found.ndim != 3 or found.shape[1:] != (count, 3) or times.shape != found.shape[:1]:
-            told = f"t_us {list(times.shape)} and vertices {list(found.shape)}"
-            raise SpecError(f"holds {told}; expected [times] and [times, {count}, 3], as the mesh has {count} vertices",
+        times, vertices = arrays["t_us"].astype(np.float64), arrays["vertices"]
+        if vertices.ndim != 3 or vertices.shape[1:] != (count, 3) or times.shape != vertices.shape[:1]:
+            held = f"t_us {list(times.shape)} and vertices {list(vertices.shape)}"
+            raise SpecError(f"holds {held}; expected [times] and [times, {count}, 3], as the mesh has {count} vertices",
                             file=spec.path, key=key)  # fmt: skip
     if len(times) < 2:
         raise SpecError("a deformation needs at least two shapes", file=spec.path, key=key)
-    if not np.isfinite(times).all() or not np.isfinite(found).all():
+    if not np.isfinite(times).all() or not np.isfinite(vertices).all():
         raise SpecError("has values that are not finite", file=spec.path, key=key)
     wrong = np.flatnonzero(np.diff(times) < 1)
     if wrong.size:
         before, after = times[wrong[0] : wrong[0] + 2]
         raise SpecError(f"times must increase by 1 µs or more: {after:g} µs follows {before:g} µs",
                         file=spec.path, key=key)  # fmt: skip
-    placed = np.empty(found.shape, np.float32)
-    for shape, own in zip(placed, found, strict=True):
+    placed = np.empty(vertices.shape, np.float32)
+    for shape, own in zip(placed, vertices, strict=True):
         shape[:] = own.astype(np.float64) @ fit[:3, :3].T + fit[:3, 3]
     return Deformation(times, placed, spec.repeat)
 
@@ -99,7 +99,7 @@ def _from_folder(
 ) -> tuple[NDArray[np.float64], NDArray[np.floating]]:
     names = spec.files
     require_memory(len(names) * count * 12, "all shapes of the mesh", spec.path)
-    found = np.empty((len(names), count, 3), np.float32)
+    shapes = np.empty((len(names), count, 3), np.float32)
     for number, name in enumerate(names):
         path = spec.folder / name
         require_fits(path)
@@ -108,6 +108,6 @@ def _from_folder(
         if mesh.vertex_count() != count or not np.array_equal(mesh_faces(mesh), faces):
             raise SpecError(f"its faces are not those of the mesh, which has {count} vertices and {len(faces)} faces",
                             file=path, key=key)  # fmt: skip
-        found[number] = mesh_vertices(mesh)
+        shapes[number] = mesh_vertices(mesh)
     assert spec.every_us is not None
-    return spec.begin_us + spec.every_us * np.arange(len(names), dtype=np.float64), found
+    return spec.begin_us + spec.every_us * np.arange(len(names), dtype=np.float64), shapes

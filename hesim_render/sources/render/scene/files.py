@@ -135,7 +135,7 @@ class SceneFiles:
         SpecError
             If it lies outside, or is no plain file.
         """
-        path = self._found(name, file)
+        path = self._resolved(name, file)
         if not path.is_file():
             raise SpecError(f"no such file: {name!r}", file=file)
         return path
@@ -143,12 +143,12 @@ class SceneFiles:
     def _folder(self, name: str, file: Path) -> Path:
         """The folder of a ``<path>``: beside the file, or else one that Mitsuba finds."""
         beside = file.resolve().parent / name
-        folder = self._found(str(beside) if beside.exists() else name, file)
+        folder = self._resolved(str(beside) if beside.exists() else name, file)
         if not folder.is_dir():
             raise SpecError(f"no such folder: {name!r}", file=file)
         return folder
 
-    def _found(self, name: str, file: Path | None) -> Path:
+    def _resolved(self, name: str, file: Path | None) -> Path:
         """What Mitsuba finds in its folders; a relative name that it does not find is one of the working folder."""
         if "$" in name or "\\" in name or "\0" in name:
             raise SpecError(f"the file name {name[:80]!r} holds a '$', '\\' or NUL", file=file)

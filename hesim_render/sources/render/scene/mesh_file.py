@@ -81,8 +81,8 @@ def mesh_shapes(
         except SpecError as error:
             if not any(said in str(error) for said in _NO_TRIANGLES):
                 raise
-            told = "has no triangles alone: export triangles (Triangulated Mesh in Blender), or a GLB file"
-            raise SpecError(told, file=path, key=key) from None
+            problem = "has no triangles alone: export triangles (Triangulated Mesh in Blender), or a GLB file"
+            raise SpecError(problem, file=path, key=key) from None
         box = shape.bbox()
         low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
         fit = placement @ _fit(item, low, high, int(shape.face_count()), path, key)
@@ -98,14 +98,14 @@ def mesh_shapes(
     corners = np.concatenate([part.vertices for part in parts] or [np.empty((0, 3))]).astype(np.float64)
     low, high = (corners.min(axis=0), corners.max(axis=0)) if len(corners) else (np.zeros(3), np.zeros(3))
     fit = placement @ _fit(item, low, high, sum(len(part.faces) for part in parts), path, key)
-    found = {}
+    meshes = {}
     for number, part in enumerate(parts):
         own = f"{name}_{number}"
         vertices = np.asarray(part.vertices, dtype=np.float64) @ fit[:3, :3].T + fit[:3, 3]
         uv = getattr(part.visual, "uv", None)
         surface = bsdf if item.materials == "own" else _principled(mi, part, path)
-        found[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv, emitter)
-    return found, None
+        meshes[own] = make_mesh(mi, own, vertices, np.asarray(part.faces, dtype=np.uint32), surface, uv, emitter)
+    return meshes, None
 
 
 def _fit(
@@ -133,8 +133,8 @@ def _load(path: Path, kind: str, root: Path | None, key: str) -> list[Any]:
         import trimesh
         from trimesh.resolvers import FilePathResolver
     except ImportError:
-        told = f"{kind.upper()} files are read by trimesh, which is not installed: {how_to_install('meshes')}"
-        raise SpecError(told, file=path, key=key) from None
+        problem = f"{kind.upper()} files are read by trimesh, which is not installed: {how_to_install('meshes')}"
+        raise SpecError(problem, file=path, key=key) from None
 
     class Beside(FilePathResolver):
         """Files in the folder of the scene alone."""
@@ -190,7 +190,7 @@ def file_materials(spec: SceneSpec) -> dict[str, list[FileMaterial]]:
     SpecError
         If a file is missing or cannot be read.
     """
-    found = {}
+    materials = {}
     for item in spec.objects:
         if item.materials == "file":
             path = spec.folder / str(item.mesh)
@@ -198,8 +198,8 @@ def file_materials(spec: SceneSpec) -> dict[str, list[FileMaterial]]:
                 raise SpecError(f"no such mesh file: {path}", key=f"objects.{item.name}.mesh")
             root = None if spec.allow_outside or spec.file is None else spec.folder
             parts = _load(path, path.suffix.lower().lstrip("."), root, f"objects.{item.name}.mesh")
-            found[item.name] = [_material_of(part) for part in parts]
-    return found
+            materials[item.name] = [_material_of(part) for part in parts]
+    return materials
 
 
 def _pbr(part: Any) -> Any:
@@ -219,7 +219,7 @@ def _material_of(part: Any) -> FileMaterial:
     metallic, rough = getattr(material, "metallicFactor", None), getattr(material, "roughnessFactor", None)
     textured = getattr(material, "baseColorTexture", None) is not None
     has_uv = getattr(part.visual, "uv", None) is not None
-    unused = [told for key, told in _UNUSED.items() if getattr(material, key, None) is not None]
+    unused = [description for key, description in _UNUSED.items() if getattr(material, key, None) is not None]
     glow = getattr(material, "emissiveFactor", None)
     if glow is not None and np.any(np.asarray(glow) > 0):
         unused.append("emission")
@@ -240,12 +240,12 @@ def _material_of(part: Any) -> FileMaterial:
 
 def _principled(mi: MitsubaModule, part: Any, path: Path) -> dict[str, Any]:
     """The material of a part as Mitsuba's."""
-    told = _material_of(part)
-    base: Any = {"type": "rgb", "value": list(told.base_color)}
-    if told.has_texture:
+    material = _material_of(part)
+    base: Any = {"type": "rgb", "value": list(material.base_color)}
+    if material.has_texture:
         picture = _pbr(part).baseColorTexture
         require_memory(_TEXEL_BYTES * picture.width * picture.height, "the texture", path)
         codes = np.asarray(picture.convert("RGB"), dtype=np.float64) / 255
-        base = picture_texture(mi, Picture((decode(codes, "srgb") * told.base_color).astype(np.float32), "srgb"))
-    surface = {"type": "principled", "base_color": base, "metallic": told.metallic, "roughness": told.roughness}
+        base = picture_texture(mi, Picture((decode(codes, "srgb") * material.base_color).astype(np.float32), "srgb"))
+    surface = {"type": "principled", "base_color": base, "metallic": material.metallic, "roughness": material.roughness}
     return {"type": "twosided", "material": surface}

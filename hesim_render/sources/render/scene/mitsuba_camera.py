@@ -45,25 +45,25 @@ class MitsubaCamera:
             If the sensor asks for an exposure, or its far plane cuts off shapes.
         """
         sensor = scene.sensors()[0]
-        told = mi.traverse(sensor)
+        parameters = mi.traverse(sensor)
         if sensor.shutter_open_time() > 0:
             raise used.refused("its shutter_open and shutter_close are an exposure, which the sensor file gives; "
                                "remove them")  # fmt: skip
-        to_world = np.array(told["to_world"].matrix, dtype=np.float64).reshape(4, 4, -1)[:, :, 0]
-        far, depth = float(told["far_clip"]), _farthest(scene, to_world)
+        to_world = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4, -1)[:, :, 0]
+        far, depth = float(parameters["far_clip"]), _farthest(scene, to_world)
         if depth > far:
             raise used.refused(
                 f"its far_clip is {far:g}, and there are shapes up to {depth:g} away, which would be seen here; "
                 "give a far_clip beyond them, or remove them"
             )
-        film = (told[f"film.{key}"] for key in ("size", "crop_size", "crop_offset"))
+        film = (parameters[f"film.{key}"] for key in ("size", "crop_size", "crop_offset"))
         size, crop, first = (np.ravel(value).astype(float) for value in film)
-        half_x = tan(radians(float(np.ravel(told["x_fov"])[0])) / 2)
+        half_x = tan(radians(float(np.ravel(parameters["x_fov"])[0])) / 2)
         half = np.array([half_x, half_x * size[1] / size[0]])
-        shift = np.array([float(np.ravel(told[f"principal_point_offset_{axis}"])[0]) for axis in "xy"])
+        shift = np.array([float(np.ravel(parameters[f"principal_point_offset_{axis}"])[0]) for axis in "xy"])
         low, high = ((2 * (edge / size + shift) - 1) * half for edge in (first, first + crop))
         picture = float(low[0]), float(high[0]), float(low[1]), float(high[1])
-        return cls(to_world, picture, float(told["near_clip"]))
+        return cls(to_world, picture, float(parameters["near_clip"]))
 
 
 def _farthest(scene: MitsubaObject, to_world: NDArray[np.float64]) -> float:

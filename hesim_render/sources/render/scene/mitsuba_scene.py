@@ -90,12 +90,12 @@ def load_mitsuba(mi: MitsubaModule, spec: SceneSpec, source: MitsubaSpec) -> Mit
         nonlocal reason, camera, plugin
         if state.nodes[0].type != mi.ObjectType.Scene:
             raise SpecError("the Mitsuba file describes no scene", file=source.file or spec.file, key="mitsuba")
-        found = used_plugins(mi, state, spec.file)
-        reason = exact_reason(found, moving)
-        camera = check_camera(found) if spec.camera is None else None
+        used = used_plugins(mi, state, spec.file)
+        reason = exact_reason(used, moving)
+        camera = check_camera(used) if spec.camera is None else None
         if spec.max_depth is not None:
-            set_depth(found, spec.max_depth)
-        plugin = integrator_plugin(found, {"type": "path", "max_depth": spec.max_depth or _DEFAULT_DEPTH, **_ROULETTE})
+            set_depth(used, spec.max_depth)
+        plugin = integrator_plugin(used, {"type": "path", "max_depth": spec.max_depth or _DEFAULT_DEPTH, **_ROULETTE})
 
     def check_and_switch_off(state: Any) -> None:
         check(state)

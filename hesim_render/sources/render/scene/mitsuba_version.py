@@ -201,8 +201,8 @@ def _opened(name: str) -> str:
     """The file that Mitsuba opens for a name: without one in its folders, that of the working folder."""
     import mitsuba as mi
 
-    found = Path(str(mi.file_resolver().resolve(name)))  # type: ignore[operator]
-    return str(found.absolute() if found.exists() else found)
+    path = Path(str(mi.file_resolver().resolve(name)))  # type: ignore[operator]
+    return str(path.absolute() if path.exists() else path)
 
 
 def switch_off(state: Any, shines: Callable[[str], bool], names: Sequence[str]) -> None:

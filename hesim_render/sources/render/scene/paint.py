@@ -1,4 +1,4 @@
-"""Paint of matt shapes."""
+"""Paint of diffuse shapes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hesim_render.spectral.spectrum import Spectrum
 
 @dataclass(frozen=True)
 class Paint:
-    """Paint of a shape: one matt colour, or a checkerboard of two.
+    """Paint of a shape: one diffuse colour, or a checkerboard of two.
 
     Parameters
     ----------

@@ -44,20 +44,20 @@ def trajectories(spec: SceneSpec) -> dict[str, Trajectory]:
 
 def camera_trajectory(spec: SceneSpec) -> Trajectory | None:
     """Trajectory of the camera; None if it stands still."""
-    found = trajectories(spec).get("camera")
-    return found if found is not None and found.moves else None
+    track = trajectories(spec).get("camera")
+    return track if track is not None and track.moves else None
 
 
 @lru_cache(maxsize=8)
 def _composed(text: str) -> dict[str, Trajectory]:
     tracks = {track.object: track for track in map(TrackSpec.model_validate, json.loads(text))}
-    found: dict[str, Trajectory] = {}
+    composed: dict[str, Trajectory] = {}
 
     def resolve(name: str) -> Trajectory:
-        if name not in found:
+        if name not in composed:
             own = tracks[name]
-            found[name] = Trajectory(own) if own.parent is None else _product(resolve(own.parent), own)
-        return found[name]
+            composed[name] = Trajectory(own) if own.parent is None else _product(resolve(own.parent), own)
+        return composed[name]
 
     return {name: resolve(name) for name in tracks}
 
@@ -126,8 +126,8 @@ def _is_enough(parent: Trajectory, child: Trajectory, spans: NDArray[np.int64]) 
     times = spans[:, :1] + (spans[:, 1:] - spans[:, :1]) * shares
     (above_segment, above), (below_segment, below) = parent.throughout(times), child.throughout(times)
     turned = _turn(parent, above_segment, spans) + _turn(child, below_segment, spans)
-    found = turned <= _MOST_TURN_RAD
-    poses = (above @ below)[found]
+    is_enough = turned <= _MOST_TURN_RAD
+    poses = (above @ below)[is_enough]
     begin, inside, end = poses[:, 0], poses[:, 1:-1], poses[:, -1]
     turn = Rotation.from_matrix(end[:, :3, :3] @ begin[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
     part = Rotation.from_rotvec((_INSIDE[:, None] * turn[:, None]).reshape(-1, 3)).as_matrix()
@@ -136,8 +136,8 @@ def _is_enough(parent: Trajectory, child: Trajectory, spans: NDArray[np.int64]) 
     pivot = np.append(child.pivot_m, 1.0)
     straight = (begin @ pivot)[:, None] + _INSIDE[:, None] * (end @ pivot - begin @ pivot)[:, None]
     away = np.linalg.norm(inside @ pivot - straight, axis=-1)
-    found[found] = (off.reshape(away.shape).max(axis=1) <= _FAR_RAD) & (away.max(axis=1) <= _FAR_M)
-    return found
+    is_enough[is_enough] = (off.reshape(away.shape).max(axis=1) <= _FAR_RAD) & (away.max(axis=1) <= _FAR_M)
+    return is_enough
 
 
 def _turn(track: Trajectory, segment: NDArray[np.intp], spans: NDArray[np.int64]) -> NDArray[np.float64]:

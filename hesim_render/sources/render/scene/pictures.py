@@ -95,15 +95,15 @@ def _spectral_texture(variant: str) -> type:
             inside_row = mi.UInt32(dr.clip(row, 0, height - 1))
             inside_col = mi.UInt32(dr.clip(col, 0, width - 1))
             first = (inside_row * cols + inside_col) * planes
-            found = []
+            bands = []
             for wavelength in si.wavelengths:
                 above = dr.binary_search(0, planes, lambda k, w=wavelength: dr.gather(mi.Float, self._knots, k) < w)
                 above = dr.clip(above, 1, planes - 1)
                 start, end = (dr.gather(mi.Float, self._knots, k) for k in (above - 1, above))
                 a, b = (dr.gather(mi.Float, self._values, first + k, active) for k in (above - 1, above))
                 covered = (wavelength >= self._ends[0]) & (wavelength <= self._ends[1])
-                found.append(dr.select(covered, dr.lerp(a, b, (wavelength - start) / (end - start)), 0.0))
-            return mi.UnpolarizedSpectrum(found)
+                bands.append(dr.select(covered, dr.lerp(a, b, (wavelength - start) / (end - start)), 0.0))
+            return mi.UnpolarizedSpectrum(bands)
 
         def mean(self) -> Float:
             return mi.Float(self._mean)

@@ -211,17 +211,17 @@ def used_plugins(mi: MitsubaModule, state: Any, file: Path | None) -> list[Used]
             if number not in reached:
                 reached.add(number)
                 waiting.append(number)
-    found: list[Used] = []
+    used_nodes: list[Used] = []
     for number in sorted(reached):
         node, above = nodes[number], owners[number]
         place, name, kind = _place(mi, state, node, file), node.props.plugin_name(), _kind_of(node)
         if kind != "Scene":
-            found.append(Used(kind, name, node.props.id(), place, node, tuple(above)))
+            used_nodes.append(Used(kind, name, node.props.id(), place, node, tuple(above)))
         for key in node.props:
             if node.props.type(key) == types.Object:
                 inside = {**place, "key": ".".join(filter(None, (place.get("key"), key)))}
-                found.extend(_made(mi, node.props[key], inside, node))
-    return found
+                used_nodes.extend(_made(mi, node.props[key], inside, node))
+    return used_nodes
 
 
 def _kind_of(node: Any) -> str:
@@ -247,10 +247,10 @@ def _leave_out_unused(mi: MitsubaModule, nodes: Sequence[Any]) -> None:
 
 def _place(mi: MitsubaModule, state: Any, node: Any, file: Path | None) -> dict[str, Any]:
     """Arguments of a `SpecError` that state the place of a node."""
-    told, own = mi.parser.file_location(state, node), node.props.id()
-    if match := _PLACE.fullmatch(told):
+    location, own = mi.parser.file_location(state, node), node.props.id()
+    if match := _PLACE.fullmatch(location):
         return {"file": match["file"], "line": int(match["line"]), "key": own or None}
-    match = _KEY.fullmatch(told)
+    match = _KEY.fullmatch(location)
     inside = "" if match is None or match["key"] == "root" else f".{match['key']}"
     return {"file": file, "key": f"mitsuba.inline{inside}"}
 
@@ -271,12 +271,12 @@ def _made(mi: MitsubaModule, value: Any, place: Mapping[str, Any], owner: Any) -
             yield Used(kind, name, item.id(), place, None, (owner,))
 
 
-def exact_reason(found: Iterable[Used], moving: Iterable[str]) -> str | None:
+def exact_reason(plugins: Iterable[Used], moving: Iterable[str]) -> str | None:
     """Why a scene needs the exact mode; None if it does not.
 
     Parameters
     ----------
-    found : plugins from `used_plugins`.
+    plugins : from `used_plugins`.
     moving : ids of shapes that move.
 
     Raises
@@ -284,7 +284,7 @@ def exact_reason(found: Iterable[Used], moving: Iterable[str]) -> str | None:
     SpecError
         If a plugin is not rendered.
     """
-    plugins, moved = list(found), set(moving)
+    plugins, moved = list(plugins), set(moving)
     reason = None
     for used in plugins:
         if used.kind in OF_A_CAMERA:
@@ -337,7 +337,7 @@ def _check_media(plugins: Iterable[Used], moved: set[str]) -> None:
             raise used.refused("the shape around it moves, and its volume would not; use a 'homogeneous' medium")
 
 
-def set_depth(found: Iterable[Used], depth: int) -> bool:
+def set_depth(plugins: Iterable[Used], depth: int) -> bool:
     """Set the path length of a parsed scene's integrator; returns False if the scene has no integrator.
 
     Raises
@@ -345,7 +345,7 @@ def set_depth(found: Iterable[Used], depth: int) -> bool:
     SpecError
         If the integrator has no path length.
     """
-    for used in found:
+    for used in plugins:
         if used.kind != "Integrator":
             continue
         if used.node is None:
@@ -358,15 +358,15 @@ def set_depth(found: Iterable[Used], depth: int) -> bool:
     return False
 
 
-def integrator_plugin(found: Iterable[Used], otherwise: dict[str, Any]) -> dict[str, Any] | None:
+def integrator_plugin(plugins: Iterable[Used], otherwise: dict[str, Any]) -> dict[str, Any] | None:
     """A parsed scene's integrator as a dictionary; `otherwise` if there is none; None if it was given as an object."""
-    for used in found:
+    for used in plugins:
         if used.kind == "Integrator":
             return None if used.node is None else {"type": used.name, **dict(used.node.props.items())}
     return otherwise
 
 
-def check_camera(found: Iterable[Used]) -> Used | None:
+def check_camera(plugins: Iterable[Used]) -> Used | None:
     """The first sensor of a parsed scene, None if it has no sensor.
 
     Raises
@@ -374,7 +374,7 @@ def check_camera(found: Iterable[Used]) -> Used | None:
     SpecError
         If the sensor asks for something that is not rendered; the message has plugin, place and alternative.
     """
-    plugins = list(found)
+    plugins = list(plugins)
     first = next((used for used in plugins if used.kind == "Sensor"), None)
     if first is None:
         return None

@@ -55,8 +55,8 @@ def _picture(file: Path, head: bytes) -> tuple[int, int]:
     """Width and height; 0 for a file that is no picture."""
     if head.startswith(b"\x76\x2f\x31\x01"):
         return exr_header(file)[0]
-    if (found := _PFM.match(head) or (head.startswith(b"#?") and _RGBE.search(head))) is not None and found:
-        return int(found[1]), int(found[2])
+    if (match := _PFM.match(head) or (head.startswith(b"#?") and _RGBE.search(head))) is not None and match:
+        return int(match[1]), int(match[2])
     from PIL import Image
 
     with warnings.catch_warnings():

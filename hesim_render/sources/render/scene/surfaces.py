@@ -25,13 +25,13 @@ from hesim_render.targets.image import read_picture
 _OPEN_SHAPES = ("rectangle", "mesh")
 
 
-def is_matt(item: ObjectSpec) -> bool:
-    """True if an object is matt, of one or two colours, and does not shine."""
+def is_diffuse(item: ObjectSpec) -> bool:
+    """True if an object is diffuse, of one or two colours, and does not shine."""
     return item.material is None and item.texture is None and item.emission is None and item.materials == "own"
 
 
 def paint_of(item: ObjectSpec, name: str) -> Paint:
-    """The paint of a matt object's shape."""
+    """The paint of a diffuse object's shape."""
     colours = [source.load() for source in (item.reflectance, item.pattern) if source is not None]
     u, v = item.pattern_count
     return Paint(name, tuple(colours), (u / 2, v / 2), two_sided=item.shape in _OPEN_SHAPES)
@@ -111,8 +111,8 @@ def _plugin(
     if not any(name in HONOURED[one] for one in kinds):
         why = REFUSED["BSDF"].get(str(name))
         known = ", ".join(sorted(known for one in kinds for known in HONOURED[one]))
-        told = why or f"it is not known here; use one of {known}"
-        raise SpecError(f"{' or '.join(kinds)} {str(name)!r}: {told}", file=spec.file, key=f"{key}.type")
+        problem = why or f"it is not known here; use one of {known}"
+        raise SpecError(f"{' or '.join(kinds)} {str(name)!r}: {problem}", file=spec.file, key=f"{key}.type")
     content: dict[str, Any] = {}
     for name_of_key, value in node.items():
         place = f"{key}.{name_of_key}"

@@ -26,8 +26,8 @@ def _unit(axis: ArrayLike) -> NDArray[np.float64]:
 
 def _arcs(frames: Sequence[KeyframeSpec]) -> list[tuple[NDArray[np.float64], float]]:
     """Axis and angle (rad, any number of turns) of the rotation from each keyframe to the next."""
-    found = [_about_one_axis(start, end) for start, end in pairwise(frames)]
-    shortest = [number for number, arc in enumerate(found) if arc is None]
+    arcs = [_about_one_axis(start, end) for start, end in pairwise(frames)]
+    shortest = [number for number, arc in enumerate(arcs) if arc is None]
     if shortest:
         vectors = np.array([radians(frame.rotation_deg) * _unit(frame.rotation_axis) for frame in frames])
         every = Rotation.from_rotvec(vectors)
@@ -35,8 +35,8 @@ def _arcs(frames: Sequence[KeyframeSpec]) -> list[tuple[NDArray[np.float64], flo
         for number, turn in zip(shortest, (second * first.inv()).as_rotvec(), strict=True):
             angle = float(np.linalg.norm(turn))
             axis = _unit(frames[number].rotation_axis)
-            found[number] = (axis, 0.0) if angle < _EPSILON else (turn / angle, angle)
-    return [arc for arc in found if arc is not None]
+            arcs[number] = (axis, 0.0) if angle < _EPSILON else (turn / angle, angle)
+    return [arc for arc in arcs if arc is not None]
 
 
 def _about_one_axis(start: KeyframeSpec, end: KeyframeSpec) -> tuple[NDArray[np.float64], float] | None:
@@ -159,14 +159,14 @@ class Trajectory:
             first = float(self.local_us(begin_us))
             last = first + end_us - begin_us
             spans = [(first, last)] if last <= period else [(first, period), (0.0, last - period)]
-        found = []
+        pieces = []
         for low, high in spans:
             for segment in range(knots.size - 1):
                 a, b = max(low, knots[segment]), min(high, knots[segment + 1])
                 if a <= b:
                     length = knots[segment + 1] - knots[segment]
-                    found.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
-        return found
+                    pieces.append(Piece(segment, (a - knots[segment]) / length, (b - knots[segment]) / length, b - a))
+        return pieces
 
     def ends_us(self, begin_us: float, end_us: float) -> NDArray[np.float64]:
         """Times strictly inside an interval at which a segment between two keyframes begins or ends, µs, in order."""

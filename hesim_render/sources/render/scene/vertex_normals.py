@@ -47,9 +47,9 @@ def ordered_normals(vertices_m: NDArray[np.floating], faces: NDArray[np.integer]
     # faces without area have no normal, and count for nothing
     has_area = twice_area > 0
     corners, faces, normal = corners[has_area], faces[has_area], across[has_area] / twice_area[has_area, None]
-    found = np.tile(np.array([1.0, 0.0, 0.0]), (len(vertices_m), 1))
-    found[faces.ravel()] = np.repeat(normal, 3, axis=0)
-    total = np.zeros_like(found)
+    normals = np.tile(np.array([1.0, 0.0, 0.0]), (len(vertices_m), 1))
+    normals[faces.ravel()] = np.repeat(normal, 3, axis=0)
+    total = np.zeros_like(normals)
     for k in range(3):
         one, other = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
         # the angle from sine and cosine: an arc cosine alone loses digits in thin triangles
@@ -59,8 +59,8 @@ def ordered_normals(vertices_m: NDArray[np.floating], faces: NDArray[np.integer]
     length = np.linalg.norm(total, axis=1)
     # less is rounding of terms that cancel
     sums = length > 1e-9
-    found[sums] = total[sums] / length[sums, None]
-    return found.astype(np.float32)
+    normals[sums] = total[sums] / length[sums, None]
+    return normals.astype(np.float32)
 
 
 def brings_normals(path: Path, shape_index: int = 0) -> bool:

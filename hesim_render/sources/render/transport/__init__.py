@@ -1,1 +1,1 @@
-"""Light transport: paths whose rays have individual times, and direct light on matt surfaces in closed form."""
+"""Light transport: paths whose rays have individual times, and direct light on diffuse surfaces in closed form."""

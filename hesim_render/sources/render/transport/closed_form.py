@@ -69,11 +69,11 @@ def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
     vertices = mesh_vertices(shape)
     triangles = mesh_faces(shape).reshape(-1, 2, 3)
     known = _at_corners(mi, shape)
-    found = []
+    faces = []
     for number, (first, second) in enumerate(triangles):
         order = _parallelogram(vertices[first], vertices[second])
-        told = {name: values[number] for name, values in known.items()}
-        flat = all(np.allclose(told[name], told[name][0, 0], rtol=0, atol=_SAME) for name in ("n", "shading"))
+        corners = {name: values[number] for name, values in known.items()}
+        flat = all(np.allclose(corners[name], corners[name][0, 0], rtol=0, atol=_SAME) for name in ("n", "shading"))
         if order is None or not flat:
             return []
         (own, on_u, on_v), (opposite, at_u, at_v) = order
@@ -82,14 +82,14 @@ def faces_of(mi: MitsubaModule, shape: MitsubaObject) -> list[Face]:
         normal = np.cross(*sides)
         inverse = np.linalg.inv(np.stack([*sides, normal / np.linalg.norm(normal)], axis=1))
         to_uvh = np.concatenate([inverse, -(inverse @ corner)[:, None]], axis=1)
-        one, other = told.pop("uv")
+        one, other = corners.pop("uv")
         uv = [
             [one[own], one[on_u] - one[own], one[on_v] - one[own]],
             [other[at_u] + other[at_v] - other[opposite], other[opposite] - other[at_v], other[opposite] - other[at_u]],
         ]
-        surface = {name: values[:, 0] for name, values in told.items()}
-        found.append(Face(2 * number, order, to_uvh, {**surface, "uv": np.array(uv)}))
-    return found
+        surface = {name: values[:, 0] for name, values in corners.items()}
+        faces.append(Face(2 * number, order, to_uvh, {**surface, "uv": np.array(uv)}))
+    return faces
 
 
 def _parallelogram(
@@ -126,9 +126,9 @@ def _at_corners(mi: MitsubaModule, shape: MitsubaObject) -> dict[str, NDArray[np
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(0, 0, 1))
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, mi.Bool(True))
     # evaluated together: each would be a kernel of its own, compiled for this shape alone
-    told = {"n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "dp_du": si.dp_du, "dp_dv": si.dp_dv, "uv": si.uv}
-    dr.eval(told)
-    return {name: np.array(value, np.float64).T.reshape(count // 2, 2, 3, -1) for name, value in told.items()}
+    data = {"n": si.n, "shading": si.sh_frame.n, "s": si.sh_frame.s, "dp_du": si.dp_du, "dp_dv": si.dp_dv, "uv": si.uv}
+    dr.eval(data)
+    return {name: np.array(value, np.float64).T.reshape(count // 2, 2, 3, -1) for name, value in data.items()}
 
 
 @dataclass(frozen=True)
@@ -233,23 +233,23 @@ class Part:
         face = mi.UInt32(0)
         if self._scene is not None:
             return self._scene.ray_intersect_preliminary(ray, coherent, active & self._near(ray)), face
-        found = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
-        found.t, end = mi.Float(dr.inf), ray.maxt
+        hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray))
+        hit.t, end = mi.Float(dr.inf), ray.maxt
 
-        def take(closer: Mask, t: Float, shape: MitsubaObject) -> Float:
-            found.valid |= closer
-            found.t, found.shape = dr.select(closer, t, found.t), dr.select(closer, shape, found.shape)
-            return dr.select(closer, t, end)
+        def take(is_nearer: Mask, t: Float, shape: MitsubaObject) -> Float:
+            hit.valid |= is_nearer
+            hit.t, hit.shape = dr.select(is_nearer, t, hit.t), dr.select(is_nearer, shape, hit.shape)
+            return dr.select(is_nearer, t, end)
 
         for middle, square, shape in self._balls:
             t = to_ball(ray, middle, square)
             end = take(active & (t >= 0) & (t < end), t, shape)
         for number, (rows, _, shape) in enumerate(self._faces, start=self._faces_before + 1):
             t, place, inside = to_face(ray, rows)
-            closer = active & inside & (t >= 0) & (t < end)
-            end, face = take(closer, t, shape), dr.select(closer, number, face)
-            found.prim_uv = dr.select(closer, place, found.prim_uv)
-        return found, face
+            is_nearer = active & inside & (t >= 0) & (t < end)
+            end, face = take(is_nearer, t, shape), dr.select(is_nearer, number, face)
+            hit.prim_uv = dr.select(is_nearer, place, hit.prim_uv)
+        return hit, face
 
     def blocks(self, ray: Ray, active: Mask) -> Mask:
         """True where a ray hits anything before its `maxt`."""
@@ -271,13 +271,17 @@ class Part:
         u, v = hit.prim_uv
         second = u + v > 1
         n, shading, s, dp_du, dp_dv = si.n, si.sh_frame.n, si.sh_frame.s, si.dp_du, si.dp_dv
-        for number, ((_, triangle, _), told) in enumerate(
+        for number, ((_, triangle, _), surface) in enumerate(
             zip(self._faces, self._surfaces, strict=True), start=self._faces_before + 1
         ):
             here = face == number
 
-            def chosen(name: str, told: dict[str, list[Any]] = told) -> DeviceArray:
-                return dr.select(second, told[name][1], told[name][0]) if len(told[name]) == 2 else told[name][0]
+            def chosen(name: str, surface: dict[str, list[Any]] = surface) -> DeviceArray:
+                return (
+                    dr.select(second, surface[name][1], surface[name][0])
+                    if len(surface[name]) == 2
+                    else surface[name][0]
+                )
 
             n, shading = dr.select(here, chosen("n"), n), dr.select(here, chosen("shading"), shading)
             s = dr.select(here, chosen("s"), s)

@@ -125,18 +125,22 @@ class Fleet:
             def try_ball(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
                 x, y, z, square = dr.gather(mi.Vector4f, self._balls, 2 * j)
                 own = to_ball(local, mi.Point3f(x, y, z), square)
-                closer = near & (own >= 0) & _before(own, number, t, group)
-                t, which, ball = dr.select(closer, own, t), dr.select(closer, j, which), ball | closer
-                return j + 1, t, place, which, ball, dr.select(closer, number, group)
+                is_nearer = near & (own >= 0) & _before(own, number, t, group)
+                t, which, ball = dr.select(is_nearer, own, t), dr.select(is_nearer, j, which), ball | is_nearer
+                return j + 1, t, place, which, ball, dr.select(is_nearer, number, group)
 
             def try_face(j: UInt32, t: Float, place: Point2, which: UInt32, ball: Mask, group: UInt32) -> LoopState:
                 own, spot, inside = to_face(local, self._rows(j))
-                closer = near & inside & (own >= 0) & _before(own, number, t, group)
-                t, which, place = dr.select(closer, own, t), dr.select(closer, j, which), dr.select(closer, spot, place)
-                return j + 1, t, place, which, ball & ~closer, dr.select(closer, number, group)
+                is_nearer = near & inside & (own >= 0) & _before(own, number, t, group)
+                t, which, place = (
+                    dr.select(is_nearer, own, t),
+                    dr.select(is_nearer, j, which),
+                    dr.select(is_nearer, spot, place),
+                )
+                return j + 1, t, place, which, ball & ~is_nearer, dr.select(is_nearer, number, group)
 
-            _, *found = dr.while_loop((balls[0], *state), lambda j, *_: j < balls[1], try_ball, label="balls")
-            return tuple(dr.while_loop((faces[0], *found), lambda j, *_: j < faces[1], try_face, label="faces")[1:])
+            _, *nearest = dr.while_loop((balls[0], *state), lambda j, *_: j < balls[1], try_ball, label="balls")
+            return tuple(dr.while_loop((faces[0], *nearest), lambda j, *_: j < faces[1], try_face, label="faces")[1:])
 
         nothing = mi.Float(length), mi.Point2f(0.0), mi.UInt32(0), mi.Bool(False), mi.UInt32(0)
         (t, place, which, ball, group), met = self._visit(ray, inverse, length, moment, active, nothing, visit)
@@ -162,8 +166,8 @@ class Fleet:
                 t, _, inside = to_face(local, self._rows(j))
                 return j + 1, blocked | (near & inside & (t >= 0) & (t < ray.maxt))
 
-            _, *found = dr.while_loop((balls[0], *state), lambda j, *_: j < balls[1], try_ball, label="balls")
-            return tuple(dr.while_loop((faces[0], *found), lambda j, *_: j < faces[1], try_face, label="faces")[1:])
+            _, *nearest = dr.while_loop((balls[0], *state), lambda j, *_: j < balls[1], try_ball, label="balls")
+            return tuple(dr.while_loop((faces[0], *nearest), lambda j, *_: j < faces[1], try_face, label="faces")[1:])
 
         (blocked,), met = self._visit(ray, inverse, ray.maxt, moment, active, (mi.Bool(False),), visit)
         return blocked, met
@@ -212,8 +216,8 @@ class Fleet:
                     k = mi.UInt32(mark)
                     return visit(near, dr.gather(mi.UInt32, self._heads, 8 * k), k, state)
 
-                found = dr.if_stmt(tuple(before), near, look, lambda *state: state, label="moving group")
-                return row + 1, *found, met | near
+                updated = dr.if_stmt(tuple(before), near, look, lambda *state: state, label="moving group")
+                return row + 1, *updated, met | near
 
             return number + 1, *dr.if_stmt(tuple(state), inside, members, lambda *state: state, label="bunch")
 
@@ -243,21 +247,21 @@ class Fleet:
         import drjit as dr
 
         mi = self._mi
-        found = [dr.gather(mi.Vector4f, self._faces, 4 * face + k) for k in range(3)]
-        return [(mi.Vector3f(row.x, row.y, row.z), row.w) for row in found]
+        rows = [dr.gather(mi.Vector4f, self._faces, 4 * face + k) for k in range(3)]
+        return [(mi.Vector3f(row.x, row.y, row.z), row.w) for row in rows]
 
-    def _hit(self, t: Float, found: Mask, place: Point2, which: UInt32, ball: Mask) -> Interaction:
+    def _hit(self, t: Float, is_hit: Mask, place: Point2, which: UInt32, ball: Mask) -> Interaction:
         """The hit record from which Mitsuba computes a surface interaction."""
         import drjit as dr
 
         mi = self._mi
         hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(t))
-        hit.valid, hit.t = found, dr.select(found, t, dr.inf)
-        face = found & ~ball
+        hit.valid, hit.t = is_hit, dr.select(is_hit, t, dr.inf)
+        face = is_hit & ~ball
         number, triangle, one, other = dr.gather(mi.Vector4f, self._faces, 4 * which + 3, face)
-        own = dr.gather(mi.Float, self._balls, _BALL * which + 4, found & ball)
+        own = dr.gather(mi.Float, self._balls, _BALL * which + 4, is_hit & ball)
         shape = mi.UInt32(dr.select(ball, own, number))
-        hit.shape = dr.reinterpret_array(mi.ShapePtr, dr.select(found, shape, 0))
+        hit.shape = dr.reinterpret_array(mi.ShapePtr, dr.select(is_hit, shape, 0))
         # the corner at (0, 0) or (1, 1) of the triangle that was hit, and its neighbours along u and v
         u, v = place
         second = u + v > 1

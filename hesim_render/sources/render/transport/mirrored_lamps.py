@@ -1,6 +1,6 @@
-"""Directions to the images of lamps in flat mirrors, which sampling of lamps and of matt surfaces both miss.
+"""Directions to the images of lamps in flat mirrors, which sampling of lamps and of diffuse surfaces both miss.
 
-A matt surface that sees a lamp in a mirror is lit by the image of the lamp. A shadow ray to the lamp ends at the
+A diffuse surface that sees a lamp in a mirror is lit by the image of the lamp. A shadow ray to the lamp ends at the
 mirror, and few directions of the surface's own sampling hit the image. Some directions are therefore drawn from cones
 around the images instead. The density of all directions is that of the mixture: one-sample multiple importance sampling
 with the balance heuristic ([veach1997], section 9.2.4). The estimate is unbiased whatever such a ray hits.
@@ -58,7 +58,7 @@ class LampImages:
     def of(cls, mi: MitsubaModule, scene: MitsubaObject) -> LampImages:
         """Images of the area lights of a Mitsuba scene in its flat, perfectly reflecting shapes."""
         lamps = [shape.bbox() for shape in scene.shapes() if shape.is_emitter()]
-        found: list[Image] = []
+        images: list[Image] = []
         for shape in scene.shapes():
             plane = _mirror(mi, shape)
             if plane is None:
@@ -71,8 +71,8 @@ class LampImages:
                 both = mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.BackSide)
                 for side in (1.0, -1.0) if both else (1.0,):
                     if side * height > -radius:
-                        found.append((centre - 2 * height * normal, radius, side * normal, side * offset))
-        return cls(mi, found)
+                        images.append((centre - 2 * height * normal, radius, side * normal, side * offset))
+        return cls(mi, images)
 
     def __len__(self) -> int:
         return len(self._images)

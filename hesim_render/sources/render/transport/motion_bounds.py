@@ -37,12 +37,12 @@ def places(
     ------- For each piece of the track between keyframes: the corners at its ends and at some instants between, [k, n,
     3], m; and the largest distance of any point from the straight line between two of these positions, m.
     """
-    found, radius = [], float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
+    pieces, radius = [], float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     for piece in trajectory.pieces(begin_us, end_us):
         share, margin = _instants(trajectory, piece, radius)
         poses = trajectory.within(np.full(share.size, piece.segment), share)
-        found.append((corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], margin))
-    return found
+        pieces.append((corners @ np.swapaxes(poses[:, :3, :3], 1, 2) + poses[:, None, :3, 3], margin))
+    return pieces
 
 
 def places_seen(
@@ -61,7 +61,7 @@ def places_seen(
     """
     radius = float(np.linalg.norm(corners - trajectory.pivot_m, axis=1).max())
     inner = np.union1d(trajectory.ends_us(begin_us, end_us), camera.ends_us(begin_us, end_us))
-    cuts, found = np.concatenate([[begin_us], inner, [end_us]]), []
+    cuts, pieces = np.concatenate([[begin_us], inner, [end_us]]), []
     for low, high in pairwise(cuts):
         speed, turn = _speed_and_turn(trajectory, low, high)
         own_speed, own_turn = _speed_and_turn(camera, low, high)
@@ -74,8 +74,8 @@ def places_seen(
         pivots = views[:, :3, :3] @ camera.pivot_m + views[:, :3, 3]
         far = float(np.linalg.norm(points - pivots[:, None], axis=2).max()) + fastest * step_s / 2
         acceleration = own_turn * own_turn * far + 2 * own_turn * fastest + turn * turn * radius
-        found.append(((points - views[:, None, :3, 3]) @ views[:, :3, :3], acceleration * step_s * step_s / 8))
-    return found
+        pieces.append(((points - views[:, None, :3, 3]) @ views[:, :3, :3], acceleration * step_s * step_s / 8))
+    return pieces
 
 
 def stays_in(

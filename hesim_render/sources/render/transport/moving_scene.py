@@ -210,26 +210,28 @@ class MovingScene:
             return Surface(mi, surface_of([self._resting], hit, face, ray, flags, active), None, mi.Bool(False))
         pose = DevicePose.none(mi.Vector3f)
 
-        def take(closer: Mask, found: Interaction, number: UInt32, own: DevicePose, state: LoopState) -> LoopState:
-            columns = (dr.select(closer, a, b) for a, b in zip((*own.columns, own.shift), state[2:], strict=True))
-            return dr.select(closer, found, state[0]), dr.select(closer, number, state[1]), *columns
+        def take(
+            is_nearer: Mask, candidate: Interaction, number: UInt32, own: DevicePose, state: LoopState
+        ) -> LoopState:
+            columns = (dr.select(is_nearer, a, b) for a, b in zip((*own.columns, own.shift), state[2:], strict=True))
+            return dr.select(is_nearer, candidate, state[0]), dr.select(is_nearer, number, state[1]), *columns
 
         def visit(group: Group, own: DevicePose, local: Ray, near: Mask, state: LoopState) -> LoopState:
             local.maxt = dr.minimum(local.maxt, state[0].t)
-            found, number = group.part.nearest(local, coherent, near)
-            return take(near & found.is_valid(), found, number, own, state)
+            candidate, number = group.part.nearest(local, coherent, near)
+            return take(near & candidate.is_valid(), candidate, number, own, state)
 
         state: LoopState = hit, face, *pose.columns, pose.shift
         state, met = self._visit_groups(ray, moment, active, hit.t, state, visit)
         if self._fleet is not None:
             fleet = self._fleet
-            found, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
+            fleet_hit, number, near = fleet.nearest(ray, moment, dr.minimum(ray.maxt, state[0].t), active)
             met |= near
 
             def pose_of(*state: Any) -> LoopState:
-                return take(found.is_valid(), found, mi.UInt32(0), fleet.pose(number, moment), state)
+                return take(fleet_hit.is_valid(), fleet_hit, mi.UInt32(0), fleet.pose(number, moment), state)
 
-            state = dr.if_stmt(state, found.is_valid(), pose_of, lambda *state: state, label="moving surface")
+            state = dr.if_stmt(state, fleet_hit.is_valid(), pose_of, lambda *state: state, label="moving surface")
         # surfaces are described once, for all parts: a description of each would be most of the kernel
         hit, face, *columns, shift = state
         pose = DevicePose(tuple(columns), shift)

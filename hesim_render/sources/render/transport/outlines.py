@@ -1,8 +1,8 @@
 """Flat convex outlines of what may hide a uniform sky, and the share of the sky that they hide, in closed form.
 
 A flat target hides from a point of a wall a part of the sky that Lambert's formula gives, and so does a closed convex
-body, face by face. Direct light takes these shares as a control variate (`matt`): shadow rays then only correct what
-the outlines do not describe, such as holes, other forms, and two outlines behind each other.
+body, face by face. Direct light takes these shares as a control variate (`transport.diffuse`): shadow rays then only
+correct what the outlines do not describe, such as holes, other forms, and two outlines behind each other.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Outline:
     @property
     def normal(self) -> NDArray[np.float64]:
         """Unit normal of the side towards which the corners run anticlockwise."""
-        found = _twice_area(self.corners)
-        return found / np.linalg.norm(found)
+        vector_area = _twice_area(self.corners)
+        return vector_area / np.linalg.norm(vector_area)
 
     @property
     def area_m2(self) -> float:
@@ -107,7 +107,7 @@ def _faces_of_body(triangles: NDArray[np.float64]) -> list[Outline]:
         return []
     points = np.unique(triangles.reshape(-1, 3), axis=0)
     size = float(np.ptp(points, axis=0).max())
-    found: list[Outline] = []
+    faces: list[Outline] = []
     done = np.zeros(len(triangles), np.bool_)
     for number, triangle in enumerate(triangles):
         if done[number]:
@@ -126,10 +126,10 @@ def _faces_of_body(triangles: NDArray[np.float64]) -> list[Outline]:
         if face is None:
             return []
         forward = _twice_area(face.corners) @ normal > 0
-        found.append(Outline(face.corners if forward else face.corners[::-1], one_sided=True))
+        faces.append(Outline(face.corners if forward else face.corners[::-1], one_sided=True))
     # the vector areas of a closed body add up to nothing
-    total = np.sum([_twice_area(face.corners) for face in found], axis=0)
-    return found if np.linalg.norm(total) <= _IN_PLANE * size**2 else []
+    total = np.sum([_twice_area(face.corners) for face in faces], axis=0)
+    return faces if np.linalg.norm(total) <= _IN_PLANE * size**2 else []
 
 
 def _twice_area(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -207,7 +207,7 @@ def largest(parts: Sequence[Sequence[Outline]]) -> list[list[Outline]]:
     return [[outline for number, outline in kept if number == own] for own in range(len(parts))]
 
 
-class HiddenSky:
+class OccludedSky:
     """What the outlines of a moving scene hide of a uniform sky.
 
     Parameters

@@ -2,7 +2,7 @@
 
 The estimator is the common one [veach1997]: light is sampled at every vertex and combined with the surface's own
 sampling by the power heuristic; long paths are ended by Russian roulette. Mitsuba's own path tracer cannot be used,
-because it follows a path through one scene at one time. This one has two additions: matt surfaces send some paths to
+because it follows a path through one scene at one time. This one has two additions: diffuse surfaces send some paths to
 the images of lamps in flat mirrors (`LampImages`), and a uniform sky is not sampled (`spare_even_skies`).
 """
 
@@ -139,9 +139,9 @@ class PathIntegrator:
             choice = lobe
             if self._images:
                 # a path to the image of a lamp needs two more segments
-                matt = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
+                is_diffuse = goes_on & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) & (depth + 3 <= most)
                 upwards = dr.mulsign(mi.Vector3f(surface.shading_normal), mi.Frame3f.cos_theta(si.wi))
-                cones = self._images.seen_from(surface.world.p, upwards, matt)
+                cones = self._images.seen_from(surface.world.p, upwards, is_diffuse)
                 # where no cone is chosen, rescale the random number for the surface's own sampling
                 lobe = dr.maximum(choice - cones.chance, 0.0) / (1 - cones.chance)
             value, pdf, chosen, chosen_weight = bsdf.eval_pdf_sample(context, si, towards, lobe, place, goes_on)

@@ -65,9 +65,9 @@ class ObjectShapes:
             else:
                 self._points[owner].append(_points_of(shape, low, high))
         self._corners = np.zeros((len(names.objects), 8, 3))
-        for number, found in enumerate(corners):
-            if found:
-                every = np.concatenate(found)
+        for number, own_corners in enumerate(corners):
+            if own_corners:
+                every = np.concatenate(own_corners)
                 self._corners[number] = box_corners(every.min(axis=0), every.max(axis=0))
 
     def boxes(self, raster: Raster, objects: NDArray[np.integer], times_us: NDArray[np.float64]) -> Boxes:

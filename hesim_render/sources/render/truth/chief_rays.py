@@ -160,15 +160,15 @@ class ChiefRays:
             facing = dr.select(dr.dot(surface.world.n, ray.d) > 0, -1.0, 1.0)
             instance: UInt32 = dr.reinterpret_array(types.UInt32, rest.instance)
             own: UInt32 = dr.reinterpret_array(types.UInt32, rest.shape)
-            found = (
+            columns = (
                 dr.select(met, rest.t + near / along, dr.inf),
                 *(dr.select(met, value * facing, dr.nan) for value in surface.world.n),
                 dr.select(met, dr.select(instance != 0, instance, own), 0),
                 dr.select(met, dr.reinterpret_array(types.UInt32, rest.bsdf()), 0),
             )
-            found = tuple(value + dr.zeros(type(value), lanes) for value in found)
-            dr.eval(found)
-            t, x, y, z, met_shape, met_material = (np.array(value) for value in found)
+            columns = tuple(value + dr.zeros(type(value), lanes) for value in columns)
+            dr.eval(columns)
+            t, x, y, z, met_shape, met_material = (np.array(value) for value in columns)
             distance[part], shape[part], material[part] = t, met_shape, met_material
             normal[part] = np.stack([x, y, z], axis=1)
         return Hits(distance, shape, material, normal)
@@ -204,7 +204,7 @@ class ChiefRays:
         import drjit as dr
 
         mi = mitsuba()
-        found = np.empty((at.t_us.size, 4), np.float32)
+        values = np.empty((at.t_us.size, 4), np.float32)
         bands = mi.UnpolarizedSpectrum(*(dr.opaque(mi.Float, float(value)) for value in wavelengths_nm))
         for part, ray, _, now in self._blocks(at, (0.0, 0.0)):
             ray.wavelengths = bands
@@ -220,8 +220,8 @@ class ChiefRays:
             columns = [value[k] + dr.zeros(mi.Float, part.stop - part.start) for k in range(4)]
             dr.eval(columns)
             for k, column in enumerate(columns):
-                found[part, k] = np.array(column)
-        return found
+                values[part, k] = np.array(column)
+        return values
 
     def sees(
         self, points: NDArray[np.float64], t_us: NDArray[np.float64], origin: NDArray[np.float64]

@@ -33,7 +33,7 @@ class LightLevels:
 def light_levels(scene: Scene, t_us: ArrayLike) -> list[LightLevels]:
     """Levels of all lights of a scene at given times, µs."""
     times = np.asarray(t_us, dtype=np.float64)
-    found = []
+    levels = []
     for number, light in enumerate(scene.spec.lights):
         if light.type == "none":
             continue
@@ -41,14 +41,14 @@ def light_levels(scene: Scene, t_us: ArrayLike) -> list[LightLevels]:
         lux = light.illuminance_lux
         mean, unit = (lux, "lx") if lux is not None else (float(light.irradiance_w_m2 or 0.0), "W m^-2")
         power = _power(None if light.waveform is None else light.waveform.load(), times)
-        found.append(LightLevels(name, unit, float(mean), mean * power))
+        levels.append(LightLevels(name, unit, float(mean), mean * power))
     for name, lamp in scene.spec.named_lamps:
         power = _power(None if lamp.waveform is None else lamp.waveform.load(), times)
-        found.append(LightLevels(name, "cd m^-2", lamp.luminance_cd_m2, lamp.luminance_cd_m2 * power))
+        levels.append(LightLevels(name, "cd m^-2", lamp.luminance_cd_m2, lamp.luminance_cd_m2 * power))
     if scene.spec.mitsuba is not None:
         for name, spec in scene.spec.mitsuba.waveforms.items():
-            found.append(LightLevels(name, "1", 1.0, _power(spec.load(), times)))
-    return found
+            levels.append(LightLevels(name, "1", 1.0, _power(spec.load(), times)))
+    return levels
 
 
 def _power(waveform: Waveform | None, t_us: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -127,11 +127,11 @@ def motion_look(scene: Scene, sensor: Sensor, t_us: float, duration_us: int) -> 
     moves = length >= _MOVES_PX
     fastest = np.nan_to_num(steps).max(axis=1) / (times[1] * S_PER_US)
     spec = rays.sensor.spec.evs
-    found = None
+    event_density = None
     if spec is not None:
         fast = float(np.quantile(fastest[moves], _FAST)) if moves.any() else 0.0
-        found = _events(rays, spec, duration_us, fast)
-    return MotionLook(picture, stride, times, paths[moves, :-2], speed, float(moves.mean()), found)
+        event_density = _events(rays, spec, duration_us, fast)
+    return MotionLook(picture, stride, times, paths[moves, :-2], speed, float(moves.mean()), event_density)
 
 
 def _follow(

@@ -72,10 +72,10 @@ class Names:
 
 def _table(numbers: dict[int, int]) -> NDArray[np.uint16]:
     """Numbers by Dr.Jit's number, with a last entry of 0 for all that are not known."""
-    found = np.zeros(max(numbers) + 2, np.uint16)
+    table = np.zeros(max(numbers) + 2, np.uint16)
     for key, value in numbers.items():
-        found[key] = value
-    return found
+        table[key] = value
+    return table
 
 
 def _material_name(own: str, shape: str) -> str:

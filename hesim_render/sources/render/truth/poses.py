@@ -65,8 +65,8 @@ def camera_model(rays: ChiefRays, raster: Raster) -> CameraModel:
             [0.0, 0.0, 1.0],
         ]
     )
-    told = rays.sensor.optics.distortion
-    model, coefficients = ("none", ()) if told is None else (told.model, told.coefficients)
+    distortion = rays.sensor.optics.distortion
+    model, coefficients = ("none", ()) if distortion is None else (distortion.model, distortion.coefficients)
     return CameraModel(k, width, height, model, coefficients, raster.is_even)
 
 

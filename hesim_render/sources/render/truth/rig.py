@@ -71,7 +71,7 @@ def rig_scenes(
     # focused at d, the image distance is f (1 + |m|) with |m| = f/(d − f)
     m = lens.magnification
     focus_m = lens.focal_length_mm * (1 + 1 / m) / MM_PER_M if m > 0 else None
-    found = {}
+    scenes = {}
     for name, given in poses.items():
         pose = np.asarray(given, dtype=np.float64)
         if pose.shape != (4, 4) or np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > _RIGID or (
@@ -88,8 +88,8 @@ def rig_scenes(
             f_number=lens.f_number,
             focus_distance_m=away,
         )
-        found[name] = Scene(scene.spec.model_copy(update={"name": f"{scene.name}-{name}", "camera": camera}))
-    return found
+        scenes[name] = Scene(scene.spec.model_copy(update={"name": f"{scene.name}-{name}", "camera": camera}))
+    return scenes
 
 
 def _vector(values: np.ndarray) -> tuple[float, float, float]:

@@ -179,9 +179,9 @@ class SceneTruth:
         -------
         Three uint16 [row, col].
         """
-        found, names = self.surfaces(when, grid), self.names
-        instance = names.instance(found.shape)
-        return Ids(names.object_of[instance], instance, names.material(found.material))
+        surfaces, names = self.surfaces(when, grid), self.names
+        instance = names.instance(surfaces.shape)
+        return Ids(names.object_of[instance], instance, names.material(surfaces.material))
 
     def objects_at(self, t_us: ArrayLike, x: ArrayLike, y: ArrayLike) -> NDArray[np.uint16]:
         """Numbers of the objects that event pixels show, each at a time of its own.
@@ -197,13 +197,13 @@ class SceneTruth:
         """
         raster, times = self.raster("events"), np.asarray(t_us, np.float64)
         place = np.asarray(y, np.intp), np.asarray(x, np.intp)
-        found = np.empty(times.size, np.uint16)
+        objects = np.empty(times.size, np.uint16)
         for first in range(0, times.size, BAND):
             part = slice(first, first + BAND)
             here = place[0][part], place[1][part]
             placed = Placed(raster.col[here].astype(np.float64), raster.row[here].astype(np.float64), times[part])
-            found[part] = self.names.object_of[self.names.instance(self._rays.trace(placed).shape)]
-        return found
+            objects[part] = self.names.object_of[self.names.instance(self._rays.trace(placed).shape)]
+        return objects
 
     def mixed(self, when: Any, grid: Grid = "mosaic") -> NDArray[np.bool_]:
         """Pixels whose footprint shows more than one surface, or an edge of one.

@@ -69,16 +69,16 @@ class Surfaces:
     def position(self, rays: ChiefRays, raster: Raster) -> NDArray[np.float32]:
         """World position of the surface, [row, col, 3], m; NaN where there is none."""
         table, row, col = PoseTable(rays, self.times_us), raster.row.ravel(), raster.col.ravel()
-        distance, found = self.distance_m.ravel(), np.empty((row.size, 3), np.float32)
+        distance, position = self.distance_m.ravel(), np.empty((row.size, 3), np.float32)
 
         def place(part: slice) -> None:
             camera = table.camera[table.index(row[part] - raster.first[1])]
             points = self.points(col[part], row[part], distance[part], camera)
             points[points[:, 3] == 0] = np.nan
-            found[part] = points[:, :3]
+            position[part] = points[:, :3]
 
         in_bands(row.size, place, BAND)
-        return found.reshape(*raster.shape, 3)
+        return position.reshape(*raster.shape, 3)
 
 
 def _placed(raster: Raster, times_us: NDArray[np.float64]) -> Placed:

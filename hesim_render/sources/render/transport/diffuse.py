@@ -1,17 +1,17 @@
-"""Direct light on matt surfaces: colour, closed-form irradiance and visibility are computed separately.
+"""Direct light on diffuse surfaces: colour, closed-form irradiance and visibility are computed separately.
 
-Light k gives a matt surface of reflectance ρ the irradiance S_k(λ)·e_k(x, n). S_k is the irradiance on the light's own
-plane, e_k depends on geometry alone. A pixel of response R(λ) then receives
+Light k gives a diffuse surface of reflectance ρ the irradiance S_k(λ)·e_k(x, n). S_k is the irradiance on the light's
+own plane, e_k depends on geometry alone. A pixel of response R(λ) then receives
 
     Φ = Σ_k C[k, ρ, R] · e_k(x, n) · V_k(x),     C[k, ρ, R] = ∫ R(λ) ρ(λ)/π S_k(λ) dλ
 
 with V_k the visible share of the light. The spectral integrals are exact (spectra are linear between their samples) and
 tabulated, e_k is a closed form, and rays estimate the visibility alone. A point drawn on the light contributes r to the
-irradiance (E[r] = e_k) and is visible or not (v = 1 or 0). This gives two unbiased estimators of e_k·V_k; `lit` uses
-e_k as a control variate:
+irradiance (E[r] = e_k) and is visible or not (v = 1 or 0). This gives two unbiased estimators of e_k·V_k, of which
+one uses e_k as a control variate:
 
-    lit     e_k − (1 − v)·r     no noise where the whole light is visible, or `outlines` hide the sky
-    hidden  v·r                 no noise where the whole light is hidden
+    controlled  e_k − (1 − v)·r     no noise where the whole light is visible, or `outlines` occlude the sky
+    plain       v·r                 no noise where the whole light is occluded
 
 Each pair of a pixel and a window uses the estimator that its pilot pass found less noisy.
 
@@ -42,7 +42,7 @@ from hesim_render.sources.render.scene import lights
 from hesim_render.sources.render.scene.paint import Paint
 from hesim_render.sources.render.transport.irradiance import RectangleLight
 from hesim_render.sources.render.transport.moving_scene import MovingScene
-from hesim_render.sources.render.transport.outlines import HiddenSky
+from hesim_render.sources.render.transport.outlines import OccludedSky
 from hesim_render.sources.render.transport.swept_boxes import Moment
 from hesim_render.specs.light import LightSpec, irradiance
 from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product, summed
@@ -52,8 +52,8 @@ from hesim_render.spectral.spectrum import Spectrum, constant, integrate_product
 _ROW = 8
 
 
-class MattIntegrator:
-    """Flux of direct light through a `MovingScene` of matt shapes; the module docstring has the method.
+class DiffuseIntegrator:
+    """Flux of direct light through a `MovingScene` of diffuse shapes; the module docstring has the method.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class MattIntegrator:
             irradiances.append(sky)
             strengths.append(sky.scaled(1 / pi))
         self._has_sky = bool(skies)
-        self._outlines = HiddenSky(scene) if skies else None
+        self._outlines = OccludedSky(scene) if skies else None
         black = constant(0.0)
         colours: list[Spectrum] = [black]
         rows: dict[str, list[float]] = {}
@@ -159,7 +159,7 @@ class MattIntegrator:
 
         Returns
         -------
-        lit, hidden : Float, both estimates of the flux, e⁻/s.
+        controlled, plain : Float, both estimates of the flux, e⁻/s.
         unshadowed : Float, the flux if nothing hid any light, e⁻/s.
         met : Bool, True where the path came through the box of a moving object.
         """
@@ -190,7 +190,7 @@ class MattIntegrator:
         painted = hit & (lamp == 0) & (front | (both > 0))
         normal = mi.Vector3f(surface.shading_normal)
         normal = dr.select(front, normal, -normal)
-        lit, hidden, unshadowed = seen, seen, seen
+        controlled, plain, unshadowed = seen, seen, seen
         for number, light in enumerate(self._lights):
             open_, share, shadow = light.seen_from(surface.world, normal, sampler)
             asks = painted & (open_ > 0)
@@ -207,10 +207,10 @@ class MattIntegrator:
                 # a share of the sky that is known to be hidden, and whether it hides this ray
                 part, hides = self._outlines.hides(surface.world.p, normal, shadow.d, moment)
                 known = open_ - part + hides
-            lit = dr.fma(scale, dr.select(blocked, known - share, known), lit)
-            hidden = dr.fma(scale, dr.select(blocked, 0.0, share), hidden)
+            controlled = dr.fma(scale, dr.select(blocked, known - share, known), controlled)
+            plain = dr.fma(scale, dr.select(blocked, 0.0, share), plain)
             unshadowed = dr.fma(scale, open_, unshadowed)
-        return lit, hidden, unshadowed, met
+        return controlled, plain, unshadowed, met
 
 
 class _Lamp:

@@ -1,4 +1,4 @@
-"""Direct light on matt surfaces: closed forms against quadrature, and both estimates against each other and Mitsuba."""
+"""Direct light on diffuse surfaces: closed forms against quadrature, both estimates against each other and Mitsuba."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ def test_flux_is_that_of_mitsubas_paths(name):
     scene = make_scene(objects=SHAPES, light=LIGHTS[name], camera=CAMERA)
     sensor = mono(48, 36)
     tracer = pair_tracer(scene, sensor)
-    assert tracer.is_matt
+    assert tracer.is_diffuse
 
     def groups(half_a, half_b):
         a, b = (np.array(half, np.float64).reshape(6, 6, 6, 8).mean(axis=(1, 3)) for half in (half_a, half_b))
@@ -95,8 +95,8 @@ def test_flux_is_that_of_mitsubas_paths(name):
 
     a, b, _ = flux_image(scene, sensor, 1024, begin_us=0.0, end_us=0.0)
     wanted, their_square = groups(a, b)
-    for lit in (True, False):
-        told = traced(tracer, 1024, 0.0, 0.0, lit)
+    for controlled in (True, False):
+        told = traced(tracer, 1024, 0.0, 0.0, controlled)
         found, square = groups(told.half_a, told.half_b)
         spread = np.sqrt(np.mean(square + their_square))
         assert spread < 0.01 * wanted.mean()
@@ -108,13 +108,13 @@ def test_what_nothing_shades_is_exact():
     """A bare wall: parallel light has no noise at all; of a lamp there is what it changes across a pixel."""
     wall = {key: value for key, value in SHAPES[0].items() if not key.startswith("pattern")}
 
-    def seen(light, rays, lit, seed=1):
+    def seen(light, rays, controlled, seed=1):
         tracer = pair_tracer(make_scene(objects=[wall], light=light, camera=CAMERA), mono(32, 24), seed)
-        return traced(tracer, rays, 0.0, 0.0, lit=lit).mean
+        return traced(tracer, rays, 0.0, 0.0, controlled=controlled).mean
 
     np.testing.assert_allclose(seen(LIGHTS["sun"], 8, True), seen(LIGHTS["sun"], 4096, True, seed=2), rtol=1e-6)
     many = seen(LAMP, 4096, True)
-    off = [np.sqrt(np.mean((seen(LAMP, 64, lit) / many - 1) ** 2)) for lit in (True, False)]
+    off = [np.sqrt(np.mean((seen(LAMP, 64, controlled) / many - 1) ** 2)) for controlled in (True, False)]
     assert off[0] < 1e-3 and off[1] > 3 * off[0]
 
 
@@ -122,5 +122,5 @@ def test_flux_is_never_negative():
     """At the dark side of a penumbra the lit estimate is a difference of two nearly equal numbers."""
     scene = make_scene(objects=SHAPES, light=LIGHTS["near lamp seen in the picture"], camera=CAMERA)
     for seed in range(3):
-        told = traced(pair_tracer(scene, mono(48, 36), seed), 8, 0.0, 0.0, lit=True)
+        told = traced(pair_tracer(scene, mono(48, 36), seed), 8, 0.0, 0.0, controlled=True)
         assert told.mean.min() >= 0 and min(told.half_a.min(), told.half_b.min()) < 0
