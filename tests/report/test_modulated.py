@@ -5,7 +5,8 @@ import pytest
 import yaml
 
 from hesim_render.core.errors import SpecError
-from hesim_render.report import figures
+from hesim_render.pixels.evs.events import EVENT_DTYPE
+from hesim_render.report import figures, modulated
 from hesim_render.report.bench import EventBench
 from hesim_render.report.modulated import bandwidth, count_thresholds
 from hesim_render.report.steady import Background, doubling
@@ -115,9 +116,22 @@ def test_what_counts_do_not_tell(tmp_path):
     assert "two swings that give 3 events a cycle" in count_thresholds(near, EVERY, 0.0)[0]["reason"]
     small = slow_bench(tmp_path / "small", own, rng, swings=(0.5, 1.5), hz=40.0)
     assert count_thresholds(small, EVERY, 0.0)[2] is None
-    right = slow_bench(tmp_path / "right", own, rng, hz=40.0)
+    right = slow_bench(tmp_path / "right", own, rng, hz=40.0, swings=(1.15, 1.3, 2.3))  # the outer two are taken
     assert "swallows more than a tenth" in count_thresholds(right, EVERY, 9000.0)[1]["reason"]
     assert count_thresholds(right, EVERY, 0.0)[1]["value"] > 0
+
+
+def test_one_cycle_after_the_first_two_is_enough(tmp_path):
+    """Of 322 pixels 161 answer the third cycle of 10 ms, which is the last."""
+    events = np.zeros(161, EVENT_DTYPE)
+    events["t_us"], events["polarity"] = 25_000, 1
+    events["x"], events["y"] = np.arange(161) % COLS, np.arange(161) // COLS
+    about = {"file": "a.npz", "lux": 1.0, "hz": 100.0, "depth": 0.3, "interval_us": [0, 30_000]}
+    bench = written(tmp_path / "a", [about], {"a.npz": events})
+    assert modulated._answered(bench, bench.spec.modulation[0], EVERY)[0] == 0.5
+    about["interval_us"] = [0, 29_000]
+    bench = written(tmp_path / "b", [about], {"a.npz": events})
+    assert np.isnan(modulated._answered(bench, bench.spec.modulation[0], EVERY)).all()
 
 
 def test_steps_without_a_reset_use_the_thresholds_by_counts(tmp_path):
