@@ -201,7 +201,12 @@ def test_dynamic_range_in_closed_form():
     errors = [found.least_lux["standard_error"] / least, found.most_lux["standard_error"] / most]
     assert found.range_db["standard_error"] == pytest.approx(20 / np.log(10) * np.hypot(*errors))
     low = dynamic_range([answers_at(*one) for one in zip(lux[2:], share[2:], strict=True)], chance[2:].tolist())
-    assert low.least_lux["reason"].startswith("at most 3 lx") and "from 3 to" in low.range_db["reason"]
+    assert low.least_lux["reason"].startswith("at most 3 lx")
+    decibels = 20 * np.log10(most / 3)
+    assert low.range_db["reason"].startswith(f"at least {decibels:.4g} dB, from 3 to {figure(most, 3)} lx")
+    high = dynamic_range([answers_at(*one) for one in zip(lux[:5], share[:5], strict=True)], chance[:5].tolist())
+    decibels = 20 * np.log10(2e4 / least)
+    assert high.range_db["reason"].startswith(f"at least {decibels:.4g} dB, from {figure(least, 3)} to 20000 lx")
     none = dynamic_range([answers_at(1.0, 0.5), answers_at(9.0, 0.7)], [0.0, 0.0])
     assert none.range_db["reason"] == "at no light are 90 % found; at most 70 %"
 

@@ -31,6 +31,7 @@ class Pixels:
 
     def __init__(self, seed):
         rng = self.rng = np.random.default_rng(seed)
+        self.slow_rng = np.random.default_rng((seed, 1))
         theta = rng.uniform(0.12, 0.3)
         self.theta = np.array([theta, theta * rng.uniform(0.9, 1.1)])
         self.spread, self.noise = rng.uniform(0.06, 0.15), rng.uniform(0.05, 0.12) * theta
@@ -156,7 +157,7 @@ class Pixels:
             log_light = np.log1p(np.tanh(swing / 2) * np.sin(2e-6 * np.pi * 5.0 * t_us))
             name = f"slow{k}.npz"
             self.files[name] = events_of(
-                log_light, 400, self.own, noise=self.noise, background_hz=1.0, cols=SHAPE[1], rng=self.rng
+                log_light, 400, self.own, noise=self.noise, background_hz=1.0, cols=SHAPE[1], rng=self.slow_rng
             )
             self.files[name] = self.files[name][~np.isin(_pixel(self.files[name]), self.dead)]
             self.content["modulation"].append({
