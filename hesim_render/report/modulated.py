@@ -19,8 +19,9 @@ from hesim_render.specs.event_bench import Modulation
 
 #: Cycles of a modulation before those that are counted.
 _WARM_CYCLES = 2
-#: Events in a cycle from which they are counted, and largest ratio of the smaller to the larger of two swings.
-_LEAST_EVENTS, _SWINGS_APART = 3.0, 0.8
+#: Events in a cycle from which they are counted: with fewer, equal thresholds round the counts of all pixels alike.
+#: Largest ratio of the smaller to the larger of two swings.
+_LEAST_EVENTS, _SWINGS_APART = 6.0, 0.8
 #: Largest part of the events that a dead time may swallow.
 _MOST_SWALLOWED = 0.1
 _SWALLOWED = "the dead time swallows more than a tenth of the events: take a lower frequency"

@@ -150,7 +150,8 @@ def design_verdict(verdict: Mapping[str, Any]) -> list[str]:
     low, high = verdict["cost_difference_low"], verdict["cost_difference_high"]
     costs = f"{verdict['cost']:.4g} and {verdict['cost_against']:.4g}, difference {low:.3g} to {high:.3g}"
     word = "has a lower cost than" if high < 0 else "has a higher cost than" if low > 0 else "is as good as"
-    better, worse = [], []
+    better: list[str] = []
+    worse: list[str] = []
     for start, title in DESIGN_RATIOS.items():
         for key, value in verdict.items():
             if key.startswith(start) and abs(value - 1) > _EQUAL:

@@ -79,7 +79,7 @@ def test_continuous_modulation_does_not_and_says_so(tmp_path):
     assert any(one.startswith("bandwidth: the dead time of 28") and "860 Hz" in one for one in found.findings)
 
 
-def slow_bench(folder, own, rng, *, swings=(1.15, 2.3), hz=9.0, dead_us=0.0, **content):
+def slow_bench(folder, own, rng, *, swings=(1.6, 3.2), hz=7.0, dead_us=0.0, **content):
     modulation, files = [], {}
     for k, swing in enumerate(swings):
         depth = float(np.tanh(swing / 2))
@@ -112,11 +112,11 @@ def test_thresholds_by_counts_need_no_reset(tmp_path, dead_us):
 def test_what_counts_do_not_tell(tmp_path):
     rng = np.random.default_rng(22)
     own = np.full((2, PIXELS), 0.2)
-    near = slow_bench(tmp_path / "near", own, rng, swings=(1.15, 1.3), hz=40.0)
-    assert "two swings that give 3 events a cycle" in count_thresholds(near, EVERY, 0.0)[0]["reason"]
-    small = slow_bench(tmp_path / "small", own, rng, swings=(0.5, 1.5), hz=40.0)
+    near = slow_bench(tmp_path / "near", own, rng, swings=(1.6, 1.8), hz=40.0)
+    assert "two swings that give 6 events a cycle" in count_thresholds(near, EVERY, 0.0)[0]["reason"]
+    small = slow_bench(tmp_path / "small", own, rng, swings=(0.9, 2.5), hz=40.0)
     assert count_thresholds(small, EVERY, 0.0)[2] is None
-    right = slow_bench(tmp_path / "right", own, rng, hz=40.0, swings=(1.15, 1.3, 2.3))  # the outer two are taken
+    right = slow_bench(tmp_path / "right", own, rng, hz=40.0, swings=(1.6, 1.8, 3.2))  # the outer two are taken
     assert "swallows more than a tenth" in count_thresholds(right, EVERY, 9000.0)[1]["reason"]
     assert count_thresholds(right, EVERY, 0.0)[1]["value"] > 0
 

@@ -152,7 +152,7 @@ class Pixels:
 
     def counts(self):
         """Two large swings of slow light, which no reset precedes."""
-        for k, swing in enumerate(self.theta.mean() * np.array([5.0, 10.0])):
+        for k, swing in enumerate(self.theta.mean() * np.array([8.0, 15.0])):
             t_us = np.arange(0, 1_200_000, 400) + 200
             log_light = np.log1p(np.tanh(swing / 2) * np.sin(2e-6 * np.pi * 5.0 * t_us))
             name = f"slow{k}.npz"
