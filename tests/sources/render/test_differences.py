@@ -88,6 +88,20 @@ def test_a_change_beside_a_pixel_may_reach_into_it(sign):
     assert lamp[CENTRE + 2] == 512  # at most
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_if_the_camera_moves_an_edge_beside_a_pixel_may_reach_into_it(sign):
+    """The level beside differs, though no ray saw a change: (0.95/ε)²·contrast²/32, and nothing bounds it."""
+    flux = np.full((1, 121), 9000.0, np.float32)
+    flux[0, CENTRE] += sign * 3000
+    still = replace(pilot_of(1), plain=flux)
+    assert np.all(rays_of(still, controlled=False)[0] == 64)
+    rays, _ = rays_of(replace(still, all_move=True), controlled=False)
+    expected = (0.95 * 3000 / WANTED) ** 2 / 32
+    assert expected > 512 and rays[CENTRE] == pytest.approx(expected, rel=1e-4)
+    assert rays[CENTRE + 12] == rays[CENTRE] and rays[CENTRE + 2] == 64
+    assert np.all(rays_of(replace(still, all_move=True))[0] == 64)  # the other estimator sees no edge
+
+
 def chosen(pilot, alone, rendered=None):
     shape = pilot.controlled.shape
     rendered = np.ones(shape, bool) if rendered is None else rendered

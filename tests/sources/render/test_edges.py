@@ -119,7 +119,7 @@ def edges():
     begin = np.array([1300.0, 21_000.0])
     windows = Windows(begin, begin + 7)
     controlled = np.ones(pixel.size, np.bool_)
-    busy = tracer.edges(pixel, window, windows, 64, 1.5, controlled)
+    busy = tracer.edges(pixel, window, windows, 64, 1.5, controlled, np.zeros(pixel.size, np.float32))
     here = np.flatnonzero(busy.high > 1.02 * busy.low)
     pairs, controlled = (pixel[here], window[here], windows), controlled[here]
     traced = [tracer.trace(*pairs, np.full(here.size, 4096), controlled, Stream.AUDIT, repeat=k).mean for k in range(8)]
@@ -155,7 +155,7 @@ def test_few_rays_about_a_line_do_the_work_of_many(edges):
     rays weigh more, so the rms error is below that of 256.
     """
     tracer, pairs, controlled, plain = edges
-    fit = tracer.edges(*pairs, 64, 1.5, controlled)
+    fit = tracer.edges(*pairs, 64, 1.5, controlled, np.zeros(controlled.size, np.float32))
     lines_ = np.flatnonzero(fit.is_edge)
     chosen = pairs[0][lines_], pairs[1][lines_], pairs[2]
     truth, few = plain.mean(axis=0)[lines_], np.full(lines_.size, 64)
@@ -167,10 +167,11 @@ def test_few_rays_about_a_line_do_the_work_of_many(edges):
 
 
 def test_a_line_depends_on_its_pair_alone(edges):
-    tracer, pairs, controlled, _ = edges
-    every = tracer.edges(*pairs, 64, 1.5, controlled)
+    tracer, pairs, controlled, plain = edges
+    little = 0.6 * plain.mean(axis=0).astype(np.float32) / tracer.axis_factor(pairs[0])
+    every = tracer.edges(*pairs, 64, 1.5, controlled, little)
     some = np.arange(5, controlled.size, 7)[::-1]
-    alone = tracer.edges(pairs[0][some], pairs[1][some], pairs[2], 64, 1.5, controlled[some])
+    alone = tracer.edges(pairs[0][some], pairs[1][some], pairs[2], 64, 1.5, controlled[some], little[some])
     for name in vars(every):
         np.testing.assert_array_equal(getattr(alone, name), getattr(every, name)[some])
     models = every.models(np.arange(controlled.size))
@@ -178,6 +179,24 @@ def test_a_line_depends_on_its_pair_alone(edges):
     whole = tracer.trace(*pairs, rays, controlled, edges=models)
     part = tracer.trace(pairs[0][some], pairs[1][some], pairs[2], rays[some], controlled[some], edges=models.part(some))
     np.testing.assert_array_equal(part.half_a, whole.half_a[some])
+
+
+def test_pairs_of_little_contrast_take_half_of_the_decision_rays(edges):
+    """32 rays where these show too little; 64 where they show more, and 128 where there is a line."""
+    tracer, pairs, controlled, _ = edges
+    every = tracer.edges(*pairs, 64, 1.5, controlled, np.zeros(controlled.size, np.float32))
+    assert set(every.rays.tolist()) == {64, 128} and every.is_edge[every.rays == 64].sum() == 0
+    contrast = every.high - every.low
+    least = np.where(np.arange(controlled.size) % 3 == 0, 1.5, 0.2).astype(np.float32) * contrast
+    done = tracer.rays_done
+    some = tracer.edges(*pairs, 64, 1.5, controlled, least)
+    halved = some.rays == 32
+    assert tracer.rays_done - done == some.rays.sum()
+    # the levels of 32 rays differ from those of 128
+    assert halved[::3].mean() > 0.8 and halved[1::3].mean() < 0.2 and halved[2::3].mean() < 0.2
+    assert np.all((some.high - some.low)[halved] < least[halved])
+    for name in vars(every):
+        np.testing.assert_array_equal(getattr(some, name)[~halved], getattr(every, name)[~halved])
 
 
 def test_a_run_takes_lines_where_there_are_some():
@@ -207,8 +226,9 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     tried = []
 
     class Tracer:
-        def edges(self, pixel, window, windows, samples, footprint_px, controlled, stream):
+        def edges(self, pixel, window, windows, samples, footprint_px, controlled, least, stream):
             tried.append((pixel.tolist(), samples, footprint_px, stream))
+            np.testing.assert_allclose(least, 4 * 2.5)  # wanted errors on the axis
             return EdgeFit(*(getattr(fit, name)[pixel] for name in vars(fit)))
 
         def axis_factor(self, pixel):
@@ -218,10 +238,10 @@ def test_rays_follow_from_what_the_decision_rays_saw():
     floor, controlled, wanted = np.array([0, 0, 0, 0, 0, 300, 0, 0]), np.ones(8, bool), np.full(8, 2.0, np.float32)
     given = law, controlled, wanted, floor, Gain(*TUNING.diffuse_gain), TUNING
     rays, edges = about_edges(Tracer(), (pixel, 0 * pixel, None), *given)
-    # 0.4 rays for each wanted error of contrast, 64 at least; an eighth of the law where there is no
-    # contrast, also if rounding makes a line of it; a corner as by the law; the floor;
+    # 0.2 rays for each wanted error of contrast, 64 at least; a sixteenth of the law where there is no
+    # contrast, also if rounding makes a line of it, 32 at least; a corner as by the law; the floor;
     # three levels as by the law; and a pair of few rays is not looked at
-    assert rays.tolist() == [64, 512, 256, 64, 1024, 512, 1024, 128]
+    assert rays.tolist() == [64, 256, 128, 32, 1024, 512, 1024, 128]
     assert edges.is_there.tolist() == [True, True, False, False, False, True, False, False]
     assert tried == [(list(range(7)), 64, 1.5, Stream.RENDER_EDGE)]
     np.testing.assert_allclose(edges.half_width[:2], [0.009, 0.014], rtol=1e-5)

@@ -85,8 +85,8 @@ class Tuning:
         interpolated from there carry its error.
     edge_least_rays : rays, C. Pairs that the law gives at least as many rays get decision rays for a line. Without
         (0): decision rays of cheap pairs cost more than they save.
-    edge_rays : rays, F. Decision rays of a pair; half as many where they show little contrast. Half as many: the strip about a line is wider. Larger: they cost more
-        than they save.
+    edge_rays : rays, F. Decision rays of a pair; half of them where these show little contrast. Half as many: the
+        strip about a line is wider. Larger: they cost more than they save.
     edge_footprint_px : px, F. Width of the area in which the first half of the decision rays start. Without (1): a
         line that only just enters a pixel, or passes beside it, is not seen.
     edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
@@ -159,7 +159,7 @@ class Tuning:
     unseen_change: float = 0.5
     audit_pilot_rays: int = 64
     least_audit_rays: int = 64
-    audit_ray_weight: float = 0.4
+    audit_ray_weight: float = 0.8
     edge_least_audit_rays: int = 1024
     most_audit_times: int = 8
 
