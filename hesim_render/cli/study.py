@@ -131,6 +131,7 @@ def _text(value: object) -> str:
 def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwrite: bool) -> None:
     from hesim_render.specs.design import read_design
     from hesim_render.studies.design_run import MARKER, design
+    from hesim_render.studies.verdict import design_verdict
 
     chosen = read_design(spec, keys)
     check_target(out, MARKER, overwrite)
@@ -141,18 +142,7 @@ def _design(console: Console, spec: str, out: Path, keys: dict[str, Any], overwr
         f"cost of {len(costs)} starts: " + ", ".join(f"{before:.3g} -> {after:.3g}" for before, after in costs)
     )
     for verdict in result.verdicts:
-        aware, free = (
-            ", ".join(
-                f"{value:.3f} at {key.split('_')[-2]} lx" for key, value in verdict.items() if key.startswith(start)
-            )
-            for start in ("ysnr_noise_aware_ratio", "ysnr_ratio")
-        )
-        console.text(
-            f"against {verdict['against']}: cost {verdict['cost']:.3f} in place of {verdict['cost_against']:.3f} "
-            f"(difference {verdict['cost_difference_low']:.3f} to {verdict['cost_difference_high']:.3f}), noise-aware "
-            f"YSNR times {aware}; noise-free: mean ΔE2000 {verdict['delta_e_mean']:.3f} in place of "
-            f"{verdict['delta_e_mean_against']:.3f}, YSNR with the matrix of colour times {free}"
-        )
+        console.text(" ".join(design_verdict(verdict)))
     console.result(
         f"sensor file: {out / 'sensor.yaml'}; report: {out / 'report.html'}",
         {"sensor": out / "sensor.yaml", "report": out / "report.html", "costs": costs, "verdicts": result.verdicts},

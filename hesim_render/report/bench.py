@@ -30,7 +30,7 @@ class Responses:
     steps : the recording.
     rises : [jump], True where the light rises.
     latency_us : [jump, pixel], time from the jump to the first event of its polarity, µs; 0 where there is none.
-    window_us : time in which an answer counts: until the next jump.
+    window_us : time in which an answer counts.
     """
 
     steps: LightSteps
@@ -127,6 +127,8 @@ class EventBench:
         stream = self.stream(steps.file)
         jumps_us, rises = self._jumps(steps, stream)
         window_us = int(np.diff(jumps_us).min())
+        if steps.window_us is not None:
+            window_us = min(window_us, steps.window_us)
         require_memory(_BYTES_PER_RESPONSE * rises.size * self.pixels, f"{rises.size} jumps", self.path(steps.file))
         outcome = np.zeros((rises.size, self.pixels), np.int32)
         for events in stream:

@@ -44,6 +44,12 @@ EVENTS: dict[str, Definition] = {
         "Smallest relative change of the light that an average pixel answers in half of the cases.",
         "C₊ = e^θ₊ − 1, C₋ = 1 − e^−θ₋", "from the threshold",
     ),
+    "threshold_by_counts": Definition(
+        "threshold θ by counts",
+        "Swing of the logarithm of slow light that adds one event of an average pixel to each cycle.",
+        "(A₂ − A₁)/(n₂ − n₁), n with the events that the dead time T swallows, 2π²·f·T·(1/√(1 − d²) − 1)/θ²",
+        "continuous modulation of one low frequency with two large swings; it takes no reset of the pixels",
+    ),
     "latency": Definition(
         "latency",
         "Median time from a jump of the light to the first event of its polarity, over answered jumps of all pixels.",
@@ -80,10 +86,11 @@ EVENTS: dict[str, Definition] = {
     ),
     "bandwidth": Definition(
         "bandwidth",
-        "Frequency above which the swing of modulated light that is answered with an ON event in half of the cycles "
-        "exceeds √2 times that at the lowest frequency.",
-        "A₅₀(f) = √2·A₅₀(f_min), A = ln(L_max/L_min)",
-        "light modulated at several frequencies and depths; linear in ln f and ln A",
+        "Frequency above which the swing of modulated light that is answered in half of the cycles or bursts exceeds "
+        "√2 times that at the lowest frequency.",
+        "A₅₀(f) = √2·A₅₀(f_min), A = ln(L_max/L_min); linear in ln f and ln A",
+        "light modulated at several frequencies and depths: always (an answer is an ON event in a cycle), or in bursts "
+        "with pauses longer than the dead time (any event in a burst)",
     ),
     "dead_time": Definition(
         "dead time",

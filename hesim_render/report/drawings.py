@@ -146,10 +146,15 @@ def _background(axes: Axes, figures: EventFigures) -> None:
 def _band(axes: Axes, figures: EventFigures) -> None:
     band = figures.band
     assert band is not None
-    axes.set(title="Swing for half of the cycles", xlabel="frequency, Hz", ylabel="ln L_max/L_min")
+    name = "bursts" if band.in_bursts else "cycles"
+    axes.set(
+        title=f"Swing for half of the {name}",
+        xlabel="frequency, Hz",
+        ylabel="ln L_max/L_min",
+    )
     there = np.isfinite(band.swing)
     if there.any():
-        axes.plot(band.hz[there], band.swing[there], color=_ON_OFF[0], marker="o", markersize=3.6, label="ON")
+        axes.plot(band.hz[there], band.swing[there], color=_ON_OFF[0], marker="o", markersize=3.6)
         axes.axhline(np.sqrt(2) * band.swing[there][0], color=COLOURS[6], linewidth=0.8, linestyle="--")
     if band.entry["value"] is not None:
         axes.axvline(band.entry["value"], color=COLOURS[6], linewidth=0.8, linestyle=":")

@@ -98,3 +98,9 @@ def log_estimated(log: float, error: float, unit: str) -> dict[str, Any]:
     value = float(np.exp(log))
     low, high = float(np.exp(log - Z_95 * error)), float(np.exp(log + Z_95 * error))
     return estimated(value, value * error, unit) | {"interval_95": [low, high]}
+
+
+def figure(value: float, digits: int = 4) -> str:
+    """A number with few digits, without an exponent up to 10 million."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from hesim_render.calibrate.estimate import not_identifiable
 from hesim_render.calibrate.recordings import still
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
+from hesim_render.core.units import S_PER_US
 from hesim_render.report.bench import EventBench, Responses
 from hesim_render.report.latency import Answers, answers
-from hesim_render.report.limits import Bandwidth, DynamicRange, bandwidth, dynamic_range, false_share
+from hesim_render.report.limits import DynamicRange, dynamic_range, false_share
+from hesim_render.report.modulated import Bandwidth, bandwidth, count_thresholds
 from hesim_render.report.s_curves import SCurve, s_curve
 from hesim_render.report.steady import Background, background, doubling
 from hesim_render.specs.event_bench import Steady
@@ -23,6 +25,8 @@ from hesim_render.specs.event_bench import Steady
 _SAME_SIZE = 0.07
 #: Lights whose ratio is no larger are the same.
 _SAME_LIGHT = 1.3
+#: Part of a cycle up to which a dead time is short.
+_SHORT_DEAD_TIME = 0.1
 #: Contrasts from which recordings of one light are an S-curve.
 _LEAST_CONTRASTS = 4
 POLARITIES = ("ON", "OFF")
@@ -103,28 +107,57 @@ def event_figures(bench: EventBench, progress: Callable[[str, float], None] | No
         _add_curves(figures, pair, light)
     stated("latency", 0.5)
     _add_latencies(figures, good)
-    stated("dynamic range", 0.6)
-    _add_ranges(figures, good)
-    stated("background", 0.7)
+    stated("short intervals", 0.6)
+    dead_us = _add_times(figures)
+    stated("dynamic range", 0.7)
+    not_reset = any(not one.reset for one in bench.spec.steps) and not _has_ticks(bench)
+    _add_ranges(figures, good, _add_count_thresholds(figures, good, dead_us, not_reset))
+    stated("background", 0.8)
     _add_background(figures)
-    stated("bandwidth", 0.8)
-    figures.band = bandwidth(bench, good)
-    if figures.band is None:
-        entry, lux = not_identifiable("no recordings of modulated light"), None
-    else:
-        entry, lux = figures.band.entry, figures.band.lux
-    figures.entries.append(
-        Entry("bandwidth", "ON", entry, lux, None, bench.spec.temperature_c, int(np.count_nonzero(good)))
-    )
-    stated("short intervals", 0.9)
-    _add_times(figures)
+    stated("bandwidth", 0.9)
+    _add_bandwidth(figures, good, dead_us)
     _add_defects(figures, hot, dead)
-    if any(not one.reset for one in bench.spec.steps) and not _has_ticks(bench):
+    if not_reset:
         figures.findings.append(
             "not all pixels were reset right before each jump: a pixel compares with the level of its last event, up "
-            "to a threshold away, which widens S-curves and latencies"
+            "to a threshold away, which widens S-curves and latencies; thresholds by counts do not have this error"
         )
     return figures
+
+
+def _add_count_thresholds(
+    figures: EventFigures, good: NDArray[np.bool_], dead_us: float | None, not_reset: bool
+) -> tuple[float, float] | None:
+    """Thresholds from counts; they are returned where those of the S-curves are not to be trusted."""
+    *entries, lux = count_thresholds(figures.bench, good, dead_us or 0.0)
+    if lux is None and not not_reset:
+        return None
+    for name, entry in zip(POLARITIES, entries, strict=True):
+        figures.entries.append(
+            Entry("threshold_by_counts", name, entry, lux, None, figures.bench.spec.temperature_c, _number(good))
+        )
+    on, off = (entry["value"] for entry in entries)
+    return (on, off) if not_reset and on is not None and off is not None else None
+
+
+def _add_bandwidth(figures: EventFigures, good: NDArray[np.bool_], dead_us: float | None) -> None:
+    band = figures.band = bandwidth(figures.bench, good)
+    celsius = figures.bench.spec.temperature_c
+    if band is None:
+        nothing = not_identifiable("no recordings of modulated light")
+        figures.entries.append(Entry("bandwidth", "", nothing, None, None, celsius, _number(good)))
+        return
+    name = "" if band.in_bursts else POLARITIES[0]
+    figures.entries.append(Entry("bandwidth", name, band.entry, band.lux, None, celsius, _number(good)))
+    if not band.in_bursts and dead_us is not None and band.hz.max() * dead_us * S_PER_US > _SHORT_DEAD_TIME:
+        figures.findings.append(
+            f"bandwidth: the dead time of {dead_us:.4g} µs is not short against a cycle of {band.hz.max():.4g} Hz, so "
+            "that a pixel misses parts of the light: modulate in bursts, or set a shorter dead time"
+        )
+
+
+def _number(good: NDArray[np.bool_]) -> int:
+    return int(np.count_nonzero(good))
 
 
 def _hot(bench: EventBench) -> NDArray[np.bool_]:
@@ -194,13 +227,16 @@ def _add_latencies(figures: EventFigures, good: NDArray[np.bool_]) -> None:
                 )
 
 
-def _add_ranges(figures: EventFigures, good: NDArray[np.bool_]) -> None:
+def _add_ranges(figures: EventFigures, good: NDArray[np.bool_], thresholds: tuple[float, float] | None) -> None:
+    """Dynamic range, at twice the thresholds: those of the S-curve, unless others are given."""
     bench = figures.bench
     ranges: list[DynamicRange | None] = []
-    pixels = int(np.count_nonzero(good))
+    pixels = _number(good)
     keys = ("least_light", "most_light", "dynamic_range")
     for polarity, name in enumerate(POLARITIES):
         theta = figures.curves[0][polarity].theta if figures.curves else float("nan")
+        if thresholds is not None:
+            theta = thresholds[polarity]
         if not np.isfinite(theta):
             nothing = not_identifiable("the threshold is not known")
             figures.entries += [Entry(key, name, nothing, None, None, None, pixels) for key in keys]
@@ -244,18 +280,21 @@ def _add_background(figures: EventFigures) -> None:
         if one.finding:
             figures.findings.append(one.finding)
     for polarity, name in enumerate(POLARITIES):
-        value = doubling(figures.backgrounds, polarity)
+        value = doubling(figures.backgrounds, polarity, figures.bench.spec.simulated)
         figures.entries.append(Entry("doubling", name, value, None, None, None, figures.bench.pixels))
 
 
-def _add_times(figures: EventFigures) -> None:
-    """Dead time and read-out limit, from all recordings."""
+def _add_times(figures: EventFigures) -> float | None:
+    """Dead time and read-out limit, from all recordings; returns the dead time, µs."""
     bench = figures.bench
     tallies = [bench.tally(name) for name in bench.names]
     figures.intervals = np.sum([one.intervals for one in tallies], axis=0)
     limit, _ = readout_limit(tallies)
-    for key, value in (("dead_time", dead_time(tallies)), ("readout_limit", limit)):
+    dead = dead_time(tallies)
+    for key, value in (("dead_time", dead), ("readout_limit", limit)):
         figures.entries.append(Entry(key, "", value, None, None, bench.spec.temperature_c, bench.pixels))
+    dead_us: float | None = dead["value"]
+    return dead_us
 
 
 def _add_defects(

@@ -43,6 +43,8 @@ _LONGEST_US = 1_200_000
 #: Swings of modulated light in thresholds, frequencies in corners, cycles, samples of each.
 _SWINGS, _FREQUENCIES = (0.6, 0.85, 1.2, 1.7, 2.4, 3.4), (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)
 _CYCLES, _SAMPLES = 8, 48
+#: Bursts: their number, cycles of each, swings in those of continuous light, since a burst begins in the middle.
+_BURSTS, _BURST_CYCLES, _BURST_SWING = 2, 5, 1.7
 #: Busy light: thresholds of a step, periods.
 _BUSY, _BUSY_PERIODS = 12.0, 10
 #: Rapid light: swing in thresholds, cycles.
@@ -77,15 +79,15 @@ class Instrument:
         self._shape = rows, cols
         self._number = 0
         self._content: dict[str, Any] = {
-            "schema_version": 1, "sensor": sensor.name, "notes": self._notes(), "rows": rows, "cols": cols,
-            "steady": [], "steps": [], "modulation": [], "busy": [],
+            "schema_version": 1, "sensor": sensor.name, "notes": self._notes(), "simulated": True,
+            "rows": rows, "cols": cols, "steady": [], "steps": [], "modulation": [], "busy": [],
         }  # fmt: skip
 
     def _notes(self) -> str:
         notes = f"simulated; even light, {self._light_name()}"
         if self._noise.spec.reference == "previous_sample":
             return notes + "; the light jumps right after a comparison of the pixels, so that a latency is the longest"
-        return notes + "; all pixels are reset before each jump"
+        return notes + "; all pixels are reset before each jump and each burst"
 
     def _light_name(self) -> str:
         sheet = self._noise.spec.data_sheet or self._noise.spec.v2e
@@ -193,22 +195,49 @@ class Instrument:
             return US_PER_S / (evs.tick_us or 1) / 4
         return evs.photoreceptor.cutoff_hz if evs.photoreceptor else (evs.photoreceptor_cutoff_hz or 1.0)
 
-    def _sine(self, hz: float, swing: float, cycles: int) -> tuple[NDArray[np.void], float, int]:
-        """Events of light whose logarithm swings by `swing`; the depth of the modulation, and the end, µs."""
+    def _sine(self, hz: float, swing: float, cycles: int) -> tuple[NDArray[np.void], int]:
+        """Events of light whose logarithm swings by `swing`, and the end, µs."""
         depth = math.tanh(swing / 2)
         time_us = np.unique(np.round(np.arange(cycles * _SAMPLES + 1) * (US_PER_S / hz / _SAMPLES)).astype(int))
         lux = REFERENCE_LUX * (1 + depth * np.sin(2 * np.pi * hz * time_us * S_PER_US))
-        return self._run(zip(time_us.tolist(), lux.tolist(), strict=True)), depth, int(time_us[-1])
+        return self._run(zip(time_us.tolist(), lux.tolist(), strict=True)), int(time_us[-1])
 
     def _modulations(self, theta: float) -> None:
+        """Continuous modulation of pixels with ticks; bursts, each after a reset, of others."""
+        has_ticks = self._noise.spec.reference == "previous_sample"
         for part in _FREQUENCIES:
             hz = float(f"{part * self._corner_hz:.3g}")
-            for swing in _SWINGS:
-                events, depth, end_us = self._sine(hz, swing * theta, _CYCLES)
-                name = self._save(events, f"sine-{hz:g}hz-{swing:g}")
-                self._content["modulation"].append({
-                    "file": name, "lux": REFERENCE_LUX, "hz": hz, "depth": depth, "interval_us": [0, end_us],
-                })  # fmt: skip
+            for number in _SWINGS:
+                swing = number * theta * (1.0 if has_ticks else _BURST_SWING)
+                about: dict[str, Any] = {"lux": REFERENCE_LUX, "hz": hz, "depth": math.tanh(swing / 2)}
+                if has_ticks:
+                    events, end_us = self._sine(hz, swing, _CYCLES)
+                else:
+                    events, end_us, about["bursts"] = self._bursts(hz, swing)
+                name = self._save(events, f"sine-{hz:g}hz-{number:g}")
+                self._content["modulation"].append({"file": name, **about, "interval_us": [0, end_us]})
+
+    def _bursts(self, hz: float, swing: float) -> tuple[NDArray[np.void], int, dict[str, int]]:
+        """Events of bursts of modulated light; the end, µs, and the times of the bursts."""
+        length_us = math.ceil(_BURST_CYCLES * US_PER_S / hz)
+        pause_us = self._half_us(REFERENCE_LUX)
+        after_us = np.unique(np.round(np.linspace(0, length_us, _BURST_CYCLES * _SAMPLES + 1)).astype(int))
+        envelope = np.sin(np.pi * after_us / length_us) ** 2
+        lux = REFERENCE_LUX * np.exp(swing / 2 * envelope * np.sin(2 * np.pi * hz * after_us * S_PER_US))
+        stage, parts = self._stage(), [no_events()]
+        times = {"begin_us": pause_us, "length_us": length_us, "period_us": length_us + pause_us}
+        parts.append(stage.step(self._electrons(REFERENCE_LUX), 0))
+        for k in range(_BURSTS):
+            begin_us = times["begin_us"] + k * times["period_us"]
+            parts.append(stage.step(self._electrons(REFERENCE_LUX), begin_us))
+            stage.compare_with(stage.level)
+            parts += [
+                stage.step(self._electrons(float(light)), begin_us + int(t_us))
+                for t_us, light in zip(after_us[1:], lux[1:], strict=True)
+            ]
+        end_us = times["begin_us"] + _BURSTS * times["period_us"]
+        parts.append(stage.step(self._electrons(REFERENCE_LUX), end_us))
+        return np.concatenate(parts), end_us, times
 
     def _rapid(self, theta: float) -> str:
         """Light that changes by a threshold in a short time, always: the next event comes right after the dead time."""

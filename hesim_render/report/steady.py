@@ -64,10 +64,11 @@ def _rate(entry: dict[str, Any], seconds: float) -> dict[str, Any]:
     return entry | {"interval_95": [max(low, 0.0), high]}
 
 
-def doubling(backgrounds: list[Background], polarity: int) -> dict[str, Any]:
+def doubling(backgrounds: list[Background], polarity: int, simulated: bool) -> dict[str, Any]:
     """Rise of temperature that doubles the background, °C, at the light with the largest range of temperatures.
 
-    A line through the logarithms of the rates, weighted by their errors.
+    A line through the logarithms of the rates, weighted by their errors. Pixels of a `simulated` sensor do not know
+    their temperature.
     """
     best: list[Background] = []
     widest = _SAME_C
@@ -75,6 +76,8 @@ def doubling(backgrounds: list[Background], polarity: int) -> dict[str, Any]:
         here = [one for one in backgrounds if one.lux == lux and one.temperature_c is not None]
         if here and (width := np.ptp([one.temperature_c or 0.0 for one in here])) > widest:
             best, widest = here, float(width)
+    if not best and simulated:
+        return not_identifiable("not modelled: simulated event pixels have no temperature")
     if not best:
         known = sorted({one.temperature_c for one in backgrounds if one.temperature_c is not None})
         stated = f"all recordings are at {known[0]:g} °C" if known else "no temperature is stated"

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from hesim_render.report.definitions import EVENTS, FRAMES, Definition
 from hesim_render.report.emva import FrameFigures
+from hesim_render.report.estimates import figure
 from hesim_render.report.figures import POLARITIES, EventFigures
 from hesim_render.report.limits import DynamicRange
 
@@ -38,12 +39,6 @@ def _value(entry: dict[str, Any]) -> tuple[str, str, str]:
     between = entry.get("interval_95")
     interval = f"{figure(between[0])} to {figure(between[1])}" if between else ""
     return figure(entry["value"]), interval, _joined(entry.get("unit", ""), entry.get("note", ""))
-
-
-def figure(value: float, digits: int = 4) -> str:
-    """A number with few digits, without an exponent up to 10 million."""
-    text = f"{value:.{digits}g}"
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e7 else text
 
 
 def _joined(unit: str, note: str) -> str:
@@ -120,7 +115,7 @@ def _share(one: DynamicRange | None, lux: float) -> str:
     if one is None or lux not in one.lux:
         return ""
     k = int((one.lux == lux).argmax())
-    return f"{100 * one.share[k]:.4g} ± {196 * one.error[k]:.2g}"
+    return f"{100 * one.share[k]:.3g} ± {196 * one.error[k]:.2g}"
 
 
 def frame_tables(measured: FrameFigures) -> list[ReportTable]:

@@ -170,6 +170,7 @@ def _verdicts(spec: DesignSpec, table: Table) -> list[dict[str, Any]]:
         verdict: dict[str, Any] = {
             "against": name, "cost": parts[0][0], "cost_against": parts[1][0], "cost_difference": difference,
             "cost_difference_low": difference - half_width, "cost_difference_high": difference + half_width,
+            "clipped_lux": sorted({row["illuminance_lux"] for row in own if row.get("white_clipped")}),
             "delta_e_mean": float(own["delta_e_mean"].mean()),
             "delta_e_mean_against": float(other["delta_e_mean"].mean()),
         }  # fmt: skip

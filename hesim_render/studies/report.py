@@ -18,7 +18,15 @@ from hesim_render.studies.candidate import Seen
 from hesim_render.studies.cfa import StudyResult
 from hesim_render.studies.plots import PARETO, chart_picture, pareto_plot, patch_plot, response_plot, seen_labels
 from hesim_render.studies.table import LEVELS, NOISE_AWARE, NOISE_FREE, NOTE, Cell, Table, level_text
-from hesim_render.studies.verdict import grouped, level_name, levels_of, ranking
+from hesim_render.studies.verdict import (
+    DESIGN_FIGURES,
+    DESIGN_RATIOS,
+    design_verdict,
+    grouped,
+    level_name,
+    levels_of,
+    ranking,
+)
 
 #: Columns that say which row it is; all but the first are left out if they say the same in every row.
 _NAMES = {"filter_set": "filter set", "sensor": "sensor", "crosstalk": "crosstalk", "exposure_us": "exposure, ms"}
@@ -91,25 +99,21 @@ def verdict_table(verdicts: Sequence[Mapping[str, Any]], costs: NDArray[np.float
     tile : the designed tile, where shares were varied.
     """
     result = []
-    named = {"delta_e_mean": "mean ΔE2000 without noise", "mtf50_cy_per_px": "MTF50, cy/px",
-             "false_colour": "false colour, C*ab", "zone_plate_colour": "zone plate, C*ab",
-             "picture_error_simulated": "rms error with noise"}  # fmt: skip
-    ratios = {"ysnr_noise_aware_ratio_": "YSNR, noise-aware,", "ysnr_ratio_": "YSNR, matrix of colour,"}
     for verdict in verdicts:
         low, high = (number(verdict[f"cost_difference_{end}"]) for end in ("low", "high"))
         pair = [number(verdict["cost"]), number(verdict["cost_against"])]
         rows = [["judged cost, noise included", *pair, f"difference {low} to {high}"]]
-        for start, title in ratios.items():
+        for start, title in DESIGN_RATIOS.items():
             for key, value in verdict.items():
                 if key.startswith(start):
                     lux = key.removeprefix(start).removesuffix("_lux")
                     rows.append([f"{title} at {lux} lx", "", "", f"{number(value)} times"])
         rows += [
             [title, number(verdict[key]), number(verdict[f"{key}_against"]), ""]
-            for key, title in named.items()
+            for key, (title, _) in DESIGN_FIGURES.items()
             if key in verdict
         ]
-        result.append((str(verdict["against"]), rows))
+        result.append((str(verdict["against"]), design_verdict(verdict), rows))
     changes = [f"{number(before)} to {number(after)}" for before, after in costs]
     return filled("studies/verdict.html", verdicts=result, tile=tile, costs=changes)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from hesim_render.studies.table import Cell, Table
 
@@ -13,6 +14,16 @@ _RANKED, _COST = "ysnr_noise_aware", "delta_e_mean_noise_aware"
 _OWN = ("filter_set", "sensor", "crosstalk")
 #: A cost within this part of the least one is no cost.
 _ALIKE = 0.05
+#: Figures of a design without an interval that differ by no more than this part count as equal.
+_EQUAL = 0.01
+#: Figures of a design, and whether more of it is better.
+DESIGN_FIGURES = {
+    "delta_e_mean": ("mean ΔE2000 without noise", False), "mtf50_cy_per_px": ("MTF50, cy/px", True),
+    "false_colour": ("false colour, C*ab", False), "zone_plate_colour": ("zone plate, C*ab", False),
+    "picture_error_simulated": ("rms error with noise", False),
+}  # fmt: skip
+#: Beginnings of the names of ratios, by lux.
+DESIGN_RATIOS = {"ysnr_noise_aware_ratio_": "noise-aware YSNR", "ysnr_ratio_": "YSNR with the matrix of colour"}
 
 
 def grouped(rows: Table, keys: Sequence[str]) -> list[tuple[tuple[Cell, ...], Table]]:
@@ -127,3 +138,33 @@ def _ranked(row: Mapping[str, Cell], own: Sequence[str]) -> _Ranked:
         _name(row, own), value, value if low is None else low, value if high is None else high, number(_COST),
         bool(row.get("white_clipped")),
     )  # fmt: skip
+
+
+def design_verdict(verdict: Mapping[str, Any]) -> list[str]:
+    """Sentences on a designed set against another one: its cost with the interval, what got better, what got worse.
+
+    Parameters
+    ----------
+    verdict : of a design, see `studies.design_run.Design`.
+    """
+    low, high = verdict["cost_difference_low"], verdict["cost_difference_high"]
+    costs = f"{verdict['cost']:.4g} and {verdict['cost_against']:.4g}, difference {low:.3g} to {high:.3g}"
+    word = "has a lower cost than" if high < 0 else "has a higher cost than" if low > 0 else "is as good as"
+    better: list[str] = []
+    worse: list[str] = []
+    for start, title in DESIGN_RATIOS.items():
+        for key, value in verdict.items():
+            if key.startswith(start) and abs(value - 1) > _EQUAL:
+                text = f"{title} at {key.removeprefix(start).removesuffix('_lux')} lx {value:.3g} times"
+                (better if value > 1 else worse).append(text)
+    for key, (title, more_is_better) in DESIGN_FIGURES.items():
+        if key in verdict:
+            own, other = verdict[key], verdict[f"{key}_against"]
+            if abs(own - other) > _EQUAL * abs(other):
+                (better if (own > other) == more_is_better else worse).append(f"{title} {own:.3g} after {other:.3g}")
+    sentences = [f"The designed set {word} {verdict['against']} ({costs})."]
+    sentences += [f"{name}: {', '.join(texts)}." for name, texts in (("Better", better), ("Worse", worse)) if texts]
+    if verdict["clipped_lux"]:
+        lights = ", ".join(f"{lux:g}" for lux in verdict["clipped_lux"])
+        sentences.append(f"White saturates at {lights} lx: take a shorter exposure.")
+    return sentences

@@ -145,6 +145,18 @@ def test_dead_time(dead_us):
     assert "no step" in dead_time([tally(EventStream.of(slow, SHAPE))])["reason"]
 
 
+def test_the_shortest_time_of_a_moving_target_is_no_dead_time():
+    """Pixels that see an edge pass have 900 µs between events; their noise in still light has a dead time of 61."""
+    rng = np.random.default_rng(4)
+    target = random_events(rng, np.full(PIXELS, 300.0), 900.0, seconds=0.5, shape=SHAPE)
+    quiet = random_events(rng, np.full(PIXELS, 2.0), 0.0, seconds=0.4, shape=SHAPE)
+    noisy = random_events(rng, np.full(PIXELS, 400.0), 61.0, seconds=0.5, shape=SHAPE)
+    quiet, noisy, moving = (tally(EventStream.of(one, SHAPE)) for one in (quiet, noisy, target))
+    found = calibration.figures([quiet], moving, None, 3.0, None)["dead_time_us"]
+    assert found["value"] is None and "at most 90" in found["reason"]
+    assert calibration.figures([noisy], moving, None, 3.0, None)["dead_time_us"]["value"] == pytest.approx(61, abs=2)
+
+
 def test_the_shortest_dead_time_is_judged_by_the_four_microseconds_after_it():
     """30 intervals in each µs from 2 µs on: 120 of them are within a factor of two and a µs, and 100 are needed."""
     counts = np.full(LONG_US, 30)
@@ -182,6 +194,20 @@ def test_readout_limit_and_saturated_recordings(tmp_path):
         calibrate_recordings([name])
     free = tally(EventStream.of(random_events(rng, np.full(PIXELS, 90.0), 0.0, seconds=1.0, shape=SHAPE), SHAPE))
     assert "at least" in readout_limit([free])[0]["reason"]
+
+
+def test_windows_with_the_same_events_of_every_pixel_are_no_readout_limit():
+    """The pixels fire twice in each of 40 windows: more of them would give more."""
+    events = np.zeros(80 * PIXELS, EVENT_DTYPE)
+    events["t_us"] = np.repeat(np.arange(80) * 500 + 7, PIXELS)
+    events["x"], events["y"] = np.tile(np.arange(PIXELS) % SHAPE[1], 80), np.tile(np.arange(PIXELS) // SHAPE[1], 80)
+    events["polarity"] = 1
+    for silent in (0, round(0.015 * PIXELS)):
+        one = tally(EventStream.of(events[events["x"] + SHAPE[1] * events["y"] >= silent], SHAPE))
+        found, saturated = readout_limit([one])
+        assert "2 events of every pixel" in found["reason"] and saturated == []
+    part = tally(EventStream.of(events[events["x"] + SHAPE[1] * events["y"] >= 0.04 * PIXELS], SHAPE))
+    assert readout_limit([part])[0]["value"] == pytest.approx(2000 * np.ceil(0.96 * PIXELS), rel=0.01)
 
 
 def test_hot_and_silent_pixels():

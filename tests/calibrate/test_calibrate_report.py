@@ -1,5 +1,6 @@
 """calibration.yaml, its maps and the report: whole, readable, without anything from outside."""
 
+import html
 import os
 import re
 from html.parser import HTMLParser
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from hesim_render.calibrate import calibrate_aps, calibrate_evs, read_calibration, read_maps, write_report
+from hesim_render.calibrate.report.parts import headline
 from hesim_render.calibrate.result import plain
 from hesim_render.core import drawing
 from hesim_render.core.errors import OutputError, SpecError
@@ -289,3 +291,29 @@ def test_histograms_of_counts_have_bins_of_whole_counts(both):
     inside = good & (on < top) & (off < top)
     np.add.at(counted, ((off[inside] // wide).astype(int), (on[inside] // wide).astype(int)), 1)
     np.testing.assert_array_equal(table, counted)
+
+
+def test_a_report_begins_with_the_figures_their_intervals_and_saturation(both):
+    """Of the calibration itself, in words; what is not known has its reason."""
+    folder, _ = both
+    data, page = read_calibration(folder / "c.yaml"), (folder / "both.html").read_text()
+    for section in (data["aps"], data["evs"]):
+        sentences = headline(section)
+        assert all(f"<li>{html.escape(text, quote=False)}</li>" in page.replace("&#39;", "'") for text in sentences)
+    k = data["aps"]["K"]
+    low, high = k["interval_95"]
+    assert f"system gain K {k['value']:.4g} DN/e- ({low:.4g} to {high:.4g})" in headline(data["aps"])[0]
+    assert any("aturation" in text for text in headline(data["aps"]))
+    section = {
+        "K": {"value": None, "reason": "there is one exposure"},
+        "read_noise_e": {"value": 3.21, "interval_95": [3.1, 3.4], "unit": "e-"},
+        "prnu_percent": {"value": 0.0, "upper_limit": 0.27, "unit": "%"},
+        "full_well_e": {"value": 9800.0, "interval_95": [9600.0, 9900.0], "unit": "e-", "limited_by": "full well"},
+    }
+    assert headline(section) == [
+        "With 95 % intervals: read noise 3.21 e- (3.1 to 3.4), PRNU below 0.27 %.",
+        "Saturation is reached at 9800 e- (9600 to 9900); the limit is the full well.",
+        "Not known is the system gain K: there is one exposure.",
+    ]
+    section["full_well_e"] = {"value": None, "reason": "no level is bright enough"}
+    assert headline(section)[1] == "Not known is the saturation capacity: no level is bright enough."

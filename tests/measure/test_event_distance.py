@@ -78,16 +78,111 @@ def test_each_change_shows_in_its_figure(changes, name, value):
         assert one.value == pytest.approx(value, abs=0.03)
 
 
-def test_intervals_are_those_of_a_loop():
-    """Also across the parts, and the lengths of bursts within them."""
+def by_loop(t_us, pixel, begin_us, part_us, shape):
+    """What `event_statistics` sums, one event after the other."""
+    cols = shape[1]
+    last, series = {}, np.zeros((20, part_us // 1000), int)
+    intervals, runs, active = [], [[] for _ in range(20)], [set() for _ in range(20)]
+    open_runs = [{} for _ in range(20)]
+    for time, place in zip(t_us, pixel, strict=True):
+        part, inside = divmod(time - begin_us, part_us)
+        if inside // 1000 < series.shape[1]:
+            series[part, inside // 1000] += 1
+        active[part].add((inside // 5000, place // cols, place % cols))
+        if place in last:
+            intervals.append(max(time - last[place], 1))
+        if place in open_runs[part] and time - last[place] <= 1000:
+            open_runs[part][place] += 1
+        else:
+            if place in open_runs[part]:
+                runs[part].append(open_runs[part][place])
+            open_runs[part][place] = 1
+        last[place] = time
+    bursts = np.zeros((20, 65), int)
+    for part in range(20):
+        for length in (*runs[part], *open_runs[part].values()):
+            bursts[part, min(length, 64)] += 1
+    neighbours = ((0, 1), (1, 0), (0, 2), (2, 0))
+    both = [
+        [len(of), *(sum((w, r + down, c + right) in of for w, r, c in of) for down, right in neighbours)]
+        for of in active
+    ]
+    return intervals, series, bursts, np.array(both)
+
+
+def test_statistics_are_those_of_a_loop():
+    """Events in blocks that end within the parts, some of them at once, one pixel with a burst longer than 64."""
     rng = np.random.default_rng(5)
-    t_us = np.sort(rng.integers(1, 400_000, 6000))
-    pixel = rng.integers(0, 40, 6000)
-    found = event_statistics(EventStream.of(made(t_us, pixel, np.ones(6000, int)), SHAPE))
-    gaps = np.concatenate([np.diff(t_us[pixel == own]) for own in range(40)])
-    bounds = 10 ** np.linspace(0.0, 8.0, 161)
-    assert np.array_equal(found.intervals.sum(axis=0), np.histogram(np.maximum(gaps, 1), bounds)[0])
-    assert found.polarity.sum() == found.pixels.sum() == (found.bursts * np.arange(65)).sum() == 6000
+    shape = (6, 9)
+    t_us = np.concatenate([rng.integers(300, 143_000, 6000), 70_100 + 11 * np.arange(90)])
+    pixel = np.concatenate([rng.integers(0, 54, 6000), np.full(90, 41)])
+    order = np.argsort(t_us, kind="stable")
+    t_us, pixel = t_us[order], pixel[order]
+    sign = np.where(rng.random(t_us.size) < 0.7, 1, -1)
+    events = np.zeros(t_us.size, EVENT_DTYPE)
+    events["t_us"], events["y"], events["x"], events["polarity"] = t_us, pixel // 9, pixel % 9, sign
+    found = event_statistics(EventStream(lambda: iter(np.array_split(events, 7)), shape))
+    part_us = -(-(t_us[-1] + 1 - t_us[0]) // 20)
+    gaps, series, bursts, active = by_loop(t_us.tolist(), pixel.tolist(), int(t_us[0]), int(part_us), shape)
+    assert found.seconds == part_us * 1e-6 and found.windows == part_us // 5000
+    assert np.array_equal(found.intervals.sum(axis=0), np.histogram(gaps, 10 ** np.linspace(0.0, 8.0, 161))[0])
+    assert np.array_equal(found.series, series)
+    assert np.array_equal(found.bursts, bursts) and bursts[:, 64].sum() == 1
+    assert np.array_equal(found.active, active)
+    part = (t_us - t_us[0]) // part_us
+    assert np.array_equal(found.pixels, np.histogram2d(part, pixel, (np.arange(21), np.arange(55)))[0])
+    assert found.polarity.tolist() == [[np.sum(sign[part == k] == s) for s in (1, -1)] for k in range(20)]
+
+
+def test_correlation_over_time_at_six_lags():
+    """Those of the definition; lags that the windows do not have count as 0."""
+    rng = np.random.default_rng(8)
+    series = rng.poisson(20 + 9 * np.sin(np.arange(50) / 3.0), (4, 50))
+    draw = np.array([2, 0, 2])
+    rest = series[draw] - series[draw].mean()
+    wanted = [np.mean(rest[:, lag:] * rest[:, : 50 - lag]) / rest.var() for lag in (1, 2, 4, 8, 16, 32)]
+    assert event_distance._over_time(SimpleNamespace(series=series), draw) == pytest.approx(wanted)
+    short = event_distance._over_time(SimpleNamespace(series=series[:, :8]), draw)
+    assert short.size == 6 and short[3:].tolist() == [0, 0, 0] and np.all(short[:3] != 0)
+
+
+def test_hot_pixels_have_more_than_ten_times_the_usual_rate():
+    """Usual is the mean of the lower nine tenths: 2; 21 is hot, 20 is not. Where nothing happens, 3 are not hot."""
+    counts = np.array([[2] * 18 + [20, 21]])
+    assert event_distance._hot(SimpleNamespace(pixels=counts), np.array([0])) == [1 / 20]
+    counts = np.array([[0] * 18 + [3, 4]])
+    assert event_distance._hot(SimpleNamespace(pixels=counts), np.array([0])) == [1 / 20]
+
+
+def test_intervals_and_bounds_are_those_of_the_bootstrap():
+    """Two rates of which each part is another: half widths as those of the law of the mean of 20 parts."""
+    rng = np.random.default_rng(11)
+    first, second = poisson(3), poisson(4, rate=1.3)
+    for one in (first, second):
+        one.polarity[:] = rng.normal(1.3 if one is second else 1.0, 0.1, (20, 1)) * np.array([[4000, 3000]])
+    found = {one.name: one for one in event_distances(first, second)}["rate"]
+    assert found.first == pytest.approx(first.polarity.sum() / (20 * first.seconds * PIXELS))
+    assert found.second == pytest.approx(second.polarity.sum() / (20 * second.seconds * PIXELS))
+    assert found.value == pytest.approx(np.log(found.second / found.first))
+    errors = [one.polarity.sum(axis=1).std() / one.polarity.sum(axis=1).mean() / np.sqrt(20) for one in (first, second)]
+    half = 1.96 * np.hypot(*errors)
+    assert found.interval_95 == pytest.approx((found.value - half, found.value + half), abs=0.3 * half)
+    assert found.within == pytest.approx(1.96 * np.sqrt(2) * errors[0], rel=0.25)
+    assert [one.name for one in event_distances(first, second) if one.first is not None] == [
+        "rate", "polarity", "hot pixels",
+    ]  # fmt: skip
+
+
+def test_the_shortest_stream_has_two_windows_a_part():
+    rng = np.random.default_rng(2)
+    for last_us, enough in ((39_980, True), (39_979, False)):
+        t_us = np.append(rng.integers(0, 39_979, 3000), (0, last_us))
+        stream = EventStream.of(made(t_us, rng.integers(0, PIXELS, 3002), np.ones(3002, int)), SHAPE)
+        if enough:
+            assert event_statistics(stream).series.shape == (20, 2)
+        else:
+            with pytest.raises(SpecError, match="expected 40000 µs at least"):
+                event_statistics(stream)
 
 
 def test_bad_input_is_one_clear_error():

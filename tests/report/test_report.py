@@ -3,21 +3,27 @@
 """
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
+from scipy import special
+from scipy.special import ndtr, ndtri
+from scipy.stats import norm
 
 from hesim_render.core.errors import OutputError, RangeError, SpecError
 from hesim_render.exchange import EVENT_FORMATS, EventStream
 from hesim_render.exchange.triggers import TRIGGER_DTYPE
-from hesim_render.report import figures, make_report
+from hesim_render.report import figures, make_report, s_curves
 from hesim_render.report.bench import EventBench
 from hesim_render.report.definitions import EVENTS, FRAMES
 from hesim_render.report.emva import frame_figures
-from hesim_render.report.estimates import corrected, crossing, mean_error
+from hesim_render.report.estimates import corrected, crossing, figure, mean_error
+from hesim_render.report.latency import Answers
+from hesim_render.report.limits import dynamic_range
 from hesim_render.report.s_curves import s_curve
-from hesim_render.report.texts import event_tables, figure
+from hesim_render.report.texts import event_tables
 from tests.support.bench_pixels import HALF_US, LUX, PIXELS, SHAPE, Pixels
 
 
@@ -114,6 +120,11 @@ def test_edges_of_triggers_stand_for_times(tmp_path, numpy_bench):
     written = next(r for r in EventBench(pixels.write(tmp_path / "same")).responses if r.steps.file == "s5.npz")
     assert read.window_us == HALF_US and list(read.rises[:3]) == [True, False, True]
     assert np.array_equal(read.latency_us[:12], written.latency_us)
+    content["steps"][0]["window_us"] = 700
+    (tmp_path / "bench.yaml").write_text(yaml.safe_dump(content))
+    short = EventBench(tmp_path).responses[0]
+    assert short.window_us == 700
+    assert np.array_equal(short.latency_us, np.where(read.latency_us <= 700, read.latency_us, 0))
     with pytest.raises(SpecError, match=r"s5\.raw.*0 edges of triggers on line 4"):
         content["steps"][0]["trigger"] = 4
         (tmp_path / "bench.yaml").write_text(yaml.safe_dump(content))
@@ -130,7 +141,7 @@ def test_what_cannot_be_told_says_why(tmp_path):
     found = figures.event_figures(EventBench(pixels.write(tmp_path / "coarse")))
     assert "the contrasts are too coarse: between" in entry_of(found, "threshold", "ON").value["reason"]
     assert "the threshold is not known" in entry_of(found, "dynamic_range", "OFF").value["reason"]
-    assert "no recordings of modulated light" in entry_of(found, "bandwidth", "ON").value["reason"]
+    assert "no recordings of modulated light" in entry_of(found, "bandwidth", "").value["reason"]
     assert "two steady recordings" in entry_of(found, "hot", "").value["reason"]
     assert "not all pixels were reset" in found.findings[0]
     steady = Pixels(6)
@@ -167,6 +178,73 @@ def test_closed_forms():
     rng = np.random.default_rng(2)
     values = rng.standard_normal((40, 500)) + 3 * rng.standard_normal((40, 1))
     assert mean_error(values, np.ones(values.shape, bool)) == pytest.approx(3 / np.sqrt(40), rel=0.4)
+
+
+def answers_at(lux, share):
+    reason = {"value": None, "reason": "none"}
+    return Answers(lux, 0.5, None, 4000, share, 0.002, 8, reason, reason, 500)
+
+
+def test_dynamic_range_in_closed_form():
+    """Shares Φ(z) with z linear in ln L on both flanks, of which chance adds a part: 90 % lie between two lights."""
+    lux = np.array([0.1, 0.5, 3.0, 100.0, 2e4, 5e4])
+    z = np.array([-0.6, 0.9, 2.6, 2.7, 1.9, -0.4])
+    chance = np.array([0.1, 0.07, 0.03, 0.02, 0.02, 0.05])
+    share = chance + (1 - chance) * ndtr(z)
+    found = dynamic_range([answers_at(*one) for one in zip(lux, share, strict=True)], chance.tolist())
+    wanted = ndtri(0.9)
+    least = np.exp(np.interp(wanted, z[1:3], np.log(lux[1:3])))
+    most = np.exp(np.interp(-wanted, -z[4:], np.log(lux[4:])))
+    assert found.share == pytest.approx(ndtr(z)) and found.error == pytest.approx(0.002 / (1 - chance))
+    assert found.least_lux["value"] == pytest.approx(least) and found.most_lux["value"] == pytest.approx(most)
+    assert found.range_db["value"] == pytest.approx(20 * np.log10(most / least))
+    errors = [found.least_lux["standard_error"] / least, found.most_lux["standard_error"] / most]
+    assert found.range_db["standard_error"] == pytest.approx(20 / np.log(10) * np.hypot(*errors))
+    low = dynamic_range([answers_at(*one) for one in zip(lux[2:], share[2:], strict=True)], chance[2:].tolist())
+    assert low.least_lux["reason"].startswith("at most 3 lx")
+    decibels = 20 * np.log10(most / 3)
+    assert low.range_db["reason"].startswith(f"at least {decibels:.4g} dB, from 3 to {figure(most, 3)} lx")
+    high = dynamic_range([answers_at(*one) for one in zip(lux[:5], share[:5], strict=True)], chance[:5].tolist())
+    decibels = 20 * np.log10(2e4 / least)
+    assert high.range_db["reason"].startswith(f"at least {decibels:.4g} dB, from {figure(least, 3)} to 20000 lx")
+    none = dynamic_range([answers_at(1.0, 0.5), answers_at(9.0, 0.7)], [0.0, 0.0])
+    assert none.range_db["reason"] == "at no light are 90 % found; at most 70 %"
+
+
+def test_steady_light_that_is_not_the_same():
+    """Up to 1.3 times brighter or darker it is the same light; the nearest one is taken."""
+    bench = SimpleNamespace(spec=SimpleNamespace(steady=[SimpleNamespace(lux=lux) for lux in (0.0, 10.0, 12.5, 40.0)]))
+    for lux, own in ((12.9, 12.5), (9.9, 10.0), (31.0, 40.0), (16.0, 12.5), (7.8, 10.0)):
+        assert figures._steady(bench, lux).lux == own
+    for lux in (16.5, 7.6, 30.0, 53.0):
+        assert figures._steady(bench, lux) is None
+
+
+@pytest.mark.parametrize("ratio", (-3.5, -1.2, 0.8))
+def test_the_likelihood_of_counts_is_an_integral_over_the_thresholds(ratio):
+    """Against a sum over a fine grid, from noise far below the spread of the thresholds to noise above it."""
+    sizes, trials = np.array([0.1, 0.17, 0.21, 0.3]), np.array([6.0, 8.0, 8.0, 4.0])
+    hits = np.array([[0, 2, 5, 4], [0, 0, 8, 4], [1, 4, 4, 3], [0, 8, 8, 4]], float)
+    fit = s_curves._Fit(sizes, hits, trials)
+    values = np.array([0.19, np.log(0.03), ratio, special.logit(0.02)])
+    theta, sigma, tau, chance = s_curves._natural(values)
+
+    own = np.linspace(theta - 7 * tau, theta + 7 * tau, 100_001)
+    share = np.clip(chance + (1 - chance) * ndtr((sizes[:, None] - own) / sigma), 1e-12, 1 - 1e-12)
+    for counts, log in zip(fit._hits, fit._log(values), strict=True):
+        each = counts @ np.log(share) + (trials - counts) @ np.log1p(-share)
+        exact = np.sum(np.exp(each) * norm.pdf(own, theta, tau)) * (own[1] - own[0])
+        assert log == pytest.approx(np.log(exact), abs=0.03)
+
+
+def test_a_ratio_at_its_end_counts_as_known():
+    """Pixels without noise: the ratio of noise and spread is at its lower end, and the covariance leaves it out."""
+    rng = np.random.default_rng(9)
+    own, sizes = 0.2 + 0.02 * rng.standard_normal(400), np.array([0.14, 0.17, 0.19, 0.2, 0.21, 0.23, 0.27])
+    fit = s_curves._Fit(sizes, 6.0 * (sizes > own[:, None]), np.full(7, 6.0))
+    values, covariance = fit.values()
+    assert values[2] < -5.9 and not covariance[2].any() and not covariance[:, 2].any()
+    assert covariance[0, 0] == pytest.approx(0.02**2 / 400, rel=0.3)
 
 
 def test_bad_input_is_one_clear_error(tmp_path, numpy_bench):

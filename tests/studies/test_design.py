@@ -27,6 +27,7 @@ from hesim_render.studies.design_cost import Condition, DesignCost, Weights, bes
 from hesim_render.studies.design_filters import Dyes, FreeCurves, ThinFilms
 from hesim_render.studies.design_run import _verdicts, design
 from hesim_render.studies.design_tile import counts_of, spread_tile
+from hesim_render.studies.verdict import design_verdict
 
 BANDS = np.arange(360.0, 831.0, 10.0)
 FAMILIES = {"dye": Dyes(BANDS, 2, 0.95), "film": ThinFilms(BANDS, 5, 0.97), "free": FreeCurves(BANDS, 0.01, 0.95)}
@@ -359,15 +360,16 @@ def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
     with pytest.raises(SystemExit) as stop:
         cli.main(["study", str(file), "--out", str(tmp_path / "out")])
     assert stop.value.code == 0, capsys.readouterr().err
-    assert "against Nikon" in capsys.readouterr().out
+    told = capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "design.json").read_text())
     verdict = found["verdicts"][0]
+    assert " ".join(design_verdict(verdict)) in " ".join(told.split("\n")) and "Nikon" in told
     assert verdict["cost_difference_low"] < verdict["cost_difference"] < verdict["cost_difference_high"]
     if steps > 5:
         assert verdict["cost_difference_high"] < 0 and verdict["delta_e_mean"] < verdict["delta_e_mean_against"]
         assert "mtf50_cy_per_px" in verdict and verdict["zone_plate_colour"] > 0
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "<h2>Verdict</h2>" in page and "difference" in page
+    assert "<h2>Verdict</h2>" in page and f"<p>{' '.join(design_verdict(verdict))}</p>" in page
     sensor = hr.load_sensor(tmp_path / "out" / "sensor.yaml")
     assert sensor.spec.tile == "RG\nGB" and list(sensor.spec.filters) == ["red", "green", "blue"]
     # the figures of the file are those of the judgement
@@ -375,6 +377,25 @@ def test_a_design_is_a_sensor_file_and_a_verdict(tmp_path, capsys, steps):
     own = (tmp_path / "out" / "results.csv").read_text().splitlines()
     column = own[0].split(",").index("delta_e_mean")
     assert table["delta_e_mean"][0] == pytest.approx(float(own[1].split(",")[column]), rel=1e-6)
+
+
+def test_a_verdict_says_what_got_better_and_worse():
+    """One per cent is no difference; a cost whose interval holds 0 is as good; saturation is named."""
+    verdict = {
+        "against": "bayer", "cost": 1.2, "cost_against": 1.5, "cost_difference": -0.3, "cost_difference_low": -0.4,
+        "cost_difference_high": -0.2, "delta_e_mean": 2.31, "delta_e_mean_against": 2.1, "clipped_lux": [200.0, 1000.0],
+        "ysnr_noise_aware_ratio_5_lux": 1.12, "ysnr_noise_aware_ratio_80_lux": 0.995, "ysnr_ratio_5_lux": 0.93,
+        "mtf50_cy_per_px": 0.31, "mtf50_cy_per_px_against": 0.28, "false_colour": 4.0, "false_colour_against": 5.0,
+    }  # fmt: skip
+    assert design_verdict(verdict) == [
+        "The designed set has a lower cost than bayer (1.2 and 1.5, difference -0.4 to -0.2).",
+        "Better: noise-aware YSNR at 5 lx 1.12 times, MTF50, cy/px 0.31 after 0.28, false colour, C*ab 4 after 5.",
+        "Worse: YSNR with the matrix of colour at 5 lx 0.93 times, mean ΔE2000 without noise 2.31 after 2.1.",
+        "White saturates at 200, 1000 lx: take a shorter exposure.",
+    ]
+    same = verdict | {"cost_difference_high": 0.1, "clipped_lux": []}
+    assert design_verdict(same)[0].startswith("The designed set is as good as bayer") and len(design_verdict(same)) == 3
+    assert "a higher cost than" in design_verdict(same | {"cost_difference_low": 0.05})[0]
 
 
 @pytest.mark.slow

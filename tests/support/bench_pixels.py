@@ -8,6 +8,7 @@ import yaml
 from scipy.stats import norm
 
 from hesim_render.pixels.evs.events import EVENT_DTYPE
+from tests.support.slow_pixels import events_of
 from tests.support.still_pixels import _events as in_order
 
 SHAPE = (21, 27)
@@ -15,6 +16,10 @@ PIXELS = SHAPE[0] * SHAPE[1]
 HALF_US = 5000
 #: Light of the S-curve, lx.
 LUX = 730.0
+
+
+def _pixel(events):
+    return events["y"].astype(int) * SHAPE[1] + events["x"]
 
 
 def none():
@@ -26,6 +31,7 @@ class Pixels:
 
     def __init__(self, seed):
         rng = self.rng = np.random.default_rng(seed)
+        self.slow_rng = np.random.default_rng((seed, 1))
         theta = rng.uniform(0.12, 0.3)
         self.theta = np.array([theta, theta * rng.uniform(0.9, 1.1)])
         self.spread, self.noise = rng.uniform(0.06, 0.15), rng.uniform(0.05, 0.12) * theta
@@ -48,7 +54,10 @@ class Pixels:
         """By figure and polarity; of the whole population of such pixels."""
         on, off = self.theta
         z = norm.ppf(0.9)
+        # mean of 1/θᵢ over pixels
+        harmonic = 1 / (1 + self.spread**2 + 3 * self.spread**4)
         return {
+            ("threshold_by_counts", "ON"): on * harmonic, ("threshold_by_counts", "OFF"): off * harmonic,
             ("threshold", "ON"): on, ("threshold", "OFF"): off,
             ("threshold_spread", "ON"): 100 * self.spread, ("threshold_spread", "OFF"): 100 * self.spread,
             ("pixel_noise", "ON"): self.noise, ("pixel_noise", "OFF"): self.noise,
@@ -141,7 +150,23 @@ class Pixels:
                     "interval_us": [0, int(12 * period_us)],
                 })  # fmt: skip
 
+    def counts(self):
+        """Two large swings of slow light, which no reset precedes."""
+        for k, swing in enumerate(self.theta.mean() * np.array([8.0, 15.0])):
+            t_us = np.arange(0, 1_200_000, 400) + 200
+            log_light = np.log1p(np.tanh(swing / 2) * np.sin(2e-6 * np.pi * 5.0 * t_us))
+            name = f"slow{k}.npz"
+            self.files[name] = events_of(
+                log_light, 400, self.own, noise=self.noise, background_hz=1.0, cols=SHAPE[1], rng=self.slow_rng
+            )
+            self.files[name] = self.files[name][~np.isin(_pixel(self.files[name]), self.dead)]
+            self.content["modulation"].append({
+                "file": name, "lux": 3.0, "hz": 5.0, "depth": float(np.tanh(swing / 2)),
+                "interval_us": [0, 1_200_000],
+            })  # fmt: skip
+
     def everything(self):
+        self.counts()
         self.s_curves()
         self.lights()
         self.temperatures()

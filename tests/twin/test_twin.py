@@ -3,6 +3,7 @@
 import json
 import os
 import warnings
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import emva_camera
@@ -16,7 +17,7 @@ from hesim_render.calibrate.aps.pairs import evaluate
 from hesim_render.cli.commands import app
 from hesim_render.core.errors import OutputError, SpecError
 from hesim_render.recording.pair_set import read_pair_set
-from hesim_render.twin import make_twin
+from hesim_render.twin import figures, make_twin
 from hesim_render.twin.comparison import Check
 from hesim_render.twin.figures import bin_edges, counts_in, spectrum
 from hesim_render.twin.simulated import TwinBench
@@ -172,3 +173,15 @@ def test_the_twin_of_a_real_ccd_passes(tmp_path):
         for check in twin.checks[:4]:
             assert kstest(check.z, "norm").pvalue > 1e-3
     calibrate_aps(REAL, tmp_path / "calibration.yaml")
+
+
+def test_spectra_have_their_frequencies_and_the_noise_of_the_other_direction(monkeypatch):
+    """Bands of 16 columns are those of 1/16 to 8/16 periods; what columns share is less than it was by the pixels'."""
+    image = np.random.default_rng(1).standard_normal((10, 16))
+    assert spectrum(image, 0.3, 0.1, 1).cycles == pytest.approx(np.arange(1, 9) / 16)
+    given = []
+    monkeypatch.setattr(figures, "spectrum", lambda *values: given.append(values[1:]))
+    series = SimpleNamespace(spatial=SimpleNamespace(noise=(0.08, 0.06, 0.48)), mean=image)
+    figures.spectra(series, 2.0)
+    assert [axis for *_, axis in given] == [1, 0]
+    assert np.ravel([noise for *noise, _ in given]) == pytest.approx([0.12, 0.015 - 0.12 / 10, 0.12, 0.02 - 0.12 / 16])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hesim_render.calibrate.estimate import not_identifiable
 from hesim_render.calibrate.recordings import still, target
 from hesim_render.calibrate.recordings.short_intervals import dead_time, readout_limit
 from hesim_render.calibrate.recordings.tally import EventTally, tally
@@ -138,5 +139,21 @@ def figures(
         "recordings": entries, "threshold_ratio": result.ratio, **of_target.entries, "leak_dark_hz": result.dark,
         "leak_growth_hz_per_lux": result.growth,
         "hot_share": still.hot_share(tallies), "silent_share": still.silent_share(tallies),
-        "dead_time_us": dead_time(every), "readout_limit_events_per_s": limit, "findings": findings,
+        "dead_time_us": _dead_time(tallies, moving), "readout_limit_events_per_s": limit, "findings": findings,
     }  # fmt: skip
+
+
+def _dead_time(tallies: Sequence[EventTally], moving: EventTally | None) -> dict[str, Any]:
+    """Dead time from the still scenes, whose noise comes at any time. A target that moves has a shortest time between
+    two events of its own, which the dead time does not exceed.
+    """
+    own = dead_time(tallies)
+    if own["value"] is not None or moving is None:
+        return own
+    most = dead_time([*tallies, moving])
+    if most["value"] is None:
+        return own
+    return not_identifiable(
+        f"at most {most['interval_95'][1]:.4g} µs, the shortest intervals of the moving target; the light between them "
+        f"may not change faster, and in the still scenes {own['reason']}"
+    )

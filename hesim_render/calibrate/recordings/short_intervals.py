@@ -21,6 +21,8 @@ _STRAY = 0.03
 _LEAST_WINDOWS, _SATURATED = 20, 0.1
 #: Fullest windows differ by no more than this part.
 _SAME = 0.01
+#: Windows are full of pixels if they hold so many events of each, but for this part of the pixels.
+_SILENT = 0.02
 
 
 def dead_time(tallies: Sequence[EventTally]) -> dict[str, Any]:
@@ -84,7 +86,8 @@ def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[E
     """Events a second that the read-out takes, and the recordings that it limits for more than a tenth of the time.
 
     A read-out at its limit passes equally many events in every window. Where the fullest windows are not equally full,
-    to 1 %, the limit has not been reached. The interval is half of that, at least one event a window.
+    to 1 %, the limit has not been reached; nor where they hold a whole number of events of each pixel, since then the
+    pixels or the light are the limit. The interval is half of that, at least one event a window.
     """
     most = max(one.windows.size - 1 for one in tallies)
     slack = max(2, round(_SAME * most))
@@ -95,6 +98,12 @@ def readout_limit(tallies: Sequence[EventTally]) -> tuple[dict[str, Any], list[E
     if full.sum() < _LEAST_WINDOWS or full.sum() < 5 * below.sum():
         return not_identifiable(
             f"no two of the fullest windows are equally full; it is at least {most * rate:.4g} events/s"
+        ), []
+    each = most / tallies[0].pixels
+    if 0 <= np.ceil(each) - each <= _SILENT * np.ceil(each):
+        return not_identifiable(
+            f"the fullest windows hold {np.ceil(each):g} events of every pixel, so that the pixels or the light limit "
+            f"them; it is at least {most * rate:.4g} events/s"
         ), []
     value = float(np.sum(full * np.arange(most - slack, most + 1)) / full.sum())
     error = max(slack / 2, 1.0) / 2

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import HEAD, findings, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
 from hesim_render.core.html import filled, tick_text
 
@@ -19,6 +19,7 @@ def asynchronous_section(section: dict[str, Any], maps: dict[str, NDArray]) -> s
     """HTML of the section: S-curves, noise rates, maps of thresholds, parameters."""
     return filled(
         "calibrate/report/asynchronous.html",
+        headline=headline(section),
         findings=findings(section),
         curves=[*(_s_curves(maps, polarity) for polarity in (1, -1)), _noise_rate(maps)],
         maps=[_pixels(maps), *(_map(maps, name, sign) for name, sign in (("on", "θ₊"), ("off", "θ₋")))],

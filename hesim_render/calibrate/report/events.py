@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import HEAD, findings, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, panel, picture, points, svg
 from hesim_render.core.html import filled, tick_text
 
@@ -29,6 +29,7 @@ def evs_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     """
     return filled(
         "calibrate/report/events.html",
+        headline=headline(section),
         findings=findings(section),
         rates=(
             picture("Event probability per trial, mean of ON and OFF", maps["figure_probability"], "", 340),

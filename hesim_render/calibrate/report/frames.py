@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hesim_render.calibrate.report.parts import HEAD, findings, p_text, parameter_row
+from hesim_render.calibrate.report.parts import HEAD, findings, headline, p_text, parameter_row
 from hesim_render.core.drawing import COLOURS, legend_below, new_figure, panel, picture, points, svg
 from hesim_render.core.html import filled, number
 from hesim_render.pixels.aps.formulas import polynomial
@@ -27,6 +27,7 @@ def aps_section(section: dict[str, Any], maps: dict[str, NDArray]) -> str:
     exposure = float(maps["figure_variance_exposure_us"]) / 1000
     return filled(
         "calibrate/report/frames.html",
+        headline=headline(section),
         findings=findings(section),
         maps=(
             picture("Row bias", band[::step, ::step], "DN", 390),

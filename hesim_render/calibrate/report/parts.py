@@ -11,6 +11,42 @@ from hesim_render.core.html import number
 HEAD = ("parameter", "value", "95 % interval", "unit, or why not")
 
 
+#: Figures that a report begins with.
+_FIRST = {
+    "K": "system gain K", "quantum_efficiency": "quantum efficiency", "read_noise_e": "read noise", "dsnu_e": "DSNU",
+    "prnu_percent": "PRNU", "theta_on": "threshold θ₊", "theta_off": "threshold θ₋",
+    "threshold_mismatch": "mismatch of the thresholds", "leak_per_trial": "leak per trial", "leak_rate_hz": "leak",
+}  # fmt: skip
+
+
+def headline(section: Mapping[str, Any]) -> list[str]:
+    """What a report says first: the main figures with their intervals, saturation, and what is not known and why."""
+    known, unknown = [], []
+    for key, name in _FIRST.items():
+        item = section.get(key)
+        if not isinstance(item, Mapping):
+            continue
+        if item["value"] is None:
+            unknown.append(f"Not known is the {name}: {item['reason']}.")
+        elif "upper_limit" in item:
+            known.append(f"{name} below {item['upper_limit']:.3g} {item.get('unit', '')}".rstrip())
+        else:
+            text = f"{name} {item['value']:.4g} {item.get('unit', '')}".rstrip()
+            low, high = item.get("interval_95", (None, None))
+            known.append(text if low is None else f"{text} ({low:.4g} to {high:.4g})")
+    sentences = [f"With 95 % intervals: {', '.join(known)}."] if known else []
+    well = section.get("full_well_e")
+    if well is not None and well["value"] is not None:
+        low, high = well["interval_95"]
+        sentences.append(
+            f"Saturation is reached at {well['value']:.4g} e- ({low:.4g} to {high:.4g}); the limit is the "
+            f"{well['limited_by']}."
+        )
+    elif well is not None:
+        sentences.append(f"Not known is the saturation capacity: {well['reason']}.")
+    return sentences + unknown
+
+
 def findings(section: Mapping[str, Any]) -> list[tuple[str, str, str]] | None:
     """The findings of a section: check, chance and text of each; None for a calibration without checks."""
     if "findings" not in section:
