@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Literal, Protocol, TextIO
+from typing import Any, Literal, TextIO
 
 from hesim_render.core.guard import printable
 
@@ -110,13 +110,20 @@ def in_words(seconds: float) -> str:
     return f"{seconds / 86400:.1f} days" if seconds < 1e7 * 86400 else f"{seconds / 86400 / 365.25:.1g} years"
 
 
-class _View(Protocol):
-    """Display of the pace."""
+class _View:
+    """Display of the pace; this one shows nothing."""
 
-    def show(self, pace: Pace) -> None: ...
-    def say(self, text: str) -> None: ...
-    def paused(self) -> contextlib.AbstractContextManager[Any]: ...
-    def close(self) -> None: ...
+    def show(self, pace: Pace) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        pass
+
+    def paused(self) -> contextlib.AbstractContextManager[Any]:
+        return contextlib.nullcontext()
+
+    def close(self) -> None:
+        pass
 
 
 class ProgressReport:
@@ -169,7 +176,7 @@ class ProgressReport:
         self._thread.join(_REFRESH_S)
 
 
-class _Lines:
+class _Lines(_View):
     """Occasional lines, for logs."""
 
     def __init__(self, title: str, stream: TextIO, first_s: float | None = None) -> None:
@@ -188,14 +195,8 @@ class _Lines:
             self._stream.write(f"{self._title}: {text}\n")
             self._stream.flush()
 
-    def paused(self) -> contextlib.AbstractContextManager[Any]:
-        return contextlib.nullcontext()
 
-    def close(self) -> None:
-        pass
-
-
-class _Bar:
+class _Bar(_View):
     """A bar that moves, on a terminal."""
 
     def __init__(self, title: str, stream: TextIO) -> None:
@@ -234,7 +235,7 @@ class _Bar:
         self._bar.stop()
 
 
-class _Notebook:
+class _Notebook(_View):
     """A bar below the cell of a notebook."""
 
     def __init__(self, title: str) -> None:
@@ -253,32 +254,13 @@ class _Notebook:
     def say(self, text: str) -> None:
         self._notes += f"<br>{html.escape(text)}"
 
-    def paused(self) -> contextlib.AbstractContextManager[Any]:
-        return contextlib.nullcontext()
-
     def close(self) -> None:
         self._handle.update(self._html(self._notes.removeprefix("<br>")))
 
 
-class _Nothing:
-    """No display."""
-
-    def show(self, pace: Pace) -> None:
-        pass
-
-    def say(self, text: str) -> None:
-        pass
-
-    def paused(self) -> contextlib.AbstractContextManager[Any]:
-        return contextlib.nullcontext()
-
-    def close(self) -> None:
-        pass
-
-
 def silent_report() -> ProgressReport:
     """A report that shows nothing."""
-    return ProgressReport(_Nothing())
+    return ProgressReport(_View())
 
 
 def in_notebook() -> bool:
