@@ -33,7 +33,7 @@ class FrameNoise:
     beta : [tile_row, tile_col, 6], temporal variance before the ADC over 1, I, t, I², I t, t²; DN and s.
     exposure_us : exposure of the frame, µs.
     residual_dn2 : further variance, DN²: noise that `beta` does not describe, and pixel offsets without a map.
-    response_std : relative spread of pixel responses without a map.
+    prnu_rel : standard deviation of pixel responses without a map over their mean.
     row_std_dn : standard deviation over rows of fixed offsets without a map, DN.
     row_noise_dn : standard deviation of row offsets that change from frame to frame (temporal row noise), DN.
     offset_dn : N_FP less the black level, [row, col], DN; 0 where it is not known.
@@ -49,7 +49,7 @@ class FrameNoise:
     beta: NDArray[np.float64]
     exposure_us: float
     residual_dn2: float = 0.0
-    response_std: float = 0.0
+    prnu_rel: float = 0.0
     row_std_dn: float = 0.0
     row_noise_dn: float = 0.0
     offset_dn: Map = 0.0
@@ -97,7 +97,7 @@ class FrameNoise:
             common["residual_dn2"] += 0.0 if "dsnu" in off else (gain * aps.dsnu_e) ** 2
             return cls(
                 **common,
-                response_std=0.0 if "prnu" in off else aps.prnu_rel,
+                prnu_rel=0.0 if "prnu" in off else aps.prnu_rel,
                 row_std_dn=0.0 if "row" in off else aps.row_offset_std_dn,
                 dark_dn_per_s=0.0 if "dark_current" in off else gain * aps.dark_current_now_e_per_s,
             )
@@ -201,7 +201,7 @@ class FrameNoise:
             self,
             beta=self.beta * factor**2,
             residual_dn2=self.residual_dn2 * factor**2,
-            response_std=self.response_std * factor,
+            prnu_rel=self.prnu_rel * factor,
         )
 
     @property
@@ -212,12 +212,12 @@ class FrameNoise:
     @property
     def is_clean(self) -> bool:
         """True if there is nothing to smooth: no temporal noise, and no pixel pattern without a map."""
-        return not (self.beta.any() or self.residual_dn2 or self.response_std)
+        return not (self.beta.any() or self.residual_dn2 or self.prnu_rel)
 
     def describe(self) -> dict[str, Any]:
         """The parameters of the noise as plain values, maps summarised."""
         known = any(isinstance(values, np.ndarray) for values in (self.offset_dn, self.dark_dn_per_s, self.response))
-        unknown = self.row_std_dn > 0 or self.response_std > 0
+        unknown = self.row_std_dn > 0 or self.prnu_rel > 0
         return {
             "maps": "unknown" if unknown else "known" if known else "none",
             "row_std_dn": self.unknown_rows_dn,
@@ -237,7 +237,7 @@ class FrameNoise:
         """
         beta, t = self.beta[position], self.exposure_us * S_PER_US
         constant = dark_variance_dn2(beta, t) + self.residual_dn2 + ADC_VARIANCE_DN2
-        return float(constant), float(light_gain_dn(beta, 0.0, t)), float(beta[3] + self.response_std**2)
+        return float(constant), float(light_gain_dn(beta, 0.0, t)), float(beta[3] + self.prnu_rel**2)
 
     def corrected(self, signal_dn: NDArray[np.float32]) -> NDArray[np.float32]:
         """Remove the fixed pattern of the sensor's maps from a frame.

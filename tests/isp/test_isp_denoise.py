@@ -75,7 +75,7 @@ def test_variance_and_maps_are_those_of_the_simulators_frames():
     electrons, exposure_us, count = 1500.0, 20_000, 64
     frames = [sensor.aps.sample(electrons, exposure_us, 5, frame=k).astype(np.float32) for k in range(count)]
     noise = FrameNoise.of_sensor(sensor.spec, sensor.layout).at(exposure_us)
-    assert noise.row_std_dn == 0 and noise.response_std == 0
+    assert noise.row_std_dn == 0 and noise.prnu_rel == 0
     black = sensor.spec.aps.black_level_dn
     corrected = np.array([noise.corrected(frame - np.float32(black)) for frame in frames], dtype=np.float64)
     signal_dn = electrons * sensor.spec.aps.system_gain_dn_per_e
@@ -345,7 +345,7 @@ def test_scatter_of_what_is_left_is_what_the_noise_makes():
 
 def test_noise_times_a_factor_has_that_factor_in_every_standard_deviation():
     beta = np.array([[[0.64, 0.16, 3.0, 2e-4, 0.7, 11.0]]])
-    noise = FrameNoise(beta, 20_000.0, residual_dn2=1.3, response_std=0.02)
+    noise = FrameNoise(beta, 20_000.0, residual_dn2=1.3, prnu_rel=0.02)
     once, more = (each.variance((0, 0)) for each in (noise, noise.times(2.5)))
     rounding = 1 / 12
     assert more[0] - rounding == pytest.approx(6.25 * (once[0] - rounding), rel=1e-12)
