@@ -5,13 +5,19 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hesim_render.cli.cube import parse_bands
+from hesim_render.cli.options import cropped
 from hesim_render.core.errors import ConflictError
 from hesim_render.core.shipped import list_names
+
+if TYPE_CHECKING:
+    from hesim_render.sensor.sensor import Sensor
+    from hesim_render.sources.scene import Scene
 
 
 class InputKind(StrEnum):
@@ -22,6 +28,28 @@ class InputKind(StrEnum):
     cube = "a hyperspectral cube"
     run = "a run file"
     recording = "a recording"
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A scene, video or cube, and a sensor: names or files, with the keys and options that change them."""
+
+    name: str
+    sensor: str
+    keys: Mapping[str, Any] = field(default_factory=dict)
+    sensor_keys: Mapping[str, Any] = field(default_factory=dict)
+    roi: str | None = None
+    allow_outside: bool = False
+
+    def load_scene(self) -> Scene:
+        from hesim_render.sources.scene import load_scene
+
+        return load_scene(self.name, self.keys, allow_outside=self.allow_outside)
+
+    def load_sensor(self) -> Sensor:
+        from hesim_render.sensor.sensor import load_sensor
+
+        return cropped(load_sensor(self.sensor, self.sensor_keys), self.roi)
 
 
 #: Ends of the names of hyperspectral cubes. A ``.npy`` file is one where its wavelengths are given, else a video.

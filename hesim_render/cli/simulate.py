@@ -10,7 +10,7 @@ import typer
 
 from hesim_render.cli.console import Console, DryRun, Json, Quiet, recording_facts
 from hesim_render.cli.exit_status import ExitStatus
-from hesim_render.cli.inputs import InputKind, check_options, input_kind, with_values
+from hesim_render.cli.inputs import InputKind, Inputs, check_options, input_kind, with_values
 from hesim_render.cli.options import (
     LONG_MINUTES,
     SENSOR_HELP,
@@ -24,11 +24,10 @@ from hesim_render.cli.options import (
     Yes,
     check_duration,
     check_output,
-    cropped,
     listed,
     names_of,
 )
-from hesim_render.cli.pictures import write_framing, write_look
+from hesim_render.cli.pictures import picture_place, write_framing, write_look
 from hesim_render.cli.terminal import split_overrides, summary
 from hesim_render.core.errors import ConflictError
 
@@ -145,18 +144,17 @@ def simulate(
     elif framing or look is not None:
         if sum((framing, look is not None, dry_run)) > 1:
             raise ConflictError("--framing", framing, "give one of --framing, --look and --dry-run")
-        if look is not None:
-            write_look(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite, look, duration)
-            return
-        write_framing(console, given, sensor, out, keys, sensor_keys, roi, allow_outside, overwrite)
-    elif kind is InputKind.scene:
-        recording = _scene(
-            console, given, sensor, out, scene_keys=keys, sensor_keys=sensor_keys, roi=roi,
-            allow_outside=allow_outside, **limits, **common, **rendered,
-        )  # fmt: skip
-        show_recording(console, recording)
+        inputs, target = Inputs(given, sensor, keys, sensor_keys, roi, allow_outside), picture_place(out, overwrite)
+        if look is None:
+            write_framing(console, inputs, target)
+        else:
+            write_look(console, inputs, target, look, duration)
     else:
-        _pictures(console, kind, given, sensor, out, keys, sensor_keys, roi, {**limits, **common})
+        inputs = Inputs(given, sensor, keys, sensor_keys, roi, allow_outside)
+        if kind is InputKind.scene:
+            show_recording(console, _scene(console, inputs, out, **limits, **common, **rendered))
+        else:
+            _pictures(console, kind, inputs, out, {**limits, **common})
 
 
 def _tell_live_file(console: Console, out: Path) -> None:
@@ -184,56 +182,33 @@ def show_recording(
     console.result(summary(recording) + more, {**recording_facts(recording), **(facts or {})}, status)
 
 
-def _scene(
-    console: Console,
-    scene: str,
-    sensor: str,
-    out: Path,
-    *,
-    scene_keys: dict[str, Any] | None = None,
-    sensor_keys: dict[str, Any] | None = None,
-    roi: str | None = None,
-    overwrite: bool = False,
-    allow_outside: bool = False,
-    **options: Any,
-) -> Recording:
+def _scene(console: Console, inputs: Inputs, out: Path, overwrite: bool = False, **options: Any) -> Recording:
     """The recording of a scene."""
     check_output(out, overwrite)
-    with console.stop_at_estimate(), console.progress(f"{scene} → {sensor}") as progress:
+    with console.stop_at_estimate(), console.progress(f"{inputs.name} → {inputs.sensor}") as progress:
         import hesim_render as hr
 
-        loaded_sensor = cropped(hr.load_sensor(sensor, sensor_keys), roi)
-        loaded_scene = hr.load_scene(scene, scene_keys, allow_outside=allow_outside)
+        sensor, scene = inputs.load_sensor(), inputs.load_scene()
         return hr.simulate(
-            loaded_scene, loaded_sensor, out=out, overwrite=overwrite, progress=progress,
+            scene, sensor, out=out, overwrite=overwrite, progress=progress,
             on_estimate=console.estimated(progress), resume=True, **options,
         )  # fmt: skip
 
 
-def _pictures(
-    console: Console,
-    kind: InputKind,
-    given: str,
-    sensor: str,
-    out: Path,
-    keys: dict[str, Any],
-    sensor_keys: dict[str, Any],
-    roi: str | None,
-    options: dict[str, Any],
-) -> None:
+def _pictures(console: Console, kind: InputKind, inputs: Inputs, out: Path, options: dict[str, Any]) -> None:
     """Record a video or a hyperspectral cube."""
     check_output(out, options["overwrite"])
-    with console.stop_at_estimate(), console.progress(f"{Path(given).name} → {sensor}") as progress:
+    with console.stop_at_estimate(), console.progress(f"{Path(inputs.name).name} → {inputs.sensor}") as progress:
         import hesim_render as hr
 
-        loaded = cropped(hr.load_sensor(sensor, sensor_keys), roi)
-        options |= with_values(keys)
+        loaded = inputs.load_sensor()
+        options |= with_values(inputs.keys)
         options |= {"out": out, "progress": progress, "on_estimate": console.estimated(progress)}
         if kind is InputKind.video:
-            recording = hr.simulate_video(given, loaded, resume=True, **options)
+            recording = hr.simulate_video(inputs.name, loaded, resume=True, **options)
         else:
             del options["max_minutes"]  # a cube takes no rays
-            recording = hr.simulate_cube(given, loaded, **options)
+            recording = hr.simulate_cube(inputs.name, loaded, **options)
     notes = recording.manifest["settings"].get("video", {}).get("notes", [])
     show_recording(console, recording, "".join(f"\nnote: {text}" for text in notes))
 
@@ -297,7 +272,9 @@ def demo(
         check_output(target, overwrite=True)
     audits = {}
     for target, (scene, sensor) in runs.items():
-        recording = _scene(console, scene, sensor, target, roi="512x384", overwrite=True, duration_s=0.1, seed=7)
+        recording = _scene(
+            console, Inputs(scene, sensor, roi="512x384"), target, overwrite=True, duration_s=0.1, seed=7
+        )
         audits[target.name] = recording.manifest["settings"].get("render", {}).get("audit")
         console.text(summary(recording) + "\n")
     still, moving = runs
