@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ValidationError
 
@@ -67,7 +67,7 @@ class _Run:
     file: Path
     sensor: Sensor
     scene: Scene | None
-    options: dict[str, Any]
+    options: dict[str, object]
     pipeline: Pipeline | None
     folder: Path
     done: list[str] = field(default_factory=list)
@@ -163,7 +163,7 @@ def _read(file: Path, out: Path, overrides: dict[str, object], allow_outside: bo
         scene = None
         if spec.scene is not None:
             scene = load_scene(spec.beside(spec.scene), sets[False], allow_outside=allow_outside)
-        options: dict[str, Any] = {}
+        options: dict[str, object] = {}
         for key, given, model in (("video", spec.video, VideoOptions), ("cube", spec.cube, CubeOptions)):
             if given is not None:
                 options = _options(file, key, given, model)
