@@ -42,14 +42,14 @@ class Inputs:
     allow_outside: bool = False
 
     def load_scene(self) -> Scene:
-        from hesim_render.sources.scene import load_scene
+        import hesim_render as hr
 
-        return load_scene(self.name, self.keys, allow_outside=self.allow_outside)
+        return hr.load_scene(self.name, self.keys, allow_outside=self.allow_outside)
 
     def load_sensor(self) -> Sensor:
-        from hesim_render.sensor.sensor import load_sensor
+        import hesim_render as hr
 
-        return cropped(load_sensor(self.sensor, self.sensor_keys), self.roi)
+        return cropped(hr.load_sensor(self.sensor, self.sensor_keys), self.roi)
 
 
 #: Ends of the names of hyperspectral cubes. A ``.npy`` file is one where its wavelengths are given, else a video.
