@@ -12,6 +12,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ValidationError
 
+from hesim_render.capture.run_settings import RunSettings
 from hesim_render.capture.simulate import simulate
 from hesim_render.capture.simulate_cube import simulate_cube
 from hesim_render.capture.simulate_video import simulate_video
@@ -243,7 +244,7 @@ def _recorded(
 
     shown: Progress | Literal[False] = False if progress is None else progress
     video, cube = spec.video, spec.cube
-    duration_s = 0.1 if spec.duration_s is None else spec.duration_s  # a video has its own
+    duration_s = RunSettings.duration_s if spec.duration_s is None else spec.duration_s  # a video has its own
     if asked.scene is not None:
         made = simulate(
             asked.scene, asked.sensor, duration_s=duration_s, seed=spec.seed,
