@@ -197,6 +197,9 @@ def test_pairs_of_little_contrast_take_half_of_the_decision_rays(edges):
     assert np.all((some.high - some.low)[halved] < least[halved])
     for name in vars(every):
         np.testing.assert_array_equal(getattr(some, name)[~halved], getattr(every, name)[~halved])
+    # the second half are other rays than the first
+    both = halved & (every.rays == 64) & (every.scatter > 0)
+    assert both.sum() > 20 and np.mean((some.low != every.low)[both]) > 0.3
 
 
 def test_a_run_takes_lines_where_there_are_some():
