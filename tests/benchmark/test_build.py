@@ -29,7 +29,7 @@ from hesim_render.capture.scene_renderer import scene_renderer
 from hesim_render.core.errors import BackendError, OutputError, RangeError, SpecError
 from hesim_render.sources.render.light_level import in_absolute_light
 
-MATT = {"plastic": 0, "rough_plastic": 0, "metal": 0}
+DIFFUSE = {"plastic": 0, "rough_plastic": 0, "metal": 0}
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def test_a_build_goes_on_where_it_was(built, tmp_path):
 def test_a_generated_scene_is_rendered_from_its_folder(tmp_path):
     """Its textures and meshes lie beside its scene file, and a render from there is the same as that of the clip."""
     spec = generated(
-        1, seed=14, scenes={"objects": 1, "size": 0.4, "contrast": 0.9, "textured": 1, "materials": MATT},
+        1, seed=14, scenes={"objects": 1, "size": 0.4, "contrast": 0.9, "textured": 1, "materials": DIFFUSE},
         motions={"speed": 2.0, "camera": 0}, lights={"illuminance_lux": 2000},
     )  # fmt: skip
     clip = next(build_benchmark(spec, tmp_path / "b", estimate=False).clips())

@@ -31,7 +31,7 @@ class Differences:
     Parameters
     ----------
     rays : number of rays of each in either window, a power of two; 0 for pairs that are rendered by themselves.
-    controlled : estimator of the difference, see `MattIntegrator`.
+    controlled : estimator of the difference, see `DiffuseIntegrator`.
     error : expected standard error of the difference, e⁻/s.
     """
 
@@ -88,16 +88,15 @@ def difference_of(
     # An edge that has moved in a neighbour may reach into this pixel between the pilot rays.
     moved = np.where(controlled, change.controlled[window], change.plain[window])
     contrast = np.maximum(sites.most(moved, 1) - moved[here], moved[here] + sites.most(-moved, 1))
-    unseen = (np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * contrast / wanted_error) ** 2
+    per_contrast = np.float32(tuning.difference_factor * tuning.unseen_area**0.5) / wanted_error
+    unseen = (per_contrast * contrast) ** 2
     brighter = np.float32(tuning.bright_rays) * sites.most(np.abs(moved), 2) / units[here]
     rays = np.maximum(rays, np.minimum(np.maximum(unseen, brighter), np.float32(tuning.most_unseen_rays)))
     if pilot.all_move:
         # Every edge moves, even by less than the distance of two pilot rays, and may come into this pixel.
         flux = np.where(controlled, pilot.controlled[window], pilot.plain[window])
         beside = np.maximum(sites.most(flux, 1) - flux[here], flux[here] + sites.most(-flux, 1))
-        rays = np.maximum(
-            rays, np.square(np.float32(tuning.difference_factor * tuning.unseen_area**0.5) * beside / wanted_error)
-        )
+        rays = np.maximum(rays, (per_contrast * beside) ** 2)
     return np.maximum(rays, np.float32(tuning.least_difference_rays)), scatter
 
 
@@ -133,11 +132,8 @@ def differences(
         bits = np.rint(np.log2(np.minimum(wanted, tuning.most_rays))).astype(np.int16)
         rays = np.left_shift(np.int16(1), bits)
         pays = rendered[window] & (np.float32(tuning.difference_gain) * rays <= alone[window])
-        out.rays[window], out.controlled[window], out.error[window] = (
-            np.where(pays, rays, 0),
-            controlled[sites.listed],
-            scatter,
-        )
+        out.rays[window] = np.where(pays, rays, 0)
+        out.controlled[window], out.error[window] = controlled[sites.listed], scatter
     for window, refined in enumerate(pilot.refined):
         # a small object passes: many rays look for it
         looked_at = np.zeros(sites.size, np.bool_)

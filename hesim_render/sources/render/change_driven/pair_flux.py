@@ -70,7 +70,7 @@ class PairFlux:
 
 @dataclass(frozen=True)
 class PilotFlux:
-    """Statistics of a few rays of each pair, one entry per pair, for both estimators of `MattIntegrator`.
+    """Statistics of a few rays of each pair, one entry per pair, for both estimators of `DiffuseIntegrator`.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class PilotRays:
 
     Parameters
     ----------
-    controlled, plain : by both estimators of `MattIntegrator`.
+    controlled, plain : by both estimators of `DiffuseIntegrator`.
     samples : rays of each pair.
     spans_us : begins and ends of the windows, µs.
     """

@@ -52,7 +52,7 @@ class PairTracer(PacketTracer):
         window : [n], number of the window among `windows`.
         windows : the windows.
         samples : [n], rays per pair, a power of two from `LEAST_SAMPLES` to `MOST_SAMPLES`.
-        controlled : [n], True takes the estimator with a control variate, False the plain one, see `MattIntegrator`.
+        controlled : [n], True takes the estimator with a control variate, False the plain one, see `DiffuseIntegrator`.
         stream : stream of random numbers.
         span_us : interval in which `PairFlux.met` tests for moving objects, µs; default: the windows themselves.
         repeat : [n] or one number, the repetition; each has random numbers of its own.

@@ -80,7 +80,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Pilot:
-    """Statistics of sites in successive windows, all arrays [window, site]; see `PilotFlux` and `MattIntegrator`.
+    """Statistics of sites in successive windows, all arrays [window, site]; see `PilotFlux` and `DiffuseIntegrator`.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ class Plan:
     ----------
     rendered : True for rendered pairs. The first and the last window always are; the others are interpolated linearly.
     rays : number of rays of each rendered pair, a power of two.
-    controlled : True for the estimator with a control variate, False for the plain one, see `MattIntegrator`.
+    controlled : True for the estimator with a control variate, False for the plain one, see `DiffuseIntegrator`.
     error : expected standard error, e⁻/s.
     wanted : wanted standard error, e⁻/s.
     floor : number of rays that a pair gets whatever is known of its edges.

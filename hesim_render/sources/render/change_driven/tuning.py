@@ -90,7 +90,7 @@ class Tuning:
     edge_footprint_px : px, F. Width of the area in which the first half of the decision rays start. Without (1): a
         line that only just enters a pixel, or passes beside it, is not seen.
     edge_contrast_rays : rays per wanted error, F. Rays of a pair with a line for each wanted error of contrast between
-        its sides. Without (0): what the decision rays missed makes single values that are far off.
+        its sides; from the star alone. Without (0): what the decision rays missed makes single values that are far off.
     flat_contrast : wanted errors, C. Where decision rays find less contrast, and no line, a pair gets the rays that
         their scatter asks for. Without (0): pixels beside an edge take the rays that its contrast asks for.
     flat_part : part, C. Of the rays by the law, a pair in which decision rays find no contrast keeps this part at

@@ -63,7 +63,7 @@ class PathIntegrator:
     def flux(
         self, sampler: MitsubaObject, ray: Ray, moment: Moment, filter_index: UInt32
     ) -> tuple[Float, Float, Float, Mask]:
-        """Trace one ray per lane. Parameters and results as `MattIntegrator.flux`, with one estimate in place of
+        """Trace one ray per lane. Parameters and results as `DiffuseIntegrator.flux`, with one estimate in place of
         two.
         """
         import drjit as dr
